@@ -1,0 +1,5 @@
+"""Run as `python -m mpmcli`."""
+
+from mpmcli.cli import main
+
+main()

@@ -1,0 +1,1 @@
+"""Speed of mpmcli beside the MPM examples that the taichi package ships, measured in turn."""

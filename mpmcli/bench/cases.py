@@ -1,0 +1,64 @@
+"""The problems that are measured: one block of fluid, moving down and splashing, at several sizes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# The fluid of both examples, in their units: a unit box, density 1, p = -E (J - 1).
+DENSITY = 1.0
+BULK_MODULUS = 400.0
+GRAVITY = 9.8
+# mpm88 starts its block with this downward speed; here every block does, so that particles
+# change cells, and sorting them again is part of what is measured.
+SPEED = 1.0
+# Lower corner and edge of the block in the example mpm88; mpm3d starts at 0.15, with the same edge.
+CORNER = 0.2
+EDGE = 0.4
+
+
+@dataclass(frozen=True)
+class BenchCase:
+    """One size of the falling block, the same for both contestants.
+
+    Attributes:
+        dimension: 2 or 3.
+        cells: grid cells along each edge of the unit box, a power of two (mpm3d needs it).
+        particles: number of particles in the block, each with an equal share of its mass.
+        step: time step, s, equal for both.
+    """
+
+    dimension: int
+    cells: int
+    particles: int
+    step: float
+
+    @property
+    def name(self) -> str:
+        """Name in tables and on the command line, like "3d-128"."""
+        return f"{self.dimension}d-{self.cells}"
+
+    @property
+    def peer(self) -> str:
+        """The example of the taichi package that solves the same problem."""
+        return "mpm3d" if self.dimension == 3 else "mpm88"
+
+    def positions(self) -> np.ndarray:
+        """Return the positions that both start from, (particles, dimension) float64: uniform in the block."""
+        return CORNER + EDGE * np.random.default_rng(0).random((self.particles, self.dimension))
+
+    def velocity(self) -> np.ndarray:
+        """Return the velocity of every particle at the start, (dimension,) float64, m/s."""
+        return np.array([0.0, -SPEED, 0.0][: self.dimension])
+
+
+# Steps are the examples' own where they give one: 4e-4, 2e-4, 8e-5 at 32, 64, 128 cells for mpm3d,
+# 2e-4 at 128 for mpm88. Particles are about 4 per cell; at the smallest size in 2D 8, in 3D 2.
+CASES = (
+    BenchCase(dimension=2, cells=64, particles=5_000, step=4e-4),
+    BenchCase(dimension=2, cells=128, particles=10_000, step=2e-4),
+    BenchCase(dimension=2, cells=256, particles=42_000, step=1e-4),
+    BenchCase(dimension=2, cells=512, particles=168_000, step=5e-5),
+    BenchCase(dimension=3, cells=32, particles=5_000, step=4e-4),
+    BenchCase(dimension=3, cells=64, particles=65_536, step=2e-4),
+    BenchCase(dimension=3, cells=128, particles=524_288, step=8e-5),
+)

@@ -1,0 +1,146 @@
+"""One contestant in a process of its own, told what to do line by line.
+
+    python -m mpmcli.bench.worker ours|peer --dimension 3 --cells 128 --particles 524288 --step 8e-5
+                                  [--threads 2] [--precision f32] [--arch cpu]
+
+It answers on stdout, one JSON object per line, and waits for commands on stdin without using the processor:
+
+    (start)        {"particles": 524288, "bytes_per_particle": 88 or null}     ready to step
+    first          {"seconds": 2.9}                                            one step, kernels compiled
+    run SECONDS    {"steps": 31, "seconds": 1.02}                              steps for about that long
+    finish         {"sound": true, "smallest_step": 8e-5, "peak_memory": 219152384}    and ends
+
+What cannot go on is told as {"error": "a sentence"} and ends the process with status 1.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import IO, Protocol
+
+from mpmcli.bench.cases import BenchCase
+from mpmcli.errors import MpmcliError
+
+
+class Contestant(Protocol):
+    """What a worker measures: a simulation, ready to step."""
+
+    particles: int
+    bytes_per_particle: int | None
+    smallest_step: float
+
+    def step(self) -> None:
+        """Advance by one time step; may return before the device is done."""
+
+    def sync(self) -> None:
+        """Wait until every step asked for is done."""
+
+    def is_sound(self) -> bool:
+        """Whether the state still makes sense."""
+
+
+def run_block(contestant: Contestant, seconds: float) -> tuple[int, float]:
+    """Step for about `seconds` and return (steps taken, seconds taken), device included."""
+    steps, chunk, elapsed = 0, 1, 0.0
+    start = time.perf_counter()
+    while elapsed < seconds:
+        for _ in range(chunk):
+            contestant.step()
+        contestant.sync()
+        steps += chunk
+        elapsed = time.perf_counter() - start
+        # Few waits for the device, and no overshoot: grow until what is left limits the next chunk.
+        left = int(steps / elapsed * (seconds - elapsed)) + 1
+        chunk = max(1, min(2 * chunk, left))
+    return steps, elapsed
+
+
+def peak_memory() -> int:
+    """Return the largest resident memory that this process has had, in bytes."""
+    status = Path("/proc/self/status")
+    if status.exists():
+        # Not getrusage: on Linux its maximum includes that of the parent which started this process.
+        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
+        return int(line.split()[1]) * 1024
+    import psutil
+
+    memory = psutil.Process().memory_info()
+    if hasattr(memory, "peak_wset"):
+        return memory.peak_wset
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # macOS: bytes
+
+
+def serve(start: Callable[[], Contestant], commands: Iterable[str], answers: IO[str]) -> int:
+    """Start a contestant and obey the commands until `finish` or their end; return the exit status."""
+
+    def answer(**values: object) -> None:
+        answers.write(json.dumps(values) + "\n")
+        answers.flush()
+
+    try:
+        contestant = start()
+        answer(particles=contestant.particles, bytes_per_particle=contestant.bytes_per_particle)
+        for command in commands:
+            match command.split():
+                case ["first"]:
+                    begin = time.perf_counter()
+                    contestant.step()
+                    contestant.sync()
+                    answer(seconds=time.perf_counter() - begin)
+                case ["run", seconds]:
+                    steps, elapsed = run_block(contestant, float(seconds))
+                    answer(steps=steps, seconds=elapsed)
+                case ["finish"]:
+                    answer(
+                        sound=contestant.is_sound(),
+                        smallest_step=contestant.smallest_step,
+                        peak_memory=peak_memory(),
+                    )
+                    return 0
+    except MpmcliError as error:
+        answer(error=str(error))
+        return 1
+    return 0
+
+
+def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
+    if who == "peer":
+        from mpmcli.bench.peers import Peer
+
+        return Peer(case, **options)
+    from mpmcli.bench.ours import Ours
+
+    return Ours(case, **options)
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m mpmcli.bench.worker")
+    parser.add_argument("who", choices=["ours", "peer"])
+    parser.add_argument("--dimension", type=int, choices=[2, 3], required=True)
+    parser.add_argument("--cells", type=int, required=True)
+    parser.add_argument("--particles", type=int, required=True)
+    parser.add_argument("--step", type=float, required=True)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--precision", choices=["f32", "f64"], default="f32")
+    parser.add_argument("--arch", default="cpu")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one contestant; taichi's own lines on stdout go to stderr."""
+    parsed = _parse(arguments)
+    case = BenchCase(parsed.dimension, parsed.cells, parsed.particles, parsed.step)
+    options = {"threads": parsed.threads, "precision": parsed.precision, "arch": parsed.arch}
+    with os.fdopen(os.dup(1), "w", encoding="utf-8") as answers:
+        os.dup2(2, 1)
+        return serve(lambda: _contestant(parsed.who, case, **options), sys.stdin, answers)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,106 @@
+"""`mpmcli info`."""
+
+from pathlib import Path
+
+import click
+
+from mpmcli.cli.options import json_option, set_option
+
+
+@click.command("info")
+@click.argument("path", type=click.Path(path_type=Path))
+@set_option
+@json_option
+def command(path: Path, overrides: tuple[str, ...], as_json: bool) -> None:
+    """Say what PATH holds: a scene (.toml), or a result (its directory, particles.vtkhdf or particles.pvd)."""
+    import json
+
+    from mpmcli.errors import InputError
+
+    if path.suffix == ".toml":
+        facts = _of_scene(path, overrides)
+    else:
+        if overrides:
+            raise InputError(f"--set changes scenes, and {path} is none; leave it out.")
+        facts = _of_result(path)
+    if as_json:
+        click.echo(json.dumps(facts, indent=2))
+        return
+    width = max(len(name) for name in facts)
+    for name, value in facts.items():
+        click.echo(f"{name.replace('_', ' '):<{width}}  {_plain(value)}", err=True)
+
+
+def _of_scene(path: Path, overrides: tuple[str, ...]) -> dict:
+    from mpmcli.materials.registry import parameter_models
+    from mpmcli.scene import load_scene
+    from mpmcli.solver.plan import make_plan
+
+    loaded = load_scene(path, overrides, laws=parameter_models())
+    scene = loaded.scene
+    plan = make_plan(scene, 1)
+    return {
+        "title": scene.title,
+        "dimension": scene.dimension,
+        "size_m": list(scene.domain.size),
+        "spacing_m": scene.domain.spacing,
+        "cells": list(scene.domain.cells),
+        "end_s": scene.time.end,
+        "frames": scene.time.frames + 1,
+        "bodies": [
+            f"{body.name}: {body.material.law}, {type(body.shape.form).__name__.lower()}" for body in scene.bodies
+        ],
+        "particles": plan.particles,
+        "bytes_per_particle": plan.bytes_per_particle,
+        "device_bytes": plan.device_bytes,
+        "fields": list(scene.output.fields),
+        "notes": list(loaded.notes),
+    }
+
+
+def _of_result(path: Path) -> dict:
+    from mpmcli.output import open_result
+
+    result = open_result(path)
+    record = result.record or {}
+    last = result.ledger[-1]
+    return {
+        "title": result.header.get("title", ""),
+        "kind": result.kind,
+        "status": record.get("status", "unknown"),
+        "frames": result.frame_count,
+        "frames_expected": record.get("frames_expected"),
+        "time_s": [float(result.times[0]), float(result.times[-1])],
+        "particles": int(result.particle_counts[-1]),
+        "dimension": result.dimension,
+        "bodies": result.header.get("bodies", []),
+        "materials": result.header.get("materials", []),
+        "fields": list(result.field_names),
+        "precision": result.header.get("precision"),
+        "backend": result.header.get("backend"),
+        "steps": record.get("steps"),
+        "step_s": [
+            min((row.step_min for row in result.ledger[1:]), default=0.0),
+            max((row.step_max for row in result.ledger[1:]), default=0.0),
+        ],
+        "limits": record.get("limits", {}),
+        "energy_J": [result.ledger[0].energy, last.energy],
+        "mass_kg": last.mass,
+        "volume_ratio": [
+            min(row.volume_ratio_min for row in result.ledger),
+            max(row.volume_ratio_max for row in result.ledger),
+        ],
+        "timings_s": record.get("timings", {}),
+        "failure": (record.get("failure") or {}).get("message"),
+        "version": result.header.get("version"),
+    }
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_plain(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(_plain(item) for item in value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "-" if value is None or value == "" else str(value)

@@ -1,0 +1,99 @@
+"""The group of all commands, loaded when named, and what every one of them does with an error."""
+
+import importlib
+import signal
+import sys
+import traceback
+from typing import Any, NoReturn
+
+import click
+
+from mpmcli import __version__
+from mpmcli.errors import MpmcliError
+
+# Name of each command, the module that holds it, and its line in the help: so that help loads no module.
+COMMANDS = {
+    "simulate": "Run a scene and store its particles.",
+    "info": "Say what a result or a scene holds.",
+    "schema": "Print the JSON Schema of scenes, for editors.",
+    "bench": "Compare speed with the MPM examples that Taichi ships.",
+    "completion": "Print the script that completes commands in a shell.",
+}
+
+INTERRUPTED = 130
+
+
+class LazyGroup(click.Group):
+    """A group whose commands are imported when they are called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        return importlib.import_module(f"mpmcli.cli.{cmd_name}").command
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            from difflib import get_close_matches
+
+            near = get_close_matches(args[0], COMMANDS, n=1)
+            hint = f' did you mean "{near[0]}"?' if near else f" the commands are {', '.join(COMMANDS)}."
+            raise click.UsageError(f'there is no command "{args[0]}";{hint}', ctx)
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+@click.version_option(__version__, prog_name="mpmcli")
+@click.pass_context
+def program(context: click.Context, debug: bool) -> None:
+    """Turn a TOML scene into a reproducible particle dataset with the Material Point Method.
+
+    Text goes to stderr and JSON to stdout. Exit codes: 0 done; 1 done, with a finding; 2 bad input or
+    usage; 130 interrupted.
+    """
+    context.obj = debug
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run the command line, `sys.argv` where no arguments are given, and exit with its code."""
+    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+
+
+def run(arguments: list[str]) -> int:
+    """Run the command line and return its exit code; a traceback is shown with --debug only."""
+    # A batch system's request to end is treated as Ctrl-C: what is written is sealed.
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    debug = "--debug" in arguments
+    # Accepted after the command too.
+    arguments = (["--debug"] if debug else []) + [word for word in arguments if word != "--debug"]
+    try:
+        result = program.main(arguments, prog_name="mpmcli", standalone_mode=False)
+        return result if isinstance(result, int) else 0
+    except click.ClickException as error:
+        error.show()
+        return 2
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted", err=True)
+        return INTERRUPTED
+    except MpmcliError as error:
+        if debug:
+            traceback.print_exc()
+        click.echo(f"error: {error}", err=True)
+        return error.exit_code
+    except BrokenPipeError:
+        # The reader of a pipe went away, which is its right.
+        sys.stderr.close()
+        return 0
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        kind = type(error).__name__
+        click.echo(f"error: {kind}: {error} (a fault of mpmcli; --debug shows where)", err=True)
+        return 1

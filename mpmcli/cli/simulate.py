@@ -1,0 +1,81 @@
+"""`mpmcli simulate`."""
+
+import sys
+from pathlib import Path
+
+import click
+
+from mpmcli.cli.options import json_option, quiet_option, set_option, threads_option
+
+
+@click.command("simulate")
+@click.argument("scene", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Where the result goes; results/<name of the scene> by default.",
+)
+@set_option
+@click.option(
+    "--arch",
+    type=click.Choice(["auto", "cpu", "cuda", "vulkan", "metal"]),
+    default="auto",
+    show_default=True,
+    help="Where to compute; auto takes CUDA or Metal where they are, and else the CPU.",
+)
+@threads_option
+@click.option("--precision", type=click.Choice(["f32", "f64"]), help="Replaces solver.precision of the scene.")
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["vtkhdf", "vtk"]),
+    default="vtkhdf",
+    show_default=True,
+    help="One temporal VTKHDF file, or a .vtu series with a .pvd.",
+)
+@click.option("--compress", is_flag=True, help="Compress the stored file with gzip.")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier result in the output directory.")
+@quiet_option
+@json_option
+def command(
+    scene: Path,
+    output: Path | None,
+    overrides: tuple[str, ...],
+    arch: str,
+    threads: int | None,
+    precision: str | None,
+    form: str,
+    compress: bool,
+    overwrite: bool,
+    quiet: bool,
+    as_json: bool,
+) -> int:
+    """Run SCENE, a TOML file, and store its particles for ParaView, h5py and learners."""
+    from mpmcli.cli.progress import Progress
+    from mpmcli.materials.registry import parameter_models
+    from mpmcli.scene import load_scene
+    from mpmcli.solver.run import RunSettings, run_scene
+
+    overrides += (f'solver.precision="{precision}"',) if precision else ()
+    overrides += ("output.compress=true",) if compress else ()
+    loaded = load_scene(scene, overrides, laws=parameter_models())
+    settings = RunSettings(
+        directory=output or Path("results") / scene.stem,
+        arch=arch,
+        threads=threads,
+        form=form,
+        overwrite=overwrite,
+        command=["mpmcli", *sys.argv[1:]],
+    )
+    progress = Progress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
+    progress.notes(loaded.notes)
+    with progress:
+        summary = run_scene(loaded, settings, progress.advance)
+    progress.close(summary)
+    if as_json:
+        import json
+
+        click.echo(json.dumps(summary.as_dict(), indent=2))
+    return {"finished": 0, "interrupted": 130}.get(summary.status, 1)

@@ -1,0 +1,22 @@
+"""Frames on disk: the stores that write them, the results that read them, the record of a run.
+
+Neither vtk nor meshio is imported until a series is written or read.
+"""
+
+from mpmcli.output.directory import prepare_directory
+from mpmcli.output.frame import Frame
+from mpmcli.output.result import Result, open_result
+from mpmcli.output.run_record import RunRecord, read_record
+from mpmcli.output.series import VtkSeriesStore
+from mpmcli.output.store import SegmentStore
+
+__all__ = [
+    "Frame",
+    "Result",
+    "RunRecord",
+    "SegmentStore",
+    "VtkSeriesStore",
+    "open_result",
+    "prepare_directory",
+    "read_record",
+]

@@ -1,0 +1,110 @@
+"""Files that are either whole or absent: temporary name, fsync, atomic rename, fsync of the directory."""
+
+import errno
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from mpmcli.errors import RunError
+
+TEMPORARY_SUFFIX = ".tmp"
+# Bytes left free on top of what is about to be written: file system metadata and other programs.
+SPACE_MARGIN = 16 * 1024 * 1024
+
+
+def sync_file(path: Path) -> None:
+    """Force the content of a closed file to the disk."""
+    descriptor = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_directory(directory: Path) -> None:
+    """Force the names in a directory to the disk, where the system can (Windows cannot)."""
+    try:
+        descriptor = os.open(directory, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        with suppress(OSError):
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def sealed(path: Path, size: int = 0) -> Iterator[Path]:
+    """Give a temporary path to write and close; on leaving, put it at `path` in one durable step.
+
+    After a crash at any moment `path` holds its old content or the whole new one. If the block
+    raises, the temporary file is removed and `path` is untouched.
+
+    Args:
+        path: the file to make or replace.
+        size: bytes that the system is asked to grant first, 0 for no question.
+
+    Raises:
+        OSError: the system does not grant them: disk full, quota, limit on the size of a file.
+    """
+    temporary = path.with_name(path.name + TEMPORARY_SUFFIX)
+    try:
+        if size:
+            _ask_for(temporary, size)
+        yield temporary
+        sync_file(temporary)
+        os.replace(temporary, path)
+    except BaseException:
+        # The error under way is what the user must see, not a failed clean-up.
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+    sync_directory(path.parent)
+
+
+def _ask_for(path: Path, size: int) -> None:
+    """Reserve `size` bytes and let them go, so that a refusal comes here and not inside HDF5.
+
+    HDF5 that is refused space raises, and then crashes the interpreter at exit. Free space alone does
+    not tell of quotas and limits.
+    """
+    if not hasattr(os, "posix_fallocate"):
+        return
+    with open(path, "wb") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, size)
+        except OSError as error:
+            # Some file systems cannot reserve; then nothing is learned.
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                raise
+        file.truncate(0)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replace a UTF-8 text file in one durable step."""
+    with sealed(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def require_free_space(directory: Path, size: int, purpose: str, kept: str) -> None:
+    """Refuse to start writing what the disk cannot hold.
+
+    Args:
+        directory: where the file goes; it exists.
+        size: bytes to be written.
+        purpose: what is to be written, the subject of the error's sentence ("frame 7").
+        kept: what stays usable, closing the sentence ("the 7 frames before it are kept").
+
+    Raises:
+        RunError: fewer than `size` + `SPACE_MARGIN` bytes are free.
+    """
+    free = shutil.disk_usage(directory).free
+    if free < size + SPACE_MARGIN:
+        raise RunError(
+            f"The disk of {directory} has {free / 1e6:.1f} MB left, but {purpose} needs "
+            f"{(size + SPACE_MARGIN) / 1e6:.1f} MB (a margin included): free some space or write to another "
+            f"disk with -o; {kept}."
+        )

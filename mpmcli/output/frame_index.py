@@ -1,0 +1,48 @@
+"""What an output says about its frames, without the particles."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mpmcli.output.layout import FrameLayout
+from mpmcli.stability.ledger import LedgerRow
+
+
+@dataclass(frozen=True)
+class FrameIndex:
+    """Tables of T frames.
+
+    Attributes:
+        layout: the arrays of every frame.
+        header: facts about the run.
+        times: (T,) float64, s.
+        frames, steps: (T,) frame number, and time steps since the start.
+        offsets, counts: (T,) first row and number of rows of each frame in its file.
+        ledger: T rows.
+    """
+
+    layout: FrameLayout
+    header: dict[str, Any]
+    times: np.ndarray
+    frames: np.ndarray
+    steps: np.ndarray
+    offsets: np.ndarray
+    counts: np.ndarray
+    ledger: list[LedgerRow]
+
+    @classmethod
+    def joined(cls, indices: Sequence["FrameIndex"]) -> "FrameIndex":
+        """The index that one file with the frames of all these, one after the other, has."""
+        counts = np.concatenate([index.counts for index in indices])
+        return cls(
+            layout=indices[0].layout,
+            header=indices[0].header,
+            times=np.concatenate([index.times for index in indices]),
+            frames=np.concatenate([index.frames for index in indices]),
+            steps=np.concatenate([index.steps for index in indices]),
+            offsets=np.cumsum(counts) - counts,
+            counts=counts,
+            ledger=[row for index in indices for row in index.ledger],
+        )

@@ -1,0 +1,171 @@
+"""How the arrays of a Frame lie in a file: names, types, and the padding of 2D to 3D for VTK."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mpmcli.output.frame import Frame
+
+POSITION = "Points"  # VTK's name; every other array keeps its own
+STANDARD = ("id", "body", "material", "velocity")
+# 2D is plane strain: out of the plane F is the identity, and every other tensor is stored as zero.
+OUT_OF_PLANE = {"deformation_gradient": 1.0}
+# What both VTK and meshio read back without conversion.
+DTYPES = tuple(np.dtype(code) for code in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"))
+
+
+@dataclass(frozen=True)
+class ArrayLayout:
+    """One array over the particles.
+
+    Attributes:
+        name: name in the file.
+        dtype: numpy type name, "float32".
+        shape: per particle as the Frame has it: (), (k,) or (d, d).
+        dimension: d, 2 or 3.
+    """
+
+    name: str
+    dtype: str
+    shape: tuple[int, ...]
+    dimension: int
+
+    @property
+    def is_tensor(self) -> bool:
+        """Whether it is a d x d tensor, given as (d, d) or flat, rows first."""
+        d = self.dimension
+        return self.shape in ((d, d), (d * d,))
+
+    @property
+    def components(self) -> int | None:
+        """Numbers per particle in the file, None for a scalar: 3 for vectors and 9 for tensors, in 2D too."""
+        if self.shape == ():
+            return None
+        if self.is_tensor:
+            return 9
+        return 3 if self.shape == (self.dimension,) else self.shape[0]
+
+    @property
+    def bytes_per_particle(self) -> int:
+        """Bytes in the file for each particle of a frame."""
+        return np.dtype(self.dtype).itemsize * (self.components or 1)
+
+    def stored_shape(self, n: int) -> tuple[int, ...]:
+        """Shape in the file for n particles."""
+        return (n,) if self.components is None else (n, self.components)
+
+    def pad(self, array: np.ndarray) -> np.ndarray:
+        """Give an array of a Frame, (n, *shape), the form of the file, (n,) or (n, components)."""
+        n, d = len(array), self.dimension
+        if self.is_tensor:
+            tensor = array.reshape(n, d, d)
+            if d == 2:
+                padded = np.zeros((n, 3, 3), array.dtype)
+                padded[:, :2, :2] = tensor
+                padded[:, 2, 2] = OUT_OF_PLANE.get(self.name, 0.0)
+                tensor = padded
+            return np.ascontiguousarray(tensor).reshape(n, 9)
+        if self.shape == (d,) and d == 2:
+            padded = np.zeros((n, 3), array.dtype)
+            padded[:, :2] = array
+            return padded
+        return np.ascontiguousarray(array)
+
+    def unpad(self, stored: np.ndarray) -> np.ndarray:
+        """Undo `pad`, bit for bit."""
+        n, d = len(stored), self.dimension
+        if self.is_tensor:
+            return np.ascontiguousarray(stored.reshape(n, 3, 3)[:, :d, :d]).reshape(n, *self.shape)
+        if self.shape == (d,):
+            return np.ascontiguousarray(stored[:, :d])
+        return stored
+
+
+@dataclass(frozen=True)
+class FrameLayout:
+    """All arrays of a frame; the same for every frame of a run.
+
+    Attributes:
+        dimension: d, 2 or 3.
+        arrays: the layouts by name: `Points`, the standard ones, then the scene's output fields.
+    """
+
+    dimension: int
+    arrays: dict[str, ArrayLayout] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, frame: Frame) -> "FrameLayout":
+        """Read the layout off a frame.
+
+        Raises:
+            ValueError: an array has a shape, type or name that a file cannot hold.
+        """
+        if frame.position.ndim != 2 or frame.position.shape[1] not in (2, 3):
+            raise ValueError(f"position must be (n, 2) or (n, 3), not {frame.position.shape}")
+        n, d = frame.position.shape
+        if frame.position.dtype not in DTYPES[:2]:
+            raise ValueError(f"position must be float32 or float64, not {frame.position.dtype}")
+        if frame.velocity.shape != (n, d) or frame.body.shape != (n,) or frame.material.shape != (n,):
+            raise ValueError(f"velocity, body, material must be (n, d), (n,), (n,) in frame {frame.index}")
+        arrays = {}
+        for name, array in _named_arrays(frame):
+            if array.dtype not in DTYPES or len(array) != n or not _shape_fits(array.shape[1:], d):
+                raise ValueError(
+                    f"{name} is {array.shape} of {array.dtype}: a field must be (n,), (n, k) or (n, d, d) "
+                    f"with n = {n} and d = {d}, of whole or 32 or 64 bit floating numbers"
+                )
+            arrays[name] = ArrayLayout(name, array.dtype.name, array.shape[1:], d)
+        return cls(d, arrays)
+
+    @property
+    def bytes_per_particle(self) -> int:
+        """Bytes in the file for each particle of a frame, without VTK's connectivity."""
+        return sum(array.bytes_per_particle for array in self.arrays.values())
+
+    def stored(self, frame: Frame) -> Iterator[tuple[str, np.ndarray]]:
+        """Yield every array in the form of the file, one at a time.
+
+        Raises:
+            ValueError: the frame has other names, types or shapes than this layout.
+        """
+        if FrameLayout.of(frame) != self:
+            raise ValueError(f"frame {frame.index} holds other arrays, types or shapes than the first frame")
+        for name, array in _named_arrays(frame):
+            yield name, self.arrays[name].pad(array)
+
+    def frame(self, index: int, time: float, step: int, stored: Mapping[str, np.ndarray]) -> Frame:
+        """Build the Frame back from arrays in the form of the file; `stored` may leave out fields."""
+        arrays = {name: self.arrays[name].unpad(array) for name, array in stored.items()}
+        arrays.pop("id", None)
+        standard = {name: arrays.pop(name) for name in STANDARD[1:]}
+        return Frame(index, time, step, position=arrays.pop(POSITION), fields=arrays, **standard)
+
+    def to_dict(self) -> dict:
+        """Plain form for JSON."""
+        shapes = {name: [a.dtype, list(a.shape)] for name, a in self.arrays.items()}
+        return {"dimension": self.dimension, "arrays": shapes}
+
+    @classmethod
+    def from_dict(cls, plain: dict) -> "FrameLayout":
+        """Undo `to_dict`."""
+        d = plain["dimension"]
+        return cls(d, {name: ArrayLayout(name, t, tuple(s), d) for name, (t, s) in plain["arrays"].items()})
+
+
+def _named_arrays(frame: Frame) -> Iterator[tuple[str, np.ndarray]]:
+    n = len(frame.position)
+    yield POSITION, frame.position
+    # Row i is particle i, so ids need no storage in a Frame; in the file they let ParaView follow one.
+    yield "id", np.arange(n, dtype=np.int32 if n < 2**31 else np.int64)
+    for name in STANDARD[1:]:
+        yield name, getattr(frame, name)
+    for name, array in frame.fields.items():
+        # VTK's reader takes "/" and "." as parts of a path (VTKHDF specification).
+        if not name or "/" in name or "." in name or name == POSITION or name in STANDARD:
+            raise ValueError(f'"{name}" cannot name an output field: it is taken, or holds "/" or "."')
+        yield name, array
+
+
+def _shape_fits(shape: tuple[int, ...], d: int) -> bool:
+    return shape in ((), (d, d)) or (len(shape) == 1 and shape[0] > 0)

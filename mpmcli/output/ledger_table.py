@@ -1,0 +1,91 @@
+"""The run-time ledger as columns, for HDF5, and as CSV text, for the VTK series."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+
+import h5py
+import numpy as np
+
+from mpmcli.stability.ledger import LedgerRow
+
+COLUMNS = tuple(f.name for f in fields(LedgerRow))
+VECTORS = ("linear_momentum", "angular_momentum")
+INTEGERS = ("steps",)
+TEXT = "limit"
+# Of each frame, in the CSV: its number, time steps since the start, particles.
+FRAME_COLUMNS = ("frame", "step", "particles")
+
+
+def ledger_columns(rows: Sequence[LedgerRow]) -> dict[str, np.ndarray]:
+    """Turn T rows into one array per column.
+
+    Returns:
+        (T,) float64, int64 for `steps`, UTF-8 of fixed length for `limit`; momenta (T, components).
+    """
+    columns = {}
+    for name in COLUMNS:
+        values = [getattr(row, name) for row in rows]
+        if name == TEXT:
+            texts = [text.encode("utf-8") for text in values]
+            length = max(1, *(len(text) for text in texts), 1)
+            columns[name] = np.array(texts, dtype=h5py.string_dtype("utf-8", length))
+        else:
+            columns[name] = np.array(values, dtype=np.int64 if name in INTEGERS else np.float64)
+    return columns
+
+
+def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:
+    """Undo `ledger_columns`."""
+    lists = []
+    for name in COLUMNS:
+        values = np.asarray(columns[name]).tolist()
+        if name == TEXT:
+            values = [text.decode("utf-8") for text in values]
+        elif name in VECTORS:
+            values = [tuple(value) for value in values]
+        lists.append(values)
+    return [LedgerRow(*values) for values in zip(*lists, strict=True)]
+
+
+def ledger_csv(rows: Sequence[LedgerRow], frames: Mapping[str, Sequence[int]]) -> str:
+    """Write T rows as CSV with a header line; numbers have the digits that read back exactly.
+
+    Args:
+        rows: the ledger.
+        frames: the first columns, whole numbers by name (`FRAME_COLUMNS`), one per row.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    for i, row in enumerate(rows):
+        record: dict[str, object] = {name: frames[name][i] for name in FRAME_COLUMNS}
+        for name in COLUMNS:
+            value = getattr(row, name)
+            if name in VECTORS:
+                record |= {f"{name}_{axis}": repr(float(v)) for axis, v in enumerate(value)}
+            else:
+                record[name] = value if name == TEXT or name in INTEGERS else repr(float(value))
+        if i == 0:
+            writer.writerow(record)
+        writer.writerow(record.values())
+    return text.getvalue()
+
+
+def parse_ledger_csv(text: str) -> tuple[list[LedgerRow], dict[str, list[int]]]:
+    """Undo `ledger_csv`: the rows, and the first columns by name."""
+    rows, frames = [], {name: [] for name in FRAME_COLUMNS}
+    for record in csv.DictReader(io.StringIO(text)):
+        for name in FRAME_COLUMNS:
+            frames[name].append(int(record[name]))
+        values: dict[str, object] = {}
+        for name in COLUMNS:
+            if name in VECTORS:
+                keys = [key for key in record if key.startswith(f"{name}_")]
+                values[name] = tuple(float(record[key]) for key in keys)
+            elif name == TEXT:
+                values[name] = record[name]
+            else:
+                values[name] = int(record[name]) if name in INTEGERS else float(record[name])
+        rows.append(LedgerRow(**values))
+    return rows, frames

@@ -1,0 +1,102 @@
+"""Packing: many sealed one-frame files become one file, proved equal before it takes its name."""
+
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from mpmcli.errors import InputError, RunError
+from mpmcli.output.durable import require_free_space, sealed, sync_file
+from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, part_tables, read_array, read_index
+
+
+def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = False) -> None:
+    """Write all frames of `segments` into `target`, compare every number, then give it its name.
+
+    Memory is that of one array of one frame. The segments are left as they are.
+
+    Args:
+        segments: sealed one-frame VTKHDF files of one run, in order.
+        target: file to make; an existing one is replaced at the very end.
+        compress: gzip-1 with shuffle.
+
+    Raises:
+        RunError: the disk cannot hold the packed file, the segments do not belong together, or the
+            packed file does not read back bit for bit. No `target` is made then.
+    """
+    try:
+        indices = [_read_index(segment) for segment in segments]
+    except InputError as error:
+        raise RunError(f"{error} The frames in {segments[0].parent} were left unpacked.") from error
+    first = indices[0]
+    for segment, index in zip(segments, indices, strict=True):
+        if index.layout != first.layout or index.header != first.header:
+            raise RunError(f"{segment} is of another run than {segments[0]}: the frames were left unpacked.")
+    counts = [int(index.counts[0]) for index in indices]
+    kept = f"the {len(segments)} frames written are kept in {segments[0].parent} and stay readable there"
+    purpose = f"packing the frames into {target.name}"
+    size = file_size(first.layout, counts)
+    require_free_space(target.parent, size, purpose, kept)
+    try:
+        with sealed(target, size) as temporary:
+            with VtkhdfWriter(temporary, first.layout, counts, compress=compress) as writer:
+                for k, segment in enumerate(segments):
+                    with closing(open_vtkhdf(segment)) as source:
+                        for name in first.layout.arrays:
+                            writer.write_array(k, name, read_array(source, name, 0, counts[k]))
+                expected = FrameIndex.joined(indices)
+                writer.finish(expected.times, expected.frames, expected.steps, expected.ledger, header=expected.header)
+            sync_file(temporary)
+            difference = find_difference(temporary, segments, expected)
+            if difference:
+                raise RunError(f"{target.name} does not read back as it was written ({difference}); {kept}.")
+    except (OSError, RuntimeError, InputError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RunError(f"{target} could not be written ({reason}); {kept}.") from error
+
+
+def find_difference(packed: Path, segments: Sequence[Path], expected: FrameIndex) -> str:
+    """Compare a packed file with its segments, bit for bit.
+
+    Returns:
+        What differs first, in words; "" when nothing does.
+    """
+    with closing(open_vtkhdf(packed)) as file:
+        index = read_index(file)
+        for table in ("times", "frames", "steps", "offsets", "counts"):
+            if not _same(getattr(index, table), getattr(expected, table)):
+                return f"the {table} of the frames"
+        # The text form compares NaN with NaN as equal.
+        if repr(index.ledger) != repr(expected.ledger):
+            return "the ledger"
+        if index.header != expected.header or index.layout != expected.layout:
+            return "the header"
+        root = file["VTKHDF"]
+        for name, table in part_tables(expected.counts).items():
+            if not _same(root[name][...], table):
+                return name
+        if root["Steps"].attrs["NSteps"] != len(segments):
+            return "NSteps"
+        for k, segment in enumerate(segments):
+            with closing(open_vtkhdf(segment)) as source:
+                for name in expected.layout.arrays:
+                    count = int(expected.counts[k])
+                    written = read_array(file, name, int(expected.offsets[k]), count)
+                    if not _same(written, read_array(source, name, 0, count)):
+                        return f"{name} of frame {expected.frames[k]}"
+    return ""
+
+
+def _read_index(segment: Path) -> FrameIndex:
+    with closing(open_vtkhdf(segment)) as file:
+        return read_index(file)
+
+
+def _same(a: np.ndarray, b: np.ndarray) -> bool:
+    """Equal in type, shape and every bit, so that NaN equals itself and -0.0 is not 0.0."""
+    if a.dtype != b.dtype or a.shape != b.shape:
+        return False
+    a, b = np.ascontiguousarray(a), np.ascontiguousarray(b)
+    return bool(np.array_equal(a.reshape(-1).view(np.uint8), b.reshape(-1).view(np.uint8)))

@@ -1,0 +1,200 @@
+"""Reading results: packed file, directory, running or broken directory, VTK series, all alike."""
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Literal
+from xml.etree import ElementTree
+
+import numpy as np
+
+from mpmcli.errors import InputError
+from mpmcli.output.frame import Frame
+from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.layout import POSITION, STANDARD, FrameLayout
+from mpmcli.output.ledger_table import FRAME_COLUMNS, parse_ledger_csv
+from mpmcli.output.run_record import read_record
+from mpmcli.output.series import SERIES, SERIES_HEADER, SERIES_LEDGER, read_vtu
+from mpmcli.output.store import PACKED, SEGMENTS, sealed_segments
+from mpmcli.output.vtkhdf import FORMAT, open_vtkhdf, read_array, read_index
+from mpmcli.stability.ledger import LedgerRow
+
+Kind = Literal["packed", "segments", "series"]
+
+
+class Result(ABC):
+    """The frames of one run, read one at a time; made by `open_result`.
+
+    No file stays open, so a Result can be copied to other processes.
+
+    Attributes:
+        path: the packed file, the directory of the segments, or the .pvd.
+        kind: "packed", "segments" (running, or ended before packing) or "series".
+        times: (T,) float64, s.
+        particle_counts: (T,) particles of each frame.
+        ledger: T rows.
+        header: facts about the run, among them "scene", the TOML text.
+        dimension: 2 or 3.
+        field_names: the fields each Frame has beside position, velocity, body and material.
+        record: content of run.json, None where there is none.
+    """
+
+    kind: Kind
+
+    def __init__(self, path: Path, index: FrameIndex) -> None:
+        self.path = path
+        self._index = index
+        self.times = index.times
+        self.particle_counts = index.counts
+        self.ledger: list[LedgerRow] = index.ledger
+        self.header: dict[str, Any] = index.header
+        self.dimension = index.layout.dimension
+        names = [name for name in index.layout.arrays if name not in (POSITION, *STANDARD)]
+        self.field_names: tuple[str, ...] = tuple(names)
+        self.record = read_record(path if path.is_dir() else path.parent)
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames that can be read."""
+        return len(self.times)
+
+    def frame(self, k: int, fields: Sequence[str] | None = None) -> Frame:
+        """Read the k-th frame, its arrays as the run gave them: (n, d), types and bits unchanged.
+
+        Args:
+            k: 0 to `frame_count` - 1.
+            fields: names of the fields to read, all when None.
+
+        Raises:
+            InputError: there is no such frame or field, or its file has gone.
+        """
+        if not 0 <= k < self.frame_count:
+            raise InputError(f"{self.path} has no frame {k}: it holds frames 0 to {self.frame_count - 1}.")
+        names = [POSITION, *STANDARD[1:], *(self.field_names if fields is None else fields)]
+        for name in names:
+            if name not in self._index.layout.arrays:
+                known = ", ".join(self.field_names) or "none"
+                raise InputError(f'{self.path} holds no field "{name}": its fields are {known}.')
+        stored = self._read(k, names)
+        index = self._index
+        return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
+
+    def frames(self, fields: Sequence[str] | None = None) -> Iterator[Frame]:
+        """Read all frames, one at a time."""
+        for k in range(self.frame_count):
+            yield self.frame(k, fields)
+
+    @abstractmethod
+    def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Read arrays of the k-th frame in the form of the file."""
+
+
+class _PackedResult(Result):
+    kind = "packed"
+
+    def __init__(self, path: Path) -> None:
+        with closing(open_vtkhdf(path)) as file:
+            super().__init__(path, read_index(file))
+
+    def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        return _read_arrays(self.path, names, int(self._index.offsets[k]), int(self.particle_counts[k]))
+
+
+class _SegmentsResult(Result):
+    kind = "segments"
+
+    def __init__(self, path: Path, segments: Sequence[Path]) -> None:
+        self._segments = list(segments)
+        indices = []
+        for segment in segments:
+            with closing(open_vtkhdf(segment)) as file:
+                indices.append(read_index(file))
+        super().__init__(path, FrameIndex.joined(indices))
+
+    def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        if not self._segments[k].exists():
+            raise InputError(f"The frames of {self.path} were packed after it was opened: open it again.")
+        return _read_arrays(self._segments[k], names, 0, int(self.particle_counts[k]))
+
+
+class _SeriesResult(Result):
+    kind = "series"
+
+    def __init__(self, path: Path) -> None:
+        directory = path.parent
+        try:
+            # The .pvd is read first: the ledger is replaced before it, so it holds at least as many rows.
+            entries = list(ElementTree.parse(path).iter("DataSet"))
+            times = np.array([float(entry.attrib["timestep"]) for entry in entries])
+            self._files = [directory / Path(entry.attrib["file"]).name for entry in entries]
+            facts = json.loads((directory / SERIES_HEADER).read_text(encoding="utf-8"))
+            table = (directory / SERIES_LEDGER).read_text(encoding="utf-8")
+            if facts["format"] > FORMAT:
+                raise InputError(f"{path} is of a newer version of mpmcli; update mpmcli to read it.")
+            layout = FrameLayout.from_dict(facts["layout"])
+            rows, columns = parse_ledger_csv(table)
+            frames, steps, counts = (np.array(columns[name][: len(times)]) for name in FRAME_COLUMNS)
+        except (OSError, ValueError, KeyError, TypeError, ElementTree.ParseError) as error:
+            raise InputError(
+                f"{path} is not a series of mpmcli: it needs {SERIES_HEADER}, {SERIES_LEDGER} and its frames "
+                "beside it, as mpmcli wrote them."
+            ) from error
+        rows = rows[: len(times)]
+        index = FrameIndex(layout, facts["header"], times, frames, steps, 0 * counts, counts, rows)
+        super().__init__(path, index)
+
+    def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        if self.particle_counts[k] == 0:
+            # meshio cannot read back the empty arrays that it wrote.
+            arrays = self._index.layout.arrays
+            return {name: np.empty(arrays[name].stored_shape(0), arrays[name].dtype) for name in names}
+        stored = read_vtu(self._files[k])
+        return {name: stored[name] for name in names}
+
+
+def open_result(path: Path) -> Result:
+    """Open what a run has written, whether it ended, was broken off, or is still under way.
+
+    Args:
+        path: a packed file, its directory, the directory of a run that was not packed (its sealed
+            frames are read, unfinished files are ignored), or the .pvd of a series.
+
+    Raises:
+        InputError: there is nothing at `path`, or nothing that mpmcli wrote, or no frame yet.
+    """
+    path = Path(path)
+    if path.name == SEGMENTS and path.is_dir():
+        path = path.parent
+    if path.is_dir():
+        return _open_directory(path)
+    if not path.exists():
+        raise InputError(f"{path} does not exist: give a {PACKED}, a {SERIES} or their directory.")
+    if path.suffix == ".pvd":
+        return _SeriesResult(path)
+    if path.suffix == ".vtu":
+        raise InputError(f"{path} is one frame of a series: give {path.with_name(SERIES)} instead.")
+    return _PackedResult(path)
+
+
+def _open_directory(directory: Path) -> Result:
+    if (directory / PACKED).exists():
+        return _PackedResult(directory / PACKED)
+    segments = sealed_segments(directory)
+    if segments:
+        return _SegmentsResult(directory, segments)
+    if (directory / SERIES).exists():
+        return _SeriesResult(directory / SERIES)
+    record = read_record(directory)
+    if record is None:
+        raise InputError(f"{directory} holds no result of mpmcli: no {PACKED}, {SEGMENTS} or {SERIES}.")
+    raise InputError(f'{directory} holds no frame yet: its run is "{record["status"]}" and has written none.')
+
+
+def _read_arrays(path: Path, names: Sequence[str], offset: int, count: int) -> dict[str, np.ndarray]:
+    try:
+        with closing(open_vtkhdf(path)) as file:
+            return {name: read_array(file, name, offset, count) for name in names}
+    except (OSError, KeyError) as error:
+        raise InputError(f"{path} is damaged: a frame that it lists cannot be read.") from error

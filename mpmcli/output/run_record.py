@@ -1,0 +1,135 @@
+"""run.json: what was run, where, how far it came and how it ended."""
+
+import json
+import math
+import os
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+from mpmcli import __version__
+from mpmcli.output.durable import write_text
+from mpmcli.stability.ledger import LedgerRow
+
+RECORD = "run.json"
+PROGRAM = "mpmcli"
+Status = Literal["running", "finished", "unstable", "interrupted", "failed"]
+
+
+@dataclass
+class RunRecord:
+    """The record of one run; `write` replaces run.json in one durable step, at any moment.
+
+    Attributes:
+        directory: where run.json goes; not part of it.
+        command: command line, the program's name first and without its path.
+        backend: arch, threads, precision, and device name where known, of the backend that really came.
+        seeds: seed of each body by name, for those that have one.
+        frames_expected, particles: as planned.
+        notes: sentences about what was chosen for the user ("auto" values).
+        status: "running" until `close`.
+        frames_written, steps, time: how far the run came; time in s.
+        timings: seconds by name: compile_s, solve_s, output_s, wall_s.
+        limits: number of frames in which each bound on the step was the nearest.
+        energy: J; first, last, and the largest and smallest total seen.
+        failure: why a run ended early: message, and step, time, particle, ... where known.
+    """
+
+    directory: Path
+    command: Sequence[str] = ()
+    backend: dict[str, Any] = field(default_factory=dict)
+    seeds: dict[str, int] = field(default_factory=dict)
+    frames_expected: int = 0
+    particles: int = 0
+    notes: Sequence[str] = ()
+    status: Status = "running"
+    frames_written: int = 0
+    steps: int = 0
+    time: float = 0.0
+    timings: dict[str, float] = field(default_factory=dict)
+    limits: dict[str, int] = field(default_factory=dict)
+    energy: dict[str, float] = field(default_factory=dict)
+    failure: dict[str, Any] | None = None
+    started: str = field(default_factory=lambda: _now())
+    ended: str | None = None
+
+    def observe(self, row: LedgerRow) -> None:
+        """Count one frame that has been written; does not write."""
+        self.frames_written += 1
+        self.steps += row.steps
+        self.time = row.time
+        if row.limit:
+            self.limits[row.limit] = self.limits.get(row.limit, 0) + 1
+        energy = row.energy
+        self.energy.setdefault("first", energy)
+        self.energy["last"] = energy
+        self.energy["smallest"] = min(energy, self.energy.get("smallest", energy))
+        self.energy["largest"] = max(energy, self.energy.get("largest", energy))
+
+    def close(self, status: Status, message: str = "", **facts: Any) -> None:
+        """Set how the run ended and write.
+
+        Args:
+            status: anything but "running".
+            message: the sentence the user saw, for a run that did not finish.
+            facts: where it failed: step, time, particle, body, position, limit, ...
+        """
+        self.status = status
+        self.ended = _now()
+        if message or facts:
+            self.failure = {"message": message, **facts}
+        self.write()
+
+    def write(self) -> None:
+        """Replace run.json by the present state, in one durable step."""
+        content = asdict(self)
+        del content["directory"]
+        content["command"] = [Path(word).name if i == 0 else word for i, word in enumerate(self.command)]
+        content = {"program": PROGRAM, "version": __version__, **content, "host": host_facts()}
+        text = json.dumps(_plain(content), indent=2, ensure_ascii=False)
+        write_text(Path(self.directory) / RECORD, text + "\n")
+
+
+def host_facts() -> dict[str, Any]:
+    """What a figure depends on and a name does not: versions, system, processors; no path, no host name."""
+    try:
+        taichi = version("taichi")
+    except PackageNotFoundError:
+        taichi = None
+    return {
+        "python": platform.python_version(),
+        "taichi": taichi,
+        "system": platform.system(),
+        "machine": platform.machine(),
+        "cpu_count": os.cpu_count(),
+    }
+
+
+def read_record(directory: Path) -> dict[str, Any] | None:
+    """Read run.json; None when there is none, or it is not of mpmcli."""
+    try:
+        record = json.loads((Path(directory) / RECORD).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return record if isinstance(record, dict) and record.get("program") == PROGRAM else None
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _plain(value: Any) -> Any:
+    """Give numpy values and paths a JSON form; what is not finite becomes null, as JSON has no NaN."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, str | int | bool) else str(value)

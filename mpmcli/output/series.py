@@ -1,0 +1,138 @@
+"""The older form of output: one .vtu file per frame, written by meshio, and a .pvd that lists them.
+
+Every ParaView and VTK reads it, at the price of more and larger files; VTKHDF is the default for that reason.
+"""
+
+import json
+import re
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from mpmcli import __version__
+from mpmcli.errors import InputError, RunError
+from mpmcli.output.durable import require_free_space, sealed, write_text
+from mpmcli.output.frame import Frame
+from mpmcli.output.layout import POSITION, FrameLayout
+from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_csv
+from mpmcli.output.store import frames_kept
+from mpmcli.output.vtkhdf import FORMAT, OVERHEAD_BYTES
+from mpmcli.stability.ledger import LedgerRow
+
+SERIES = "particles.pvd"
+SERIES_HEADER = "particles.json"
+SERIES_LEDGER = "ledger.csv"
+SERIES_FRAME = re.compile(r"particles_\d{6,}\.vtu")
+
+
+def series_frame_name(index: int) -> str:
+    """File name of the frame with this number."""
+    return f"particles_{index:06d}.vtu"
+
+
+class VtkSeriesStore:
+    """The same interface as `SegmentStore`, for `--format vtk`.
+
+    After each frame `directory` holds its .vtu file, ledger.csv and particles.pvd, each replaced in one
+    step, so that ParaView can open the series while the run goes on. particles.json holds the header.
+
+    Args:
+        directory: the output directory, made by `prepare_directory`.
+        header: facts about the run that JSON can hold.
+        compress: zlib in the .vtu files.
+    """
+
+    def __init__(self, directory: Path, header: dict, *, compress: bool = False) -> None:
+        self._directory = Path(directory)
+        self._header = header
+        self._compress = compress
+        self._layout: FrameLayout | None = None
+        self._times: list[float] = []
+        self._frames: dict[str, list[int]] = {name: [] for name in FRAME_COLUMNS}
+        self._rows: list[LedgerRow] = []
+        self._count = 0
+
+    @property
+    def frames_written(self) -> int:
+        """Number of frames that a crash can no longer harm."""
+        return self._count
+
+    def write(self, frame: Frame, row: LedgerRow) -> None:
+        """Write the next frame; it is durable and listed in the .pvd when this returns.
+
+        Raises:
+            RunError: the disk is full or refuses; all frames before this one are kept.
+            InputError: the directory holds an earlier result.
+            ValueError: the frame is out of order or has other arrays than the first one.
+        """
+        if frame.index != self._count:
+            raise ValueError(f"frame {frame.index} was given where frame {self._count} comes next")
+        if self._layout is None:
+            self._layout = FrameLayout.of(frame)
+            if (self._directory / SERIES).exists():
+                raise InputError(f"{self._directory} holds an earlier result: give another directory, or --overwrite.")
+            self._directory.mkdir(parents=True, exist_ok=True)
+        purpose, kept = f"frame {frame.index}", frames_kept(self._count)
+        # Base64 makes 4 bytes of 3; each particle is a cell of its own: number, offset and type.
+        size = len(frame.position) * (self._layout.bytes_per_particle + 24) * 4 // 3 + OVERHEAD_BYTES
+        require_free_space(self._directory, size, purpose, kept)
+        try:
+            with sealed(self._directory / series_frame_name(frame.index)) as temporary:
+                _write_vtu(temporary, dict(self._layout.stored(frame)), compress=self._compress)
+            self._write_tables(frame, row)
+        except OSError as error:
+            reason = getattr(error, "strerror", None) or error
+            place = self._directory
+            raise RunError(f"{purpose} could not be written to {place} ({reason}); {kept}.") from error
+        self._count += 1
+
+    def finish(self) -> Path | None:
+        """Give the .pvd, which is complete after every frame; None when no frame was written."""
+        return self._directory / SERIES if self._count else None
+
+    def _write_tables(self, frame: Frame, row: LedgerRow) -> None:
+        if frame.index == 0:
+            facts = {"format": FORMAT, "version": __version__, "header": self._header}
+            facts["layout"] = FrameLayout.of(frame).to_dict()
+            write_text(self._directory / SERIES_HEADER, json.dumps(facts, indent=1) + "\n")
+        self._times.append(float(frame.time))
+        self._rows.append(row)
+        for name, value in zip(FRAME_COLUMNS, (frame.index, frame.step, len(frame.position)), strict=True):
+            self._frames[name].append(int(value))
+        write_text(self._directory / SERIES_LEDGER, ledger_csv(self._rows, self._frames))
+        # The .pvd comes last: what it lists is there.
+        write_text(self._directory / SERIES, _pvd_text(self._times))
+
+
+def read_vtu(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of one frame, in the form of the file.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    from meshio import vtu
+
+    try:
+        mesh = vtu.read(path)
+    # A damaged file makes meshio and the XML parser raise almost anything.
+    except Exception as error:
+        raise InputError(f"{path} is missing or damaged: this frame of the series cannot be read.") from error
+    return {POSITION: mesh.points, **mesh.point_data}
+
+
+def _write_vtu(path: Path, arrays: dict[str, np.ndarray], *, compress: bool) -> None:
+    from meshio import Mesh, vtu
+
+    points = arrays.pop(POSITION)
+    mesh = Mesh(points, [("vertex", np.arange(len(points)).reshape(-1, 1))], point_data=arrays)
+    # The writer is named, because meshio.write would choose one by the end of the temporary name.
+    vtu.write(path, mesh, compression="zlib" if compress else None, header_type="UInt64")
+
+
+def _pvd_text(times: list[float]) -> str:
+    lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "<Collection>"]
+    for k, time in enumerate(times):
+        name = quoteattr(series_frame_name(k))
+        lines.append(f'<DataSet timestep="{time!r}" group="" part="0" file={name}/>')
+    return "\n".join([*lines, "</Collection>", "</VTKFile>", ""])

@@ -1,0 +1,41 @@
+"""Scenes: what is asked of a simulation, read from TOML, checked, and filled with particles."""
+
+from mpmcli.scene.bounds import highest_speed, scene_bounds
+from mpmcli.scene.domain import Domain, Wall, Walls
+from mpmcli.scene.editor import json_schema
+from mpmcli.scene.effective import scene_to_toml
+from mpmcli.scene.load import LoadedScene, load_scene, parse_scene
+from mpmcli.scene.material import MaterialParameters, SceneBounds
+from mpmcli.scene.sampling import BodyParticles, estimate_particles, sample_bodies
+from mpmcli.scene.schema import Body, Output, ParticleField, Scene, SolverSettings, Time, scene_model
+from mpmcli.scene.shapes import Ball, Box, Cylinder, Polygon, Shape
+
+__all__ = [
+    "Ball",
+    "Body",
+    "BodyParticles",
+    "Box",
+    "Cylinder",
+    "Domain",
+    "LoadedScene",
+    "MaterialParameters",
+    "Output",
+    "ParticleField",
+    "Polygon",
+    "Scene",
+    "SceneBounds",
+    "Shape",
+    "SolverSettings",
+    "Time",
+    "Wall",
+    "Walls",
+    "estimate_particles",
+    "highest_speed",
+    "json_schema",
+    "load_scene",
+    "parse_scene",
+    "sample_bodies",
+    "scene_bounds",
+    "scene_model",
+    "scene_to_toml",
+]

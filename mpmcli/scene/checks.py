@@ -1,0 +1,101 @@
+"""Checks that need the whole scene: bodies inside the domain, apart from each other, and not empty."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from mpmcli.scene.problem import Problem
+from mpmcli.scene.quantity import AXES
+from mpmcli.scene.sampling import holds_particles, lattice_points, lattice_spacing, no_particles
+from mpmcli.scene.schema import Body, Scene
+from mpmcli.scene.shapes import Box
+
+# Lengths below this fraction of the grid spacing are round-off.
+_TOLERANCE = 1e-6
+# Points per axis that are tried where two bodies may overlap, 2D and 3D.
+_MOST_TRIED = {2: 512, 3: 64}
+# Lattices above this size are not searched for a first particle; sampling does it later.
+_MOST_SEARCHED = 1_000_000
+
+
+def problems_in(scene: Scene) -> list[Problem]:
+    """Return everything that is wrong with a scene whose tables are valid, one by one."""
+    outside = list(_outside(scene))
+    # A body that is much too large is told so, not filled.
+    empty = [] if outside else _empty(scene)
+    return [*_repeated_names(scene), *outside, *_overlaps(scene), *empty]
+
+
+def _repeated_names(scene: Scene) -> Iterator[Problem]:
+    first: dict[str, int] = {}
+    for i, body in enumerate(scene.bodies):
+        if first.setdefault(body.name, i) != i:
+            sentence = f'"{body.name}" is the name of bodies[{first[body.name]}] already; every body needs its own'
+            yield Problem(("bodies", i, "name"), sentence)
+
+
+def _outside(scene: Scene) -> Iterator[Problem]:
+    domain = scene.domain
+    tolerance = _TOLERANCE * domain.spacing
+    for i, body in enumerate(scene.bodies):
+        lower, upper = body.shape.form.bounds()
+        faces = []
+        for k, axis in enumerate(AXES[: scene.dimension]):
+            start, end = domain.origin[k], domain.upper[k]
+            faces.append((f"{axis}_min", start - lower[k], lower[k], start))
+            faces.append((f"{axis}_max", upper[k] - end, upper[k], end))
+        said = [
+            f"{face} by {out:.6g} m (it reaches {face[0]} = {reach:.6g}, the face is at {wall:.6g})"
+            for face, out, reach, wall in faces
+            if out > tolerance
+        ]
+        if said:
+            ways = " and ".join(said)
+            sentence = f'body "{body.name}" leaves the domain through {ways}; move it or enlarge the domain'
+            yield Problem(("bodies", i, "shape"), sentence)
+
+
+def _overlaps(scene: Scene) -> Iterator[Problem]:
+    h = scene.domain.spacing
+    bounds = [body.shape.form.bounds() for body in scene.bodies]
+    lowers, uppers = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
+    for j in range(1, len(bounds)):
+        # Only bodies whose bounding boxes meet are looked at closely.
+        lower, upper = np.maximum(lowers[:j], lowers[j]), np.minimum(uppers[:j], uppers[j])
+        for i in np.flatnonzero(np.all(upper - lower > _TOLERANCE * h, axis=1)):
+            first, second = scene.bodies[i], scene.bodies[j]
+            point = _common_point(first, second, lower[i], upper[i], h)
+            if point is not None:
+                where = ", ".join(f"{x:.6g}" for x in point)
+                sentence = (
+                    f'body "{second.name}" overlaps body "{first.name}", for example at [{where}]; '
+                    "bodies may touch but not overlap"
+                )
+                yield Problem(("bodies", j, "shape"), sentence)
+
+
+def _common_point(first: Body, second: Body, lower: np.ndarray, upper: np.ndarray, h: float) -> np.ndarray | None:
+    """Return a point well inside both bodies, of those tried between `lower` and `upper`, or None.
+
+    Points are tried on a lattice of half the distance between particles, at least 8 along each axis.
+    """
+    forms = first.shape.form, second.shape.form
+    if all(isinstance(form, Box) for form in forms):
+        return (lower + upper) / 2
+    most = _MOST_TRIED[len(lower)]
+    finest = min(lattice_spacing(first, h), lattice_spacing(second, h)) / 2
+    counts = [int(np.clip(math.ceil(min(r, most)), 8, most)) for r in (upper - lower) / finest]
+    axes = [lo + (np.arange(n) + 0.5) * (hi - lo) / n for lo, hi, n in zip(lower, upper, counts, strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(lower))
+    inside = np.logical_and(*(form.contains(points, inset=_TOLERANCE * h) for form in forms))
+    return points[np.argmax(inside)] if inside.any() else None
+
+
+def _empty(scene: Scene) -> Iterator[Problem]:
+    h = scene.domain.spacing
+    for i, body in enumerate(scene.bodies):
+        if isinstance(body.shape.form, Box):
+            continue  # its lattice is fitted to it, and has a point at least
+        if lattice_points(body, h) <= _MOST_SEARCHED and not holds_particles(body, i, h):
+            yield Problem(("bodies", i, "shape"), no_particles(body, h))

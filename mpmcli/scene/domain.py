@@ -1,0 +1,154 @@
+"""The domain of a scene: a box of whole grid cells, gravity, and what its walls do."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
+
+from mpmcli.scene.quantity import (
+    AXES,
+    NUMBER_WORDS,
+    Integer,
+    Positive,
+    Table,
+    Vector,
+    flaw,
+    scene_dimension,
+)
+
+Wall = Literal["slip", "stick", "separate"]
+WALLS = ("slip", "stick", "separate")
+MOST_CELLS = 2**31 - 1
+
+
+class Walls(Table):
+    """What each face of the domain does to the material that meets it.
+
+    slip: no motion through the wall, free motion along it. stick: no motion at all.
+    separate: as slip, but the material may leave the wall.
+    """
+
+    default: Annotated[Wall, Field(description="For every face that is not named.")] = "separate"
+    x_min: Annotated[Wall | None, Field(description="Lower face along x.")] = None
+    x_max: Annotated[Wall | None, Field(description="Upper face along x.")] = None
+    y_min: Annotated[Wall | None, Field(description="Lower face along y.")] = None
+    y_max: Annotated[Wall | None, Field(description="Upper face along y.")] = None
+    z_min: Annotated[Wall | None, Field(description="Lower face along z; 3D only.")] = None
+    z_max: Annotated[Wall | None, Field(description="Upper face along z; 3D only.")] = None
+
+    @field_validator("z_min", "z_max")
+    @classmethod
+    def _needs_a_third_axis(cls, wall: Wall | None, info: ValidationInfo) -> Wall | None:
+        if wall is not None and scene_dimension(info) == 2:
+            raise flaw("is a face of a 3D scene and this one is 2D; leave it out")
+        return wall
+
+    def faces(self, dimension: int) -> tuple[tuple[Wall, Wall], ...]:
+        """Return what the lower and the upper face along each axis do."""
+        return tuple(
+            (getattr(self, f"{axis}_min") or self.default, getattr(self, f"{axis}_max") or self.default)
+            for axis in AXES[:dimension]
+        )
+
+
+def _one_word_for_all(value: object) -> object:
+    if not isinstance(value, str):
+        return value
+    if value not in WALLS:
+        raise flaw(f'must be "slip", "stick" or "separate", or a table with one of them per face; found "{value}"')
+    return {"default": value}
+
+
+def _walls_schema(schema: dict[str, Any]) -> None:
+    table = {key: schema.pop(key) for key in ("$ref", "allOf") if key in schema}
+    schema["anyOf"] = [{"enum": list(WALLS)}, table]
+    schema["default"] = "separate"
+
+
+class Domain(Table):
+    """A box of square (2D) or cubic (3D) grid cells."""
+
+    size: Annotated[
+        tuple[Positive, ...],
+        Field(
+            description="Edge lengths, m; two numbers make a 2D scene, three a 3D one.",
+            json_schema_extra={"minItems": 2, "maxItems": 3},
+        ),
+    ]
+    origin: Annotated[
+        Vector,
+        Field(validate_default=True, description="Coordinates of the lower corner, m. Default: zeros."),
+    ] = None  # type: ignore[assignment]
+    spacing: Annotated[
+        Positive,
+        Field(description="Grid spacing h, m, of which the size is a whole multiple; or give cells."),
+    ] = None  # type: ignore[assignment]
+    cells: Annotated[
+        tuple[Annotated[Integer, Field(ge=1, le=MOST_CELLS)], ...],
+        Field(
+            description="Number of cells along each axis; or give spacing.",
+            json_schema_extra={"minItems": 2, "maxItems": 3},
+        ),
+    ] = None  # type: ignore[assignment]
+    gravity: Annotated[Vector, Field(validate_default=True, description="Gravity, m/s^2. Default: none.")] = None  # type: ignore[assignment]
+    walls: Annotated[
+        Walls,
+        BeforeValidator(_one_word_for_all),
+        Field(
+            description="slip, stick or separate: one word for all faces, or a table.",
+            json_schema_extra=_walls_schema,
+        ),
+    ] = Walls()
+
+    @field_validator("size")
+    @classmethod
+    def _two_or_three(cls, size: tuple[float, ...]) -> tuple[float, ...]:
+        if len(size) not in NUMBER_WORDS:
+            raise flaw(f"needs two numbers (2D) or three (3D); found {len(size)}")
+        return size
+
+    @model_validator(mode="after")
+    def _both_spacing_and_cells(self) -> "Domain":
+        """Give the domain its cells from its spacing, or its spacing from its cells."""
+        if self.spacing is None and self.cells is None:
+            raise flaw('missing key "spacing" (m), or "cells" (a number per axis) in its place')
+        if self.spacing is not None and self.cells is not None:
+            raise flaw('"spacing" is given as well; leave one of them out', "cells")
+        if self.cells is None:
+            return self.model_copy(update={"cells": _cells_of(self.size, self.spacing)})
+        return self.model_copy(update={"spacing": _spacing_of(self.size, self.cells)})
+
+    @property
+    def upper(self) -> tuple[float, ...]:
+        """Coordinates of the upper corner, m."""
+        return tuple(o + s for o, s in zip(self.origin, self.size, strict=True))
+
+
+def _cells_of(size: tuple[float, ...], spacing: float) -> tuple[int, ...]:
+    ratios = [s / spacing for s in size]
+    if max(ratios) > MOST_CELLS:
+        raise flaw(f"makes more than {MOST_CELLS} cells along an axis; make it coarser", "spacing")
+    # A relative 1e-6 counts as round-off, but never more than a hundredth of a cell.
+    broken = [k for k, r in enumerate(ratios) if round(r) < 1 or abs(r - round(r)) > min(1e-6 * r, 1e-2)]
+    if not broken:
+        return tuple(round(r) for r in ratios)
+    said = []
+    for k in broken:
+        below = int(ratios[k])
+        nearest = " or ".join(f"{n * spacing:.8g}" for n in (below, below + 1) if n)
+        said.append(f"{size[k]:.8g} m is {ratios[k]:.6g} cells along {AXES[k]}, {nearest} m would fit")
+    raise flaw(f"must be a whole number of cells of spacing {spacing:.8g} m: {'; '.join(said)}", "size")
+
+
+def _spacing_of(size: tuple[float, ...], cells: tuple[int, ...]) -> float:
+    if len(cells) != len(size):
+        raise flaw(f"needs {NUMBER_WORDS[len(size)]} numbers, as domain.size has; found {len(cells)}", "cells")
+    spacings = [s / n for s, n in zip(size, cells, strict=True)]
+    if max(spacings) - min(spacings) > 1e-6 * max(spacings):
+        found = ", ".join(f"{h:.6g} m along {axis}" for axis, h in zip(AXES, spacings, strict=False))
+        fitting = ", ".join(str(max(1, round(s / spacings[0]))) for s in size)
+        raise flaw(
+            f"must make {'square' if len(size) == 2 else 'cubic'} cells; found {found}; "
+            f"nearest to the size is [{fitting}]",
+            "cells",
+        )
+    return spacings[0]

@@ -1,0 +1,173 @@
+"""From a TOML file to a complete scene, or to one error that names everything wrong with it."""
+
+import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path as File
+from typing import Any
+
+from pydantic import ValidationError
+
+from mpmcli.errors import InputError
+from mpmcli.scene.bounds import scene_bounds
+from mpmcli.scene.checks import problems_in
+from mpmcli.scene.locate import key_lines, line_of
+from mpmcli.scene.material import MaterialParameters
+from mpmcli.scene.overrides import apply_overrides
+from mpmcli.scene.problem import Path, Problem, path_text
+from mpmcli.scene.quantity import dimension_of
+from mpmcli.scene.repair import Renames, original_path, repaired
+from mpmcli.scene.schema import Scene, scene_model
+from mpmcli.scene.sentences import problems_of
+
+Laws = tuple[type[MaterialParameters], ...]
+
+_POSITION = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
+# What tomllib says, where a plainer sentence helps more.
+_SYNTAX = {
+    "Cannot overwrite a value": "this key is given twice",
+    "Invalid value": "this is no TOML value; text needs quotes, numbers and lists none",
+    "Expected '=' after a key in a key/value pair": "expected key = value",
+    "Invalid initial character for a key part": "expected a key; a table in { } stands on one line",
+    "Unclosed array": "a list is not closed with ]",
+    "Invalid statement": "expected key = value or a [table]",
+}
+
+
+@dataclass(frozen=True)
+class LoadedScene:
+    """A complete scene and what was chosen on the way to it.
+
+    Attributes:
+        scene: the scene, with no "auto" left in its materials.
+        notes: one sentence for every choice, each beginning with the name of its body.
+        source: the file it came from, as it was given.
+    """
+
+    scene: Scene
+    notes: tuple[str, ...]
+    source: str
+
+
+def load_scene(path: str | PathLike[str], overrides: Sequence[str] = (), *, laws: Laws) -> LoadedScene:
+    """Read a scene from a TOML file.
+
+    Args:
+        path: the file.
+        overrides: values to replace, `KEY=VALUE` each; see `overrides.apply_overrides`.
+        laws: parameter models of the constitutive laws that a material may follow.
+
+    Raises:
+        InputError: one line per fault: `FILE:LINE: KEY PATH: what is wrong and what would be right`.
+    """
+    text = _read(File(path))
+    return parse_scene(_parse(text, str(path)), laws=laws, source=str(path), text=text, overrides=overrides)
+
+
+def parse_scene(
+    data: dict[str, Any],
+    *,
+    laws: Laws,
+    source: str = "<scene>",
+    text: str = "",
+    overrides: Sequence[str] = (),
+) -> LoadedScene:
+    """Build a scene from parsed TOML.
+
+    Args:
+        data: what `tomllib` reads from a scene; lists and dictionaries.
+        laws: parameter models of the constitutive laws that a material may follow.
+        source: what to call the scene in errors.
+        text: the TOML text of `data`, for line numbers in errors.
+        overrides: as for `load_scene`.
+
+    Raises:
+        InputError: as for `load_scene`.
+    """
+    data, overridden = apply_overrides(data, overrides)
+    scene, problems, renames = _validate(data, scene_model(laws))
+    if scene is not None:
+        problems += problems_in(scene)
+    if problems or scene is None:
+        lines = key_lines(text)
+        original = [Problem(original_path(p.path, renames), p.sentence) for p in problems]
+        original.sort(key=lambda p: line_of(p.path, lines) or 0)
+        raise InputError("\n".join(_report(p, source, lines, overridden) for p in original))
+    return _resolve(scene, source)
+
+
+def _validate(data: dict[str, Any], model: type[Scene]) -> tuple[Scene | None, list[Problem], Renames]:
+    """Validate until no key is unknown, so that a misspelled key does not hide other faults."""
+    problems: list[Problem] = []
+    renames: Renames = {}
+    while True:
+        try:
+            scene = model.model_validate(data, context={"dimension": dimension_of(data)})
+            return scene, problems, renames
+        except ValidationError as error:
+            unknown = [one["loc"] for one in error.errors() if one["type"] == "extra_forbidden"]
+            found = problems_of(error, data, model)
+        if not unknown:
+            return None, problems + found, renames
+        unknown_paths, data, new = repaired(data, unknown, model)
+        problems += [Problem(original_path(p.path, renames), p.sentence) for p in found if p.path in unknown_paths]
+        renames = {**renames, **{p: original_path(old, renames) for p, old in new.items()}}
+
+
+def _resolve(scene: Scene, source: str) -> LoadedScene:
+    """Let every material choose what it was left to choose, from what the scene can reach."""
+    bounds = scene_bounds(scene)
+    bodies, notes = [], []
+    for body in scene.bodies:
+        material, sentences = body.material.resolve(bounds)
+        bodies.append(body.model_copy(update={"material": material}))
+        notes += [f"{body.name}: {sentence}" for sentence in sentences]
+    return LoadedScene(scene.model_copy(update={"bodies": tuple(bodies)}), tuple(notes), source)
+
+
+def _report(problem: Problem, source: str, lines: dict[Path, int], overridden: dict[Path, str]) -> str:
+    """Write a problem with its place: the override that made it, or the file and its line."""
+    for end in range(len(problem.path), 0, -1):
+        if problem.path[:end] in overridden:
+            place = overridden[problem.path[:end]]
+            break
+    else:
+        line = line_of(problem.path, lines)
+        place = source if line is None else f"{source}:{line}"
+    return ": ".join(filter(None, [place, path_text(problem.path), problem.sentence]))
+
+
+def _read(file: File) -> str:
+    try:
+        # utf-8-sig: some editors begin a file with a byte order mark.
+        return file.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{file}: there is no such file; give the path of a scene in TOML") from None
+    except IsADirectoryError:
+        inside = file / "scene.toml"
+        hint = f"did you mean {inside}?" if inside.is_file() else "give the path of a scene in TOML"
+        raise InputError(f"{file}: this is a directory; {hint}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{file}: this is no text in UTF-8 (byte {error.start} is {error.object[error.start]:#04x}); "
+            "give a scene in TOML"
+        ) from None
+    except OSError as error:
+        raise InputError(f"{file}: the file cannot be read: {error.strerror}") from None
+
+
+def _parse(text: str, source: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        said = str(error)
+        place = source
+        if position := _POSITION.search(said):
+            said = said[: position.start()]
+            line, column = position.groups() if position[1] else (max(1, len(text.splitlines())), None)
+            place += f":{line}" + (f":{column}" if column else "")
+        raise InputError(f"{place}: not valid TOML: {_SYNTAX.get(said, said[:1].lower() + said[1:])}") from None
+    except (ValueError, RecursionError):
+        raise InputError(f"{source}: not valid TOML: a number is too long or lists are too deep") from None

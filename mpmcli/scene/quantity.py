@@ -1,0 +1,90 @@
+"""The kinds of values that a scene is made of: numbers, counts, and vectors as long as the scene has axes."""
+
+from typing import Annotated
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
+from pydantic_core import PydanticCustomError
+
+NUMBER_WORDS = {2: "two", 3: "three"}
+AXES = "xyz"
+LARGEST = 1e15
+
+
+class Table(BaseModel):
+    """A table of a scene: frozen, no unknown keys, no infinities."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def flaw(sentence: str, key: str = "") -> PydanticCustomError:
+    """Return the error that a validator raises for a fault that has its own sentence.
+
+    Args:
+        sentence: what is wrong and what would be right.
+        key: the key of the validated table that the sentence is about; empty for the value itself.
+    """
+    return PydanticCustomError("flaw", "{sentence}", {"sentence": sentence, "key": key})
+
+
+def dimension_of(data: object) -> int | None:
+    """Return 2 or 3, the length of `domain.size` in parsed TOML, or None where it is not readable."""
+    domain = data.get("domain") if isinstance(data, dict) else None
+    size = domain.get("size") if isinstance(domain, dict) else None
+    return len(size) if isinstance(size, list | tuple) and len(size) in NUMBER_WORDS else None
+
+
+def scene_dimension(info: ValidationInfo) -> int | None:
+    """Return the dimension that the validation context carries; None when the scene's size is not readable.
+
+    Raises:
+        RuntimeError: there is no context, so defaults that depend on the dimension cannot be filled in.
+    """
+    if not isinstance(info.context, dict):
+        raise RuntimeError("A Scene is built by load_scene or parse_scene, which know its dimension.")
+    return info.context["dimension"]
+
+
+def numbers_needed(dimension: int, found: int) -> str:
+    return f"needs {NUMBER_WORDS[dimension]} numbers in this {dimension}D scene (as many as domain.size); found {found}"
+
+
+def _zeros(value: object, info: ValidationInfo) -> object:
+    return (0.0,) * (scene_dimension(info) or 2) if value is None else value
+
+
+def _as_long_as_the_scene(value: tuple, info: ValidationInfo) -> tuple:
+    dimension = scene_dimension(info)
+    if dimension is not None and len(value) != dimension:
+        raise flaw(numbers_needed(dimension, len(value)))
+    return value
+
+
+def _not_enormous(value: float) -> float:
+    """Refuse numbers whose powers leave the range of floating point; no scene in SI units needs them."""
+    if abs(value) > LARGEST:
+        raise flaw(f"is beyond what can be computed with, {LARGEST:g} at most; found {value:g}")
+    return value
+
+
+def _not_minute(value: float) -> float:
+    if value < 1 / LARGEST:
+        raise flaw(f"is below what can be computed with, {1 / LARGEST:g} at least; found {value:g}")
+    return value
+
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False), AfterValidator(_not_enormous)]
+Positive = Annotated[
+    float,
+    Field(strict=True, allow_inf_nan=False, gt=0),
+    AfterValidator(_not_enormous),
+    AfterValidator(_not_minute),
+]
+Integer = Annotated[int, Field(strict=True)]
+Flag = Annotated[bool, Field(strict=True)]
+
+_ONE_PER_AXIS = Field(json_schema_extra={"minItems": 2, "maxItems": 3})
+
+# One number per axis; None, which TOML cannot write, stands for the default: zeros.
+Vector = Annotated[tuple[Number, ...], BeforeValidator(_zeros), AfterValidator(_as_long_as_the_scene), _ONE_PER_AXIS]
+# One row per axis, each a vector.
+Matrix = Annotated[tuple[Vector, ...], AfterValidator(_as_long_as_the_scene), _ONE_PER_AXIS]

@@ -1,0 +1,173 @@
+"""What a scene may say: one frozen model per table, each key with its unit, range and default."""
+
+from functools import lru_cache
+from typing import Annotated, Any, Literal, Union
+
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, create_model
+
+from mpmcli.scene.domain import Domain
+from mpmcli.scene.material import MaterialParameters
+from mpmcli.scene.quantity import Flag, Integer, Matrix, Positive, Table, Vector, flaw, scene_dimension
+from mpmcli.scene.shapes import OneShape
+
+ParticleField = Literal[
+    "velocity",
+    "density",
+    "pressure",
+    "volume_ratio",
+    "deformation_gradient",
+    "affine",
+    "stress",
+    "mass",
+]
+
+
+class Time(Table):
+    """How long the scene runs, how often it is stored, and how it is stepped."""
+
+    end: Annotated[Positive, Field(description="Simulated time, s; the scene starts at 0.")]
+    frames: Annotated[
+        Integer,
+        Field(
+            ge=1,
+            le=10**9,
+            description="Number of equal intervals between stored frames; one frame more is stored.",
+        ),
+    ]
+    step: Annotated[
+        Positive | Literal["auto"],
+        Field(description='Largest time step, s; "auto" leaves it to the stability limits alone.'),
+    ] = "auto"
+    safety: Annotated[
+        float,
+        Field(
+            strict=True,
+            gt=0,
+            le=1,
+            description="Fraction of the smallest stability limit that a step takes, 0 to 1.",
+        ),
+    ] = 0.9
+
+
+def _filled_lattice(value: object, info: ValidationInfo) -> object:
+    return 2 ** (scene_dimension(info) or 2) if value is None else value
+
+
+def _whole_lattice(count: int, info: ValidationInfo) -> int:
+    """Refuse a lattice whose number of particles per cell is no square (2D) or cube (3D)."""
+    dimension = scene_dimension(info)
+    if dimension is None or info.data.get("sampling") != "lattice":
+        return count
+    root = round(count ** (1 / dimension))
+    if root**dimension == count:
+        return count
+    below = root if root**dimension < count else root - 1
+    nearest = f"{below**dimension} or {(below + 1) ** dimension}"
+    raise flaw(
+        f"must be a {'square' if dimension == 2 else 'cube'} number for a lattice in {dimension}D, "
+        f'for example {nearest}; found {count}. With sampling = "jittered" any number will do'
+    )
+
+
+class Body(Table):
+    """One body: a shape filled with particles of one material."""
+
+    name: Annotated[
+        str, Field(pattern=r"^[^\W\d_][\w -]*$", description="Name of the body, used in messages and --set.")
+    ]
+    material: Annotated[MaterialParameters, Field(description="Constitutive law and its parameters.")]
+    shape: Annotated[OneShape, Field(description="Exactly one of box, ball, cylinder (3D), polygon (2D).")]
+    velocity: Annotated[
+        Vector, Field(validate_default=True, description="Initial velocity, m/s. Default: at rest.")
+    ] = None  # type: ignore[assignment]
+    velocity_gradient: Annotated[
+        Matrix | None,
+        Field(
+            description="Initial velocity gradient L, 1/s, one row per axis: v = velocity + L (x - c), "
+            "c the centre of the bounding box of the shape. Default: none."
+        ),
+    ] = None
+    sampling: Annotated[
+        Literal["lattice", "jittered"],
+        Field(description="Particles on a lattice, or one at random in each cell of that lattice."),
+    ] = "lattice"
+    particles_per_cell: Annotated[
+        Integer,
+        Field(ge=1, le=10**4),
+        BeforeValidator(_filled_lattice),
+        AfterValidator(_whole_lattice),
+        Field(
+            validate_default=True,
+            description="Particles per cell of the grid; a square (2D) or cube (3D) number for a lattice. "
+            "Default: 4 in 2D, 8 in 3D.",
+        ),
+    ] = None  # type: ignore[assignment]
+    seed: Annotated[
+        Integer, Field(ge=0, le=2**63 - 1, description="Seed of the random positions; unused by a lattice.")
+    ] = 0
+
+
+def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:
+    repeated = sorted({name for name in fields if fields.count(name) > 1})
+    if repeated:
+        raise flaw(f'lists "{repeated[0]}" more than once; once is enough')
+    return fields
+
+
+class Output(Table):
+    """What is stored of each particle, besides its position, body and material."""
+
+    fields: Annotated[
+        tuple[ParticleField, ...],
+        AfterValidator(_no_repeats),
+        Field(
+            description="Fields of each stored frame: velocity (m/s), density (kg/m^3), pressure (Pa), "
+            "volume_ratio J, deformation_gradient F, affine C (1/s), stress (Cauchy, Pa), mass (kg)."
+        ),
+    ] = ("velocity", "density", "pressure")
+    compress: Annotated[
+        Flag, Field(description="Compress the stored file with gzip: smaller, and slower to write.")
+    ] = False
+
+
+class SolverSettings(Table):
+    """How the scene is computed."""
+
+    precision: Annotated[
+        Literal["f32", "f64"], Field(description="Floating-point numbers of the solver: 32 or 64 bits.")
+    ] = "f32"
+
+
+class Scene(Table):
+    """A complete scene in SI units: every default filled in, every key checked.
+
+    Built by `load_scene` or `parse_scene`. In 2D all extensive quantities are per metre of depth.
+    """
+
+    title: Annotated[str, Field(description="One line that says what the scene is.")] = ""
+    domain: Annotated[Domain, Field(description="The box that the scene lives in, and its grid.")]
+    time: Annotated[Time, Field(description="How long, how many frames, which steps.")]
+    bodies: Annotated[tuple[Body, ...], Field(min_length=1, description="The bodies, at least one.")]
+    output: Annotated[Output, Field(description="What is stored.")] = Output()
+    solver: Annotated[SolverSettings, Field(description="How it is computed.")] = SolverSettings()
+
+    @property
+    def dimension(self) -> int:
+        """Return 2 or 3."""
+        return len(self.domain.size)
+
+
+@lru_cache
+def scene_model(laws: tuple[type[MaterialParameters], ...]) -> type[Scene]:
+    """Return the scene whose materials are one of the given laws, told apart by their key `law`.
+
+    Cached, so that two scenes of the same laws have the same type and can be compared.
+    """
+    material: Any = laws[0] if len(laws) == 1 else Annotated[Union[laws], Field(discriminator="law")]  # noqa: UP007
+    described = Annotated[material, Field(description=Body.model_fields["material"].description)]
+    body = create_model("Body", __base__=Body, __doc__=Body.__doc__, material=(described, ...))
+    bodies = Annotated[
+        tuple[body, ...],  # type: ignore[valid-type]
+        Field(min_length=1, description=Scene.model_fields["bodies"].description),
+    ]
+    return create_model("Scene", __base__=Scene, __doc__=Scene.__doc__, bodies=(bodies, ...))

@@ -1,0 +1,118 @@
+"""Starts Taichi, once per process, on the backend that was asked for, and says which one came."""
+
+import contextlib
+import io
+import multiprocessing
+import os
+import platform
+from dataclasses import dataclass
+from typing import Literal
+
+import taichi as ti
+
+from mpmcli.errors import InputError
+
+Arch = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
+ARCHES: tuple[str, ...] = ("auto", "cpu", "cuda", "vulkan", "metal")
+
+_started: "Backend | None" = None
+
+
+@dataclass(frozen=True)
+class Backend:
+    """The backend that runs the kernels.
+
+    Attributes:
+        arch: "cpu", "cuda", "vulkan" or "metal": the one that really came.
+        threads: CPU threads that kernels use (1 on a GPU).
+        precision: "f32" or "f64", the type of every particle and node value.
+        compile_cache: whether compiled kernels are kept for the next start.
+    """
+
+    arch: str
+    threads: int
+    precision: str
+    compile_cache: bool
+
+    @property
+    def on_cpu(self) -> bool:
+        """Whether kernels run on the CPU, where the scatter needs no atomics."""
+        return self.arch == "cpu"
+
+
+def start_backend(
+    arch: Arch = "auto", threads: int | None = None, precision: str = "f32", *, compile_cache: bool = True
+) -> Backend:
+    """Start Taichi and return the backend that came; a second call must ask for the same.
+
+    "auto" takes CUDA where a driver and a device are, Metal on a Mac, and otherwise the CPU:
+    Vulkan is taken only by name, since software Vulkan would pass for a GPU.
+
+    Raises:
+        InputError: the backend is not there, cannot do this precision, or another one is running.
+    """
+    global _started
+    if arch not in ARCHES:
+        raise InputError(f'--arch "{arch}" is not a backend; use one of {", ".join(ARCHES)}.')
+    if precision not in ("f32", "f64"):
+        raise InputError(f'precision "{precision}" is not known; use f32 or f64.')
+    wanted = _available() if arch == "auto" else arch
+    if wanted in ("vulkan", "metal") and precision == "f64":
+        raise InputError(f"precision f64 is not available on {wanted}; use --arch cpu or cuda, or f32.")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else multiprocessing.cpu_count()
+    count = (threads or cores) if wanted == "cpu" else 1
+    if count < 1:
+        raise InputError(f"--threads {count} is not possible; give 1 or more.")
+    backend = Backend(wanted, count, precision, compile_cache)
+    if _started is not None:
+        if _started != backend:
+            raise InputError(
+                f"this process already runs on {_started.arch} with {_started.threads} threads in "
+                f"{_started.precision}; another backend needs a new process."
+            )
+        return _started
+    _initialise(backend)
+    _started = backend
+    return backend
+
+
+def stop_backend() -> None:
+    """End the running backend, and with it every field and kernel; another may start then."""
+    global _started
+    ti.reset()
+    _started = None
+
+
+def _available() -> str:
+    """Name the fastest backend that this machine has."""
+    if platform.system() == "Darwin":
+        return "metal"
+    return "cuda" if _has("cuda") else "cpu"
+
+
+def _has(arch: str) -> bool:
+    if arch == "cpu":
+        return True
+    # Taichi loads CUDA wherever the driver's library is, and then dies without a device.
+    if arch == "cuda" and not (os.path.exists("/dev/nvidia0") or os.path.exists("/dev/dxg")):
+        return False
+    return bool(ti.lang.misc.is_arch_supported(getattr(ti, arch)))
+
+
+def _initialise(backend: Backend) -> None:
+    if not _has(backend.arch):
+        raise InputError(f"--arch {backend.arch} needs a device that this machine does not have; use --arch cpu.")
+    arch = getattr(ti, backend.arch)
+    # Taichi lets this variable override what it is asked for, and announces its start on standard output.
+    os.environ.pop("TI_ARCH", None)
+    with contextlib.redirect_stdout(io.StringIO()):
+        ti.init(
+            arch=arch,
+            default_fp=ti.f64 if backend.precision == "f64" else ti.f32,
+            cpu_max_num_threads=backend.threads,
+            offline_cache=backend.compile_cache,
+            log_level=ti.ERROR,
+        )
+    came = ti.lang.impl.current_cfg().arch
+    if came != arch:
+        raise InputError(f"--arch {backend.arch} did not start ({came.name} came instead); use --arch cpu.")

@@ -1,0 +1,81 @@
+"""Says what went wrong with a run that cannot go on: which particle, where, and which limit was nearest."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.errors import RunError
+from mpmcli.solver.snapshot import Snapshot
+from mpmcli.stability.limits import Limit
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Where and why a run stopped.
+
+    Attributes:
+        step: number of the step after which it was seen; time: s.
+        particle: row of the particle in every frame; body: its name; position: last one inside the domain, m.
+        cause: what happened to it.
+        limit: name of the bound on the step that was nearest; step_size: of that step, s.
+    """
+
+    step: int
+    time: float
+    particle: int
+    body: str
+    position: tuple[float, ...]
+    cause: str
+    limit: str
+    step_size: float
+    suggestion: str
+
+    def sentence(self) -> str:
+        """Return all of it in one sentence."""
+        place = ", ".join(f"{x:.4g}" for x in self.position)
+        return (
+            f"the run became unstable at step {self.step}, t = {self.time:.6g} s: particle {self.particle} of body "
+            f'"{self.body}" at ({place}) m {self.cause}; the step was {self.step_size:.3g} s, its nearest limit '
+            f'"{self.limit}"; {self.suggestion}.'
+        )
+
+
+class UnstableRunError(RunError):
+    """The state of a run is no longer physical; frames already written stay."""
+
+    def __init__(self, diagnosis: Diagnosis) -> None:
+        super().__init__(diagnosis.sentence())
+        self.diagnosis = diagnosis
+
+
+def diagnose(
+    snapshot: Snapshot,
+    p: int,
+    names: tuple[str, ...],
+    origin: np.ndarray,
+    step: int,
+    time: float,
+    step_size: float,
+    limit: Limit,
+) -> Diagnosis:
+    """Describe particle p (in solver order) of a group that stopped the run."""
+    values = (snapshot.v[p], snapshot.C[p], snapshot.deformation[p])
+    J = float(np.linalg.det(snapshot.deformation[p])) if snapshot.deformation.ndim == 3 else values[2]
+    if not all(np.isfinite(value).all() for value in values):
+        cause = "has a state that is not finite"
+    elif not J > 0:
+        cause = f"was turned inside out (J = {J:.3g})"
+    else:
+        speed = float(np.linalg.norm(values[0]))
+        cause = f"left the domain at {speed:.4g} m/s"
+    return Diagnosis(
+        step,
+        time,
+        int(snapshot.id[p]),
+        names[int(snapshot.body[p])],
+        tuple((snapshot.x[p].astype(np.float64) + origin).tolist()),
+        cause,
+        limit.name,
+        step_size,
+        "lower time.safety or time.step, or check that its material and speed are what you mean",
+    )

@@ -1,0 +1,97 @@
+"""The background grid: nodes of mass and momentum, and the box of them that is in use."""
+
+from itertools import product
+
+import numpy as np
+import taichi as ti
+
+# Nodes beyond each wall: ghost nodes that the wall folds, and the reach of the kernel.
+PAD = 3
+# Edge of a tile, cells: same-coloured tiles write disjoint nodes as long as no particle has drifted
+# more than one cell out of the tile that it was sorted into (4 + 4 cells apart, 3 + 1 + 1 nodes reach).
+TILE = 4
+DRIFT = 1.0
+
+
+@ti.data_oriented
+class Grid:
+    """A dense grid of nodes over the domain and its ghost margin, addressed by one linear index.
+
+    Node index n along an axis lies at (n - PAD) h from the lower wall.
+
+    Attributes:
+        dimension: 2 or 3.
+        spacing: h, m.
+        cells: cells of the domain per axis.
+        shape: nodes per axis, margins included, a multiple of TILE.
+        tiles: tiles per axis.
+        strides: of the linear node index, per axis.
+        lines: of a stencil's lines of nodes along the last axis: (offsets along the other axes, linear offset).
+        nodes: Vector(d + 1) field: momentum and mass after P2G, velocity and mass after the update.
+        box: (2, d) ints: first node in use and number of nodes in use, per axis.
+    """
+
+    def __init__(self, dimension: int, spacing: float, cells: tuple[int, ...]) -> None:
+        self.dimension = dimension
+        self.spacing = spacing
+        self.cells = tuple(cells)
+        self.tiles = tuple(-(-(n + 1 + 2 * PAD) // TILE) for n in cells)
+        self.shape = tuple(TILE * n for n in self.tiles)
+        self.strides = tuple(int(np.prod(self.shape[a + 1 :])) for a in range(dimension))
+        self.lines = tuple(
+            (o, sum(n * stride for n, stride in zip(o, self.strides, strict=False)))
+            for o in product(range(3), repeat=dimension - 1)
+        )
+        self.node_count = int(np.prod(self.shape))
+        self.nodes = ti.Vector.field(dimension + 1, float, shape=self.node_count)
+        self.box = ti.field(int, shape=(2, dimension))
+
+    @staticmethod
+    def bytes_needed(cells: tuple[int, ...], real_bytes: int) -> int:
+        """Return the bytes that the nodes of such a grid take."""
+        count = 1
+        for n in cells:
+            count *= TILE * (-(-(n + 1 + 2 * PAD) // TILE))
+        return count * (len(cells) + 1) * real_bytes
+
+    @ti.func
+    def first_node(self, base: ti.template()):
+        """Return the linear index of the node at the integer coordinates `base`."""
+        index = 0
+        for a in ti.static(range(self.dimension)):
+            index += base[a] * self.strides[a]
+        return index
+
+    @ti.func
+    def row_count(self):
+        """Return the number of rows of nodes, along the last axis, in the box in use."""
+        count = 1
+        for a in ti.static(range(self.dimension - 1)):
+            count *= self.box[1, a]
+        return count
+
+    @ti.func
+    def row_start(self, row: int):
+        """Return the integer coordinates of the first node of a row of the box."""
+        start = ti.Vector.zero(int, self.dimension)
+        rest = row
+        for b in ti.static(range(self.dimension - 1)):
+            a = ti.static(self.dimension - 2 - b)
+            start[a] = self.box[0, a] + rest % self.box[1, a]
+            rest = rest // self.box[1, a]
+        last = ti.static(self.dimension - 1)
+        start[last] = self.box[0, last]
+        return start
+
+    @ti.func
+    def box_nodes(self):
+        """Return the number of nodes of the box in use."""
+        return self.row_count() * self.box[1, ti.static(self.dimension - 1)]
+
+    @ti.func
+    def box_node(self, q: int):
+        """Return the integer coordinates of the q-th node of the box."""
+        last = ti.static(self.dimension - 1)
+        node = self.row_start(q // self.box[1, last])
+        node[last] += q % self.box[1, last]
+        return node

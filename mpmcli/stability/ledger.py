@@ -1,0 +1,46 @@
+"""One row of the run-time ledger: what happened up to a frame, and what is conserved there."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class LedgerRow:
+    """Health and conserved quantities of a run at one frame, all sums in float64.
+
+    Attributes:
+        time: s.
+        steps: time steps taken since the previous frame.
+        step_min, step_max: smallest and largest step since the previous frame, s (0 at frame 0).
+        limit: name of the bound that set the smallest step, "" at frame 0.
+        speed_max: largest particle speed, m/s.
+        courant_max: largest particle displacement in one step since the previous frame, in cells.
+        volume_ratio_min, volume_ratio_max: range of J = det F.
+        mass: kg (kg per metre of depth in 2D, and so for all that follows).
+        kinetic: sum m (|v|^2 + h^2/4 |C|^2)/2, J (Jiang et al. 2015: the affine part included).
+        elastic: stored energy of every law that has one, J.
+        potential: -sum m g.x relative to the origin of the domain, J.
+        linear_momentum: sum m v, kg m/s, one number per axis.
+        angular_momentum: sum m x cross v + m h^2/4 axl(C) about the origin of the domain,
+            kg m^2/s, one number in 2D and three in 3D.
+    """
+
+    time: float
+    steps: int
+    step_min: float
+    step_max: float
+    limit: str
+    speed_max: float
+    courant_max: float
+    volume_ratio_min: float
+    volume_ratio_max: float
+    mass: float
+    kinetic: float
+    elastic: float
+    potential: float
+    linear_momentum: tuple[float, ...]
+    angular_momentum: tuple[float, ...]
+
+    @property
+    def energy(self) -> float:
+        """Total energy, J."""
+        return self.kinetic + self.elastic + self.potential

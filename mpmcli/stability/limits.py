@@ -1,0 +1,75 @@
+"""Closed-form bounds on the time step, one function per bound (verification: 10.1).
+
+For MLS-MPM with APIC, quadratic B-splines and symplectic Euler. The wave bound is exact for an isolated
+particle, which is the least stable configuration: particles that share nodes allow 1.0 to 1.4 times more.
+"""
+
+import math
+from typing import NamedTuple
+
+# Largest displacement in one step, cells: keeps a particle's stencil local (verification: 10.1).
+COURANT = 0.5
+# Largest velocity gradient times step: keeps I + dt C, and with it J, away from zero.
+DEFORMATION = 0.5
+
+WHY = {
+    "wave": "a pressure or shear wave must not cross more than one cell in a step, even for a lone particle",
+    "speed": "a particle must not move more than half a cell in a step",
+    "deformation": "a particle must not be compressed by more than half in a step",
+    "maximum": "time.step in the scene sets it",
+}
+FIX = {
+    "wave": "a softer material or a coarser grid allows a larger step",
+    "speed": "a coarser grid or a slower scene allows a larger step",
+    "deformation": "a coarser grid or a stiffer material deforms less in a step",
+    "maximum": 'a larger time.step, or "auto", allows a larger step',
+}
+
+
+class Limit(NamedTuple):
+    """One bound on the time step.
+
+    Attributes:
+        value: the largest step that it allows, s.
+        name: "wave", "speed", "deformation" or "maximum".
+        body: name of the body that sets it, "" where no single one does.
+    """
+
+    value: float
+    name: str
+    body: str
+
+    @property
+    def why(self) -> str:
+        """What the bound keeps from happening."""
+        return WHY[self.name]
+
+    @property
+    def fix(self) -> str:
+        """What to change for a larger step."""
+        return FIX[self.name]
+
+
+def wave_limit(spacing: float, density: float, stiffness: float) -> float:
+    """Return h sqrt(density / stiffness), s: an isolated particle's bound.
+
+    Its velocity gradient obeys C' = C - dt 4/(h^2 density) tau, and tau changes by at most
+    stiffness |C| dt, so dt^2 (4/h^2) stiffness / density <= 4. At rest the stiffness is d lambda + 2 mu for
+    a solid and d K for a fluid.
+
+    Args:
+        spacing: h, m.
+        density: kg/m^3, at rest.
+        stiffness: Pa, see `Law.stiffness`.
+    """
+    return spacing * math.sqrt(density / stiffness)
+
+
+def speed_limit(spacing: float, speed: float) -> float:
+    """Return the step in which the fastest particle (m/s) moves COURANT cells, s."""
+    return COURANT * spacing / speed if speed > 0 else math.inf
+
+
+def deformation_limit(gradient: float) -> float:
+    """Return the step in which the largest velocity gradient (1/s) deforms by DEFORMATION, s."""
+    return DEFORMATION / gradient if gradient > 0 else math.inf

@@ -1,0 +1,63 @@
+"""Fixtures that every test may use."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# Kernels compile inside examples and machines are shared: time says nothing about correctness.
+settings.register_profile("mpmcli", deadline=None, max_examples=50, print_blob=True)
+settings.load_profile("mpmcli")
+
+
+@dataclass(frozen=True)
+class PythonRun:
+    """What a Python process left: exit status, stdout and stderr as text."""
+
+    status: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def run_python(tmp_path: Path) -> Callable[..., PythonRun]:
+    """Return `run(code_or_arguments, ...)`: it runs Python in a process of its own and returns a PythonRun.
+
+    A string is code, a sequence is arguments (`["-m", "mpmcli.cli", "--help"]`). Taichi can start only once
+    per process, so whatever needs a second backend, or a fresh interpreter, runs here. `check=True` (the
+    default) fails the test with the process's stderr when its status is not 0. Further keywords: `stdin`
+    (text), `cwd` (default tmp_path), `timeout` in seconds, `environment` to add to the present one.
+    """
+
+    def run(
+        code_or_arguments: str | list[str],
+        *,
+        check: bool = True,
+        stdin: str | None = None,
+        cwd: Path = tmp_path,
+        timeout: float = 300,
+        environment: dict[str, str] | None = None,
+    ) -> PythonRun:
+        arguments = ["-c", code_or_arguments] if isinstance(code_or_arguments, str) else code_or_arguments
+        path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+        done = subprocess.run(
+            [sys.executable, *map(str, arguments)],
+            input=stdin if stdin is not None else "",
+            capture_output=True,
+            text=True,
+            cwd=cwd,
+            timeout=timeout,
+            env={**os.environ, "PYTHONPATH": path, **(environment or {})},
+        )
+        if check and done.returncode != 0:
+            pytest.fail(f"python exited with {done.returncode}:\n{done.stdout}\n{done.stderr}")
+        return PythonRun(done.returncode, done.stdout, done.stderr)
+
+    return run

@@ -1,0 +1,275 @@
+"""The benchmark: peers are the package's own examples, and both sides run in turn. No clock decides here."""
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mpmcli.bench import ours, peers, worker
+from mpmcli.bench.cases import CASES, DENSITY, EDGE, GRAVITY, SPEED, BenchCase
+from mpmcli.bench.compare import Setting, run_bench, start_worker
+from mpmcli.bench.report import BenchReport, CaseResult, ContestantResult
+from mpmcli.errors import RunError
+
+SMALL_2D = BenchCase(dimension=2, cells=32, particles=200, step=5e-4)
+# At 16 cells the wall of mpm3d, 3 cells thick, would touch the block.
+SMALL_3D = BenchCase(dimension=3, cells=32, particles=200, step=5e-4)
+
+
+def adapted(case: BenchCase, text: str | None = None) -> str:
+    text = text or peers.example_path(case.peer).read_text(encoding="utf-8")
+    return peers.adapted_source(text, case, threads=3, precision="f64", arch="cpu")
+
+
+class TestCases:
+    def test_names_are_unique(self) -> None:
+        assert len({case.name for case in CASES}) == len(CASES)
+
+    @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+    def test_block_is_filled_about_as_the_examples_fill_theirs(self, case: BenchCase) -> None:
+        per_cell = case.particles / (EDGE * case.cells) ** case.dimension
+        assert 2 <= per_cell <= 8
+
+    @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+    def test_grid_suits_mpm3d(self, case: BenchCase) -> None:
+        # It passes the number of cells as a block size, which must be a power of two.
+        assert case.cells & (case.cells - 1) == 0
+
+    def test_positions_are_the_same_every_time(self) -> None:
+        assert SMALL_3D.positions().shape == (200, 3)
+        np.testing.assert_array_equal(SMALL_3D.positions(), SMALL_3D.positions())
+
+
+class TestAdaptedSource:
+    @pytest.mark.parametrize("case", [SMALL_2D, SMALL_3D], ids=lambda case: case.peer)
+    def test_settings_are_ours_and_nothing_is_drawn(self, case: BenchCase) -> None:
+        source = adapted(case)
+        compile(source, "adapted", "exec")
+        assert "ti.init(arch=ti.cpu, default_fp=ti.f64, cpu_max_num_threads=3, offline_cache=False)" in source
+        assert "n_particles = 200" in source
+        assert "GUI" not in source
+        assert "ti.gpu" not in source
+
+    @pytest.mark.parametrize("case", [SMALL_2D, SMALL_3D], ids=lambda case: case.peer)
+    def test_everything_else_is_untouched(self, case: BenchCase) -> None:
+        """As many lines as in the example up to where it draws, and only the settings differ."""
+        original = peers.example_path(case.peer).read_text(encoding="utf-8").splitlines()
+        pairs = list(zip(original, adapted(case).splitlines(), strict=False))
+        changed = [new for old, new in pairs if old != new]
+        assert len(changed) == {"mpm3d": 3, "mpm88": 4}[case.peer]
+
+    def test_another_version_of_an_example_is_noticed(self) -> None:
+        text = peers.example_path("mpm88").read_text(encoding="utf-8")
+        with pytest.raises(RunError, match="`n_grid = 128` 0 times instead of once"):
+            adapted(SMALL_2D, text.replace("n_grid = 128", "n_grid = 129"))
+
+
+class TestOurs:
+    @pytest.mark.parametrize("case", [SMALL_2D, SMALL_3D], ids=lambda case: case.name)
+    def test_both_start_from_the_same_block(self, case: BenchCase) -> None:
+        particles = ours.particles_of(case)
+        np.testing.assert_array_equal(particles.position, case.positions())
+        assert particles.count == case.particles
+        assert particles.count * particles.mass == pytest.approx(DENSITY * EDGE**case.dimension)
+
+    @pytest.mark.parametrize("case", [SMALL_2D, SMALL_3D], ids=lambda case: case.peer)
+    def test_both_move_alike(self, case: BenchCase, run_python: Callable, tmp_path: Path) -> None:
+        """The same physics: from the same block, before a wall is in reach, both give the same positions.
+
+        Both take tau = E (J - 1), J by 1 + dt tr C and x by dt v, so in f64 only round-off differs:
+        20 steps of 1e-16, grown a little by the compression of randomly placed particles. And both fall:
+        after n symplectic Euler steps the mean is at y0 - V n dt - g dt^2 n (n + 1) / 2.
+        """
+        steps = 20
+        for module, name in (("ours", "Ours"), ("peers", "Peer")):
+            run_python(f"""
+import numpy as np
+from mpmcli.bench.cases import BenchCase
+from mpmcli.bench.{module} import {name}
+side = {name}({case!r}, threads=1, precision="f64", arch="cpu")
+for _ in range({steps}):
+    side.step()
+side.sync()
+assert side.particles == {case.particles}
+assert side.smallest_step == {case.step}
+assert side.is_sound()
+np.save("{module}.npy", side.positions())
+""")
+        found, expected = np.load(tmp_path / "ours.npy"), np.load(tmp_path / "peers.npy")
+        assert np.abs(found - expected).max() < 1e-12
+        fallen = SPEED * steps * case.step + GRAVITY * case.step**2 * steps * (steps + 1) / 2
+        assert expected[:, 1].mean() == pytest.approx(case.positions()[:, 1].mean() - fallen, abs=1e-12)
+
+
+class Clock:
+    """A simulation whose steps take 10 ms of a clock of its own."""
+
+    particles = 7
+    bytes_per_particle = 64
+    smallest_step = 1e-3
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def step(self) -> None:
+        self.now += 0.01
+
+    def sync(self) -> None:
+        pass
+
+    def is_sound(self) -> bool:
+        return True
+
+
+class TestWorker:
+    def test_block_lasts_as_long_as_asked(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        clock = Clock()
+        monkeypatch.setattr(worker.time, "perf_counter", lambda: clock.now)
+        steps, seconds = worker.run_block(clock, 1.0)
+        assert seconds == pytest.approx(steps * 0.01)
+        assert 1.0 <= seconds <= 1.02
+
+    def test_commands_are_answered_line_by_line(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        clock, answers = Clock(), io.StringIO()
+        monkeypatch.setattr(worker.time, "perf_counter", lambda: clock.now)
+        assert worker.serve(lambda: clock, ["first\n", "run 0.1\n", "finish\n"], answers) == 0
+        ready, first, block, end = map(json.loads, answers.getvalue().splitlines())
+        assert ready == {"particles": 7, "bytes_per_particle": 64}
+        assert first == {"seconds": pytest.approx(0.01)}
+        assert block["steps"] in (10, 11)
+        assert end["sound"] is True
+        assert end["smallest_step"] == 1e-3
+        assert end["peak_memory"] > 1e6
+
+    def test_expected_errors_become_an_answer(self) -> None:
+        def fail() -> Clock:
+            raise RunError("There is no such example.")
+
+        answers = io.StringIO()
+        assert worker.serve(fail, [], answers) == 1
+        assert json.loads(answers.getvalue()) == {"error": "There is no such example."}
+
+    def test_a_peer_runs_in_its_own_process(self) -> None:
+        with start_worker("peer", SMALL_2D, Setting(threads=1)) as process:
+            assert process.ready == {"particles": 200, "bytes_per_particle": None}
+            assert process.ask("first")["seconds"] > 0
+            assert process.ask("run 0.01")["steps"] > 0
+            assert process.ask("finish")["sound"] is True
+
+    def test_a_process_that_dies_is_a_sentence_with_its_last_words(self) -> None:
+        with pytest.raises(RunError, match=r"stopped: it ended with status 1\..*no_such_arch"):
+            start_worker("peer", SMALL_2D, Setting(threads=1, arch="no_such_arch"))
+
+
+class FakeWorker:
+    """Answers like a contestant that takes `step_seconds` per step, and notes what it was asked."""
+
+    start_seconds = 0.5
+
+    def __init__(self, who: str, step_seconds: float, particles: int, log: list[tuple[str, str]]) -> None:
+        self.who, self.step_seconds, self.log = who, step_seconds, log
+        self.ready = {"particles": particles, "bytes_per_particle": None}
+        self.closed = False
+
+    def ask(self, command: str) -> dict:
+        self.log.append((self.who, command))
+        match command.split():
+            case ["first"]:
+                return {"seconds": 2.0 + self.step_seconds}
+            case ["run", _]:
+                return {"steps": 100, "seconds": 100 * self.step_seconds}
+        return {"sound": True, "smallest_step": SMALL_2D.step, "peak_memory": 10**8}
+
+    def __enter__(self) -> "FakeWorker":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.closed = True
+
+
+class TestComparison:
+    def run(self, particles: int = 200, **options) -> tuple[BenchReport, list[tuple[str, str]], list[FakeWorker]]:
+        log, started = [], []
+
+        def start(who: str, case: BenchCase, setting: Setting) -> FakeWorker:
+            started.append(FakeWorker(who, {"ours": 0.001, "peer": 0.004}[who], particles, log))
+            return started[-1]
+
+        try:
+            report = run_bench([SMALL_2D], threads=2, seconds=1.5, start=start, blocks=3, **options)
+        finally:
+            assert all(fake.closed for fake in started)
+        return report, log, started
+
+    def test_blocks_alternate(self) -> None:
+        _, log, _ = self.run()
+        assert [who for who, command in log if command == "run 1.5"] == ["ours", "peer"] * 3
+
+    def test_medians_and_ratio(self) -> None:
+        report, _, _ = self.run()
+        (result,) = report.results
+        assert result.ours.rates == pytest.approx([200 / 0.001] * 3)
+        assert result.ratio == pytest.approx(4)
+        assert result.ours.compile_seconds == pytest.approx(2.0)
+
+    def test_progress_is_told(self) -> None:
+        lines = []
+        self.run(progress=lines.append)
+        assert len(lines) == 4
+        assert lines[-1].startswith("2d-32: block 3 of 3, 0.20 against 0.05")
+
+    def test_unequal_numbers_of_particles_are_refused(self) -> None:
+        with pytest.raises(RunError, match="199 particles instead of 200"):
+            self.run(particles=199)
+
+
+class TestReport:
+    side = ContestantResult(
+        rates=(2e6, 4e6, 3e6),
+        start_seconds=0.51,
+        compile_seconds=1.24,
+        peak_memory=150_000_000,
+        bytes_per_particle=96,
+        smallest_step=8e-5,
+        sound=True,
+    )
+    peer = replace(side, rates=(1e6, 1e6, 2e6), bytes_per_particle=None)
+
+    def report(self, peer: ContestantResult = peer) -> BenchReport:
+        result = CaseResult(CASES[-1], ours=self.side, peer=peer)
+        return BenchReport((result,), 2, "f32", "cpu", 1.0, {"processor": "A processor", "taichi": "1.7.4"})
+
+    def test_table(self) -> None:
+        lines = self.report().table().splitlines()
+        assert lines[0] == "A processor, cpu, 2 threads, f32, taichi 1.7.4"
+        row = next(line for line in lines if line.startswith("3d-128"))
+        found = " ".join(row.split())
+        assert found == "3d-128 524,288 3.00 mpm3d 1.00 3.00 1.50-4.00 0.5+1.2 / 0.5+1.2 150 / 150"
+        assert lines[-1] == "Device memory at 3d-128: 96 bytes per particle."
+
+    def test_table_warns_of_a_run_that_broke_down(self) -> None:
+        assert "Beware" not in self.report().table()
+        assert "Beware: mpm3d broke down at 3d-128" in self.report(replace(self.peer, sound=False)).table()
+
+    def test_table_warns_of_smaller_steps(self) -> None:
+        result = CaseResult(CASES[-1], ours=replace(self.side, smallest_step=4e-5), peer=self.peer)
+        report = replace(self.report(), results=(result,))
+        assert "Beware: at 3d-128 mpmcli's own limits asked for steps down to 4e-05 s" in report.table()
+
+    def test_dictionary_is_json_with_every_block(self) -> None:
+        found = json.loads(json.dumps(self.report().as_dict()))
+        (case,) = found["cases"]
+        assert found["threads"] == 2
+        assert case["ours"]["particle_steps_per_s_blocks"] == [2e6, 4e6, 3e6]
+        assert case["ratio"] == 3
+        assert (case["ratio_min"], case["ratio_max"]) == (1.5, 4)
+        assert case["ours"]["device_bytes_per_particle"] == 96
+
+    def test_machine_is_described(self) -> None:
+        found = BenchReport((), 1, "f32", "cpu", 1.0).machine
+        assert found["processor"]
+        assert found["taichi"].startswith("1.7")

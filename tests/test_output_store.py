@@ -1,0 +1,377 @@
+"""The VTKHDF store: what it writes is read back bit for bit, and survives crashes and full disks."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections import namedtuple
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_output_frames import FIELDS, assert_same_frame, make_frame, make_row
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
+from vtkmodules.vtkIOHDF import vtkHDFReader
+
+from mpmcli.errors import InputError, RunError
+from mpmcli.output import SegmentStore, open_result, prepare_directory
+from mpmcli.output import pack as pack_module
+from mpmcli.output.layout import FrameLayout
+from mpmcli.output.store import sealed_segments
+
+HEADER = {
+    "dimension": 2,
+    "bodies": ["column"],
+    "laws": ["fluid"],
+    "precision": "f32",
+    "scene": 'title = "é"\n',
+}
+Usage = namedtuple("Usage", "total used free")
+
+
+def fill(directory: Path, frames, *, finish: bool = True, compress: bool = False) -> SegmentStore:
+    store = SegmentStore(directory, HEADER, compress=compress)
+    for frame in frames:
+        store.write(frame, make_row(frame.index, frame.position.shape[1]))
+    if finish:
+        store.finish()
+    return store
+
+
+def read_with_vtk(path: Path) -> list[dict[str, np.ndarray]]:
+    """Every frame as VTK, and so ParaView, sees it: Points, point data, and the cells."""
+    reader = vtkHDFReader()
+    reader.SetFileName(str(path))
+    reader.UpdateInformation()
+    # A file with one frame has no time for VTK: UpdateTimeStep then reads what there is.
+    times = reader.GetOutputInformation(0).Get(vtkStreamingDemandDrivenPipeline.TIME_STEPS()) or [None]
+    frames = []
+    for time in times:
+        reader.UpdateTimeStep(0.0 if time is None else time)
+        data = reader.GetOutput()
+        frame = {"time": time, "cells": data.GetNumberOfVerts(), "all_cells": data.GetNumberOfCells()}
+        if data.GetNumberOfPoints():
+            frame["Points"] = vtk_to_numpy(data.GetPoints().GetData()).copy()
+            frame["connectivity"] = vtk_to_numpy(data.GetVerts().GetConnectivityArray()).copy()
+            for i in range(data.GetPointData().GetNumberOfArrays()):
+                array = data.GetPointData().GetArray(i)
+                frame[array.GetName()] = vtk_to_numpy(array).copy()
+        frames.append(frame)
+    return frames
+
+
+def assert_vtk_sees(path: Path, written) -> None:
+    read = read_with_vtk(path)
+    if len(written) > 1:
+        assert [frame["time"] for frame in read] == [frame.time for frame in written]
+    for seen, frame in zip(read, written, strict=True):
+        n = len(frame.position)
+        assert seen["cells"] == seen["all_cells"] == (1 if n else 0)
+        for name, stored in FrameLayout.of(frame).stored(frame) if n else ():
+            assert seen[name].dtype == stored.dtype and seen[name].tobytes() == stored.tobytes(), name
+        if n:
+            assert seen["connectivity"].tolist() == list(range(n))
+
+
+@settings(deadline=None, max_examples=20)
+@given(
+    counts=st.lists(st.integers(0, 40), min_size=1, max_size=4),
+    d=st.sampled_from([2, 3]),
+    dtype=st.sampled_from(["float32", "float64"]),
+    fields=st.sets(st.sampled_from(sorted(FIELDS))),
+    compress=st.booleans(),
+)
+def test_round_trip(counts, d, dtype, fields, compress):
+    """Random counts, dimensions, types and fields; sealed, packed, and through VTK's own reader."""
+    frames = [make_frame(k, n, d, dtype, sorted(fields)) for k, n in enumerate(counts)]
+    with TemporaryDirectory() as place:
+        directory = Path(place)
+        store = fill(directory, frames, finish=False)
+        for kind in ("segments", "packed"):
+            result = open_result(directory)
+            assert (result.kind, result.frame_count, result.dimension) == (kind, len(counts), d)
+            assert result.times.dtype == np.float64
+            assert result.times.tolist() == [frame.time for frame in frames]
+            assert result.particle_counts.tolist() == counts
+            assert result.ledger == [make_row(k, d) for k in range(len(counts))]
+            assert result.header == HEADER and set(result.field_names) == fields
+            for read, frame in zip(result.frames(), frames, strict=True):
+                assert_same_frame(read, frame)
+            if kind == "segments":
+                store._compress = compress
+                store.finish()
+        if sum(counts):
+            assert_vtk_sees(directory / "particles.vtkhdf", frames)
+
+
+@pytest.mark.parametrize("compress", [False, True])
+def test_vtk_reads_every_frame_of_a_packed_file(tmp_path, compress):
+    frames = [make_frame(k, n, 3, fields=tuple(FIELDS)) for k, n in enumerate((30_000, 31_274, 1, 29_137))]
+    fill(tmp_path, frames, compress=compress)
+    assert [path.name for path in tmp_path.iterdir()] == ["particles.vtkhdf"]
+    assert_vtk_sees(tmp_path / "particles.vtkhdf", frames)
+
+
+def test_vtk_reads_a_sealed_segment_while_the_run_goes_on(tmp_path):
+    frames = [make_frame(k, 50, 2) for k in range(2)]
+    fill(tmp_path, frames, finish=False)
+    for path, frame in zip(sealed_segments(tmp_path), frames, strict=True):
+        assert_vtk_sees(path, [frame])
+        single = open_result(path)
+        assert_same_frame(single.frame(0), frame)
+
+
+def test_h5py_needs_three_lines(tmp_path):
+    frames = [make_frame(k, n, 3) for k, n in enumerate((10, 20, 5))]
+    fill(tmp_path, frames)
+    with h5py.File(tmp_path / "particles.vtkhdf") as f:
+        start, n = f["VTKHDF/Steps/PointOffsets"][1], f["VTKHDF/NumberOfPoints"][1]
+        position = f["VTKHDF/Points"][start : start + n]
+    assert position.tobytes() == frames[1].position.tobytes()
+
+
+def test_the_file_says_what_it_is(tmp_path):
+    fill(tmp_path, [make_frame(0, 10, 2)])
+    with h5py.File(tmp_path / "particles.vtkhdf") as f:
+        assert f["VTKHDF"].attrs["Type"] == b"PolyData"
+        assert f["mpmcli"].attrs["scene"] == HEADER["scene"]
+        assert f["ledger/limit"].shape == (1,) and f["ledger/linear_momentum"].shape == (1, 2)
+        # The vertex list is stored once and no dataset wastes room on padding.
+        assert f["VTKHDF/Points"].chunks is None
+        assert f["VTKHDF/Vertices/Connectivity"].shape == (10,)
+
+
+def test_a_long_scene_fits(tmp_path):
+    """HDF5 attributes were once limited to 64 KiB."""
+    store = SegmentStore(tmp_path, {"scene": "#" * 300_000})
+    store.write(make_frame(0, 3, 2), make_row(0, 2))
+    store.finish()
+    assert open_result(tmp_path).header == {"scene": "#" * 300_000}
+
+
+def test_compression_saves_what_is_constant(tmp_path):
+    sizes = []
+    for compress in (False, True):
+        directory = tmp_path / str(compress)
+        frames = [make_frame(k, 20_000, 3) for k in range(3)]
+        for frame in frames:
+            frame.fields["density"][:] = 1000
+            frame.fields["pressure"][:] = 0
+        fill(directory, frames, compress=compress)
+        sizes.append((directory / "particles.vtkhdf").stat().st_size)
+        assert_same_frame(open_result(directory).frame(2), frames[2])
+    # Of 44 bytes per particle, 24 are random; ids, and random numbers below 3, shrink to little.
+    assert sizes[1] < 0.65 * sizes[0]
+    assert sizes[0] < 3 * 20_000 * 44 + 20_000 * 8 + 30_000
+
+
+def test_nothing_written_makes_no_file(tmp_path):
+    assert SegmentStore(tmp_path, HEADER).finish() is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_come_in_order(tmp_path):
+    store = SegmentStore(tmp_path, HEADER)
+    with pytest.raises(ValueError, match="frame 1 was given where frame 0"):
+        store.write(make_frame(1, 3, 2), make_row(1, 2))
+
+
+def test_an_earlier_result_is_not_mixed_with_a_new_one(tmp_path):
+    fill(tmp_path, [make_frame(0, 3, 2)])
+    with pytest.raises(InputError, match="earlier result"):
+        fill(tmp_path, [make_frame(0, 3, 2)])
+
+
+def test_a_killed_run_keeps_every_sealed_frame(tmp_path):
+    """SIGKILL in the middle of a frame: what was reported as written is there, the rest is ignored."""
+    program = f"""
+import sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+from test_output_frames import make_frame, make_row
+from mpmcli.output import SegmentStore
+store = SegmentStore(Path({str(tmp_path)!r}), {{}})
+k = 0
+while True:
+    store.write(make_frame(k, 2000, 2), make_row(k, 2))
+    k = store.frames_written
+    print(k, flush=True)
+"""
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    reported = 0
+    while reported < 5:
+        reported = int(process.stdout.readline())
+    process.send_signal(signal.SIGKILL)
+    rest = process.stdout.read().split()
+    process.wait()
+    reported = int(rest[-1]) if rest else reported
+    (tmp_path / "segments/frame_999999.vtkhdf.tmp").write_bytes(b"torn")
+    result = open_result(tmp_path)
+    assert reported <= result.frame_count <= reported + 1
+    for k, frame in enumerate(result.frames()):
+        assert_same_frame(frame, make_frame(k, 2000, 2))
+
+
+def test_a_full_disk_is_seen_before_it_is_met(tmp_path, monkeypatch):
+    frames = [make_frame(k, 100, 2) for k in range(3)]
+    store = fill(tmp_path, frames[:2], finish=False)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9 - 10**6, 10**6))
+    with pytest.raises(RunError, match=r"1\.0 MB left, but frame 2 needs .* the 2 frames before it are kept"):
+        store.write(frames[2], make_row(2, 2))
+    with pytest.raises(RunError, match=r"packing the frames into particles.vtkhdf needs .* 2 frames .* kept"):
+        store.finish()
+    assert store.frames_written == 2
+    result = open_result(tmp_path)
+    assert result.kind == "segments" and result.frame_count == 2
+    for read, frame in zip(result.frames(), frames[:2], strict=True):
+        assert_same_frame(read, frame)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="needs POSIX file size limits")
+def test_a_disk_that_refuses_ends_in_one_sentence(tmp_path):
+    """The write itself fails, as on a disk that fills between the question and the write."""
+    program = f"""
+import resource, signal, sys
+sys.path.insert(0, {str(Path(__file__).parent)!r})
+from pathlib import Path
+from test_output_frames import make_frame, make_row
+from mpmcli.errors import RunError
+from mpmcli.output import SegmentStore
+store = SegmentStore(Path({str(tmp_path)!r}), {{}})
+store.write(make_frame(0, 100, 2), make_row(0, 2))
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+try:
+    store.write(make_frame(1, 50_000, 2), make_row(1, 2))
+except RunError as error:
+    print(error)
+"""
+    process = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+    assert "frame 1 could not be written" in process.stdout and "the frame before it is kept" in process.stdout
+    assert [path.name for path in (tmp_path / "segments").iterdir()] == ["frame_000000.vtkhdf"]
+    assert_same_frame(open_result(tmp_path).frame(0), make_frame(0, 100, 2))
+
+
+@pytest.mark.parametrize("name", ["VTKHDF/Points", "VTKHDF/PointData/id", "VTKHDF/Steps/CellOffsets", "ledger/mass"])
+def test_verification_catches_a_corrupted_pack(tmp_path, monkeypatch, name):
+    frames = [make_frame(k, 20, 3) for k in range(3)]
+    store = fill(tmp_path, frames, finish=False)
+
+    def corrupt(path: Path) -> None:
+        if path.name.startswith("particles"):
+            with h5py.File(path, "r+") as f:
+                data = f[name][:]
+                data.reshape(-1).view(np.uint8)[-4] ^= 1
+                f[name][...] = data
+
+    monkeypatch.setattr(pack_module, "sync_file", corrupt)
+    with pytest.raises(RunError, match=r"does not read back as it was written.*3 frames written are kept"):
+        store.finish()
+    assert [path.name for path in tmp_path.iterdir()] == ["segments"]
+    assert_same_frame(open_result(tmp_path).frame(2), frames[2])
+    monkeypatch.undo()
+    store.finish()
+    assert open_result(tmp_path).kind == "packed"
+
+
+def test_a_damaged_or_foreign_segment_is_not_packed(tmp_path):
+    store = fill(tmp_path, [make_frame(k, 20, 3) for k in range(2)], finish=False)
+    last = sealed_segments(tmp_path)[-1]
+    content = last.read_bytes()
+    last.write_bytes(content[:100])
+    with pytest.raises(RunError, match="left unpacked"):
+        store.finish()
+    last.unlink()
+    with pytest.raises(RunError, match="1 of the 2 frames"):
+        store.finish()
+    other = SegmentStore(tmp_path / "other", {"scene": "another"})
+    for k in range(2):
+        other.write(make_frame(k, 20, 3), make_row(k, 3))
+    shutil.copy(sealed_segments(tmp_path / "other")[1], last)
+    with pytest.raises(RunError, match="another run"):
+        store.finish()
+    last.write_bytes(content)
+    assert store.finish() == tmp_path / "particles.vtkhdf"
+
+
+def test_an_interrupt_while_packing_leaves_the_segments(tmp_path, monkeypatch):
+    store = fill(tmp_path, [make_frame(k, 20, 3) for k in range(2)], finish=False)
+
+    def interrupt(path: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pack_module, "sync_file", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        store.finish()
+    assert os.listdir(tmp_path) == ["segments"]
+    assert open_result(tmp_path).frame_count == 2
+
+
+def test_a_frame_sealed_but_not_counted_is_packed(tmp_path):
+    store = fill(tmp_path, [make_frame(k, 20, 3) for k in range(2)], finish=False)
+    store._count = 1
+    store.finish()
+    assert open_result(tmp_path).frame_count == 2
+    assert os.listdir(tmp_path) == ["particles.vtkhdf"]
+
+
+def test_what_others_put_beside_the_segments_stays(tmp_path):
+    store = fill(tmp_path, [make_frame(0, 20, 3)], finish=False)
+    (tmp_path / "segments/notes.txt").write_text("mine")
+    store.finish()
+    assert (tmp_path / "segments/notes.txt").read_text() == "mine"
+    assert open_result(tmp_path / "segments").kind == "packed"
+
+
+def test_fields_can_be_left_out(tmp_path):
+    fill(tmp_path, [make_frame(0, 20, 3, fields=tuple(FIELDS))])
+    result = open_result(tmp_path)
+    assert set(result.frame(0, fields=["stress"]).fields) == {"stress"}
+    assert result.frame(0, fields=[]).fields == {}
+    with pytest.raises(InputError, match='no field "strain": its fields are density, pressure'):
+        result.frame(0, fields=["strain"])
+
+
+def test_what_is_no_result_is_named(tmp_path):
+    fill(tmp_path / "good", [make_frame(k, 20, 3) for k in range(3)])
+    result = open_result(tmp_path / "good")
+    for k in (-1, 3):
+        with pytest.raises(InputError, match=f"no frame {k}: it holds frames 0 to 2"):
+            result.frame(k)
+    with pytest.raises(InputError, match="nowhere does not exist"):
+        open_result(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no result of mpmcli"):
+        open_result(tmp_path / "empty")
+    (tmp_path / "text.vtkhdf").write_text("no")
+    with pytest.raises(InputError, match="not an HDF5 file"):
+        open_result(tmp_path / "text.vtkhdf")
+    with h5py.File(tmp_path / "foreign.h5", "w") as f:
+        f["x"] = 1
+    with pytest.raises(InputError, match="mpmcli did not write it"):
+        open_result(tmp_path / "foreign.h5")
+    with h5py.File(tmp_path / "good/particles.vtkhdf", "r+") as f:
+        f["mpmcli"].attrs["format"] = 99
+    with pytest.raises(InputError, match="newer version"):
+        open_result(tmp_path / "good")
+
+
+def test_frames_packed_under_a_reader_are_named(tmp_path):
+    store = fill(tmp_path, [make_frame(0, 20, 3)], finish=False)
+    result = open_result(tmp_path)
+    store.finish()
+    with pytest.raises(InputError, match="open it again"):
+        result.frame(0)
+
+
+def test_the_stores_work_in_a_prepared_directory(tmp_path):
+    directory = prepare_directory(tmp_path / "a/b", overwrite=False)
+    fill(directory, [make_frame(0, 20, 3)])
+    assert open_result(directory).frame_count == 1

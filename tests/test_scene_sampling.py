@@ -1,0 +1,165 @@
+"""Particles of bodies: how many, where, and with exactly the mass of the shape."""
+
+import copy
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mpmcli.errors import InputError
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import estimate_particles, parse_scene, sample_bodies, sampling
+
+FLUID = {"law": "fluid", "density": 800.0, "bulk_modulus": 1e5}
+
+
+def scene_of(*bodies, size=(4.0, 4.0), spacing=0.1, **domain):
+    data = {
+        "domain": {"size": list(size), "spacing": spacing, **domain},
+        "time": {"end": 1.0, "frames": 1},
+        "bodies": [{"name": f"b{i}", "material": FLUID, **body} for i, body in enumerate(bodies)],
+    }
+    return parse_scene(copy.deepcopy(data), laws=parameter_models()).scene
+
+
+BOX = {"box": {"min": [0.0, 0.0], "max": [1.0, 0.5]}}
+DISC = {"ball": {"center": [2.5, 2.5], "radius": 1.0}}
+
+
+def test_a_box_on_the_grid_has_particles_at_a_quarter_and_three_quarters_of_each_cell():
+    (particles,) = sample_bodies(scene_of({"shape": BOX}))
+    assert particles.count == 10 * 5 * 4
+    in_cell = np.sort(np.unique(np.round(np.mod(particles.position / 0.1, 1.0), 9)))
+    assert np.allclose(in_cell, [0.25, 0.75])
+    assert particles.volume == pytest.approx(0.1**2 / 4, rel=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 4, 9, 16])
+def test_a_lattice_has_its_number_of_particles_per_cell(count):
+    scene = scene_of({"shape": BOX, "particles_per_cell": count})
+    (particles,) = sample_bodies(scene)
+    cells, number = np.unique(np.floor(particles.position / 0.1).astype(int), axis=0, return_counts=True)
+    assert len(cells) == 50 and np.all(number == count)
+    assert estimate_particles(scene) == particles.count
+
+
+def test_in_3d_27_particles_per_cell():
+    box = {"box": {"min": [0, 0, 0], "max": [0.4, 0.2, 0.2]}}
+    scene = scene_of({"shape": box, "particles_per_cell": 27}, size=(1, 1, 1))
+    assert sample_bodies(scene)[0].count == estimate_particles(scene) == 16 * 27
+
+
+@given(
+    lower=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+    extent=st.tuples(st.floats(1e-4, 2), st.floats(1e-4, 2)),
+    jittered=st.booleans(),
+)
+def test_a_box_of_any_size_is_filled_evenly(lower, extent, jittered):
+    upper = [lo + e for lo, e in zip(lower, extent, strict=True)]
+    body = {
+        "shape": {"box": {"min": list(lower), "max": upper}},
+        "sampling": "jittered" if jittered else "lattice",
+    }
+    scene = scene_of(body)
+    (particles,) = sample_bodies(scene)
+    assert particles.count == estimate_particles(scene)
+    form = scene.bodies[0].shape.form
+    assert form.contains(particles.position).all()
+    assert particles.count * particles.mass == pytest.approx(800 * form.volume, rel=1e-12)
+    # A lattice point stands for a cell within a factor of two of h/2 along each axis, thin boxes apart.
+    if not jittered and min(extent) > 0.05:
+        assert 0.5 < particles.volume / (0.1**2 / 4) < 2.0
+
+
+SHAPES = {
+    "disc": ((4, 4), DISC),
+    "polygon": ((4, 4), {"polygon": {"vertices": [[0.5, 0.5], [3, 1], [2, 3]]}}),
+    "ball": ((2, 2, 2), {"ball": {"center": [1, 1, 1], "radius": 0.7}}),
+    "cylinder": (
+        (2, 2, 2),
+        {"cylinder": {"base": [0.5, 0.5, 0.5], "axis": [1, 1, 1], "radius": 0.4, "height": 1}},
+    ),
+}
+
+
+@pytest.mark.parametrize("way", ["lattice", "jittered"])
+@pytest.mark.parametrize("name", SHAPES)
+def test_mass_is_exact_and_the_estimate_close(name, way):
+    size, shape = SHAPES[name]
+    scene = scene_of({"shape": shape, "sampling": way}, size=size)
+    (particles,) = sample_bodies(scene)
+    form = scene.bodies[0].shape.form
+    assert form.contains(particles.position).all()
+    assert particles.count * particles.volume == pytest.approx(form.volume, rel=1e-12)
+    assert particles.count * particles.mass == pytest.approx(800 * form.volume, rel=1e-12)
+    assert abs(particles.count - estimate_particles(scene)) < 0.05 * particles.count
+
+
+def test_a_disc_on_a_lattice_is_symmetric():
+    position = sample_bodies(scene_of({"shape": DISC}))[0].position - 2.5
+    assert np.allclose(position.mean(axis=0), 0, atol=1e-12)
+    quarters = {tuple(q) for q in np.round(np.abs(position), 9)}
+    assert len(quarters) * 4 == len(position)
+
+
+@pytest.mark.parametrize("count", [3, 5, 7])
+def test_jittered_takes_any_number_per_cell(count):
+    scene = scene_of(
+        {
+            "shape": {"box": {"min": [0, 0], "max": [3.0, 3.0]}},
+            "sampling": "jittered",
+            "particles_per_cell": count,
+        }
+    )
+    (particles,) = sample_bodies(scene)
+    assert particles.count == pytest.approx(900 * count, rel=0.02)
+    assert np.unique(particles.position, axis=0).shape == particles.position.shape
+
+
+def test_jitter_is_told_by_the_seed_and_the_body_alone(monkeypatch):
+    def positions(seed, other=BOX):
+        bodies = ({"shape": other}, {"shape": DISC, "sampling": "jittered", "seed": seed})
+        return sample_bodies(scene_of(*bodies))[1].position
+
+    first = positions(7)
+    assert np.array_equal(first, positions(7))
+    assert np.array_equal(first, positions(7, other={"box": {"min": [0, 0], "max": [0.3, 0.3]}}))
+    assert not np.array_equal(first, positions(8))
+    monkeypatch.setattr(sampling, "_POINTS_AT_ONCE", 37)
+    assert np.array_equal(first, positions(7))
+
+
+def test_two_bodies_of_one_seed_differ():
+    boxes = [{"box": {"min": [x, 0], "max": [x + 1, 1]}} for x in (0, 2)]
+    a, b = sample_bodies(scene_of(*({"shape": box, "sampling": "jittered"} for box in boxes)))
+    assert not np.allclose(a.position + np.array([2, 0]), b.position)
+
+
+def test_velocity_is_linear_in_the_offset_from_the_centre():
+    gradient = [[-1.0, 0.5], [0.0, 2.0]]
+    body = {"shape": DISC, "velocity": [3.0, -1.0], "velocity_gradient": gradient}
+    (particles,) = sample_bodies(scene_of(body))
+    expected = (3.0, -1.0) + (particles.position - 2.5) @ np.array(gradient).T
+    assert np.allclose(particles.velocity, expected, rtol=0, atol=1e-14)
+    assert particles.affine.shape == (particles.count, 2, 2)
+    assert np.array_equal(particles.affine[-1], gradient)
+    assert np.array_equal(sample_bodies(scene_of({"shape": DISC}))[0].affine[0], np.zeros((2, 2)))
+
+
+def test_an_enormous_scene_is_estimated_without_being_made():
+    box = {"box": {"min": [0, 0, 0], "max": [1, 1, 1]}}
+    scene = scene_of({"shape": box}, size=(1, 1, 1), spacing=1 / 5000)
+    assert estimate_particles(scene) == 10**12
+    ball = {"ball": {"center": [0.5, 0.5, 0.5], "radius": 0.5}}
+    assert estimate_particles(scene_of({"shape": ball}, size=(1, 1, 1), spacing=1 / 5000)) == pytest.approx(
+        np.pi / 6 * 1e12, rel=1e-6
+    )
+
+
+def test_a_body_too_thin_for_its_lattice_is_named(monkeypatch):
+    monkeypatch.setattr("mpmcli.scene.checks._MOST_SEARCHED", 0)
+    sliver = {"polygon": {"vertices": [[0, 1], [1, 1.1], [0, 1.00001]]}}
+    scene = scene_of({"shape": sliver})
+    with pytest.raises(InputError, match='body "b0" is too thin to hold a particle'):
+        sample_bodies(scene)
