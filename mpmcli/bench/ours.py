@@ -60,7 +60,7 @@ class Ours:
         self._waits = not backend.on_cpu
         self._dt = self.smallest_step = case.step
         self.particles: int = self._solver.particle_count
-        self.bytes_per_particle: int | None = make_plan(scene, threads).bytes_per_particle
+        self.bytes_per_particle: int | None = make_plan(scene, backend).bytes_per_particle
 
     def step(self) -> None:
         """Advance by one step, as `frames` does: of the case's size, unless the limits ask for less."""

@@ -130,7 +130,7 @@ class Walls:
             if acts[a] == 1 and depth[a] < 0:
                 owned = False
         if owned:
-            total = ti.Vector.zero(float, d + 1)
+            total = ti.Vector.zero(float, grid.width)
             for images in range(ti.static(2**d)):
                 if self.mirrored(images, acts, depth):
                     total += self.flip(grid.nodes[self.image(grid, node, mirror, images)], images, upper)

@@ -34,11 +34,12 @@ def command(path: Path, overrides: tuple[str, ...], as_json: bool) -> None:
 def _of_scene(path: Path, overrides: tuple[str, ...]) -> dict:
     from mpmcli.materials.registry import parameter_models
     from mpmcli.scene import load_scene
+    from mpmcli.solver.backend import Backend
     from mpmcli.solver.plan import make_plan
 
     loaded = load_scene(path, overrides, laws=parameter_models())
     scene = loaded.scene
-    plan = make_plan(scene, 1)
+    plan = make_plan(scene, Backend("cpu", 1, scene.solver.precision, True))
     return {
         "title": scene.title,
         "dimension": scene.dimension,

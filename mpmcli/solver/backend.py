@@ -111,6 +111,8 @@ def _initialise(backend: Backend) -> None:
             default_fp=ti.f64 if backend.precision == "f64" else ti.f32,
             cpu_max_num_threads=backend.threads,
             offline_cache=backend.compile_cache,
+            # On the CPU strict arithmetic is as fast, and a NaN stays a NaN in every comparison.
+            fast_math=not backend.on_cpu,
             log_level=ti.ERROR,
         )
     came = ti.lang.impl.current_cfg().arch

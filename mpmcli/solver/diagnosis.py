@@ -48,6 +48,15 @@ class UnstableRunError(RunError):
         self.diagnosis = diagnosis
 
 
+def first_unsound(snapshot: Snapshot) -> int | None:
+    """Return the first particle (in solver order) that is inverted or not finite, None where all are sound."""
+    sound = snapshot.volume_ratio > 0
+    for values in (snapshot.x, snapshot.v, snapshot.C):
+        sound &= np.isfinite(values).reshape(len(sound), -1).all(1)
+    unsound = np.flatnonzero(~sound)
+    return int(unsound[0]) if len(unsound) else None
+
+
 def diagnose(
     snapshot: Snapshot,
     p: int,

@@ -13,6 +13,11 @@ TILE = 4
 DRIFT = 1.0
 
 
+def node_width(dimension: int, *, on_cpu: bool) -> int:
+    """Return the numbers per node: momentum and mass, and on the CPU padding to a vector register."""
+    return 4 if on_cpu else dimension + 1
+
+
 @ti.data_oriented
 class Grid:
     """A dense grid of nodes over the domain and its ghost margin, addressed by one linear index.
@@ -27,12 +32,14 @@ class Grid:
         tiles: tiles per axis.
         strides: of the linear node index, per axis.
         lines: of a stencil's lines of nodes along the last axis: (offsets along the other axes, linear offset).
-        nodes: Vector(d + 1) field: momentum and mass after P2G, velocity and mass after the update.
+        width: numbers per node, at least d + 1.
+        nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update.
         box: (2, d) ints: first node in use and number of nodes in use, per axis.
     """
 
-    def __init__(self, dimension: int, spacing: float, cells: tuple[int, ...]) -> None:
+    def __init__(self, dimension: int, spacing: float, cells: tuple[int, ...], width: int) -> None:
         self.dimension = dimension
+        self.width = width
         self.spacing = spacing
         self.cells = tuple(cells)
         self.tiles = tuple(-(-(n + 1 + 2 * PAD) // TILE) for n in cells)
@@ -43,16 +50,16 @@ class Grid:
             for o in product(range(3), repeat=dimension - 1)
         )
         self.node_count = int(np.prod(self.shape))
-        self.nodes = ti.Vector.field(dimension + 1, float, shape=self.node_count)
+        self.nodes = ti.Vector.field(width, float, shape=self.node_count)
         self.box = ti.field(int, shape=(2, dimension))
 
     @staticmethod
-    def bytes_needed(cells: tuple[int, ...], real_bytes: int) -> int:
+    def bytes_needed(cells: tuple[int, ...], width: int, real_bytes: int) -> int:
         """Return the bytes that the nodes of such a grid take."""
         count = 1
         for n in cells:
             count *= TILE * (-(-(n + 1 + 2 * PAD) // TILE))
-        return count * (len(cells) + 1) * real_bytes
+        return count * width * real_bytes
 
     @ti.func
     def first_node(self, base: ti.template()):

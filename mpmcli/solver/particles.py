@@ -24,11 +24,12 @@ class ParticleGroup:
         parameters: of each body's material.
         count: number of particles n.
         x: position relative to the origin of the domain, (n) Vector(d), m.
-        v: velocity, (n) Vector(d), m/s.
-        C: affine velocity, (n) d x d, 1/s.
-        deformation: J (n) or F (n) d x d, as the law says.
+        v: velocity, (n) Vector, m/s, as wide as a node of the grid; the first d entries count.
+        gradient: of the velocity, (n) matrix of d rows as wide, 1/s: row a holds dv/dx_a, the transpose of C.
+        deformation: J, (n), or F, (n) matrix of d rows as wide as a node, as the law says.
         id: (n) int, row of the particle in every frame.
         body: (n) int, place in `bodies`; None where the group has one body.
+        real: numpy's type of the real fields.
         table: per body a row of particle mass, particle volume and the constants of the law.
     """
 
@@ -40,6 +41,7 @@ class ParticleGroup:
         particles: Sequence[BodyParticles],
         first_ids: Sequence[int],
         origin: np.ndarray,
+        width: int,
         layout: ti.Layout,
     ) -> None:
         self.law = law
@@ -48,10 +50,10 @@ class ParticleGroup:
         self.count = n = sum(len(b.position) for b in particles)
         self.dimension = d = particles[0].position.shape[1]
         self.x = ti.Vector.field(d, float, shape=n, layout=layout)
-        self.v = ti.Vector.field(d, float, shape=n, layout=layout)
-        self.C = ti.Matrix.field(d, d, float, shape=n, layout=layout)
+        self.v = ti.Vector.field(width, float, shape=n, layout=layout)
+        self.gradient = ti.Matrix.field(d, width, float, shape=n, layout=layout)
         if law.deformation == "F":
-            self.deformation = ti.Matrix.field(d, d, float, shape=n, layout=layout)
+            self.deformation = ti.Matrix.field(d, width, float, shape=n, layout=layout)
         else:
             self.deformation = ti.field(float, shape=n)
         self.id = ti.field(int, shape=n)
@@ -60,14 +62,11 @@ class ParticleGroup:
         rows = [(b.mass, b.volume, *law.constants(p)) for b, p in zip(particles, parameters, strict=True)]
         self.table = ti.Vector.field(len(rows[0]), float, shape=len(rows))
 
-        real = ti.f64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else ti.f32
-        host = np.float64 if real == ti.f64 else np.float32
+        self.real = host = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.table.from_numpy(np.array(rows, dtype=host))
         self.x.from_numpy(np.concatenate([b.position - origin for b in particles]).astype(host))
-        self.v.from_numpy(np.concatenate([b.velocity for b in particles]).astype(host))
-        self.C.from_numpy(np.concatenate([b.affine for b in particles]).astype(host))
-        rest = np.ones(n) if law.deformation == "J" else np.tile(np.eye(d), (n, 1, 1))
-        self.deformation.from_numpy(rest.astype(host))
+        self.set_motion(np.concatenate([b.velocity for b in particles]), np.concatenate([b.affine for b in particles]))
+        self.set_deformation(np.ones(n) if law.deformation == "J" else np.tile(np.eye(d), (n, 1, 1)))
         ids = [first + np.arange(len(b.position)) for b, first in zip(particles, first_ids, strict=True)]
         self.id.from_numpy(np.concatenate(ids).astype(np.int32))
         if self.body is not None:
@@ -77,12 +76,65 @@ class ParticleGroup:
     @property
     def state(self) -> tuple[ti.Field, ...]:
         """Every real field that the sort must move."""
-        return (self.x, self.v, self.C, self.deformation)
+        return (self.x, self.v, self.gradient, self.deformation)
 
     @property
     def labels(self) -> tuple[ti.Field, ...]:
         """Every integer field that the sort must move."""
         return (self.id,) if self.body is None else (self.id, self.body)
+
+    def set_motion(self, velocity: np.ndarray, C: np.ndarray) -> None:
+        """Set the velocity, (n, d), and the affine velocity C, (n, d, d), of all particles."""
+        d, width = self.dimension, self.v.n
+        v = np.zeros((self.count, width), self.real)
+        v[:, :d] = velocity
+        gradient = np.zeros((self.count, d, width), self.real)
+        gradient[:, :, :d] = C.transpose(0, 2, 1)
+        self.v.from_numpy(v)
+        self.gradient.from_numpy(gradient)
+
+    def motion_to_numpy(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the velocity, (n, d), and the affine velocity C, (n, d, d), in the solver's order."""
+        d = self.dimension
+        gradient = self.gradient.to_numpy()[:, :, :d]
+        return np.ascontiguousarray(self.v.to_numpy()[:, :d]), np.ascontiguousarray(gradient.transpose(0, 2, 1))
+
+    def set_deformation(self, deformation: np.ndarray) -> None:
+        """Set J, (n,), or F, (n, d, d), of all particles, in the solver's order."""
+        if deformation.ndim == 3:
+            padded = np.zeros((self.count, self.dimension, self.deformation.m), self.real)
+            padded[:, :, : self.dimension] = deformation
+            deformation = padded
+        self.deformation.from_numpy(deformation.astype(self.real))
+
+    def deformation_to_numpy(self) -> np.ndarray:
+        """Return J, (n,), or F, (n, d, d), in the solver's order."""
+        values = self.deformation.to_numpy()
+        return values if values.ndim == 1 else np.ascontiguousarray(values[:, :, : self.dimension])
+
+    @ti.func
+    def stored(self, p: int):
+        """Return J, or F as a d x d matrix, of particle p."""
+        if ti.static(self.law.deformation == "F"):
+            F = ti.Matrix.zero(float, self.dimension, self.dimension)
+            for i in ti.static(range(self.dimension)):
+                for j in ti.static(range(self.dimension)):
+                    F[i, j] = self.deformation[p][i, j]
+            return F
+        else:
+            return self.deformation[p]
+
+    @ti.func
+    def motion(self, p: int):
+        """Return the velocity, d, and the affine velocity C, d x d, of particle p."""
+        d = ti.static(self.dimension)
+        v = ti.Vector.zero(float, d)
+        C = ti.Matrix.zero(float, d, d)
+        for c in ti.static(range(d)):
+            v[c] = self.v[p][c]
+            for a in ti.static(range(d)):
+                C[c, a] = self.gradient[p][a, c]
+        return v, C
 
     @ti.func
     def row(self, p: int):

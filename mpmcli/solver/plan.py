@@ -7,7 +7,8 @@ import psutil
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
 from mpmcli.scene import Scene, estimate_particles
-from mpmcli.solver.grid import PAD, TILE, Grid
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.grid import PAD, TILE, Grid, node_width
 
 # Taichi counts particles and nodes with 32-bit integers.
 MOST_PARTICLES = 2**31 - 1
@@ -39,39 +40,39 @@ class Plan:
         return self.particles * self.bytes_per_particle + self.grid_bytes
 
 
-def bytes_per_particle(deformation: str, dimension: int, precision: str, *, several_bodies: bool) -> int:
+def bytes_per_particle(deformation: str, dimension: int, backend: Backend, *, several_bodies: bool) -> int:
     """Return the device bytes of one particle of a law that stores `deformation`, sort buffers included."""
-    real = 8 if precision == "f64" else 4
-    matrix = dimension * dimension
-    state = 2 * dimension + matrix + (1 if deformation == "J" else matrix)
+    real = 8 if backend.precision == "f64" else 4
+    width = node_width(dimension, on_cpu=True) if backend.on_cpu else dimension
+    gradient = dimension * width
+    state = dimension + width + gradient + (1 if deformation == "J" else dimension**2)
     labels = 2 if several_bodies else 1
-    scratch = matrix * real + 4 + 4
-    return state * real + 4 * labels + scratch
+    return (state + gradient) * real + 4 * labels + 8
 
 
-def make_plan(scene: Scene, threads: int) -> Plan:
+def make_plan(scene: Scene, backend: Backend) -> Plan:
     """Return the memory that a scene needs.
 
     Raises:
         InputError: it is more than this machine has free.
     """
     dimension = scene.dimension
-    precision = scene.solver.precision
-    real = 8 if precision == "f64" else 4
+    real = 8 if backend.precision == "f64" else 4
+    width = node_width(dimension, on_cpu=backend.on_cpu)
     particles = estimate_particles(scene)
     by_law: dict[str, int] = {}
     for body in scene.bodies:
         by_law[body.material.law] = by_law.get(body.material.law, 0) + 1
     per_particle = max(
-        bytes_per_particle(laws()[law].deformation, dimension, precision, several_bodies=count > 1)
+        bytes_per_particle(laws()[law].deformation, dimension, backend, several_bodies=count > 1)
         for law, count in by_law.items()
     )
     tiles = 1
     for n in scene.domain.cells:
         tiles *= -(-(n + 1 + 2 * PAD) // TILE)
-    grid_bytes = Grid.bytes_needed(scene.domain.cells, real) + 4 * tiles * (threads + 1) * len(by_law)
+    grid_bytes = Grid.bytes_needed(scene.domain.cells, width, real) + 4 * tiles * (backend.threads + 1) * len(by_law)
     state_bytes = 8 * (2 * dimension + dimension**2)
-    plan = Plan(particles, per_particle, real * (dimension + 1), grid_bytes, particles * 2 * state_bytes)
+    plan = Plan(particles, per_particle, real * width, grid_bytes, particles * 2 * state_bytes)
     total = plan.device_bytes + plan.host_bytes
     free = psutil.virtual_memory().available
     if total > MEMORY_SHARE * free or particles > MOST_PARTICLES:

@@ -119,7 +119,7 @@ def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda 
     backend = start_backend(
         settings.arch, settings.threads, scene.solver.precision, compile_cache=settings.compile_cache
     )
-    plan = make_plan(scene, backend.threads)
+    plan = make_plan(scene, backend)
     particles = sample_bodies(scene)
     prepare_directory(settings.directory, settings.overwrite)
     solver = Solver(scene, backend, particles)

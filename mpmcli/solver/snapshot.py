@@ -46,12 +46,13 @@ class Snapshot:
 
 def read_group(group: ParticleGroup) -> Snapshot:
     """Copy one group from the device."""
+    v, C = group.motion_to_numpy()
     return Snapshot(
         group,
         group.x.to_numpy(),
-        group.v.to_numpy(),
-        group.C.to_numpy(),
-        group.deformation.to_numpy(),
+        v,
+        C,
+        group.deformation_to_numpy(),
         group.id.to_numpy(),
         group.body_index(),
     )

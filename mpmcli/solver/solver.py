@@ -8,31 +8,24 @@ import numpy as np
 import taichi as ti
 
 from mpmcli.boundaries.walls import Walls
-from mpmcli.materials.law import StateBound
 from mpmcli.materials.registry import laws
 from mpmcli.output.frame import Frame
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.diagnosis import UnstableRunError, diagnose
-from mpmcli.solver.grid import DRIFT, PAD, TILE, Grid
+from mpmcli.solver.diagnosis import UnstableRunError, diagnose, first_unsound
+from mpmcli.solver.extremes import build_extremes
+from mpmcli.solver.grid import DRIFT, PAD, TILE, Grid, node_width
 from mpmcli.solver.ordering import SortBuffers, TileOrder, build_sort
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.snapshot import build_frame, measure, read_group
-from mpmcli.solver.step import (
-    GRADIENT,
-    J_MAX,
-    J_MIN,
-    NOT_LOST,
-    REPORT,
-    SPEED_SQUARED,
-    STRETCH_SQUARED,
-    build_step,
-)
+from mpmcli.solver.step import NOT_LOST, build_step
 from mpmcli.stability.ledger import LedgerRow
 from mpmcli.stability.limits import Limit, deformation_limit, speed_limit, wave_limit
 
-# On a GPU the state is measured once in so many steps at most: reading it back stalls the device.
+# The state is measured, and the limits with it, once in so many steps at most, and more often where it may
+# deform by more than this fraction in between; the margin of time.safety covers that.
 MOST_UNWATCHED_STEPS = 16
+UNWATCHED_CHANGE = 0.1
 
 
 class Solver:
@@ -62,6 +55,7 @@ class Solver:
         self.particle_count = sum(len(b.position) for b in particles)
         first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
         self.laws = tuple(sorted({body.material.law for body in scene.bodies}))
+        width = node_width(scene.dimension, on_cpu=backend.on_cpu)
         layout = ti.Layout.AOS if backend.on_cpu else ti.Layout.SOA
         self.groups = []
         for name in self.laws:
@@ -74,10 +68,11 @@ class Solver:
                     [particles[i] for i in members],
                     [int(first_ids[i]) for i in members],
                     self._origin,
+                    width if backend.on_cpu else scene.dimension,
                     layout,
                 )
             )
-        self.grid = Grid(scene.dimension, self.spacing, scene.domain.cells)
+        self.grid = Grid(scene.dimension, self.spacing, scene.domain.cells, width)
         walls = Walls(scene.domain.walls.faces(scene.dimension), PAD, self.grid.cells, self.grid.shape)
         buffers = SortBuffers(self.groups)
         orders = [TileOrder(g, self.grid, buffers, backend.threads, backend.on_cpu) for g in self.groups]
@@ -93,27 +88,25 @@ class Solver:
             on_cpu=backend.on_cpu,
             drift=int(self._drift_allowed),
         )
+        self._measure = build_extremes(self.groups, backend)
         self._drift = math.inf
+        self._measure_limits()
+
+    def _measure_limits(self) -> None:
         self._unwatched = 0
-        self._report = self._kernels.measure()
+        self._extremes = self._measure()
+        self._speed = max(extremes.speed for extremes in self._extremes)
         self._limit = min(self.limits())
 
     def limits(self) -> list[Limit]:
         """Return every bound on the next step, from the state as last measured."""
-        bounds = []
-        speed_squared = 0.0
-        for g, group in enumerate(self.groups):
-            report = self._report[REPORT * g : REPORT * (g + 1)]
-            stretch = report[STRETCH_SQUARED] if group.law.deformation == "F" else report[J_MAX] ** 2
-            reached = StateBound(report[J_MIN], report[J_MAX], stretch)
+        bounds = [Limit(speed_limit(self.spacing, self._speed), "speed", "")]
+        for group, extremes in zip(self.groups, self._extremes, strict=True):
+            bounds.append(Limit(deformation_limit(extremes.gradient), "deformation", ""))
             for place, parameters in zip(group.bodies, group.parameters, strict=True):
-                stiffness = group.law.stiffness(parameters, reached, self.scene.dimension)
+                stiffness = group.law.stiffness(parameters, extremes.bound, self.scene.dimension)
                 bound = wave_limit(self.spacing, parameters.density, stiffness)
                 bounds.append(Limit(bound, "wave", self._names[place]))
-            bounds.append(Limit(deformation_limit(report[GRADIENT]), "deformation", ""))
-            speed_squared = max(speed_squared, report[SPEED_SQUARED])
-        self._speed = math.sqrt(speed_squared)
-        bounds.append(Limit(speed_limit(self.spacing, self._speed), "speed", ""))
         return bounds
 
     def stable_step(self) -> tuple[float, Limit]:
@@ -136,49 +129,47 @@ class Solver:
                 sort()
             self._kernels.find_box()
             self._drift = 0.0
-        result = self._kernels.step(dt)
+        fastest = self._kernels.step(dt)
         self.time += dt
         self.step_count += 1
         if self.step_count == 1:
             self.first_step_seconds = time.perf_counter() - began
-        if self.backend.on_cpu:
-            self._watch(result, dt)
-            self._drift += dt * self._speed / self.spacing
-            return
-        # Speeds may grow unseen; half the allowance per doubling keeps the stencils inside the box.
-        courant = 2 * dt * self._speed / self.spacing + 0.05
+        if fastest is not None:
+            self._speed = fastest
+            if not fastest >= 0:
+                self._stop(dt)
+        # What was not read back may have doubled, and starts from rest with some acceleration.
+        courant = dt * self._speed / self.spacing if fastest is not None else 2 * dt * self._speed / self.spacing + 0.05
         self._drift += courant
         self._unwatched += 1
-        if self._unwatched >= MOST_UNWATCHED_STEPS or self._drift + courant >= self._drift_allowed:
+        change = dt * self._unwatched * max(extremes.gradient for extremes in self._extremes)
+        blind = fastest is None and self._drift + courant >= self._drift_allowed
+        if self._unwatched >= MOST_UNWATCHED_STEPS or change >= UNWATCHED_CHANGE or blind:
             self.watch(dt)
 
     def watch(self, dt: float) -> None:
-        """Measure the device's state and stop if it is lost."""
-        self._unwatched = 0
-        self._watch(self._kernels.measure(), dt)
+        """Measure the device's state, and the limits with it.
 
-    def _watch(self, report: ti.Matrix, dt: float) -> None:
-        self._report = report
-        lost = report[REPORT * len(self.groups)] > 0
-        if lost or not math.isfinite(sum(report)):
+        Args:
+            dt: the step last taken, s.
+
+        Raises:
+            UnstableRunError: a particle is lost.
+        """
+        if self._kernels.any_lost():
             self._stop(dt)
-        self._limit = min(self.limits())
+        self._measure_limits()
+        if not min(extremes.bound.volume_ratio_min for extremes in self._extremes) > 0:
+            # Inverted by the last step: the next one would have refused to scatter it.
+            self._stop(dt)
 
     def _stop(self, dt: float) -> None:
-        for group, p in zip(self.groups, self._kernels.lost.to_numpy(), strict=True):
-            if p != NOT_LOST:
-                snapshot = read_group(group)
+        for group, lost in zip(self.groups, self._kernels.lost.to_numpy(), strict=True):
+            snapshot = read_group(group)
+            p = int(lost) if lost != NOT_LOST else first_unsound(snapshot)
+            if p is not None:
                 raise UnstableRunError(
-                    diagnose(
-                        snapshot,
-                        int(p),
-                        self._names,
-                        self._origin,
-                        self.step_count,
-                        self.time,
-                        dt,
-                        self._limit,
-                    )
+                    diagnose(snapshot, p, self._names, self._origin, self.step_count, self.time, dt, self._limit)
                 )
         raise AssertionError("a step reported a lost particle and kept no trace of it")
 
@@ -205,8 +196,7 @@ class Solver:
                 if splits == 1:
                     break
             self.time = target
-            if not self.backend.on_cpu:
-                self.watch(dt)
+            self.watch(dt)
             yield self.frame(index, taken)
 
     def frame(self, index: int, taken: list[tuple[float, float, str]]) -> tuple[Frame, LedgerRow]:

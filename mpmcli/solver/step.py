@@ -6,14 +6,12 @@ from dataclasses import dataclass
 import taichi as ti
 
 from mpmcli.boundaries.walls import REACH, Walls
+from mpmcli.solver.extremes import volume_ratio
 from mpmcli.solver.grid import TILE, Grid
 from mpmcli.solver.ordering import CHUNK, TileOrder
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.transfer import gather, scatter
 
-# Per group, what a step reports: squared speed, smallest and largest J, squared stretch, velocity gradient.
-SPEED_SQUARED, J_MIN, J_MAX, STRETCH_SQUARED, GRADIENT = range(5)
-REPORT = 5
 NOT_LOST = 2**31 - 1
 
 
@@ -22,18 +20,18 @@ class StepKernels:
     """Compiled steps.
 
     Attributes:
-        step: (dt) -> report: one step; the report is a vector of REPORT entries per group and
-            one that is 1 where a particle was lost. On a GPU the report is empty.
-        measure: () -> report, of the state as it is.
+        step: (dt) -> largest speed of a node, m/s, which no particle exceeds. On a GPU it is not read
+            back, and None.
         find_box: set the grid's box in use from the sorted tiles.
         lost: per group, the first particle (in solver order) that left the domain, inverted or became
             non-finite, or NOT_LOST.
+        any_lost: () -> whether there is one.
     """
 
-    step: Callable[[float], ti.Matrix]
-    measure: Callable[[], ti.Matrix]
+    step: Callable[[float], float | None]
     find_box: Callable[[], None]
     lost: ti.Field
+    any_lost: Callable[[], bool]
 
 
 def build_step(
@@ -50,103 +48,64 @@ def build_step(
 
     Args:
         gravity: m/s^2 per axis.
-        on_cpu: scatter by coloured pencils without atomics and report every step.
+        on_cpu: scatter by coloured pencils without atomics, and read the largest speed back.
         drift: cells that a particle may move away from the tile that it was sorted into.
     """
     d = grid.dimension
     h = grid.spacing
     threads = orders[0].threads
     pairs = tuple(zip(range(len(groups)), groups, orders, strict=True))
-    size = REPORT * len(groups) + 1
-    report_type = ti.types.vector(size, float)
-    # One field each: only atomics on such a field become sums per thread instead of contended ones.
-    report = tuple(ti.field(float, shape=()) for _ in range(size))
+    fastest = ti.field(float, shape=())
     lost = ti.field(int, shape=len(groups))
     tile_low = ti.field(int, shape=d)
     tile_high = ti.field(int, shape=d)
     extent = tuple(n * h for n in grid.cells)
 
     @ti.func
-    def clear_report():
-        for g in ti.static(range(len(groups))):
-            lost[g] = NOT_LOST
-            for i in ti.static(range(REPORT)):
-                report[REPORT * g + i][None] = 1e30 if ti.static(i == J_MIN) else 0.0
-        report[size - 1][None] = 0.0
-
-    @ti.func
-    def read_report():
-        result = report_type(0.0)
-        for i in ti.static(range(size)):
-            result[i] = report[i][None]
-        for g in ti.static(range(len(groups))):
-            if lost[g] != NOT_LOST:
-                result[size - 1] = 1.0
-        return result
-
-    @ti.func
-    def note(g: ti.template(), v: ti.template(), C: ti.template(), deformation: ti.template(), J: float):
-        """Add one particle to the report."""
-        ti.atomic_max(report[REPORT * g + SPEED_SQUARED][None], v.norm_sqr())
-        ti.atomic_min(report[REPORT * g + J_MIN][None], J)
-        ti.atomic_max(report[REPORT * g + J_MAX][None], J)
-        if ti.static(groups[g].law.deformation == "F"):
-            # Gershgorin's bound on the largest eigenvalue of b = F F^T: exact at rest, in any rotation.
-            b = deformation @ deformation.transpose()
-            bound = 0.0
-            for i in ti.static(range(d)):
-                row = 0.0
-                for j in ti.static(range(d)):
-                    row += ti.abs(b[i, j])
-                bound = ti.max(bound, row)
-            ti.atomic_max(report[REPORT * g + STRETCH_SQUARED][None], bound)
-            gradient = 0.0
-            for i in ti.static(range(d)):
-                row = 0.0
-                for j in ti.static(range(d)):
-                    row += ti.abs(C[i, j])
-                gradient = ti.max(gradient, row)
-            ti.atomic_max(report[REPORT * g + GRADIENT][None], gradient)
-        else:
-            ti.atomic_max(report[REPORT * g + GRADIENT][None], ti.abs(C.trace()))
-
-    @ti.func
-    def volume_ratio(group: ti.template(), deformation: ti.template()):
-        J = 1.0
-        if ti.static(group.law.deformation == "F"):
-            J = deformation.determinant()
-        else:
-            J = deformation
-        return J
-
-    @ti.func
     def advance(g: ti.template(), group: ti.template(), p: int, dt: float):
         """Gather and move one particle: x += dt v, J *= 1 + dt tr C or F <- (I + dt C) F."""
         x = group.x[p]
-        v, C = gather(x, grid)
-        x_new = x + dt * v
-        fine = True
-        for a in ti.static(range(d)):
-            # Written so that a NaN is not fine.
-            fine = fine and x_new[a] > -0.5 * h and x_new[a] < extent[a] + 0.5 * h
-        deformation = group.deformation[p]
-        if ti.static(group.law.deformation == "F"):
-            deformation = deformation + dt * (C @ deformation)
-        else:
-            deformation = deformation * (1.0 + dt * C.trace())
-        J = volume_ratio(group, deformation)
-        fine = fine and J > 0.0
-        group.v[p] = v
-        group.C[p] = C
-        group.deformation[p] = deformation
-        if fine:
+        v, gradient = gather(x, grid)
+        C = ti.Matrix.zero(float, d, d)
+        inside = x
+        beyond = 0.0
+        for c in ti.static(range(d)):
             for a in ti.static(range(d)):
-                x_new[a] = ti.min(ti.max(x_new[a], 0.0), extent[a])
-            group.x[p] = x_new
+                C[c, a] = gradient[a, c]
+            moved = x[c] + dt * v[c]
+            inside[c] = ti.select(moved > 0.0, moved, 0.0)
+            inside[c] = ti.select(inside[c] < extent[c], inside[c], extent[c])
+            beyond += ti.abs(moved - inside[c])
+        for c in ti.static(range(group.v.n)):
+            group.v[p][c] = v[c]
+        for a in ti.static(range(d)):
+            for c in ti.static(range(group.v.n)):
+                group.gradient[p][a, c] = gradient[a, c]
+        if ti.static(group.law.deformation == "F"):
+            old = group.deformation[p]
+            F = old
+            for i in ti.static(range(d)):
+                for k in ti.static(range(d)):
+                    rate = dt * C[i, k]
+                    for j in ti.static(range(old.m)):
+                        F[i, j] += rate * old[k, j]
+            group.deformation[p] = F
         else:
-            # The position stays, so that no later step can write outside the grid.
+            group.deformation[p] *= 1.0 + dt * C.trace()
+        # Written so that a NaN is not sound; then the position stays, and no later step writes outside the grid.
+        sound = beyond <= 0.5 * h
+        for c in ti.static(range(d)):
+            group.x[p][c] = ti.select(sound, inside[c], x[c])
+        if not sound:
             ti.atomic_min(lost[g], p)
-        return v, C, deformation, J
+
+    @ti.func
+    def spread_one(g: ti.template(), group: ti.template(), p: int, dt: float, atomic: ti.template()):
+        """Scatter one particle, unless it is inverted: its stress would be NaN and spread over the grid."""
+        if volume_ratio(group, group.stored(p)) > 0.0:
+            scatter(group, grid, p, dt, atomic)
+        else:
+            ti.atomic_min(lost[g], p)
 
     @ti.func
     def update_node(node: ti.template(), index: int, gravity_step: ti.template()):
@@ -158,6 +117,15 @@ def build_step(
                 for a in ti.static(range(d)):
                     value[a] = value[a] / value[d] + gravity_step[a]
                 grid.nodes[index] = value
+
+    @ti.func
+    def node_speed_squared(index: int):
+        value = grid.nodes[index]
+        total = 0.0
+        if value[d] > 0:
+            for a in ti.static(range(d)):
+                total += value[a] ** 2
+        return total
 
     @ti.func
     def gravity_of(dt: float):
@@ -179,8 +147,8 @@ def build_step(
                 for row in range(rows * t // threads, rows * (t + 1) // threads):
                     first = grid.first_node(grid.row_start(row))
                     for k in range(grid.box[1, d - 1]):
-                        grid.nodes[first + k] = ti.Vector.zero(float, d + 1)
-        for _g, group, order in ti.static(pairs):
+                        grid.nodes[first + k] = ti.Vector.zero(float, grid.width)
+        for g, group, order in ti.static(pairs):
             for parity in ti.static(range(2)):
                 for q in range(CHUNK * threads):
                     if q % CHUNK == 0:
@@ -189,12 +157,12 @@ def build_step(
                         for r in range(order.work[colour, t], order.work[colour, t + 1]):
                             first = order.pencil_start(colour, r)
                             for p in range(order.start[first], order.start[first + order.pencil]):
-                                scatter(group, grid, p, dt, False)
+                                spread_one(g, group, p, dt, False)
 
     @ti.kernel
-    def collect(dt: float) -> report_type:
-        """Update the grid, gather, and report."""
-        clear_report()
+    def collect(dt: float) -> float:
+        """Update the grid, gather, and return the largest speed of a node, or -1 where a particle was lost."""
+        fastest[None] = 0.0
         if ti.static(len(walls.separating) > 0):
             for q in range(walls.plane_nodes(grid)):
                 walls.find_contact(grid, q, gravity_of(dt))
@@ -203,19 +171,25 @@ def build_step(
                 t = q // CHUNK
                 rows = grid.row_count()
                 gravity_step = gravity_of(dt)
+                speed_squared = 0.0
                 for row in range(rows * t // threads, rows * (t + 1) // threads):
                     node = grid.row_start(row)
                     first = grid.first_node(node)
                     for k in range(grid.box[1, d - 1]):
                         update_node(node, first + k, gravity_step)
+                        speed_squared = ti.max(speed_squared, node_speed_squared(first + k))
                         node[d - 1] += 1
+                ti.atomic_max(fastest[None], speed_squared)
         for g, group, _order in ti.static(pairs):
             for p in range(group.count):
-                v, C, deformation, J = advance(g, group, p, dt)
-                note(g, v, C, deformation, J)
-        return read_report()
+                advance(g, group, p, dt)
+        result = ti.sqrt(fastest[None])
+        for g in ti.static(range(len(groups))):
+            if lost[g] != NOT_LOST:
+                result = -1.0
+        return result
 
-    def step_cpu(dt: float) -> ti.Matrix:
+    def step_cpu(dt: float) -> float:
         for half in range(orders[0].colours // 2):
             spread(half, dt)
         return collect(dt)
@@ -223,10 +197,10 @@ def build_step(
     @ti.kernel
     def step_gpu(dt: float):
         for q in range(grid.box_nodes()):
-            grid.nodes[grid.first_node(grid.box_node(q))] = ti.Vector.zero(float, d + 1)
-        for _g, group, _order in ti.static(pairs):
+            grid.nodes[grid.first_node(grid.box_node(q))] = ti.Vector.zero(float, grid.width)
+        for g, group, _order in ti.static(pairs):
             for p in range(group.count):
-                scatter(group, grid, p, dt, True)
+                spread_one(g, group, p, dt, True)
         if ti.static(len(walls.separating) > 0):
             for q in range(walls.plane_nodes(grid)):
                 walls.find_contact(grid, q, gravity_of(dt))
@@ -241,18 +215,6 @@ def build_step(
     def clear_lost():
         for g in ti.static(range(len(groups))):
             lost[g] = NOT_LOST
-
-    @ti.kernel
-    def measure() -> report_type:
-        for g in ti.static(range(len(groups))):
-            for i in ti.static(range(REPORT)):
-                report[REPORT * g + i][None] = 1e30 if ti.static(i == J_MIN) else 0.0
-        report[size - 1][None] = 0.0
-        for g, group, _order in ti.static(pairs):
-            for p in range(group.count):
-                deformation = group.deformation[p]
-                note(g, group.v[p], group.C[p], deformation, volume_ratio(group, deformation))
-        return read_report()
 
     @ti.kernel
     def find_box():
@@ -280,5 +242,8 @@ def build_step(
             grid.box[0, a] = first
             grid.box[1, a] = last - first + 1
 
+    def any_lost() -> bool:
+        return bool((lost.to_numpy() != NOT_LOST).any())
+
     clear_lost()
-    return StepKernels(step_cpu if on_cpu else step_gpu, measure, find_box, lost)
+    return StepKernels(step_cpu if on_cpu else step_gpu, find_box, lost, any_lost)

@@ -1,7 +1,9 @@
 """Particle to grid and back: MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015).
 
-Both transfers walk the stencil in lines along the last axis: the factors of a line are formed once,
-which costs fewer operations and a quarter of the compile time of the fully written-out sum.
+Both transfers walk the stencil in lines of three nodes along the last axis and measure positions from its
+middle node, whose neighbours lie at -1, 0 and 1: moments are then differences of what the nodes share anyway.
+On the CPU every node and every row below is four numbers wide, which the compiler turns into vector
+instructions; that halves the time of the gather in 3D.
 """
 
 import taichi as ti
@@ -21,72 +23,84 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, dt: float, atomic
     h = ti.static(grid.spacing)
     row = group.row(p)
     mass = row[MASS]
-    C = group.C[p]
+    v, C = group.motion(p)
     constants = ti.Vector([row[CONSTANTS + c] for c in ti.static(range(row.n - CONSTANTS))])
-    stress = group.law.kirchhoff_stress(group.deformation[p], C, constants)
-    A = mass * C - (dt * row[VOLUME] * (4 / (h * h))) * stress
+    stress = group.law.kirchhoff_stress(group.stored(p), C, constants)
     base, distance = stencil(group.x[p], 1 / h)
     w = weights(distance)
 
-    # Momentum that the stencil's first node would take, and its change per cell along each axis.
-    at_base = ti.Vector.zero(float, d + 1)
-    change = ti.Matrix.zero(float, d, d + 1)
-    v = group.v[p]
-    for a in ti.static(range(d)):
-        at_base[a] = mass * v[a]
-        for b in ti.static(range(d)):
-            change[b, a] = A[a, b] * h
-            at_base[a] -= change[b, a] * distance[b]
-    at_base[d] = mass
+    # Momentum and mass that the middle node would take, and their change per cell along each axis.
+    middle = ti.Vector.zero(float, grid.width)
+    change = ti.Matrix.zero(float, d, grid.width)
+    stress_scale = dt * row[VOLUME] * (4 / h)
+    for c in ti.static(range(d)):
+        middle[c] = mass * v[c]
+        for a in ti.static(range(d)):
+            change[a, c] = (mass * h) * C[c, a] - stress_scale * stress[c, a]
+            middle[c] -= change[a, c] * (distance[a] - 1.0)
+    middle[d] = mass
 
     first = grid.first_node(base)
     for o, line_node in ti.static(grid.lines):
-        line = at_base
         line_weight = 1.0
+        line = middle
+        step = ti.Vector.zero(float, grid.width)
         for a in ti.static(range(d - 1)):
             line_weight *= w[o[a]][a]
-            for c in ti.static(range(d)):
-                line[c] += o[a] * change[a, c]
-        for k in ti.static(range(3)):
-            node = first + (line_node + k)
-            share = line
-            for c in ti.static(range(d)):
-                share[c] += k * change[d - 1, c]
-            share *= line_weight * w[k][d - 1]
-            if ti.static(atomic):
-                ti.atomic_add(grid.nodes[node], share)
-            else:
-                grid.nodes[node] = grid.nodes[node] + share
+        for c in ti.static(range(grid.width)):
+            for a in ti.static(range(d - 1)):
+                if ti.static(o[a] == 0):
+                    line[c] -= change[a, c]
+                if ti.static(o[a] == 2):
+                    line[c] += change[a, c]
+            line[c] *= line_weight
+            step[c] = line_weight * change[d - 1, c]
+        node = first + line_node
+        add(grid, node, (line - step) * w[0][d - 1], atomic)
+        add(grid, node + 1, line * w[1][d - 1], atomic)
+        add(grid, node + 2, (line + step) * w[2][d - 1], atomic)
+
+
+@ti.func
+def add(grid: ti.template(), node: int, share: ti.template(), atomic: ti.template()):
+    """Add a share of momentum and mass to a node."""
+    if ti.static(atomic):
+        ti.atomic_add(grid.nodes[node], share)
+    else:
+        grid.nodes[node] = grid.nodes[node] + share
 
 
 @ti.func
 def gather(x: ti.template(), grid: ti.template()):
-    """Return the velocity and the affine velocity C = (4/h^2) sum w_i v_i (x_i - x)^T at a point."""
+    """Return the velocity at a point and its gradient, (4/h^2) sum w_i (x_i - x) v_i^T.
+
+    The gradient has a row for each axis: row a holds dv/dx_a, so it is the transpose of C. Both are as wide
+    as a node; what they hold beyond the d components of the velocity means nothing.
+    """
     d = ti.static(grid.dimension)
-    h = ti.static(grid.spacing)
-    base, distance = stencil(x, 1 / h)
+    base, distance = stencil(x, ti.static(1 / grid.spacing))
     w = weights(distance)
     first = grid.first_node(base)
-    velocity = ti.Vector.zero(float, d)
-    moment = ti.Matrix.zero(float, d, d)
+    velocity = ti.Vector.zero(float, grid.width)
+    moment = ti.Matrix.zero(float, d, grid.width)
     for o, line_node in ti.static(grid.lines):
-        line = ti.Vector.zero(float, d)
-        line_moment = ti.Vector.zero(float, d)
-        for k in ti.static(range(3)):
-            node = first + (line_node + k)
-            value = grid.nodes[node]
-            lever = w[k][d - 1] * (k - distance[d - 1])
-            for c in ti.static(range(d)):
-                line[c] += w[k][d - 1] * value[c]
-                line_moment[c] += lever * value[c]
         line_weight = 1.0
         for a in ti.static(range(d - 1)):
             line_weight *= w[o[a]][a]
-        velocity += line_weight * line
-        for a in ti.static(range(d - 1)):
-            lever = line_weight * (o[a] - distance[a])
-            for c in ti.static(range(d)):
-                moment[c, a] += lever * line[c]
-        for c in ti.static(range(d)):
-            moment[c, d - 1] += line_weight * line_moment[c]
-    return velocity, moment * (4 / h)
+        node = first + line_node
+        low = grid.nodes[node] * (w[0][d - 1] * line_weight)
+        mid = grid.nodes[node + 1] * (w[1][d - 1] * line_weight)
+        high = grid.nodes[node + 2] * (w[2][d - 1] * line_weight)
+        total = (low + high) + mid
+        velocity += total
+        for c in ti.static(range(grid.width)):
+            for a in ti.static(range(d - 1)):
+                if ti.static(o[a] == 0):
+                    moment[a, c] -= total[c]
+                if ti.static(o[a] == 2):
+                    moment[a, c] += total[c]
+            moment[d - 1, c] += high[c] - low[c]
+    for a in ti.static(range(d)):
+        for c in ti.static(range(grid.width)):
+            moment[a, c] = (moment[a, c] - velocity[c] * (distance[a] - 1.0)) * ti.static(4 / grid.spacing)
+    return velocity, moment
