@@ -136,6 +136,12 @@ def test_h5py_needs_three_lines(tmp_path):
     assert position.tobytes() == frames[1].position.tobytes()
 
 
+def test_a_file_that_a_notebook_holds_open_can_be_read(tmp_path):
+    fill(tmp_path, [make_frame(0, 10, 2)])
+    with h5py.File(tmp_path / "particles.vtkhdf"):
+        assert open_result(tmp_path).frame(0).index == 0
+
+
 def test_the_file_says_what_it_is(tmp_path):
     fill(tmp_path, [make_frame(0, 10, 2)])
     with h5py.File(tmp_path / "particles.vtkhdf") as f:

@@ -113,7 +113,13 @@ def test_the_origin_moves_the_domain():
 
 
 def test_a_body_may_reach_the_wall_up_to_round_off():
-    scene_of(box(0, 0, 0.1 + 0.2, 0.3), size=(0.3, 0.3))
+    # 0.2 + 0.4 is a little more than 0.6.
+    scene_of(box(0, 0, 0.2 + 0.4, 0.6), size=(0.6, 0.6))
+
+
+def test_a_domain_has_room_between_its_walls():
+    with pytest.raises(InputError, match="makes 4 cells along y, and opposite walls need at least 5 between them"):
+        scene_of(box(0, 0, 0.1, 0.1), size=(1.0, 0.4))
 
 
 def test_the_speed_of_a_fall():

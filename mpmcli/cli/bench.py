@@ -2,6 +2,7 @@
 
 import click
 
+from mpmcli.cli.json_output import print_json
 from mpmcli.cli.options import json_option, threads_option
 
 # What --quick still takes.
@@ -23,7 +24,6 @@ def command(
     Both sides run the same fluid block: equal particles, grid, precision and threads, in turn (A B A B),
     and medians are printed: particle-steps per second, start-up and compile time, peak memory.
     """
-    import json
     import os
 
     from mpmcli.bench.cases import CASES
@@ -46,5 +46,5 @@ def command(
     )
     click.echo(report.table(), err=True)
     if as_json:
-        click.echo(json.dumps(report.as_dict(), indent=2))
+        print_json(report.as_dict())
     return 0

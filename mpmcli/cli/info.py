@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 
+from mpmcli.cli.json_output import print_json
 from mpmcli.cli.options import json_option, set_option
 
 
@@ -13,8 +14,6 @@ from mpmcli.cli.options import json_option, set_option
 @json_option
 def command(path: Path, overrides: tuple[str, ...], as_json: bool) -> None:
     """Say what PATH holds: a scene (.toml), or a result (its directory, particles.vtkhdf or particles.pvd)."""
-    import json
-
     from mpmcli.errors import InputError
 
     if path.suffix == ".toml":
@@ -24,10 +23,11 @@ def command(path: Path, overrides: tuple[str, ...], as_json: bool) -> None:
             raise InputError(f"--set changes scenes, and {path} is none; leave it out.")
         facts = _of_result(path)
     if as_json:
-        click.echo(json.dumps(facts, indent=2))
+        print_json(facts)
         return
-    width = max(len(name) for name in facts)
-    for name, value in facts.items():
+    told = {name: value for name, value in facts.items() if value not in (None, "", [], {})}
+    width = max(len(name) for name in told)
+    for name, value in told.items():
         click.echo(f"{name.replace('_', ' '):<{width}}  {_plain(value)}", err=True)
 
 
@@ -76,7 +76,7 @@ def _of_result(path: Path) -> dict:
         "dimension": result.dimension,
         "bodies": result.header.get("bodies", []),
         "materials": result.header.get("materials", []),
-        "fields": list(result.field_names),
+        "fields": ["velocity", *result.field_names],
         "precision": result.header.get("precision"),
         "backend": result.header.get("backend"),
         "steps": record.get("steps"),
@@ -104,4 +104,4 @@ def _plain(value: object) -> str:
         return ", ".join(_plain(item) for item in value)
     if isinstance(value, float):
         return f"{value:.6g}"
-    return "-" if value is None or value == "" else str(value)
+    return str(value)

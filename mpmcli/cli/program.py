@@ -1,7 +1,6 @@
 """The group of all commands, loaded when named, and what every one of them does with an error."""
 
 import importlib
-import signal
 import sys
 import traceback
 from typing import Any, NoReturn
@@ -9,6 +8,7 @@ from typing import Any, NoReturn
 import click
 
 from mpmcli import __version__
+from mpmcli.cli.interrupt import catch_interrupts, interrupt_came
 from mpmcli.errors import MpmcliError
 
 # Name of each command, the module that holds it, and its line in the help: so that help loads no module.
@@ -48,7 +48,7 @@ class LazyGroup(click.Group):
             formatter.write_dl(list(COMMANDS.items()))
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=LazyGroup, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
 @click.version_option(__version__, prog_name="mpmcli")
 @click.pass_context
@@ -59,6 +59,9 @@ def program(context: click.Context, debug: bool) -> None:
     usage; 130 interrupted.
     """
     context.obj = debug
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help(), err=True)
+        context.exit(2)
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
@@ -68,8 +71,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 def run(arguments: list[str]) -> int:
     """Run the command line and return its exit code; a traceback is shown with --debug only."""
-    # A batch system's request to end is treated as Ctrl-C: what is written is sealed.
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    catch_interrupts()
     debug = "--debug" in arguments
     # Accepted after the command too.
     arguments = (["--debug"] if debug else []) + [word for word in arguments if word != "--debug"]
@@ -77,7 +79,7 @@ def run(arguments: list[str]) -> int:
         result = program.main(arguments, prog_name="mpmcli", standalone_mode=False)
         return result if isinstance(result, int) else 0
     except click.ClickException as error:
-        error.show()
+        click.echo(f"error: {_usage_sentence(error)}", err=True)
         return 2
     except (click.Abort, KeyboardInterrupt):
         click.echo("interrupted", err=True)
@@ -92,8 +94,18 @@ def run(arguments: list[str]) -> int:
         sys.stderr.close()
         return 0
     except Exception as error:
+        if interrupt_came():
+            click.echo("interrupted", err=True)
+            return INTERRUPTED
         if debug:
             traceback.print_exc()
         kind = type(error).__name__
         click.echo(f"error: {kind}: {error} (a fault of mpmcli; --debug shows where)", err=True)
         return 1
+
+
+def _usage_sentence(error: click.ClickException) -> str:
+    message = error.format_message()
+    message = message[:1].lower() + message[1:] + ("" if message.endswith((".", "?")) else ".")
+    context = getattr(error, "ctx", None)
+    return message if context is None else f"{message} See {context.command_path} --help."

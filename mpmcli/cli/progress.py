@@ -33,13 +33,13 @@ class Progress:
         self._console = Console(stderr=True)
         self._bar: Bar | None = None
         self._task: Any = None
-        self._began = self._spoke = time.perf_counter()
+        self._spoke = time.perf_counter()
         self._told = False
 
     def notes(self, notes: Sequence[str]) -> None:
         """Print what was chosen for the user."""
         for note in notes:
-            self._say(f"  {note}")
+            self._say(note)
 
     def __enter__(self) -> "Progress":
         if not self._quiet and self._console.is_terminal:
@@ -66,7 +66,9 @@ class Progress:
         if not self._told:
             self._told = True
             self._introduce(summary)
-        rate = f"{summary.rate / 1e6:.1f} M particle-steps/s" if summary.rate else ""
+        if summary.frames < 2:
+            return  # the kernels compile in the first step
+        rate = f"{summary.rate / 1e6:.1f} M particle-steps/s"
         if self._bar is not None:
             self._bar.update(
                 self._task,
@@ -76,9 +78,10 @@ class Progress:
             )
             return
         now = time.perf_counter()
-        if now - self._spoke >= PAUSE and summary.frames > 1:
+        if now - self._spoke >= PAUSE:
             self._spoke = now
-            left = (now - self._began) * (self._frames - summary.frames) / (summary.frames - 1)
+            taken = summary.timings["solve_s"] + summary.timings["output_s"]
+            left = taken * (self._frames - summary.frames) / (summary.frames - 1)
             self._say(
                 f"t = {row.time:.4g} of {self._end:.4g} s, {summary.frames}/{self._frames} frames, "
                 f"step {row.step_min:.3g} s ({row.limit}), {rate}, {left:.0f} s left"
@@ -89,31 +92,36 @@ class Progress:
         if summary.message:
             click.echo(f"error: {summary.message}", err=True)
         timings = summary.timings
+        rate = f", {summary.rate / 1e6:.1f} M particle-steps/s" if summary.rate else ""
         self._say(
             f"{summary.status}: {summary.frames} of {self._frames} frames, {summary.steps} steps in "
-            f"{timings['wall_s']:.1f} s (start {timings['start_s']:.1f}, compile {timings['compile_s']:.1f}, "
-            f"solve {timings['solve_s']:.1f}, output {timings['output_s']:.1f}), "
-            f"{summary.rate / 1e6:.1f} M particle-steps/s"
+            f"{timings['wall_s']:.1f} s{rate}"
+        )
+        self._say(
+            f"seconds: start {timings['start_s']:.1f}, compile {timings['compile_s']:.1f}, "
+            f"solve {timings['solve_s']:.1f}, output {timings['output_s']:.1f}"
         )
         if summary.first is not None and summary.last is not None and summary.frames > 1:
             first, last = summary.first, summary.last
             self._say(
-                f"energy {first.energy:.5g} -> {last.energy:.5g} J (kinetic {last.kinetic:.4g}, elastic "
-                f"{last.elastic:.4g}, potential {last.potential:.4g}), J from {last.volume_ratio_min:.4g} to "
-                f"{last.volume_ratio_max:.4g}"
+                f"energy: {first.energy:.5g} -> {last.energy:.5g} J (kinetic {last.kinetic:.4g}, elastic "
+                f"{last.elastic:.4g}, potential {last.potential:.4g})"
             )
+            self._say(f"volume ratio J at the end: {last.volume_ratio_min:.4g} to {last.volume_ratio_max:.4g}")
         if summary.path is not None:
-            self._say(f"result: {summary.path}")
+            self._say(f"result: {summary.path}", whole=True)
 
     def _introduce(self, summary: RunSummary) -> None:
         backend, plan = summary.backend, summary.plan
         threads = f", {backend['threads']} threads" if backend["arch"] == "cpu" else ""
         self._say(
             f"{summary.particles} particles on {backend['arch']}{threads}, {backend['precision']}; "
-            f"{plan.bytes_per_particle} bytes per particle and {plan.bytes_per_node} per node, "
-            f"{plan.device_bytes / 1e6:.0f} MB on the device"
+            f"{plan.device_bytes / 1e6:.3g} MB on the device "
+            f"({plan.bytes_per_particle} B per particle, {plan.bytes_per_node} B per node)"
         )
 
-    def _say(self, line: str) -> None:
+    def _say(self, line: str, *, whole: bool = False) -> None:
         if not self._quiet:
-            self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+            # A terminal gets its lines broken between words, but a path that can be copied.
+            whole = whole or not self._console.is_terminal
+            self._console.print(line, markup=False, highlight=False, soft_wrap=whole)

@@ -2,6 +2,8 @@
 
 import click
 
+from mpmcli.cli.json_output import print_json
+
 
 @click.command("schema")
 def command() -> None:
@@ -9,9 +11,7 @@ def command() -> None:
 
     Editors with TOML support complete and check a scene that begins with `#:schema ./scene.schema.json`.
     """
-    import json
-
     from mpmcli.materials.registry import parameter_models
     from mpmcli.scene import json_schema
 
-    click.echo(json.dumps(json_schema(parameter_models()), indent=2, ensure_ascii=False))
+    print_json(json_schema(parameter_models()))

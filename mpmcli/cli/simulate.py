@@ -2,10 +2,17 @@
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
+from mpmcli.cli.interrupt import interrupt_came
+from mpmcli.cli.json_output import print_json
 from mpmcli.cli.options import json_option, quiet_option, set_option, threads_option
+
+if TYPE_CHECKING:
+    from mpmcli.solver.run import RunSummary
+    from mpmcli.stability.ledger import LedgerRow
 
 
 @click.command("simulate")
@@ -71,11 +78,15 @@ def command(
     )
     progress = Progress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
     progress.notes(loaded.notes)
+
+    def watch(row: "LedgerRow", summary: "RunSummary") -> None:
+        progress.advance(row, summary)
+        if interrupt_came():
+            raise KeyboardInterrupt
+
     with progress:
-        summary = run_scene(loaded, settings, progress.advance)
+        summary = run_scene(loaded, settings, watch)
     progress.close(summary)
     if as_json:
-        import json
-
-        click.echo(json.dumps(summary.as_dict(), indent=2))
+        print_json(summary.as_dict())
     return {"finished": 0, "interrupted": 130}.get(summary.status, 1)

@@ -3,7 +3,7 @@
 Neither vtk nor meshio is imported until a series is written or read.
 """
 
-from mpmcli.output.directory import prepare_directory
+from mpmcli.output.directory import check_directory, prepare_directory
 from mpmcli.output.frame import Frame
 from mpmcli.output.result import Result, open_result
 from mpmcli.output.run_record import RunRecord, read_record
@@ -16,6 +16,7 @@ __all__ = [
     "RunRecord",
     "SegmentStore",
     "VtkSeriesStore",
+    "check_directory",
     "open_result",
     "prepare_directory",
     "read_record",

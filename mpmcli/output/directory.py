@@ -27,20 +27,32 @@ def prepare_directory(directory: Path, overwrite: bool) -> Path:
             or removed then.
     """
     directory = Path(directory)
+    check_directory(directory, overwrite)
+    if directory.is_dir():
+        _remove_result(directory)
+    else:
+        _make(directory)
+    return directory
+
+
+def check_directory(directory: Path, overwrite: bool) -> None:
+    """Refuse a directory that holds something or cannot be written; nothing is made or removed.
+
+    Cheap, so that a long preparation need not come first; `prepare_directory` has the last word.
+
+    Raises:
+        InputError: as `prepare_directory`.
+    """
+    directory = Path(directory)
     if directory.is_dir():
         _refuse_unwritable(directory)
-        if any(directory.iterdir()):
-            if not overwrite:
-                raise InputError(
-                    f"{directory} exists and is not empty: give another directory with -o, or --overwrite to "
-                    "replace the result in it."
-                )
-            _remove_result(directory)
-        return directory
-    if directory.exists() or directory.is_symlink():
+        if not overwrite and any(directory.iterdir()):
+            raise InputError(
+                f"{directory} exists and is not empty: give another directory with -o, or --overwrite to "
+                "replace the result in it."
+            )
+    elif directory.exists() or directory.is_symlink():
         raise InputError(f"{directory} is a file, not a directory: give another place with -o.")
-    _make(directory)
-    return directory
 
 
 def _make(directory: Path) -> None:

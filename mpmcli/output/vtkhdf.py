@@ -160,7 +160,11 @@ def open_vtkhdf(path: Path) -> h5py.File:
         InputError: the file is missing, damaged, or was not written by mpmcli.
     """
     try:
-        file = h5py.File(path, "r", locking=False)
+        try:
+            file = h5py.File(path, "r", locking=False)
+        except OSError:
+            # Somebody in this process has it open with locking, and HDF5 wants the same of everyone.
+            file = h5py.File(path, "r")
     except OSError as error:
         reason = "is not an HDF5 file, or a damaged one" if path.exists() else "does not exist"
         raise InputError(f"{path} {reason}; give a particles.vtkhdf of mpmcli or its directory.") from error

@@ -18,6 +18,8 @@ from mpmcli.scene.quantity import (
 Wall = Literal["slip", "stick", "separate"]
 WALLS = ("slip", "stick", "separate")
 MOST_CELLS = 2**31 - 1
+# Each wall acts on nodes up to two cells away from it, and no node may belong to both walls of an axis.
+FEWEST_CELLS = 5
 
 
 class Walls(Table):
@@ -113,9 +115,17 @@ class Domain(Table):
             raise flaw('missing key "spacing" (m), or "cells" (a number per axis) in its place')
         if self.spacing is not None and self.cells is not None:
             raise flaw('"spacing" is given as well; leave one of them out', "cells")
-        if self.cells is None:
-            return self.model_copy(update={"cells": _cells_of(self.size, self.spacing)})
-        return self.model_copy(update={"spacing": _spacing_of(self.size, self.cells)})
+        key = "cells" if self.spacing is None else "spacing"
+        spacing = self.spacing or _spacing_of(self.size, self.cells)
+        cells = self.cells or _cells_of(self.size, self.spacing)
+        if min(cells) < FEWEST_CELLS:
+            axis = cells.index(min(cells))
+            raise flaw(
+                f"makes {cells[axis]} cells along {AXES[axis]}, and opposite walls need at least {FEWEST_CELLS} "
+                f"between them; a spacing of {self.size[axis] / FEWEST_CELLS:.6g} m or less would do",
+                key,
+            )
+        return self.model_copy(update={"spacing": spacing, "cells": cells})
 
     @property
     def upper(self) -> tuple[float, ...]:

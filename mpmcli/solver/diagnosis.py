@@ -6,6 +6,7 @@ import numpy as np
 
 from mpmcli.errors import RunError
 from mpmcli.solver.snapshot import Snapshot
+from mpmcli.solver.step import SMALLEST_J
 from mpmcli.stability.limits import Limit
 
 
@@ -49,17 +50,37 @@ class UnstableRunError(RunError):
 
 
 def first_unsound(snapshot: Snapshot) -> int | None:
-    """Return the first particle (in solver order) that is inverted or not finite, None where all are sound."""
-    sound = snapshot.volume_ratio > 0
+    """Return the first particle (in solver order) that is crushed, inverted or not finite, None where all are sound."""
+    sound = snapshot.volume_ratio > SMALLEST_J
     for values in (snapshot.x, snapshot.v, snapshot.C):
         sound &= np.isfinite(values).reshape(len(sound), -1).all(1)
     unsound = np.flatnonzero(~sound)
     return int(unsound[0]) if len(unsound) else None
 
 
+def rate_of_change(snapshot: Snapshot, spacing: float) -> np.ndarray:
+    """Return how fast each particle moves through cells or deforms, (n,), 1/s."""
+    speed = np.linalg.norm(snapshot.v.astype(np.float64), axis=1)
+    return speed / spacing + np.abs(snapshot.C.astype(np.float64)).sum((1, 2))
+
+
+def cause_of(snapshot: Snapshot, p: int) -> str:
+    """Say what happened to particle p (in solver order), read off its state."""
+    values = (snapshot.x[p], snapshot.v[p], snapshot.C[p], snapshot.deformation[p])
+    if not all(np.isfinite(value).all() for value in values):
+        return "has a state that is not finite"
+    J = float(snapshot.volume_ratio[p])
+    if not J > 0:
+        return f"was turned inside out (J = {J:.3g})"
+    if J <= SMALLEST_J:
+        return f"was crushed to nothing (J = {J:.3g})"
+    return f"left the domain at {float(np.linalg.norm(snapshot.v[p])):.4g} m/s"
+
+
 def diagnose(
     snapshot: Snapshot,
     p: int,
+    cause: str,
     names: tuple[str, ...],
     origin: np.ndarray,
     step: int,
@@ -67,16 +88,7 @@ def diagnose(
     step_size: float,
     limit: Limit,
 ) -> Diagnosis:
-    """Describe particle p (in solver order) of a group that stopped the run."""
-    values = (snapshot.v[p], snapshot.C[p], snapshot.deformation[p])
-    J = float(np.linalg.det(snapshot.deformation[p])) if snapshot.deformation.ndim == 3 else values[2]
-    if not all(np.isfinite(value).all() for value in values):
-        cause = "has a state that is not finite"
-    elif not J > 0:
-        cause = f"was turned inside out (J = {J:.3g})"
-    else:
-        speed = float(np.linalg.norm(values[0]))
-        cause = f"left the domain at {speed:.4g} m/s"
+    """Describe particle p (in solver order) of a group, which stopped the run for this cause."""
     return Diagnosis(
         step,
         time,

@@ -8,7 +8,7 @@ from typing import Literal
 
 from mpmcli import __version__
 from mpmcli.errors import MpmcliError, RunError
-from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, prepare_directory
+from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, check_directory, prepare_directory
 from mpmcli.output.durable import write_text
 from mpmcli.scene import LoadedScene, sample_bodies, scene_to_toml
 from mpmcli.solver.backend import Arch, start_backend
@@ -116,6 +116,7 @@ def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda 
     """
     began = time.perf_counter()
     scene = loaded.scene
+    check_directory(settings.directory, settings.overwrite)
     backend = start_backend(
         settings.arch, settings.threads, scene.solver.precision, compile_cache=settings.compile_cache
     )
@@ -185,6 +186,7 @@ def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda 
             # An error of ours: the record must not claim that the run goes on.
             record.close("failed", "an internal error ended the run")
     summary.steps = solver.step_count
+    clock.move(solver.first_step_seconds, "solve_s", "compile_s")
     with clock.adding("output_s"):
         # Until it is packed, the result is the directory with its sealed frames.
         summary.path = settings.directory

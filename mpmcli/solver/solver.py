@@ -12,13 +12,13 @@ from mpmcli.materials.registry import laws
 from mpmcli.output.frame import Frame
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.diagnosis import UnstableRunError, diagnose, first_unsound
+from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError, cause_of, diagnose, first_unsound, rate_of_change
 from mpmcli.solver.extremes import build_extremes
 from mpmcli.solver.grid import DRIFT, PAD, TILE, Grid, node_width
 from mpmcli.solver.ordering import SortBuffers, TileOrder, build_sort
 from mpmcli.solver.particles import ParticleGroup
-from mpmcli.solver.snapshot import build_frame, measure, read_group
-from mpmcli.solver.step import NOT_LOST, build_step
+from mpmcli.solver.snapshot import Snapshot, build_frame, measure, read_group
+from mpmcli.solver.step import NOT_LOST, SMALLEST_J, build_step
 from mpmcli.stability.ledger import LedgerRow
 from mpmcli.stability.limits import Limit, deformation_limit, speed_limit, wave_limit
 
@@ -26,6 +26,8 @@ from mpmcli.stability.limits import Limit, deformation_limit, speed_limit, wave_
 # deform by more than this fraction in between; the margin of time.safety covers that.
 MOST_UNWATCHED_STEPS = 16
 UNWATCHED_CHANGE = 0.1
+# A stable step this much smaller than the first one will not recover: the run stops instead of crawling on.
+COLLAPSE = 1e-4
 
 
 class Solver:
@@ -91,6 +93,7 @@ class Solver:
         self._measure = build_extremes(self.groups, backend)
         self._drift = math.inf
         self._measure_limits()
+        self._first_stable_step = self.stable_step()[0]
 
     def _measure_limits(self) -> None:
         self._unwatched = 0
@@ -159,8 +162,8 @@ class Solver:
         if self._kernels.any_lost():
             self._stop(dt)
         self._measure_limits()
-        if not min(extremes.bound.volume_ratio_min for extremes in self._extremes) > 0:
-            # Inverted by the last step: the next one would have refused to scatter it.
+        if not min(extremes.bound.volume_ratio_min for extremes in self._extremes) > SMALLEST_J:
+            # Crushed or inverted by the last step: the next one would have refused to scatter it.
             self._stop(dt)
 
     def _stop(self, dt: float) -> None:
@@ -168,10 +171,20 @@ class Solver:
             snapshot = read_group(group)
             p = int(lost) if lost != NOT_LOST else first_unsound(snapshot)
             if p is not None:
-                raise UnstableRunError(
-                    diagnose(snapshot, p, self._names, self._origin, self.step_count, self.time, dt, self._limit)
-                )
+                raise UnstableRunError(self._diagnose(snapshot, p, cause_of(snapshot, p), dt))
         raise AssertionError("a step reported a lost particle and kept no trace of it")
+
+    def _stop_collapsed(self, step: float) -> None:
+        """Name the particle that forces the smallest step: the fastest to move or to deform."""
+        snapshots = [read_group(group) for group in self.groups]
+        haste = [rate_of_change(snapshot, self.spacing) for snapshot in snapshots]
+        worst = max(range(len(snapshots)), key=lambda g: haste[g].max())
+        p = int(haste[worst].argmax())
+        cause = f"allows a step of only {step:.3g} s, where the run began with {self._first_stable_step:.3g} s"
+        raise UnstableRunError(self._diagnose(snapshots[worst], p, cause, step))
+
+    def _diagnose(self, snapshot: Snapshot, p: int, cause: str, dt: float) -> Diagnosis:
+        return diagnose(snapshot, p, cause, self._names, self._origin, self.step_count, self.time, dt, self._limit)
 
     def frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield the initial state and then one frame for each output time, with its ledger row.
@@ -188,6 +201,8 @@ class Solver:
             taken: list[tuple[float, float, str]] = []
             while True:
                 largest, limit = self.stable_step()
+                if largest < COLLAPSE * self._first_stable_step:
+                    self._stop_collapsed(largest)
                 left = target - self.time
                 splits = max(1, math.ceil(left / largest - 1e-6))
                 dt = left / splits

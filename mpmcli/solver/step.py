@@ -13,6 +13,8 @@ from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.transfer import gather, scatter
 
 NOT_LOST = 2**31 - 1
+# A particle crushed to less than this fraction of its volume is lost: near zero J is round-off, not physics.
+SMALLEST_J = 1e-6
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,8 @@ def build_step(
 
     @ti.func
     def spread_one(g: ti.template(), group: ti.template(), p: int, dt: float, atomic: ti.template()):
-        """Scatter one particle, unless it is inverted: its stress would be NaN and spread over the grid."""
-        if volume_ratio(group, group.stored(p)) > 0.0:
+        """Scatter one particle, unless it is crushed or inverted: its stress would spread NaN over the grid."""
+        if volume_ratio(group, group.stored(p)) > SMALLEST_J:
             scatter(group, grid, p, dt, atomic)
         else:
             ti.atomic_min(lost[g], p)

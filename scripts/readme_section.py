@@ -1,0 +1,27 @@
+"""Parts of README.md that a command writes: the lines between a pair of markers."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+README = ROOT / "README.md"
+
+
+def replace_section(name: str, text: str, file: Path = README) -> None:
+    """Put `text` between `<!-- NAME: ... -->` and `<!-- end of NAME -->`, each on a line of its own.
+
+    Raises:
+        ValueError: the file does not hold exactly one such pair.
+    """
+    lines = file.read_text(encoding="utf-8").splitlines()
+    starts = [i for i, line in enumerate(lines) if line.startswith(f"<!-- {name}:")]
+    ends = [i for i, line in enumerate(lines) if line == f"<!-- end of {name} -->"]
+    if len(starts) != 1 or len(ends) != 1 or ends[0] < starts[0]:
+        raise ValueError(f"{file.name} needs one <!-- {name}: ... --> and one <!-- end of {name} --> after it")
+    lines[starts[0] + 1 : ends[0]] = text.strip("\n").splitlines()
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+def markdown_table(head: list[str], rows: list[list[str]], right: set[int]) -> str:
+    """Write a table; the columns numbered in `right` are aligned to the right."""
+    rule = ["---:" if column in right else "---" for column in range(len(head))]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in [head, rule, *rows])

@@ -1,0 +1,88 @@
+"""A run that is ended from outside: every sealed frame stays, packed where there was time for it."""
+
+import json
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import SCENE, run_here, started
+
+from mpmcli.output import open_result
+
+# So many frames that no machine comes to the end of it before the signal does.
+LONG = SCENE.replace("end = 0.05", "end = 50.0").replace("frames = 4", "frames = 40000")
+FRAMES_BEFORE = 3
+PATIENCE = 120  # s
+
+
+def end_with(number: signal.Signals, directory: Path, *, ctrl_c_off: bool = False) -> tuple[int, str, str]:
+    """Start a long run, send a signal once a few frames are sealed, and return its status, stdout and stderr."""
+    (directory / "scene.toml").write_text(LONG, encoding="utf-8")
+    with started(directory, "simulate", "scene.toml", "-o", "result", ctrl_c_off=ctrl_c_off) as process:
+        waited_until = time.monotonic() + PATIENCE
+        while len(list((directory / "result" / "segments").glob("*.vtkhdf"))) < FRAMES_BEFORE:
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < waited_until, "no frame came"
+            time.sleep(0.05)
+        process.send_signal(number)
+        stdout, stderr = process.communicate(timeout=PATIENCE)
+    return process.returncode, stdout, stderr
+
+
+@pytest.mark.parametrize(
+    ("number", "ctrl_c_off"),
+    [(signal.SIGINT, False), (signal.SIGTERM, True)],
+    ids=["Ctrl-C", "SIGTERM of a run in the background"],
+)
+def test_an_interrupt_packs_what_is_done(tmp_path, number, ctrl_c_off):
+    status, stdout, stderr = end_with(number, tmp_path, ctrl_c_off=ctrl_c_off)
+    assert status == 130 and stdout == "" and "Traceback" not in stderr
+    assert "error: the run was interrupted" in stderr.splitlines()
+    assert f"result: {Path('result/particles.vtkhdf')}" in stderr.splitlines()
+    directory = tmp_path / "result"
+    assert sorted(path.name for path in directory.iterdir()) == ["particles.vtkhdf", "run.json", "scene.toml"]
+    record = json.loads((directory / "run.json").read_text(encoding="utf-8"))
+    assert record["status"] == "interrupted" and record["ended"]
+    check_readable(directory, "packed", record["frames_written"])
+
+
+def test_sealed_frames_survive_a_kill(tmp_path):
+    status, _, _ = end_with(signal.SIGKILL, tmp_path)
+    assert status == -signal.SIGKILL
+    # The record is written after the frame, so it may be one frame behind.
+    directory = tmp_path / "result"
+    record = json.loads((directory / "run.json").read_text(encoding="utf-8"))
+    assert record["status"] == "running"
+    check_readable(directory, "segments", record["frames_written"])
+
+
+def check_readable(directory: Path, kind: str, count: int) -> None:
+    """Read every frame of a result that should hold `count` frames, or one more."""
+    result = open_result(directory)
+    assert result.kind == kind
+    assert result.frame_count >= FRAMES_BEFORE and result.frame_count - count in (0, 1)
+    for frame, row in zip(result.frames(), result.ledger, strict=True):
+        assert np.isfinite(frame.position).all() and frame.time == row.time
+
+
+def test_an_interrupt_that_got_lost_ends_the_run_at_its_next_frame(tmp_path, monkeypatch):
+    """C code that imports modules may swallow a KeyboardInterrupt."""
+    (tmp_path / "scene.toml").write_text(SCENE, encoding="utf-8")
+    monkeypatch.setattr("mpmcli.cli.simulate.interrupt_came", lambda: True)
+    outcome = run_here("simulate", tmp_path / "scene.toml", "-o", tmp_path / "result")
+    assert outcome.status == 130 and "error: the run was interrupted" in outcome.stderr
+    assert open_result(tmp_path / "result").frame_count == 1
+
+
+def test_an_interrupt_that_became_another_error_is_still_one(tmp_path, monkeypatch):
+    def interrupted_import(path: Path) -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            raise ImportError("initialization failed") from None
+
+    monkeypatch.setattr("mpmcli.output.open_result", interrupted_import)
+    outcome = run_here("info", tmp_path)
+    assert (outcome.status, outcome.stdout, outcome.stderr) == (130, "", "interrupted\n")

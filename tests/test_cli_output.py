@@ -1,0 +1,180 @@
+"""What commands print: JSON on stdout, everything else on stderr."""
+
+import json
+import shutil
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from command import CONFIGS, SCENE, Outcome, run_here
+
+from mpmcli import __version__
+from mpmcli.output import open_result
+
+
+@dataclass(frozen=True)
+class Results:
+    """A directory with scene.toml, its result in `packed`, and the same as a series in `series`."""
+
+    directory: Path
+    packed: Outcome
+    series: Outcome
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory) -> Results:
+    directory = tmp_path_factory.mktemp("results")
+    scene = directory / "scene.toml"
+    scene.write_text(SCENE, encoding="utf-8")
+    packed = run_here("simulate", scene, "-o", directory / "packed", "--json")
+    series = run_here("simulate", scene, "-o", directory / "series", "--format", "vtk", "--quiet")
+    return Results(directory, packed, series)
+
+
+@pytest.fixture
+def run(results, monkeypatch):
+    """Return `run(*arguments)`: a command, run beside the results."""
+    monkeypatch.chdir(results.directory)
+    return run_here
+
+
+def test_json_is_all_there_is_on_stdout(results):
+    outcome = results.packed
+    assert outcome.status == 0
+    summary = json.loads(outcome.stdout)
+    assert summary["status"] == "finished" and summary["frames"] == 5 and summary["particles"] == 256
+    assert summary["path"] == str(results.directory / "packed" / "particles.vtkhdf")
+    assert set(summary["timings"]) == {"start_s", "compile_s", "solve_s", "output_s", "wall_s"}
+    assert summary["notes"][0].startswith("drop: bulk_modulus = ")
+    lines = outcome.stderr.splitlines()
+    assert lines[0] == summary["notes"][0]
+    assert lines[1].startswith("256 particles on ")
+    assert [line.split(":")[0] for line in lines[2:]] == [
+        "finished",
+        "seconds",
+        "energy",
+        "volume ratio J at the end",
+        "result",
+    ]
+
+
+def test_quiet_says_nothing(results):
+    assert results.series == Outcome(0, "", "")
+    assert (results.directory / "series" / "particles.pvd").is_file()
+
+
+@pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ("packed", "packed"),
+        ("packed/particles.vtkhdf", "packed"),
+        ("series", "series"),
+        ("series/particles.pvd", "series"),
+    ],
+)
+def test_info_says_what_a_result_holds(run, path, kind):
+    facts = json.loads(run("info", path, "--json").stdout)
+    expected = {"title": "A drop", "kind": kind, "status": "finished", "frames": 5, "particles": 256}
+    expected |= {"fields": ["velocity", "density", "pressure"], "bodies": ["drop"], "time_s": [0.0, 0.05]}
+    assert {key: facts[key] for key in expected} == expected
+    outcome = run("info", path)
+    assert outcome.status == 0 and outcome.stdout == ""
+    told = dict(line.split("  ", 1) for line in outcome.stderr.splitlines())
+    assert told["frames"].strip() == "5"
+    assert "failure" not in told
+
+
+def test_info_reads_a_run_that_goes_on(run, tmp_path):
+    """Sealed segments and a record that says "running" are all that a run under way shows."""
+    from mpmcli.output import RunRecord, SegmentStore
+
+    result = open_result(Path("packed"))
+    store, record = SegmentStore(tmp_path, result.header), RunRecord(tmp_path, frames_expected=5)
+    for k in range(2):
+        store.write(result.frame(k), result.ledger[k])
+        record.observe(result.ledger[k])
+    record.write()
+    (tmp_path / "segments" / "frame_000002.vtkhdf.tmp").write_bytes(b"not sealed")
+    facts = json.loads(run("info", tmp_path, "--json").stdout)
+    expected = {"kind": "segments", "status": "running", "frames": 2, "frames_expected": 5}
+    assert {key: facts[key] for key in expected} == expected
+
+
+def test_info_of_a_scene_says_what_it_takes(run):
+    facts = json.loads(run("info", "scene.toml", "--set", "time.frames=9", "--json").stdout)
+    expected = {"dimension": 2, "cells": [16, 16], "particles": 256, "frames": 10, "bodies": ["drop: fluid, box"]}
+    assert {key: facts[key] for key in expected} == expected
+    assert "bytes per particle" in run("info", "scene.toml").stderr
+
+
+def test_json_has_no_infinity(run, tmp_path):
+    """A run that broke down may end with an infinite energy."""
+    from dataclasses import replace
+
+    from mpmcli.output import SegmentStore
+
+    result = open_result(Path("packed"))
+    store = SegmentStore(tmp_path, result.header)
+    store.write(result.frame(0), replace(result.ledger[0], elastic=float("inf")))
+    outcome = run("info", tmp_path, "--json")
+    assert json.loads(outcome.stdout, parse_constant=pytest.fail)["energy_J"] == [None, None]
+
+
+def test_debug_shows_where(run):
+    assert "Traceback" not in run("simulate", "nothing.toml").stderr
+    for arguments in (["--debug", "simulate", "nothing.toml"], ["simulate", "nothing.toml", "--debug"]):
+        outcome = run(*arguments)
+        assert outcome.status == 2 and outcome.stdout == ""
+        assert outcome.stderr.startswith("Traceback") and "error: nothing.toml: there is no" in outcome.stderr
+
+
+def test_a_fault_of_ours_is_one_sentence_too(run, monkeypatch):
+    def fault(*_: object, **__: object) -> None:
+        raise KeyError("surprise")
+
+    monkeypatch.setattr("mpmcli.output.open_result", fault)
+    outcome = run("info", "packed")
+    assert outcome.status == 1 and outcome.stdout == ""
+    assert outcome.stderr == "error: KeyError: 'surprise' (a fault of mpmcli; --debug shows where)\n"
+    assert "Traceback" in run("--debug", "info", "packed").stderr
+
+
+def test_version(run):
+    outcome = run("--version")
+    assert outcome.status == 0 and outcome.stdout == f"mpmcli, version {__version__}\n"
+
+
+@pytest.mark.parametrize("command", ["simulate", "info", "schema", "bench", "completion"])
+def test_every_command_explains_itself(run, command):
+    outcome = run(command, "--help")
+    assert outcome.status == 0 and outcome.stdout.startswith(f"Usage: mpmcli {command}")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_prints_a_script_that_calls_mpmcli(run, shell):
+    outcome = run("completion", shell)
+    assert outcome.status == 0
+    assert f"_MPMCLI_COMPLETE={shell}_complete" in outcome.stdout
+
+
+@pytest.mark.skipif(not shutil.which("bash"), reason="there is no bash on this machine")
+def test_completion_completes(run_python, tmp_path):
+    words = {"COMP_WORDS": "mpmcli simulate --ove", "COMP_CWORD": "2", "_MPMCLI_COMPLETE": "bash_complete"}
+    code = "import sys; sys.argv = ['mpmcli']; from mpmcli.cli import main; main()"
+    assert run_python(code, environment=words, check=False).stdout.split() == ["plain,--overwrite"]
+
+
+def test_the_schema_of_the_configs_is_what_the_command_prints(run):
+    """`mpmcli schema > configs/scene.schema.json` after a change of the scene."""
+    outcome = run("schema")
+    assert outcome.stdout == (CONFIGS / "scene.schema.json").read_text(encoding="utf-8")
+
+
+def test_a_reader_may_leave_early(tmp_path):
+    """As in `mpmcli schema | head -n 1`: no traceback, whatever the exit code."""
+    import subprocess
+
+    command = f'"{sys.executable}" -m mpmcli schema | head -c 1'
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=Path(__file__).parent.parent)
+    assert done.stdout == "{" and done.stderr == ""

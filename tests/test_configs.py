@@ -1,0 +1,70 @@
+"""Every scene of configs/ loads, starts, and runs a few steps on its own grid."""
+
+import re
+
+import numpy as np
+import pytest
+from command import CONFIGS, run_here
+
+from mpmcli.materials.registry import parameter_models
+from mpmcli.output import open_result
+from mpmcli.scene import load_scene
+
+SCENES = sorted(CONFIGS.glob("*.toml"))
+
+
+def test_there_are_five():
+    assert [path.stem for path in SCENES] == [
+        "dam_break_2d",
+        "dam_break_3d",
+        "elliptical_drop_2d",
+        "jelly_drop_2d",
+        "jelly_drop_3d",
+    ]
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_a_config_says_what_it_is(path):
+    """The header: schema for editors, what one sees, how long it takes, where it comes from."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert lines[0] == "#:schema ./scene.schema.json"
+    header = "\n".join(line for line in lines[: lines.index("[domain]")] if line.startswith("#"))
+    for part in ("# What you will see: ", "# How long it takes: ", "# Where it comes from: "):
+        assert header.count(part) == 1, part
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_a_config_says_how_many_particles_it_has(path):
+    """The header's round number is that of the plan, to the two digits it gives."""
+    from mpmcli.scene import estimate_particles
+
+    said = int(
+        re.search(r"# How long it takes: ([\d,]+) particles", path.read_text(encoding="utf-8"))[1].replace(",", "")
+    )
+    particles = estimate_particles(load_scene(path, laws=parameter_models()).scene)
+    assert said == pytest.approx(particles, rel=0.05)
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+def test_a_config_runs(path, tmp_path):
+    """A few steps to the first frames, which land on their times; nothing is lost, and energy is not made."""
+    scene = load_scene(path, laws=parameter_models()).scene
+    end = 5e-3
+    outcome = run_here(
+        "simulate", path, "-o", tmp_path / "result", "--set", f"time.end={end}", "--set", "time.frames=2", "--quiet"
+    )
+    assert (outcome.status, outcome.stdout, outcome.stderr) == (0, "", "")
+    result = open_result(tmp_path / "result")
+    assert result.dimension == scene.dimension and result.header["title"] == scene.title
+    assert result.times.tolist() == [0.0, end / 2, end]
+    stored = {"velocity", *result.field_names}
+    assert stored == {"velocity", *scene.output.fields}
+    first, last = result.frame(0), result.frame(2)
+    assert last.step >= 2
+    lower = np.array(scene.domain.origin)
+    assert (last.position >= lower).all() and (last.position <= lower + scene.domain.size).all()
+    assert not np.array_equal(first.position, last.position)
+    energies = [row.energy for row in result.ledger]
+    # f32 rounds each position, and with it the potential, to 6e-8.
+    assert energies[2] <= energies[0] * (1 + 1e-5)
+    assert result.ledger[2].mass == result.ledger[0].mass

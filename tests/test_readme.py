@@ -1,0 +1,210 @@
+"""The README: every command and every line of Python on it runs, and its tables come from the scripts."""
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import ROOT
+
+from mpmcli.output import open_result
+from mpmcli.output.ledger_table import COLUMNS
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+# Commands that are run in a shorter form. The README gives the one of the demo itself.
+SHORTER = {
+    "scripts/demo": "scripts/demo --overwrite --set time.end=0.1 --set time.frames=5",
+    "mpmcli bench --json > results/bench.json": (
+        "mpmcli bench --case 2d-64 --seconds 0.1 --blocks 1 --json > results/bench.json"
+    ),
+}
+# scripts/test is what runs this test.
+NOT_RUN = {"scripts/test"}
+
+
+def blocks(language: str) -> list[str]:
+    """The fenced blocks of a language, in order."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+
+
+def test_the_shorter_demo_is_what_the_readme_says():
+    assert f"`{SHORTER['scripts/demo']}`" in README
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory) -> Path:
+    """A copy of the repository, with the installation that scripts/demo would make, and drop.toml of the README."""
+    directory = tmp_path_factory.mktemp("readme") / "mpmcli"
+    directory.mkdir()
+    for name in ("configs", "scripts", "mpmcli", "README.md", "pyproject.toml", "constraints.txt"):
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, directory / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, directory / name)
+    (scene,) = blocks("toml")
+    (directory / "drop.toml").write_text(scene, encoding="utf-8")
+    programs = directory / ".venv" / "bin"
+    programs.mkdir(parents=True)
+    for name, arguments in {"python": "", "mpmcli": "-m mpmcli"}.items():
+        program = programs / name
+        program.write_text(f'#!/bin/sh\nPYTHONPATH="{directory}" exec "{sys.executable}" {arguments} "$@"\n')
+        program.chmod(0o755)
+    # The stamp says that everything is installed, so that the demo installs nothing.
+    stamp = ". scripts/environment.sh; installation_stamp > .venv/installed-core"
+    subprocess.run(["bash", "-c", stamp], cwd=directory, check=True)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def commands(checkout) -> dict[str, subprocess.CompletedProcess]:
+    """What came of every command of the README, run in order in the copy."""
+    lines = [line for block in blocks("sh") for line in block.splitlines() if line and line not in NOT_RUN]
+    environment = {**os.environ, "PATH": f"{checkout / '.venv' / 'bin'}{os.pathsep}{os.environ['PATH']}"}
+    return {
+        line: subprocess.run(
+            ["bash", "-c", SHORTER.get(line, line)], cwd=checkout, env=environment, capture_output=True, text=True
+        )
+        for line in lines
+    }
+
+
+def test_every_command_runs(commands):
+    assert len(commands) >= 9
+    failed = {line: done.stderr for line, done in commands.items() if done.returncode != 0}
+    assert not failed, failed
+
+
+def test_the_commands_make_what_the_readme_says(commands, checkout):
+    demo = open_result(checkout / "results" / "dam_break_2d" / "particles.vtkhdf")
+    assert demo.frame_count == 6
+    assert "results/dam_break_2d/particles.vtkhdf" in commands["scripts/demo"].stdout
+    assert open_result(checkout / "results" / "series" / "particles.pvd").frame_count == 5
+    assert open_result(checkout / "results" / "faster").times[-1] == 0.4
+    summary = json.loads((checkout / "series.json").read_text(encoding="utf-8"))
+    assert summary["status"] == "finished" and summary["backend"]["precision"] == "f64"
+    assert json.loads((checkout / "scene.schema.json").read_text(encoding="utf-8"))["title"] == "Scene"
+    assert sorted(path.name for path in (checkout / "results" / "drop").iterdir()) == [
+        "particles.vtkhdf",
+        "run.json",
+        "scene.toml",
+    ]
+
+
+def test_three_lines_of_h5py_read_a_result(commands, checkout, monkeypatch):
+    monkeypatch.chdir(checkout)
+    (code,) = blocks("python")
+    assert len(code.splitlines()) == 3
+    result = open_result(checkout / "results" / "drop")
+    expected = list(result.frames([]))
+    names: dict = {}
+    exec(code, names)
+    try:
+        position = names["position"]
+        assert position.shape == (result.frame_count, result.particle_counts[0], 3)
+        for k, frame in enumerate(expected):
+            np.testing.assert_array_equal(position[k, :, :2], frame.position)
+            assert not position[k, :, 2].any()
+        stored = set(names["file"]["VTKHDF/PointData"])
+        assert stored == {"id", "body", "material", "velocity", "density", "pressure"}
+        assert names["file"]["mpmcli"].attrs["scene"] == result.header["scene"]
+        np.testing.assert_array_equal(names["file"]["VTKHDF/Steps/Values"][:], result.times)
+    finally:
+        names["file"].close()
+
+
+def test_the_ledger_of_the_readme_is_complete():
+    told = README[README.index("**The ledger**") : README.index("While a run goes on")]
+    assert set(COLUMNS) <= set(re.findall(r"`(\w+)`", told))
+
+
+def test_the_keys_of_the_readme_are_those_of_a_scene():
+    """Each row of the table of keys names keys of its table, and all of them."""
+    from mpmcli.scene.domain import Domain
+    from mpmcli.scene.schema import Body, Output, SolverSettings, Time
+
+    models = {"[domain]": Domain, "[time]": Time, "[[bodies]]": Body, "[output]": Output, "[solver]": SolverSettings}
+    for table, model in models.items():
+        row = next(line for line in README.splitlines() if line.startswith(f"| `{table}` |"))
+        missing = set(model.model_fields) - set(re.findall(r"`(\w+)`", row))
+        assert not missing, f"{table}: {missing}"
+
+
+def script(name: str):
+    """Load a maintainers' script, which needs its neighbours."""
+    path = ROOT / "scripts" / name
+    loader = importlib.machinery.SourceFileLoader(name, str(path))
+    module = importlib.util.module_from_spec(importlib.util.spec_from_loader(name, loader))
+    loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def scripts(monkeypatch):
+    """Let scripts import their neighbours, and leave no compiled files among them."""
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    return script
+
+
+def test_the_scene_table_covers_every_config(scripts):
+    known = scripts("known_answers.py").KNOWN_ANSWERS
+    assert sorted(known) == sorted(path.stem for path in (ROOT / "configs").glob("*.toml"))
+    section = README[README.index("<!-- scenes:") : README.index("<!-- end of scenes -->")]
+    assert all(section.count(f"`{name}`") == 2 for name in known)
+
+
+# A0 t, a: verification, section 6.3.
+@pytest.mark.parametrize(
+    ("time", "a"),
+    [(0.2, 0.82082616), (0.76, 0.51426647), (1.0, 0.43946077), (2.0, 0.27181408)],
+)
+def test_the_known_half_axis_of_the_drop(scripts, time, a):
+    assert scripts("known_answers.py").half_axis(time) == pytest.approx(a, rel=2e-8)
+
+
+def test_the_known_answer_of_the_drop_measures_an_error(scripts, tmp_path):
+    """An exact affine motion has none; the same with one axis 1 % too long has 1 % there."""
+    known = scripts("known_answers.py")
+    rng = np.random.default_rng(1)
+    start = rng.normal(size=(500, 2))
+
+    class Fake:
+        times = np.array([0.0, 0.4, 0.76])
+
+        def __init__(self, factor: float) -> None:
+            self.factor = factor
+
+        def frame(self, k: int, fields: list[str]):
+            a = known.half_axis(float(self.times[k])) if k else 1.0
+            stretch = [a * (self.factor if k else 1.0), 1 / a]
+            return type("F", (), {"position": start * stretch})
+
+    assert known.elliptical_drop_2d(Fake(1.0)).startswith("half axes +0.00 % and +0.00 %")
+    assert known.elliptical_drop_2d(Fake(1.01)).startswith("half axes +1.00 % and +0.00 %")
+
+
+def test_a_section_is_replaced_between_its_markers(scripts, tmp_path):
+    file = tmp_path / "page.md"
+    file.write_text("before\n<!-- t: by hand -->\nold\n<!-- end of t -->\nafter\n", encoding="utf-8")
+    replace_section = scripts("readme_section.py").replace_section
+    replace_section("t", "new\n\nlines\n", file)
+    assert file.read_text(encoding="utf-8") == "before\n<!-- t: by hand -->\nnew\n\nlines\n<!-- end of t -->\nafter\n"
+    with pytest.raises(ValueError, match="needs one <!-- u"):
+        replace_section("u", "new", file)
+
+
+def test_the_bench_table_is_written_from_its_json(commands, checkout):
+    """The command of the README wrote it into the README of the copy."""
+    page = (checkout / "README.md").read_text(encoding="utf-8")
+    section = page[page.index("<!-- bench:") : page.index("<!-- end of bench -->")]
+    report = json.loads((checkout / "results" / "bench.json").read_text(encoding="utf-8"))
+    assert f"**{report['cases'][0]['ratio']:.1f}**" in section
+    assert "| 2d-64 | 5,000 |" in section
