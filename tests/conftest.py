@@ -3,12 +3,16 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
+
+if TYPE_CHECKING:
+    from mpmcli.solver.backend import Backend
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -61,3 +65,38 @@ def run_python(tmp_path: Path) -> Callable[..., PythonRun]:
         return PythonRun(done.returncode, done.stdout, done.stderr)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def run_module() -> Callable[..., PythonRun]:
+    """Return `run(file, *arguments)`: a Python file in a process of its own, with any exit status."""
+
+    def run(file: Path, *arguments: object) -> PythonRun:
+        path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+        done = subprocess.run(
+            [sys.executable, str(file), *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            timeout=300,
+            env={**os.environ, "PYTHONPATH": path},
+        )
+        return PythonRun(done.returncode, done.stdout, done.stderr)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def backend_of() -> "Iterator[Callable[..., Backend]]":
+    """Return `start(precision, threads=2, arch="cpu")`: it ends the running backend and starts a fresh one.
+
+    Taichi is global: whatever was built on the backend before dies with it, so a module starts one and
+    builds its solvers on it, or keeps no solver from one test to the next.
+    """
+    from mpmcli.solver.backend import start_backend, stop_backend
+
+    def start(precision: str, threads: int = 2, arch: str = "cpu") -> "Backend":
+        stop_backend()
+        return start_backend(arch, threads, precision)
+
+    yield start
+    stop_backend()

@@ -21,6 +21,7 @@ class Walls:
     Attributes:
         faces: per axis the words of the lower and the upper face: "slip", "stick" or "separate".
         first: index of the wall's node plane at the lower faces; `last`, per axis, at the upper ones.
+        crossed: per axis, whether walls along other axes always act on its faces.
         contact: per separating face and node of its plane, whether the material presses on it.
     """
 
@@ -33,6 +34,9 @@ class Walls:
             (a, side) for a in range(self.dimension) for side in (0, 1) if self.faces[a][side] == "separate"
         )
         self.lateral = tuple(tuple(b for b in range(self.dimension) if b != a) for a in range(self.dimension))
+        self.crossed = tuple(
+            any(word != "separate" for b in self.lateral[a] for word in self.faces[b]) for a in range(self.dimension)
+        )
         self.shape = tuple(shape)
         if self.separating:
             planes = [self._plane_size(a) for a, _ in self.separating]
@@ -83,10 +87,55 @@ class Walls:
             low = grid.box[0, axis]
             if inside and node[axis] >= low and node[axis] < low + grid.box[1, axis]:
                 value = grid.nodes[grid.first_node(node)]
+                if ti.static(self.crossed[axis]):
+                    # What other walls fold onto this node is pressed or pulled with it.
+                    depth, mirror, upper_side = self.place(node)
+                    acts = ti.Vector.zero(int, self.dimension)
+                    for b in ti.static(self.lateral[axis]):
+                        separates = self.face_is("separate", b, upper_side[b])
+                        acts[b] = ti.cast(depth[b] <= REACH and not separates, int)
+                    value = self.folded(grid, node, mirror, acts, depth, upper_side)
                 outward = value[axis] + value[self.dimension] * gravity_step[axis]
                 if ti.static(not upper):
                     outward = -outward
                 self.contact[f, self.plane_index(node, axis)] = ti.cast(outward >= 0, int)
+
+    @ti.func
+    def place(self, node: ti.template()):
+        """Return, per axis, how deep inside a wall within reach the node lies, its mirror, and which wall it is.
+
+        The depth counts nodes inwards, and is REACH + 1 where no wall is within reach.
+        """
+        depth = ti.Vector.zero(int, self.dimension)
+        mirror = node
+        upper = ti.Vector.zero(int, self.dimension)
+        for a in ti.static(range(self.dimension)):
+            depth[a] = REACH + 1
+            if node[a] <= self.first + REACH:
+                depth[a] = node[a] - self.first
+                mirror[a] = 2 * self.first - node[a]
+            elif node[a] >= self.last[a] - REACH:
+                upper[a] = 1
+                depth[a] = self.last[a] - node[a]
+                mirror[a] = 2 * self.last[a] - node[a]
+        return depth, mirror, upper
+
+    @ti.func
+    def folded(
+        self,
+        grid: ti.template(),
+        node: ti.template(),
+        mirror: ti.template(),
+        acts: ti.template(),
+        depth: ti.template(),
+        upper: ti.template(),
+    ):
+        """Return the momentum and mass of a node with those of its images behind the walls that act."""
+        total = ti.Vector.zero(float, grid.width)
+        for images in range(ti.static(2**self.dimension)):
+            if self.mirrored(images, acts, depth):
+                total += self.flip(grid.nodes[self.image(grid, node, mirror, images)], images, upper)
+        return total
 
     @ti.func
     def near(self, node: ti.template()):
@@ -98,29 +147,20 @@ class Walls:
 
     @ti.func
     def update(self, grid: ti.template(), node: ti.template(), gravity_step: ti.template()):
-        """Turn momentum into velocity, with gravity and the walls, at a node near a wall and at its images."""
+        """Turn momentum into velocity, with gravity and the walls, at a node near a wall and at its images.
+
+        Returns:
+            Whether it did: an image behind a wall is left to the node inside.
+        """
         d = ti.static(self.dimension)
-        # Distance to the wall counted inwards, and whether the wall acts here; far from walls: no action.
-        depth = ti.Vector.zero(int, d)
-        mirror = node
-        upper = ti.Vector.zero(int, d)
+        depth, mirror, upper = self.place(node)
         acts = ti.Vector.zero(int, d)
         inner = node
         for a in ti.static(range(d)):
-            depth[a] = REACH + 1
-            if node[a] <= self.first + REACH:
-                depth[a] = node[a] - self.first
-                mirror[a] = 2 * self.first - node[a]
-            elif node[a] >= self.last[a] - REACH:
-                upper[a] = 1
-                depth[a] = self.last[a] - node[a]
-                mirror[a] = 2 * self.last[a] - node[a]
+            acts[a] = ti.cast(depth[a] <= REACH, int)
             if depth[a] < 0:
                 inner[a] = mirror[a]
-        for a in ti.static(range(d)):
-            if depth[a] <= REACH:
-                acts[a] = 1
-        # Whether a face presses is looked up at the image inside the domain, so that a node and all its images agree.
+        # Whether a face presses is looked up at the image inside the domain: a node and all its images agree.
         for f in ti.static(range(len(self.separating))):
             axis = ti.static(self.separating[f][0])
             if depth[axis] <= REACH and upper[axis] == self.separating[f][1]:
@@ -130,10 +170,7 @@ class Walls:
             if acts[a] == 1 and depth[a] < 0:
                 owned = False
         if owned:
-            total = ti.Vector.zero(float, grid.width)
-            for images in range(ti.static(2**d)):
-                if self.mirrored(images, acts, depth):
-                    total += self.flip(grid.nodes[self.image(grid, node, mirror, images)], images, upper)
+            total = self.folded(grid, node, mirror, acts, depth, upper)
             if total[d] > 0:
                 velocity = total / total[d]
                 velocity[d] = total[d]
@@ -150,6 +187,7 @@ class Walls:
                 for images in range(ti.static(2**d)):
                     if self.mirrored(images, acts, depth):
                         grid.nodes[self.image(grid, node, mirror, images)] = self.flip(velocity, images, upper)
+        return owned
 
     @ti.func
     def mirrored(self, images: int, acts: ti.template(), depth: ti.template()):
@@ -169,10 +207,10 @@ class Walls:
         return grid.first_node(place)
 
     @ti.func
-    def sticks(self, axis: ti.template(), upper: int):
-        """Return whether the face of `axis` on that side holds tangentially too."""
-        low = ti.static(self.faces[axis][0] == "stick")
-        high = ti.static(self.faces[axis][1] == "stick")
+    def face_is(self, word: ti.template(), axis: ti.template(), upper: int):
+        """Return whether the face of `axis` on that side has this word."""
+        low = ti.static(self.faces[axis][0] == word)
+        high = ti.static(self.faces[axis][1] == word)
         return (upper == 0 and low) or (upper == 1 and high)
 
     @ti.func
@@ -181,7 +219,7 @@ class Walls:
         result = value
         for a in ti.static(range(self.dimension)):
             if images >> a & 1 == 1:
-                holds = self.sticks(a, upper[a])
+                holds = self.face_is("stick", a, upper[a])
                 for c in ti.static(range(self.dimension)):
                     if ti.static(c == a):
                         result[c] = -result[c]
@@ -193,7 +231,7 @@ class Walls:
     def stop(self, velocity: ti.template(), axis: ti.template(), upper: int):
         """Return the velocity on the wall: no normal part, and none at all where the wall sticks."""
         result = velocity
-        holds = self.sticks(axis, upper)
+        holds = self.face_is("stick", axis, upper)
         for c in ti.static(range(self.dimension)):
             if ti.static(c == axis):
                 result[c] = 0.0

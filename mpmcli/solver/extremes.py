@@ -123,7 +123,7 @@ def build_extremes(groups: Sequence[ParticleGroup], backend: Backend) -> Callabl
         return result
 
     def measured() -> list[Extremes]:
-        values = measure()
+        values = [float(value) for value in measure()]
         return [
             Extremes(
                 speed=values[ENTRIES * g + SPEED_SQUARED] ** 0.5,

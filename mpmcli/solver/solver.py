@@ -26,6 +26,8 @@ from mpmcli.stability.limits import Limit, deformation_limit, speed_limit, wave_
 # deform by more than this fraction in between; the margin of time.safety covers that.
 MOST_UNWATCHED_STEPS = 16
 UNWATCHED_CHANGE = 0.1
+# Cells that a particle of a GPU run may move in a step beyond what was expected.
+UNSEEN = 0.05
 # A stable step this much smaller than the first one will not recover: the run stops instead of crawling on.
 COLLAPSE = 1e-4
 
@@ -50,6 +52,7 @@ class Solver:
         self.first_step_seconds = 0.0
         self.spacing = scene.domain.spacing
         self._gravity = np.array(scene.domain.gravity)
+        self._pull = float(np.linalg.norm(self._gravity))
         self._origin = np.array(scene.domain.origin)
         self._names = tuple(body.name for body in scene.bodies)
 
@@ -92,18 +95,24 @@ class Solver:
         )
         self._measure = build_extremes(self.groups, backend)
         self._drift = math.inf
-        self._measure_limits()
+        self._extremes = self._measure()
+        self._use_extremes()
         self._first_stable_step = self.stable_step()[0]
 
-    def _measure_limits(self) -> None:
+    def _use_extremes(self) -> None:
         self._unwatched = 0
-        self._extremes = self._measure()
         self._speed = max(extremes.speed for extremes in self._extremes)
-        self._limit = min(self.limits())
+        self._slow_limit = min(self._slow_limits())
 
     def limits(self) -> list[Limit]:
-        """Return every bound on the next step, from the state as last measured."""
-        bounds = [Limit(speed_limit(self.spacing, self._speed), "speed", "")]
+        """Return every bound on the next step: of the speed as it is, of the rest as last measured."""
+        return [self._speed_limit(), *self._slow_limits()]
+
+    def _speed_limit(self) -> Limit:
+        return Limit(speed_limit(self.spacing, self._speed, self._pull), "speed", "")
+
+    def _slow_limits(self) -> list[Limit]:
+        bounds = []
         for group, extremes in zip(self.groups, self._extremes, strict=True):
             bounds.append(Limit(deformation_limit(extremes.gradient), "deformation", ""))
             for place, parameters in zip(group.bodies, group.parameters, strict=True):
@@ -112,13 +121,19 @@ class Solver:
                 bounds.append(Limit(bound, "wave", self._names[place]))
         return bounds
 
+    @property
+    def nearest_limit(self) -> Limit:
+        """The smallest bound on the next step."""
+        return min(self._slow_limit, self._speed_limit())
+
     def stable_step(self) -> tuple[float, Limit]:
         """Return the step to take, safety included, and the bound that sets it."""
-        step = self.scene.time.safety * self._limit.value
+        limit = self.nearest_limit
+        step = self.scene.time.safety * limit.value
         maximum = self.scene.time.step
         if maximum != "auto" and maximum < step:
             return maximum, Limit(maximum, "maximum", "")
-        return step, self._limit
+        return step, limit
 
     def step(self, dt: float) -> None:
         """Advance by dt (s).
@@ -138,15 +153,19 @@ class Solver:
         if self.step_count == 1:
             self.first_step_seconds = time.perf_counter() - began
         if fastest is not None:
-            self._speed = fastest
             if not fastest >= 0:
                 self._stop(dt)
-        # What was not read back may have doubled, and starts from rest with some acceleration.
-        courant = dt * self._speed / self.spacing if fastest is not None else 2 * dt * self._speed / self.spacing + 0.05
-        self._drift += courant
+            self._speed = float(fastest)
+            self._drift += dt * self._speed / self.spacing
+            unseen = 0.0
+        else:
+            # Not read back: gravity counts in full, and whatever else may push is allowed to double the speed.
+            self._speed += dt * self._pull
+            unseen = 2 * dt * self._speed / self.spacing + UNSEEN
+            self._drift += unseen
         self._unwatched += 1
         change = dt * self._unwatched * max(extremes.gradient for extremes in self._extremes)
-        blind = fastest is None and self._drift + courant >= self._drift_allowed
+        blind = unseen > 0 and self._drift + unseen >= self._drift_allowed
         if self._unwatched >= MOST_UNWATCHED_STEPS or change >= UNWATCHED_CHANGE or blind:
             self.watch(dt)
 
@@ -161,10 +180,11 @@ class Solver:
         """
         if self._kernels.any_lost():
             self._stop(dt)
-        self._measure_limits()
+        self._extremes = self._measure()
         if not min(extremes.bound.volume_ratio_min for extremes in self._extremes) > SMALLEST_J:
             # Crushed or inverted by the last step: the next one would have refused to scatter it.
             self._stop(dt)
+        self._use_extremes()
 
     def _stop(self, dt: float) -> None:
         for group, lost in zip(self.groups, self._kernels.lost.to_numpy(), strict=True):
@@ -184,7 +204,9 @@ class Solver:
         raise UnstableRunError(self._diagnose(snapshots[worst], p, cause, step))
 
     def _diagnose(self, snapshot: Snapshot, p: int, cause: str, dt: float) -> Diagnosis:
-        return diagnose(snapshot, p, cause, self._names, self._origin, self.step_count, self.time, dt, self._limit)
+        return diagnose(
+            snapshot, p, cause, self._names, self._origin, self.step_count, self.time, dt, self.nearest_limit
+        )
 
     def frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield the initial state and then one frame for each output time, with its ledger row.

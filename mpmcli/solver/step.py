@@ -111,23 +111,21 @@ def build_step(
 
     @ti.func
     def update_node(node: ti.template(), index: int, gravity_step: ti.template()):
+        """Turn momentum into velocity and return its square; 0 at a node that a wall leaves to its mirror image."""
+        owned = True
         if walls.near(node):
-            walls.update(grid, node, gravity_step)
+            owned = walls.update(grid, node, gravity_step)
         else:
             value = grid.nodes[index]
             if value[d] > 0:
                 for a in ti.static(range(d)):
                     value[a] = value[a] / value[d] + gravity_step[a]
                 grid.nodes[index] = value
-
-    @ti.func
-    def node_speed_squared(index: int):
-        value = grid.nodes[index]
-        total = 0.0
-        if value[d] > 0:
+        speed_squared = 0.0
+        if owned and grid.nodes[index][d] > 0:
             for a in ti.static(range(d)):
-                total += value[a] ** 2
-        return total
+                speed_squared += grid.nodes[index][a] ** 2
+        return speed_squared
 
     @ti.func
     def gravity_of(dt: float):
@@ -178,8 +176,7 @@ def build_step(
                     node = grid.row_start(row)
                     first = grid.first_node(node)
                     for k in range(grid.box[1, d - 1]):
-                        update_node(node, first + k, gravity_step)
-                        speed_squared = ti.max(speed_squared, node_speed_squared(first + k))
+                        speed_squared = ti.max(speed_squared, update_node(node, first + k, gravity_step))
                         node[d - 1] += 1
                 ti.atomic_max(fastest[None], speed_squared)
         for g, group, _order in ti.static(pairs):

@@ -62,12 +62,23 @@ def wave_limit(spacing: float, density: float, stiffness: float) -> float:
         density: kg/m^3, at rest.
         stiffness: Pa, see `Law.stiffness`.
     """
-    return spacing * math.sqrt(density / stiffness)
+    return spacing * math.sqrt(density / stiffness) if stiffness > 0 else math.inf
 
 
-def speed_limit(spacing: float, speed: float) -> float:
-    """Return the step in which the fastest particle (m/s) moves COURANT cells, s."""
-    return COURANT * spacing / speed if speed > 0 else math.inf
+def speed_limit(spacing: float, speed: float, gravity: float) -> float:
+    """Return the step in which the fastest particle moves COURANT cells, s.
+
+    It solves speed dt + gravity dt^2 = COURANT h: gravity adds to the speed before the particle moves.
+
+    Args:
+        spacing: h, m.
+        speed: of the fastest particle, m/s.
+        gravity: its magnitude, m/s^2.
+    """
+    if speed == 0 and gravity == 0:
+        return math.inf
+    # The root in the form that neither cancels nor divides by zero.
+    return 2 * COURANT * spacing / (speed + math.sqrt(speed**2 + 4 * gravity * COURANT * spacing))
 
 
 def deformation_limit(gradient: float) -> float:

@@ -1,0 +1,75 @@
+"""Drops a soft block and poisons a drop, on any backend, in its own process: `python fall_run.py ARCH` prints JSON.
+
+Exit status 77: this machine has no such backend.
+"""
+
+import json
+import sys
+
+import numpy as np
+from path_run import NO_DEVICE
+from solver_state import scene_of
+
+from mpmcli.errors import InputError
+from mpmcli.scene import Scene
+from mpmcli.solver.backend import Backend, start_backend
+from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.solver import Solver
+
+GRAVITY, SECONDS, H = 9.81, 0.5, 0.05
+
+
+def soft_block() -> Scene:
+    """Return a block that falls from rest, so soft that gravity alone moves it by cells within a few steps."""
+    return scene_of(
+        domain={"size": [1.0, 2.0], "spacing": H, "gravity": [0.0, -GRAVITY]},
+        time={"end": SECONDS, "frames": 1},
+        bodies=[
+            {
+                "name": "block",
+                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e3},
+                "shape": {"box": {"min": [0.35, 1.6], "max": [0.65, 1.9]}},
+            }
+        ],
+    )
+
+
+def fall(backend: Backend) -> dict:
+    """Return the fall, the speed and the largest Courant number of the block."""
+    (first, _), (last, row) = Solver(soft_block(), backend).frames()
+    return {
+        "fallen": float((first.position - last.position)[:, 1].mean()),
+        "speeds": [float(v) for v in (last.velocity[:, 1].min(), last.velocity[:, 1].max())],
+        "courant": float(row.courant_max),
+        "step_max": float(row.step_max),
+    }
+
+
+def lose(backend: Backend) -> dict:
+    """Return how a run ends whose particle 10 loses its state after 20 steps."""
+    solver = Solver(soft_block(), backend)
+    for _ in range(20):
+        solver.step(1e-4)
+    group = solver.groups[0]
+    deformation = group.deformation_to_numpy()
+    deformation[np.flatnonzero(group.id.to_numpy() == 10)] = np.nan
+    group.set_deformation(deformation)
+    try:
+        for _ in range(40):
+            solver.step(1e-4)
+    except UnstableRunError as error:
+        return {"particle": error.diagnosis.particle, "step": error.diagnosis.step, "sentence": str(error)}
+    return {}
+
+
+if __name__ == "__main__":
+    try:
+        backend = start_backend(sys.argv[1], 2, "f32")
+    except InputError as error:
+        print(error)
+        sys.exit(NO_DEVICE)
+    try:
+        fallen = fall(backend)
+    except UnstableRunError as error:
+        fallen = {"lost": str(error)}
+    print(json.dumps({"fall": fallen, "lose": lose(backend)}))

@@ -1,0 +1,176 @@
+"""Runs one scene with both laws, every kind of wall and many sorts, and stores what happened; its own process.
+
+`python path_run.py ARCH THREADS DIMENSION PRECISION FILE` writes an .npz: the state before and after each of the
+first steps with the nodes in between, the state after WATCHED steps, after LONG steps and at the last frame. All
+arrays are in the order of the particles' ids. Exit status 77: this machine has no such backend.
+"""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+
+from mpmcli.errors import InputError
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import BodyParticles, Scene, parse_scene, sample_bodies
+from mpmcli.solver.backend import Backend, start_backend
+from mpmcli.solver.snapshot import read_group
+from mpmcli.solver.solver import Solver
+
+NO_DEVICE = 77
+STEP = 0.006
+RECORDED, WATCHED, LONG = 6, 60, 300
+CELLS = {2: (20, 13), 3: (11, 10, 9)}
+SPACING = 0.1
+FACES = {"x_min": "slip", "x_max": "stick", "y_min": "separate", "y_max": "slip"}
+FACES_3D = {**FACES, "z_min": "stick", "z_max": "separate"}
+
+
+def scene_of(dimension: int, precision: str) -> Scene:
+    """Return a scene whose three bodies fly apart at several cells per sort and meet every face."""
+    d = dimension
+    size = [n * SPACING for n in CELLS[d]]
+    origin = [-0.35, 0.2, 0.1][:d]
+
+    def box(low: tuple[float, ...], high: tuple[float, ...]) -> dict:
+        return {
+            "box": {
+                "min": [o + s * f for o, s, f in zip(origin, size, low, strict=False)],
+                "max": [o + s * f for o, s, f in zip(origin, size, high, strict=False)],
+            }
+        }
+
+    fluid = {"law": "fluid", "density": 1000.0, "bulk_modulus": 8000.0}
+    per_cell = {"sampling": "jittered", "particles_per_cell": 4 if d == 2 else 3}
+    bodies = [
+        {
+            "name": "jelly",
+            "material": {"law": "neo_hookean", "density": 800.0, "youngs_modulus": 6000.0, "poissons_ratio": 0.3},
+            "shape": box((0.0, 0.0, 0.0), (0.3, 0.45, 0.5)),
+            "velocity": [1.0, -2.0, 1.5][:d],
+            **per_cell,
+        },
+        {
+            "name": "water",
+            "material": fluid,
+            "shape": box((0.65, 0.5, 0.5), (1.0, 1.0, 1.0)),
+            "velocity": [3.0, 1.0, 1.0][:d],
+            **per_cell,
+        },
+        {
+            "name": "oil",
+            "material": {**fluid, "density": 500.0, "bulk_modulus": 5000.0},
+            "shape": box((0.65, 0.1, 0.1), (0.9, 0.4, 0.45)),
+            "velocity": [-3.0, 2.0, -2.0][:d],
+            **per_cell,
+        },
+    ]
+    data = {
+        "domain": {
+            "size": size,
+            "origin": origin,
+            "spacing": SPACING,
+            "gravity": [0.4, -9.81, 1.0][:d],
+            "walls": FACES if d == 2 else FACES_3D,
+        },
+        "time": {"end": 2.4, "frames": 1},
+        "solver": {"precision": precision},
+        "output": {"fields": ["velocity", "volume_ratio", "affine", "deformation_gradient"]},
+        "bodies": bodies,
+    }
+    return parse_scene(data, laws=parameter_models()).scene
+
+
+def stirred(scene: Scene) -> list[BodyParticles]:
+    """Return the particles of the scene with random velocities and affine velocities added."""
+    random = np.random.default_rng(7)
+    return [
+        replace(
+            body,
+            velocity=body.velocity + random.normal(0, 0.5, body.velocity.shape),
+            affine=random.normal(0, 1.0, body.affine.shape),
+        )
+        for body in sample_bodies(scene)
+    ]
+
+
+def deform(solver: Solver) -> None:
+    """Give every particle a random deformation, the same for every backend."""
+    random = np.random.default_rng(11)
+    for group in solver.groups:
+        rest = group.deformation_to_numpy()
+        spread = 0.03 * random.standard_normal(rest.shape)
+        group.set_deformation(rest + spread)
+
+
+def state(solver: Solver) -> dict[str, np.ndarray]:
+    """Return x, v, C and deformation of each group, by id, as <law>_<name>."""
+    found = {}
+    for law, group in zip(solver.laws, solver.groups, strict=True):
+        snapshot = read_group(group)
+        order = np.argsort(snapshot.id)
+        for name in ("x", "v", "C", "deformation"):
+            found[f"{law}_{name}"] = getattr(snapshot, name)[order]
+    return found
+
+
+def nodes_of(solver: Solver) -> np.ndarray:
+    """Return the nodes, (..., d + 1): velocity, or momentum after P2G, and mass; any padding is left out."""
+    nodes = solver.grid.nodes.to_numpy()[:, : solver.grid.dimension + 1]
+    return nodes.reshape(*solver.grid.shape, -1)
+
+
+def prepare(backend: Backend, dimension: int) -> Solver:
+    """Return a solver of the scene with its random state."""
+    scene = scene_of(dimension, backend.precision)
+    solver = Solver(scene, backend, stirred(scene))
+    deform(solver)
+    return solver
+
+
+def record(backend: Backend, dimension: int) -> dict[str, np.ndarray]:
+    """Return the state before and after each of the first steps, and the nodes in between."""
+    return record_steps(prepare(backend, dimension))
+
+
+def record_steps(solver: Solver) -> dict[str, np.ndarray]:
+    """Take the first steps of a solver; see `record`."""
+    arrays = {f"0_{name}": value for name, value in state(solver).items()}
+    for k in range(RECORDED):
+        solver.step(STEP)
+        arrays[f"{k}_nodes"] = nodes_of(solver)
+        arrays |= {f"{k + 1}_{name}": value for name, value in state(solver).items()}
+    return arrays
+
+
+def order_of(solver: Solver) -> bytes:
+    """Return the order of the particles in memory: it changes when a sort moves one."""
+    return b"".join(group.id.to_numpy().tobytes() for group in solver.groups)
+
+
+def run(backend: Backend, dimension: int) -> dict[str, np.ndarray]:
+    """Run the scene on a backend and return every array that it left."""
+    solver = prepare(backend, dimension)
+    arrays = record_steps(solver)
+    sorts, order = 0, order_of(solver)
+    for k in range(RECORDED, LONG):
+        solver.step(STEP)
+        sorts, order = sorts + (order_of(solver) != order), order_of(solver)
+        if k + 1 == WATCHED:
+            arrays |= {f"watched_{name}": value for name, value in state(solver).items()}
+    arrays |= {f"long_{name}": value for name, value in state(solver).items()}
+    arrays["sorts"] = np.array(sorts)
+    for frame, row in solver.frames():
+        arrays |= {"frame_position": frame.position, "frame_velocity": frame.velocity, **frame.fields}
+        arrays["ledger"] = np.array([row.steps, row.step_min, row.step_max, row.speed_max, row.kinetic])
+    return arrays
+
+
+if __name__ == "__main__":
+    arch, threads, dimension, precision, path = sys.argv[1:]
+    try:
+        backend = start_backend(arch, int(threads), precision)
+    except InputError as error:
+        print(error)
+        sys.exit(NO_DEVICE)
+    np.savez(path, **run(backend, int(dimension)))

@@ -1,0 +1,237 @@
+"""The stable time step: predicted to a few per cent, for a particle alone and in deformed states (verification: 10)."""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from solver_state import bodies_of, scene_of
+
+from mpmcli.materials.law import StateBound
+from mpmcli.materials.registry import laws
+from mpmcli.scene import sample_bodies
+from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.solver import Solver
+from mpmcli.stability.limits import COURANT, DEFORMATION, FIX, WHY, Limit, deformation_limit, speed_limit, wave_limit
+
+H, RHO = 0.1, 1000.0
+E, NU = 1e5, 0.3
+MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
+START = 1e-6
+
+
+def lone_particles(dimension: int) -> object:
+    """Return a scene of one fluid and one elastic particle, far apart, whose limits are equal.
+
+    h sqrt(rho / (d K)) for the fluid and h sqrt(rho / (d lambda + 2 mu)) for the solid: K = lambda + 2 mu / d.
+    """
+    d = dimension
+    side = {"particles_per_cell": 1}
+
+    def cell(x: float) -> dict:
+        low = [x] + [0.33] * (d - 1)
+        return {"box": {"min": low, "max": [c + H for c in low]}}
+
+    return scene_of(
+        domain={"size": [1.6] + [0.8] * (d - 1), "spacing": H},
+        time={"end": 1.0, "frames": 1},
+        solver={"precision": "f64"},
+        bodies=[
+            {
+                "name": "solid",
+                "material": {
+                    "law": "neo_hookean",
+                    "density": RHO,
+                    "youngs_modulus": E,
+                    "poissons_ratio": NU,
+                },
+                "shape": cell(0.32),
+                **side,
+            },
+            {
+                "name": "liquid",
+                "material": {"law": "fluid", "density": RHO, "bulk_modulus": LAMBDA + 2 * MU / d},
+                "shape": cell(1.07),
+                **side,
+            },
+        ],
+    )
+
+
+def started(backend_of: Callable, dimension: int) -> Solver:
+    """Return a solver of the lone particles with C0 = START I, their most unstable mode."""
+    scene = lone_particles(dimension)
+    mode = START * np.eye(dimension)
+    samples = [replace(s, affine=np.tile(mode, (s.count, 1, 1))) for s in sample_bodies(scene)]
+    assert [s.count for s in samples] == [1, 1]
+    return Solver(scene, backend_of("f64", 1), samples)
+
+
+def predicted(dimension: int) -> float:
+    """h / sqrt((d lambda + 2 mu) / rho) (10.1)."""
+    return H / np.sqrt((dimension * LAMBDA + 2 * MU) / RHO)
+
+
+@pytest.mark.parametrize(
+    ("dimension", "steps"),
+    [
+        (2, 100_000),
+        (3, 10_000),
+        pytest.param(3, 100_000, marks=pytest.mark.slow),
+    ],
+)
+def test_a_lone_particle_is_stable_just_below_its_limit(
+    backend_of: Callable, dimension: int, steps: int, record_property: Callable
+) -> None:
+    """At 0.98 of the limit C stays of its size, for the fluid and the solid (10.3 T1).
+
+    The step is a rotation in (C, tau dt / C scale) with trace 2 - 4 r^2 and determinant 1, so |C| stays below
+    C0 / sqrt(1 - r^2) = 5.0 C0 at r = 0.98.
+    """
+    solver = started(backend_of, dimension)
+    dt = 0.98 * predicted(dimension)
+    for limit in solver.limits():
+        if limit.name == "wave":
+            assert limit.value == pytest.approx(predicted(dimension), rel=1e-6)
+    largest = {"solid": 0.0, "liquid": 0.0}
+    for n in range(steps):
+        solver.step(dt)
+        if n % 997 < 16 or n > steps - 50:
+            for name, body in bodies_of(solver).items():
+                largest[name] = max(largest[name], float(np.abs(body.C).max()))
+    for name, value in largest.items():
+        record_property(f"{name} max |C|/C0", value / START)
+        assert START / 2 < value < 1.05 * START / np.sqrt(1 - 0.98**2)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_lone_particle_grows_just_above_its_limit(
+    backend_of: Callable, dimension: int, record_property: Callable
+) -> None:
+    """At 1.02 of the limit |C| grows by |lambda| = 2 r^2 - 1 + 2 r sqrt(r^2 - 1) = 1.49 per step, past 1e3 (10.3)."""
+    solver = started(backend_of, dimension)
+    r = 1.02
+    growth = 2 * r * r - 1 + 2 * r * np.sqrt(r * r - 1)
+    n = 10
+    # Within these the state stays far inside the linear range: 1e-6 x 1.49^25 dt = 1e-4.
+    for _ in range(25 - n):
+        solver.step(r * predicted(dimension))
+    middle = {name: float(np.abs(body.C).max()) for name, body in bodies_of(solver).items()}
+    for _ in range(n):
+        solver.step(r * predicted(dimension))
+    for name, body in bodies_of(solver).items():
+        largest = float(np.abs(body.C).max())
+        record_property(f"{name} growth/step", (largest / middle[name]) ** (1 / n))
+        assert largest > 1e3 * START
+        assert (largest / middle[name]) ** (1 / n) == pytest.approx(growth, rel=0.01)
+
+
+def test_an_unstable_particle_stops_the_run(backend_of: Callable) -> None:
+    """Growth beyond the limit ends in an error that names a body, and never in numbers that are not finite."""
+    solver = started(backend_of, 2)
+    with pytest.raises(UnstableRunError) as stopped:
+        for _ in range(2000):
+            solver.step(1.1 * predicted(2))
+    assert stopped.value.diagnosis.body in ("solid", "liquid")
+
+
+def tangent(stress: Callable[[np.ndarray], np.ndarray], F: np.ndarray, dimension: int) -> np.ndarray:
+    """Return d tau / d C (d^2, d^2) of tau((I + C) F) at C = 0, by central differences.
+
+    Only the in-plane part counts, and `stress` returns tau (d, d).
+    """
+    d = dimension
+    step = 1e-6
+    columns = []
+    for i, j in itertools.product(range(d), range(d)):
+        C = np.zeros((d, d))
+        C[i, j] = step
+        plus, minus = stress((np.eye(d) + C) @ F), stress((np.eye(d) - C) @ F)
+        columns.append(((plus - minus) / (2 * step)).ravel())
+    return np.array(columns).T
+
+
+def kirchhoff(name: str, parameters: object, F: np.ndarray) -> np.ndarray:
+    """Return tau = J sigma of one deformation gradient from the law's host stress."""
+    law = laws()[name]()
+    d = len(F)
+    J = float(np.linalg.det(F))
+    deformation = F[None] if law.deformation == "F" else np.array([J])
+    return J * law.cauchy_stress(parameters, deformation)[0, :d, :d]
+
+
+def rotation(random: np.random.Generator, dimension: int) -> np.ndarray:
+    """Return a random rotation, by a QR decomposition."""
+    Q, R = np.linalg.qr(random.normal(size=(dimension, dimension)))
+    Q = Q * np.sign(np.diag(R))
+    Q[:, 0] *= np.sign(np.linalg.det(Q))
+    return Q
+
+
+MATERIALS = {
+    "fluid": st.builds(lambda K: {"law": "fluid", "density": RHO, "bulk_modulus": K}, st.floats(1e3, 1e9)),
+    "neo_hookean": st.builds(
+        lambda E, nu: {"law": "neo_hookean", "density": RHO, "youngs_modulus": E, "poissons_ratio": nu},
+        st.floats(1e3, 1e9),
+        st.floats(-0.9, 0.49),
+    ),
+}
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("name", sorted(laws()))
+@given(data=st.data())
+def test_stiffness_bounds_the_tangent(name: str, dimension: int, data: st.DataObject) -> None:
+    """No eigenvalue of d tau / d C exceeds `Law.stiffness`, at any stretch; at rest the bound is met.
+
+    tau is differentiated numerically, in states stretched by 0.5 to 2 along random axes.
+    """
+    parameters = laws()[name].parameters(**data.draw(MATERIALS[name]))
+    stretches = np.array(data.draw(st.lists(st.floats(0.5, 2.0), min_size=dimension, max_size=dimension)))
+    random = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    F = rotation(random, dimension) @ np.diag(stretches) @ rotation(random, dimension).T
+    J = float(np.prod(stretches))
+    bound = StateBound(J, J, float(stretches.max() ** 2))
+    law = laws()[name]()
+
+    def stiffest(F: np.ndarray) -> float:
+        matrix = tangent(lambda deformed: kirchhoff(name, parameters, deformed), F, dimension)
+        return float(np.linalg.eigvals(matrix).real.max())
+
+    stated = law.stiffness(parameters, bound, dimension)
+    assert stiffest(F) <= stated * (1 + 1e-6)
+    rest = law.stiffness(parameters, StateBound(), dimension)
+    lam = getattr(parameters, "lame_lambda", 1.0)
+    if lam >= 0:
+        assert stiffest(np.eye(dimension)) == pytest.approx(rest, rel=1e-5)
+
+
+def test_bounds_are_their_formulas() -> None:
+    """h sqrt(rho / stiffness), COURANT h / v and DEFORMATION / |grad v|; nothing moving bounds nothing."""
+    assert wave_limit(0.02, 1000.0, 2 * 2.25e9) == pytest.approx(0.02 / np.sqrt(2) / 1500.0)
+    assert speed_limit(0.1, 4.0) == pytest.approx(COURANT * 0.1 / 4.0)
+    assert speed_limit(0.1, 0.0) == np.inf
+    assert deformation_limit(5.0) == pytest.approx(DEFORMATION / 5.0)
+    assert deformation_limit(0.0) == np.inf
+
+
+def test_every_bound_says_why_and_what_helps() -> None:
+    """Each name has its two sentences, and limits sort by their value."""
+    assert WHY.keys() == FIX.keys()
+    assert all(WHY[name] and FIX[name] for name in WHY)
+    first, second = Limit(1e-3, "wave", "a"), Limit(2e-3, "speed", "")
+    assert min(second, first) is first
+    assert first.why == WHY["wave"]
+    assert first.fix == FIX["wave"]
+
+
+def test_mpm88_is_stable_at_128_cells_and_not_at_200() -> None:
+    """Taichi's mpm88 takes C = c dt / h = 0.512 at 128 cells and 0.80 at 200: the limit is 1/sqrt(2) (section 0.3)."""
+    E_88, rho, dt = 400.0, 1.0, 2e-4
+    for cells, stable in ((128, True), (200, False)):
+        limit = wave_limit(1 / cells, rho, 2 * E_88)
+        assert limit * np.sqrt(E_88 / rho) * cells == pytest.approx(1 / np.sqrt(2))
+        assert (dt < limit) == stable

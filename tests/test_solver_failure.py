@@ -1,0 +1,194 @@
+"""A run whose state is lost stops at once, and says which particle, where and why."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from solver_state import scene_of
+
+from mpmcli.scene import Scene, sample_bodies
+from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.solver import Solver
+
+H = 0.1
+STEP = 1e-3
+
+
+def scene(dimension: int = 2, precision: str = "f32") -> Scene:
+    """Return a scene of a block of jelly, a drop, and a second drop of another density, all moving slowly."""
+    d = dimension
+
+    def box(low: float) -> dict:
+        return {"box": {"min": [low] + [0.5] * (d - 1), "max": [low + 0.3] + [0.8] * (d - 1)}}
+
+    fluid = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e4}
+    return scene_of(
+        domain={"size": [2.4] + [1.5] * (d - 1), "origin": [-1.0] + [0.0] * (d - 1), "spacing": H},
+        time={"end": 0.2, "frames": 10},
+        solver={"precision": precision},
+        bodies=[
+            {"name": "drop", "material": fluid, "shape": box(-0.8), "velocity": [0.1] * d},
+            {
+                "name": "jelly",
+                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e4},
+                "shape": box(0.0),
+                "velocity": [0.2] * d,
+            },
+            {"name": "second drop", "material": {**fluid, "density": 700.0}, "shape": box(0.8)},
+        ],
+    )
+
+
+def by_id(solver: Solver, law: str) -> tuple[object, np.ndarray]:
+    """Return the group of a law and where each of its particles, in the order of their ids, lies in memory."""
+    group = solver.groups[solver.laws.index(law)]
+    return group, np.argsort(group.id.to_numpy())
+
+
+def first_id(solver: Solver, body: str) -> int:
+    """Return the id of the first particle of a body: ids count through the bodies in the order of the scene."""
+    counts = [sample.count for sample in sample_bodies(solver.scene)]
+    names = [b.name for b in solver.scene.bodies]
+    return sum(counts[: names.index(body)])
+
+
+def poison_velocity(solver: Solver, law: str, row: int, value: float) -> None:
+    group, place = by_id(solver, law)
+    v, C = group.motion_to_numpy()
+    v[place[row]] = value
+    group.set_motion(v, C)
+
+
+def poison_deformation(solver: Solver, law: str, row: int, value: object) -> None:
+    group, place = by_id(solver, law)
+    deformation = group.deformation_to_numpy()
+    deformation[place[row]] = value
+    group.set_deformation(deformation)
+
+
+def run_until_lost(solver: Solver, steps: int = 40) -> UnstableRunError:
+    """Return the error that ends the run."""
+    with pytest.raises(UnstableRunError) as stopped:
+        for _ in range(steps):
+            solver.step(STEP)
+    return stopped.value
+
+
+@pytest.fixture
+def running(backend_of: Callable) -> Solver:
+    """Return a solver on two threads that has taken some steps and sorts."""
+    solver = Solver(scene(), backend_of("f32", 2))
+    for _ in range(30):
+        solver.step(STEP)
+    return solver
+
+
+@pytest.mark.parametrize(
+    ("law", "body", "value", "cause"),
+    [
+        ("fluid", "drop", np.nan, "not finite"),
+        ("fluid", "second drop", -0.5, "inside out"),
+        ("fluid", "drop", 0.0, "inside out"),
+        ("neo_hookean", "jelly", np.nan, "not finite"),
+        ("neo_hookean", "jelly", np.diag([-1.0, 1.0]), "inside out"),
+    ],
+    ids=["J NaN", "J negative", "J zero", "F NaN", "F inverted"],
+)
+def test_a_lost_deformation_names_its_particle(running: Solver, law: str, body: str, value: object, cause: str) -> None:
+    """The very particle is named, before its stress spreads over its neighbours, one step later at most."""
+    names = [b.name for b in running.scene.bodies if b.material.law == law]
+    counts = {s.name: s.count for s in sample_bodies(running.scene)}
+    row = sum(counts[n] for n in names[: names.index(body)]) + 5
+    before = running.step_count
+    poison_deformation(running, law, row, value)
+    error = run_until_lost(running)
+    diagnosis = error.diagnosis
+    assert diagnosis.particle == first_id(running, body) + 5
+    assert diagnosis.body == body
+    assert cause in diagnosis.cause
+    assert before < diagnosis.step <= before + 2
+    assert diagnosis.time == pytest.approx(diagnosis.step * STEP)
+    assert diagnosis.step_size == pytest.approx(STEP)
+    # A body is 0.3 m wide and has moved by less than a cell: the place, in the scene's coordinates, is in it.
+    assert {"drop": -0.8, "jelly": 0.0, "second drop": 0.8}[body] - 0.01 < diagnosis.position[0]
+    assert diagnosis.position[0] < {"drop": -0.5, "jelly": 0.3, "second drop": 1.1}[body] + 0.05
+    assert 0.5 < diagnosis.position[1] < 0.85
+    sentence = str(error)
+    for part in (f"particle {diagnosis.particle}", f'"{body}"', f"step {diagnosis.step}", diagnosis.limit):
+        assert part in sentence
+    assert sentence.endswith(".")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30], ids=["NaN", "infinite", "1e30"])
+def test_a_lost_velocity_names_its_body(running: Solver, value: float) -> None:
+    """What a velocity does reaches its neighbours in the same step: one of them is named, of the same body."""
+    poison_velocity(running, "neo_hookean", 7, value)
+    before = running.step_count
+    diagnosis = run_until_lost(running).diagnosis
+    assert diagnosis.body == "jelly"
+    assert diagnosis.step == before + 1
+    assert any(part in diagnosis.cause for part in ("not finite", "left the domain", "inside out"))
+    assert all(np.isfinite(diagnosis.position))
+
+
+def test_a_particle_that_leaves_is_named_with_its_speed(backend_of: Callable) -> None:
+    """One lone particle, faster than the step allows, leaves: it is it, there, and that fast."""
+    lone = scene_of(
+        domain={"size": [2.4, 1.5], "origin": [-1.0, 0.0], "spacing": H},
+        time={"end": 1.0, "frames": 1},
+        bodies=[
+            {
+                "name": "bullet",
+                "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e4},
+                "shape": {"box": {"min": [1.0, 0.7], "max": [1.1, 0.8]}},
+                "particles_per_cell": 1,
+                "velocity": [900.0, 0.0],
+            }
+        ],
+    )
+    diagnosis = run_until_lost(Solver(lone, backend_of("f32", 2))).diagnosis
+    assert (diagnosis.particle, diagnosis.body, diagnosis.step) == (0, "bullet", 1)
+    assert diagnosis.cause == "left the domain at 900 m/s"
+    assert diagnosis.position == pytest.approx((1.05, 0.75), abs=1e-5)
+    assert diagnosis.limit == "speed"
+
+
+def test_frames_before_the_end_stay(running: Solver, backend_of: Callable) -> None:
+    """A run that is lost between two frames has yielded the earlier ones, all of them finite and complete."""
+    solver = Solver(scene(), backend_of("f32", 2))
+    frames = solver.frames()
+    kept = [next(frames) for _ in range(4)]
+    poison_deformation(solver, "fluid", 3, np.nan)
+    with pytest.raises(UnstableRunError):
+        next(frames)
+    with pytest.raises(StopIteration):
+        next(frames)
+    assert [frame.time for frame, _ in kept] == pytest.approx([0.0, 0.02, 0.04, 0.06], abs=1e-15)
+    for frame, row in kept:
+        assert len(frame.position) == solver.particle_count
+        assert np.isfinite(frame.position).all()
+        assert row.volume_ratio_min > 0
+        assert np.isfinite(row.energy)
+
+
+def test_no_frame_holds_an_inverted_particle(backend_of: Callable) -> None:
+    """A particle that a step turns over is seen before that state becomes a frame."""
+    lone = scene()
+    samples = sample_bodies(lone)
+    # Compressed to nothing within the first step: 1 + dt tr C < 0.
+    crushed = [replace(s, affine=np.tile(-2e5 * np.eye(2), (s.count, 1, 1))) for s in samples[:1]]
+    solver = Solver(lone, backend_of("f32", 2), [*crushed, *samples[1:]])
+    limits = [limit for limit in solver.limits() if limit.name == "deformation"]
+    assert min(limits).value == pytest.approx(0.5 / 4e5)
+    frames = solver.frames()
+    with pytest.raises(UnstableRunError):
+        for frame, row in frames:
+            assert row.volume_ratio_min > 0, frame.index
+        pytest.skip("the step was small enough for it to survive")
+
+
+def test_the_number_of_particles_never_changes(running: Solver) -> None:
+    """Every id from 0 to n - 1 is there once, after many sorts."""
+    ids = np.concatenate([group.id.to_numpy() for group in running.groups])
+    assert np.array_equal(np.sort(ids), np.arange(running.particle_count))

@@ -1,0 +1,233 @@
+"""Frames and the ledger: on time, in the particles' own order, and as their formulas say."""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from solver_state import bodies_of, scene_of
+
+from mpmcli.output.frame import Frame
+from mpmcli.scene import Scene, sample_bodies
+from mpmcli.solver.solver import Solver
+from mpmcli.stability.ledger import LedgerRow
+
+H = 0.1
+FIELDS = [
+    "velocity",
+    "density",
+    "pressure",
+    "volume_ratio",
+    "deformation_gradient",
+    "affine",
+    "stress",
+    "mass",
+]
+E, NU, K = 2e4, 0.3, 3e4
+GRAVITY = [0.3, -9.81]
+Run = list[tuple[Frame, LedgerRow]]
+
+
+def tumbling() -> Scene:
+    """Return two drops and two blocks, given in turn, that fall, turn and hit the floor."""
+    fluid = {"law": "fluid", "density": 1000.0, "bulk_modulus": K}
+    solid = {"law": "neo_hookean", "density": 800.0, "youngs_modulus": E, "poissons_ratio": NU}
+
+    def box(x: float, y: float) -> dict:
+        return {"box": {"min": [x, y], "max": [x + 0.35, y + 0.3]}}
+
+    spin = [[0.0, -3.0], [3.0, 0.0]]
+    return scene_of(
+        domain={"size": [3.0, 1.5], "origin": [10.0, -5.0], "spacing": H, "gravity": GRAVITY},
+        time={"end": 0.6, "frames": 7},
+        solver={"precision": "f64"},
+        output={"fields": FIELDS},
+        bodies=[
+            {"name": "a", "material": fluid, "shape": box(10.1, -4.8), "velocity": [2.0, 0.0]},
+            {"name": "b", "material": solid, "shape": box(10.7, -4.6), "velocity_gradient": spin},
+            {"name": "c", "material": {**fluid, "density": 500.0}, "shape": box(11.6, -4.7)},
+            {
+                "name": "d",
+                "material": {**solid, "density": 400.0},
+                "shape": box(12.4, -4.8),
+                "velocity": [-2.0, 1.0],
+            },
+        ],
+    )
+
+
+@pytest.fixture(scope="module")
+def solver(backend_of: Callable) -> Solver:
+    """Return the solver of the tumbling scene, after all of its frames."""
+    return Solver(tumbling(), backend_of("f64", 2))
+
+
+@pytest.fixture(scope="module")
+def frames(solver: Solver) -> Run:
+    """Return every frame of the tumbling scene."""
+    return list(solver.frames())
+
+
+def test_frames_land_on_their_times(frames: Run) -> None:
+    """t_k = end k / frames, exactly, from 0 on; the steps of an interval sum to it."""
+    assert [frame.index for frame, _ in frames] == list(range(8))
+    assert [frame.time for frame, _ in frames] == [0.6 * k / 7 for k in range(8)]
+    taken = 0
+    for frame, row in frames:
+        taken += row.steps
+        assert frame.step == taken
+        assert row.time == frame.time
+        if row.steps:
+            assert row.step_min <= 0.6 / 7 / row.steps * (1 + 1e-9)
+            assert row.step_max >= 0.6 / 7 / row.steps * (1 - 1e-9)
+
+
+def test_every_row_is_the_same_particle_in_every_frame(frames: Run, solver: Solver) -> None:
+    """Rows start at the lattice of the bodies in the scene's order, and move by less than v dt between frames."""
+    samples = sample_bodies(solver.scene)
+    first = frames[0][0]
+    assert np.array_equal(first.position, np.concatenate([s.position for s in samples]))
+    assert np.array_equal(first.velocity, np.concatenate([s.velocity for s in samples]))
+    body = np.repeat(np.arange(4), [s.count for s in samples])
+    law = np.array([solver.laws.index(b.material.law) for b in solver.scene.bodies])
+    for (before, _), (frame, _) in pairwise(frames):
+        assert np.array_equal(frame.body, body)
+        assert np.array_equal(frame.material, law[body])
+        assert frame.body.dtype == frame.material.dtype == np.int32
+        moved = np.linalg.norm(frame.position - before.position, axis=1)
+        # 5 m/s is more than any particle reaches here; a mixed-up row would jump by up to 3 m.
+        assert moved.max() < 5 * 0.6 / 7
+        assert np.isfinite(frame.position).all()
+    # The sort did move particles in memory, or this would show nothing.
+    assert any((np.diff(group.id.to_numpy()) < 0).any() for group in solver.groups)
+
+
+def test_neighbours_of_a_lattice_stay_neighbours_in_a_solid(frames: Run, solver: Solver) -> None:
+    """In an elastic body x_q - x_p = F_p (X_q - X_p) to second order: rows, positions and F belong together."""
+    first, last = frames[0][0], frames[-1][0]
+    for body in (1, 3):
+        rows = np.flatnonzero(first.body == body)
+        X, x = first.position[rows], last.position[rows]
+        F = last.fields["deformation_gradient"][rows].reshape(-1, 2, 2)
+        distance = np.linalg.norm(X[:, None] - X[None], axis=2)
+        p, q = np.nonzero((distance > 0) & (distance < 0.06))
+        expected = np.einsum("nij,nj->ni", (F[p] + F[q]) / 2, X[q] - X[p])
+        error = np.linalg.norm(x[q] - x[p] - expected, axis=1) / distance[p, q]
+        assert np.median(error) < 0.05
+        assert error.max() < 0.5
+
+
+def test_fields_are_their_formulas(frames: Run, solver: Solver) -> None:
+    """density = rho0 / J, p = -tr(sigma) / 3, sigma of each law, J = det F, mass = rho0 V0."""
+    samples = sample_bodies(solver.scene)
+    counts = [s.count for s in samples]
+    rho0 = np.repeat([b.material.density for b in solver.scene.bodies], counts)
+    for frame, _ in frames:
+        fields = frame.fields
+        assert set(fields) == set(FIELDS) - {"velocity"}
+        n = len(frame.position)
+        assert {name: value.shape for name, value in fields.items()} == {
+            "density": (n,),
+            "pressure": (n,),
+            "volume_ratio": (n,),
+            "mass": (n,),
+            "deformation_gradient": (n, 4),
+            "affine": (n, 4),
+            "stress": (n, 9),
+        }
+        J = fields["volume_ratio"]
+        F = fields["deformation_gradient"].reshape(n, 2, 2)
+        sigma = fields["stress"].reshape(n, 3, 3)
+        assert np.linalg.det(F) == pytest.approx(J, rel=1e-12)
+        assert fields["density"] == pytest.approx(rho0 / J, rel=1e-12)
+        assert fields["mass"] == pytest.approx(np.repeat([s.mass for s in samples], counts), rel=1e-15)
+        assert fields["pressure"] == pytest.approx(-np.trace(sigma, axis1=1, axis2=2) / 3, abs=1e-9 * K)
+        fluid = np.isin(frame.body, [0, 2])
+        pressure = K * (1 / J[fluid] - 1)
+        assert np.abs(fields["pressure"][fluid] - pressure).max() < 1e-9 * K
+        mu, lam = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
+        b = np.tile(np.eye(3), (n, 1, 1))
+        b[:, :2, :2] = F @ F.transpose(0, 2, 1)
+        expected = (mu * (b - np.eye(3)) + lam * np.log(J)[:, None, None] * np.eye(3)) / J[:, None, None]
+        assert np.abs(sigma - expected)[~fluid].max() < 1e-9 * E
+
+
+def test_the_ledger_adds_up(frames: Run, solver: Solver) -> None:
+    """Mass, energies and momenta are the sums over the frame's own particles; nothing gains energy (9.9)."""
+    for frame, row in frames:
+        m, v = frame.fields["mass"], frame.velocity
+        x = frame.position - np.array(solver.scene.domain.origin)
+        C = frame.fields["affine"].reshape(-1, 2, 2)
+        kinetic = m @ ((v**2).sum(1) + H * H / 4 * (C**2).sum((1, 2))) / 2
+        spin = m @ (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0] + H * H / 4 * (C[:, 1, 0] - C[:, 0, 1]))
+        assert row.mass == pytest.approx(m.sum(), rel=1e-12)
+        assert row.kinetic == pytest.approx(kinetic, rel=1e-12)
+        assert row.potential == pytest.approx(-m @ (x @ np.array(GRAVITY)), rel=1e-12)
+        assert row.linear_momentum == pytest.approx(m @ v, rel=1e-9)
+        assert row.angular_momentum == pytest.approx([spin], rel=1e-9)
+        assert row.speed_max == pytest.approx(np.linalg.norm(v, axis=1).max())
+        assert row.volume_ratio_min == frame.fields["volume_ratio"].min()
+        assert row.volume_ratio_max == frame.fields["volume_ratio"].max()
+        assert row.elastic >= 0
+    energies = [row.energy for _, row in frames]
+    assert max(energies) <= energies[0] * (1 + 1e-3)
+    first = frames[0][1]
+    assert (first.steps, first.step_min, first.step_max, first.limit, first.courant_max) == (0, 0.0, 0.0, "", 0.0)
+    assert all(row.limit in ("wave", "speed", "deformation") for _, row in frames[1:])
+    numbers = ("time", "step_min", "step_max", "speed_max", "courant_max", "kinetic", "elastic", "potential")
+    for _, row in frames:
+        assert {name: type(getattr(row, name)) for name in numbers} == dict.fromkeys(numbers, float)
+
+
+def test_courant_number_is_that_of_the_fastest_particle(backend_of: Callable) -> None:
+    """A heavy block slides along a slip floor at v: every node moves at v, and courant_max = v dt / h.
+
+    The nodes beyond the floor hold momentum until the wall folds it, and momentum is no speed.
+    """
+    speed = 0.3
+    scene = scene_of(
+        domain={"size": [2.0, 1.0], "spacing": H, "walls": "slip"},
+        time={"end": 0.05, "frames": 2},
+        solver={"precision": "f64"},
+        bodies=[
+            {
+                "name": "block",
+                "material": {"law": "neo_hookean", "density": 1e5, "youngs_modulus": 1e6},
+                "shape": {"box": {"min": [0.6, 0.0], "max": [1.0, 0.4]}},
+                "velocity": [speed, 0.0],
+            }
+        ],
+    )
+    for _, row in list(Solver(scene, backend_of("f64")).frames())[1:]:
+        assert row.courant_max == pytest.approx(speed * row.step_max / H, rel=1e-9)
+
+
+def test_a_step_given_in_the_scene_is_a_maximum(backend_of: Callable) -> None:
+    """time.step bounds every step and is named as its limit; the frames still land on their times."""
+    data = tumbling().model_dump()
+    data["time"] |= {"step": 1e-3, "end": 0.01, "frames": 3}
+    del data["domain"]["cells"]
+    rows = [row for _, row in Solver(scene_of(**data), backend_of("f64", 2)).frames()]
+    assert [row.steps for row in rows[1:]] == [4, 4, 4]
+    assert all(row.step_max <= 1e-3 * (1 + 1e-6) for row in rows)
+    assert all(row.limit == "maximum" for row in rows[1:])
+    assert [row.time for row in rows] == [0.01 * k / 3 for k in range(4)]
+
+
+def test_energies_of_bodies_at_rest(backend_of: Callable) -> None:
+    """Bitwise rest: with no gravity and no motion nothing ever changes (H22)."""
+    data = tumbling().model_dump()
+    data["domain"]["gravity"] = [0.0, 0.0]
+    del data["domain"]["cells"]
+    for body in data["bodies"]:
+        body["velocity"] = [0.0, 0.0]
+        body["velocity_gradient"] = None
+    data["solver"]["precision"] = "f32"
+    solver = Solver(scene_of(**data), backend_of("f32", 2))
+    start = bodies_of(solver)
+    for _ in range(500):
+        solver.step(2e-3)
+    for name, body in bodies_of(solver).items():
+        assert np.array_equal(body.x, start[name].x)
+        assert np.array_equal(body.deformation, start[name].deformation)
+        assert not body.v.any()

@@ -1,0 +1,198 @@
+"""Every path of a step against plain numpy and against each other: the coloured CPU scatter and the atomic one.
+
+One scene with both laws, three densities, all kinds of wall and random states runs in a process per path. Each of its
+first steps (the first right after a sort, the next ones after drift, and those in which a sort falls) is compared with
+`mpm_reference.step` from the same state, nodes and particles both.
+"""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import mpm_reference as reference
+import numpy as np
+import path_run
+import pytest
+from conftest import PythonRun
+
+from mpmcli.scene import Scene, sample_bodies
+from mpmcli.solver.grid import PAD
+
+CPU_THREADS = (1, 2, 3)
+PATHS = [("cpu", threads) for threads in CPU_THREADS] + [("vulkan", 1)]
+# Round-off of a step relative to the largest value of each array: sums of some ten terms, and products of
+# about ten factors.
+TOLERANCE = {"f32": 1e-6, "f64": 1e-12}
+
+Arrays = dict[str, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def path_arrays(tmp_path_factory: pytest.TempPathFactory, run_module: Callable) -> Iterator[Callable[..., Arrays]]:
+    """Return `arrays(arch, threads, dimension, again=False)`: what a process of its own stored.
+
+    All processes are started at once, two at a time: most of their time is compilation on one core.
+    """
+    room = tmp_path_factory.mktemp("paths")
+    wanted = [(*path, dimension, False) for dimension in (2, 3) for path in PATHS]
+    wanted += [("cpu", 2, dimension, True) for dimension in (2, 3)]
+
+    def run(arch: str, threads: int, dimension: int, again: bool) -> PythonRun:
+        file = room / f"{arch}_{threads}_{dimension}_{again}.npz"
+        return run_module(Path(path_run.__file__), arch, threads, dimension, "f32", file)
+
+    with ThreadPoolExecutor(2) as pool:
+        runs = {path: pool.submit(run, *path) for path in wanted}
+
+        def arrays(arch: str, threads: int, dimension: int, again: bool = False) -> Arrays:
+            done = runs[arch, threads, dimension, again].result()
+            if done.status == path_run.NO_DEVICE or (arch != "cpu" and done.status < 0):
+                pytest.skip(f"no {arch} device here: {done.stdout.strip() or f'signal {-done.status}'}")
+            assert done.status == 0, done.stderr
+            with np.load(room / f"{arch}_{threads}_{dimension}_{again}.npz") as stored:
+                return dict(stored)
+
+        yield arrays
+        pool.shutdown(cancel_futures=True)
+
+
+def reference_groups(scene: Scene, arrays: Arrays, k: int) -> list[reference.Particles]:
+    """Return the stored state before step k as the reference takes it, the groups in the solver's order."""
+    groups = []
+    for law in ("fluid", "neo_hookean"):
+        bodies = [(b, s) for b, s in zip(scene.bodies, sample_bodies(scene), strict=True) if b.material.law == law]
+        counts = [sample.count for _, sample in bodies]
+
+        def per_particle(values: list[float], counts: list[int] = counts) -> np.ndarray:
+            return np.repeat(values, counts)
+
+        materials = [body.material for body, _ in bodies]
+        if law == "fluid":
+            stress = reference.fluid_stress(per_particle([m.bulk_modulus for m in materials]), scene.dimension)
+        else:
+            E = per_particle([m.youngs_modulus for m in materials])
+            nu = per_particle([m.poissons_ratio for m in materials])
+            stress = reference.neo_hookean_stress(E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu)))
+        x, v, C, deformation = (
+            arrays[f"{k}_{law}_{name}"].astype(np.float64) for name in ("x", "v", "C", "deformation")
+        )
+        mass = per_particle([sample.mass for _, sample in bodies])
+        volume = per_particle([sample.volume for _, sample in bodies])
+        groups.append(reference.Particles(x, v, C, deformation, mass, volume, stress))
+    return groups
+
+
+# Paths that agree to the last bit start a step from the same state, and need its answer only once.
+_answers: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray, list[reference.Particles]]] = {}
+
+
+def reference_step(
+    groups: list[reference.Particles], box: reference.Box, dt: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[reference.Particles]]:
+    """Return node momentum, mass and velocity, and the particles after the step."""
+    key = b"".join(a.tobytes() for g in groups for a in (g.x, g.v, g.C, g.deformation))
+    if key not in _answers:
+        momentum, mass = reference.scatter(groups, box, dt)
+        velocity = reference.update(momentum, mass, box, dt)
+        _answers[key] = (momentum, mass, velocity, reference.gather(groups, velocity, box, dt))
+    return _answers[key]
+
+
+def check_steps(scene: Scene, arrays: Arrays, tolerance: float) -> None:
+    """Compare the nodes and the particles of every recorded step with the reference."""
+    gravity = np.array(scene.domain.gravity)
+    faces = scene.domain.walls.faces(scene.dimension)
+    box = reference.Box(scene.domain.cells, scene.domain.spacing, gravity, faces)
+    inside = tuple(slice(PAD - reference.MARGIN, PAD + n + 1 + reference.MARGIN) for n in box.cells)
+    for k in range(path_run.RECORDED):
+        groups = reference_groups(scene, arrays, k)
+        momentum, mass, velocity, expected = reference_step(groups, box, path_run.STEP)
+        fastest = np.abs(velocity).max()
+        for law, group in zip(("fluid", "neo_hookean"), expected, strict=True):
+            # C is (4/h) times differences of velocities, so their round-off is its measure.
+            scales = {"x": group.x.max(), "v": fastest, "C": 4 / box.spacing * fastest, "deformation": 1.0}
+            for name, scale in scales.items():
+                error = np.abs(arrays[f"{k + 1}_{law}_{name}"] - getattr(group, name)).max() / scale
+                assert error < tolerance, f"step {k}, {law} {name}: {error:.2e}"
+        check_nodes(arrays[f"{k}_nodes"][inside], momentum, mass, velocity, box, tolerance)
+
+
+def check_nodes(
+    nodes: np.ndarray,
+    momentum: np.ndarray,
+    mass: np.ndarray,
+    velocity: np.ndarray,
+    box: reference.Box,
+    tolerance: float,
+) -> None:
+    """Compare the momentum and the mass that P2G left, where no wall folds, and every node's velocity."""
+    free = np.zeros(mass.shape, bool)
+    away = 2 * reference.MARGIN + 1
+    free[tuple(slice(away, -away) for _ in box.cells)] = True
+    loaded = free & (mass > 0)
+    step = path_run.STEP * box.gravity
+    scattered = nodes[loaded][:, -1:] * (nodes[loaded][:, :-1].astype(np.float64) - step)
+    assert np.abs(nodes[loaded][:, -1] - mass[loaded]).max() < tolerance * mass.max()
+    assert np.abs(scattered - momentum[loaded]).max() < tolerance * np.abs(momentum).max()
+    # The velocity of a node with next to no mass is a quotient of round-off: weigh it by its mass.
+    weight = mass / mass.max()
+    moving = np.abs(velocity).max()
+    at = mass > 0
+    assert (weight[at][:, None] * np.abs(nodes[at][:, :-1] - velocity[at])).max() < tolerance * moving
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize(("arch", "threads"), PATHS)
+def test_steps_match_plain_numpy(path_arrays: Callable, arch: str, threads: int, dimension: int) -> None:
+    """Six steps, each from the device's own state, to f32 round-off."""
+    arrays = path_arrays(arch, threads, dimension)
+    check_steps(path_run.scene_of(dimension, "f32"), arrays, TOLERANCE["f32"])
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_steps_match_plain_numpy_in_double_precision(backend_of: Callable, dimension: int) -> None:
+    """The same kernels in f64, to f64 round-off: what f32 shows is round-off, and nothing else."""
+    arrays = path_run.record(backend_of("f64", 3), dimension)
+    check_steps(path_run.scene_of(dimension, "f64"), arrays, TOLERANCE["f64"])
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_bitwise_equal_for_any_number_of_threads_and_again(path_arrays: Callable, dimension: int) -> None:
+    """State, frames and step sizes after some 350 steps and many sorts: not one bit depends on the threads."""
+    one = path_arrays("cpu", 1, dimension)
+    others = [path_arrays("cpu", threads, dimension) for threads in CPU_THREADS[1:]]
+    others.append(path_arrays("cpu", 2, dimension, again=True))
+    assert one["sorts"] > 20
+    for other in others:
+        assert one.keys() == other.keys()
+        different = [name for name in one if not np.array_equal(one[name], other[name])]
+        assert not different
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_vulkan_follows_the_cpu(path_arrays: Callable, dimension: int) -> None:
+    """Atomics add in another order: round-off of 6e-8 per step and sum, which 60 steps may amplify tenfold."""
+    vulkan, cpu = path_arrays("vulkan", 1, dimension), path_arrays("cpu", 2, dimension)
+    for law in ("fluid", "neo_hookean"):
+        for name, tolerance in (("x", 1e-5), ("v", 5e-5), ("C", 5e-5), ("deformation", 5e-5)):
+            right = cpu[f"watched_{law}_{name}"]
+            error = np.abs(vulkan[f"watched_{law}_{name}"] - right).max() / np.abs(right).max()
+            assert error < tolerance, f"{law} {name}: {error:.2e}"
+
+
+def test_particles_stay_in_the_domain_and_keep_their_number(path_arrays: Callable) -> None:
+    """Bodies are thrown at every kind of wall: 0 <= x <= size, with nothing lost and nothing not finite."""
+    for dimension in (2, 3):
+        size = np.array(path_run.CELLS[dimension]) * path_run.SPACING
+        scene = path_run.scene_of(dimension, "f32")
+        count = sum(sample.count for sample in sample_bodies(scene))
+        for threads in CPU_THREADS:
+            arrays = path_arrays("cpu", threads, dimension)
+            x = np.concatenate([arrays["long_fluid_x"], arrays["long_neo_hookean_x"]])
+            assert x.shape == (count, dimension)
+            assert np.isfinite(x).all()
+            assert x.min() >= 0
+            assert (x <= size * (1 + 1e-6)).all()
+            assert arrays["frame_position"].shape == (count, dimension)
+        # The scene reaches the walls, or it would show nothing.
+        assert x.min() < path_run.SPACING / 2
