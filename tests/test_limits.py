@@ -210,10 +210,13 @@ def test_stiffness_bounds_the_tangent(name: str, dimension: int, data: st.DataOb
 
 
 def test_bounds_are_their_formulas() -> None:
-    """h sqrt(rho / stiffness), COURANT h / v and DEFORMATION / |grad v|; nothing moving bounds nothing."""
+    """h sqrt(rho / stiffness), v dt + g dt^2 = COURANT h and DEFORMATION / |grad v|; nothing moving bounds nothing."""
     assert wave_limit(0.02, 1000.0, 2 * 2.25e9) == pytest.approx(0.02 / np.sqrt(2) / 1500.0)
-    assert speed_limit(0.1, 4.0) == pytest.approx(COURANT * 0.1 / 4.0)
-    assert speed_limit(0.1, 0.0) == np.inf
+    assert speed_limit(0.1, 4.0, 0.0) == pytest.approx(COURANT * 0.1 / 4.0)
+    assert speed_limit(0.1, 0.0, 0.0) == np.inf
+    for speed in (0.0, 1e-9, 2.0):
+        dt = speed_limit(0.1, speed, 9.81)
+        assert speed * dt + 9.81 * dt**2 == pytest.approx(COURANT * 0.1)
     assert deformation_limit(5.0) == pytest.approx(DEFORMATION / 5.0)
     assert deformation_limit(0.0) == np.inf
 

@@ -209,9 +209,14 @@ class Walls:
     @ti.func
     def face_is(self, word: ti.template(), axis: ti.template(), upper: int):
         """Return whether the face of `axis` on that side has this word."""
-        low = ti.static(self.faces[axis][0] == word)
-        high = ti.static(self.faces[axis][1] == word)
-        return (upper == 0 and low) or (upper == 1 and high)
+        # In branches: Taichi takes a static flag as an operand of `and` for false inside some conditions.
+        result = False
+        if ti.static(self.faces[axis][0] == word):
+            result = upper == 0
+        if ti.static(self.faces[axis][1] == word):
+            if upper == 1:
+                result = True
+        return result
 
     @ti.func
     def flip(self, value: ti.template(), images: int, upper: ti.template()):

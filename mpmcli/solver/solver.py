@@ -209,7 +209,7 @@ class Solver:
         )
 
     def frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
-        """Yield the initial state and then one frame for each output time, with its ledger row.
+        """Yield the state as it is and then one frame for each output time to come, with its ledger row.
 
         The time left to the next frame is split into equal steps, so that frames land on their times.
 
@@ -220,6 +220,8 @@ class Solver:
         yield self.frame(0, [])
         for index in range(1, count + 1):
             target = self.scene.time.end * index / count
+            if target <= self.time:
+                continue
             taken: list[tuple[float, float, str]] = []
             while True:
                 largest, limit = self.stable_step()
