@@ -108,7 +108,8 @@ class FakeSolver:
     fault: BaseException | None = None
 
     def __init__(self, *_: object) -> None:
-        self.particle_count, self.step_count, self.first_step_seconds = 1, 0, 0.0
+        self.particle_count, self.step_count = 1, 0
+        self.first_step_seconds = self.frame_seconds = 0.0
         self.laws = ("fluid",)
 
     def frames(self):

@@ -7,6 +7,7 @@ import taichi as ti
 from pydantic import Field
 
 from mpmcli.materials.law import Law, StateBound
+from mpmcli.materials.tensors import determinant
 from mpmcli.scene.material import MaterialParameters
 
 
@@ -54,18 +55,21 @@ class NeoHookean(Law):
 
     def cauchy_stress(self, parameters: NeoHookeanParameters, deformation: np.ndarray) -> np.ndarray:
         count, dimension, _ = deformation.shape
-        full = np.tile(np.eye(3, dtype=deformation.dtype), (count, 1, 1))
-        full[:, :dimension, :dimension] = deformation
-        volume_ratio = np.linalg.det(full)[:, None, None]
-        identity = np.eye(3, dtype=deformation.dtype)
-        left_cauchy_green = full @ full.transpose(0, 2, 1)
-        kirchhoff = parameters.shear_modulus * (left_cauchy_green - identity)
-        return (kirchhoff + parameters.lame_lambda * np.log(volume_ratio) * identity) / volume_ratio
+        volume_ratio = determinant(deformation)[:, None]
+        pressure_part = parameters.lame_lambda * np.log(volume_ratio)
+        # Out of plane F is 1, so that b - I vanishes there.
+        stress = np.zeros((count, 3, 3), deformation.dtype)
+        stress[:, :dimension, :dimension] = np.einsum("nik,njk->nij", deformation, deformation)
+        diagonal = np.einsum("nii->ni", stress)
+        diagonal[:, :dimension] -= 1.0
+        stress *= parameters.shear_modulus
+        diagonal += pressure_part
+        return stress / volume_ratio[:, :, None]
 
     def energy_density(self, parameters: NeoHookeanParameters, deformation: np.ndarray) -> np.ndarray:
         """mu/2 (tr b - d) - mu ln J + lambda/2 (ln J)^2."""
         dimension = deformation.shape[1]
-        log_volume = np.log(np.linalg.det(deformation))
+        log_volume = np.log(determinant(deformation))
         trace = np.einsum("nij,nij->n", deformation, deformation)
         shear = 0.5 * parameters.shear_modulus * (trace - dimension - 2 * log_volume)
         return shear + 0.5 * parameters.lame_lambda * log_volume**2

@@ -169,7 +169,8 @@ def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda 
                 record.observe(row)
                 summary.frames, summary.steps = store.frames_written, solver.step_count
                 summary.first, summary.last = summary.first or row, row
-                clock.move(solver.first_step_seconds, "solve_s", "compile_s")
+                clock.book(solver.first_step_seconds, "compile_s")
+                clock.book(solver.frame_seconds, "output_s")
                 record.timings = summary.timings
                 record.write()
             watch(row, summary)
@@ -186,7 +187,7 @@ def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda 
             # An error of ours: the record must not claim that the run goes on.
             record.close("failed", "an internal error ended the run")
     summary.steps = solver.step_count
-    clock.move(solver.first_step_seconds, "solve_s", "compile_s")
+    clock.book(solver.first_step_seconds, "compile_s")
     with clock.adding("output_s"):
         # Until it is packed, the result is the directory with its sealed frames.
         summary.path = settings.directory
@@ -213,7 +214,7 @@ class _Clock:
         self._timings = timings
         self._began = began
         self._key = ""
-        self._moved = False
+        self._booked: dict[str, float] = {}
         timings.update(start_s=time.perf_counter() - began, compile_s=0.0, solve_s=0.0, output_s=0.0, wall_s=0.0)
 
     def adding(self, key: str) -> "_Clock":
@@ -229,12 +230,12 @@ class _Clock:
         self._timings[self._key] += now - self._since
         self._timings["wall_s"] = now - self._began
 
-    def move(self, seconds: float, source: str, target: str) -> None:
-        """Book the seconds of the first step under another entry, once they are known."""
-        if seconds > 0 and not self._moved:
-            self._moved = True
-            self._timings[source] -= seconds
-            self._timings[target] += seconds
+    def book(self, total: float, key: str) -> None:
+        """Move seconds that the solver spent so far on something else from solve_s to another entry."""
+        seconds = total - self._booked.get(key, 0.0)
+        self._booked[key] = total
+        self._timings["solve_s"] -= seconds
+        self._timings[key] += seconds
 
     def stop(self) -> None:
         """Set the total."""

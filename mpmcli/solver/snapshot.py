@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
+from mpmcli.materials.tensors import determinant
 from mpmcli.output.frame import Frame
 from mpmcli.solver.particles import ParticleGroup
 
@@ -26,10 +28,10 @@ class Snapshot:
     id: np.ndarray
     body: np.ndarray
 
-    @property
+    @cached_property
     def volume_ratio(self) -> np.ndarray:
         """J of each particle, (n,)."""
-        return self.deformation if self.deformation.ndim == 1 else np.linalg.det(self.deformation)
+        return self.deformation if self.deformation.ndim == 1 else determinant(self.deformation)
 
     def each_body(self) -> list[tuple[np.ndarray, int]]:
         """Return (rows, place in the group) of each body of the group."""

@@ -41,6 +41,7 @@ class Solver:
         particle_count: number of particles.
         laws: names of the laws, in the order of `Frame.material`.
         first_step_seconds: wall time of the first step, which compiles the kernels; 0 before it.
+        frame_seconds: wall time spent so far on building frames and ledger rows.
     """
 
     def __init__(self, scene: Scene, backend: Backend, particles: list[BodyParticles] | None = None) -> None:
@@ -50,6 +51,7 @@ class Solver:
         self.time = 0.0
         self.step_count = 0
         self.first_step_seconds = 0.0
+        self.frame_seconds = 0.0
         self.spacing = scene.domain.spacing
         self._gravity = np.array(scene.domain.gravity)
         self._pull = float(np.linalg.norm(self._gravity))
@@ -240,6 +242,7 @@ class Solver:
 
     def frame(self, index: int, taken: list[tuple[float, float, str]]) -> tuple[Frame, LedgerRow]:
         """Return the state as a frame, and the ledger row for the steps (size, Courant number, limit) taken."""
+        began = time.perf_counter()
         snapshots = [read_group(group) for group in self.groups]
         frame = build_frame(snapshots, self.scene.output.fields, self._origin, index, self.time, self.step_count)
         sums = measure(snapshots, self._gravity, self.spacing)
@@ -253,4 +256,5 @@ class Solver:
             courant_max=max((courant for _, courant, _ in taken), default=0.0),
             **vars(sums),
         )
+        self.frame_seconds += time.perf_counter() - began
         return frame, row
