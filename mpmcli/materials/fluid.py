@@ -33,15 +33,17 @@ class FluidParameters(MaterialParameters):
         """Replace "auto" by K = density v^2 / compressibility, with v the highest speed of the scene.
 
         Weakly compressible flow varies in density by v^2/c^2 (Monaghan 1994); a column that is let
-        go uncompressed presses with up to 2 density g H = density v^2 (verification: 6.1), the same bound.
+        go uncompressed presses with up to 2 density g H = density v^2, the same bound. Where fluid hits
+        fluid or a wall head on, the pressure is density c v for a moment (water hammer), and so v/c.
         """
         if self.bulk_modulus != "auto":
             return self, []
         speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
         modulus = self.density * speed**2 / self.compressibility
         note = (
-            f"bulk_modulus = {modulus:.4g} Pa (sound speed {np.sqrt(modulus / self.density):.4g} m/s) keeps the "
-            f"density within {100 * self.compressibility:.3g} % at the highest speed, {speed:.4g} m/s"
+            f"bulk_modulus = {modulus:.4g} Pa (sound speed {np.sqrt(modulus / self.density):.4g} m/s) lets the density "
+            f"of smooth flow vary by {100 * self.compressibility:.3g} % at the highest speed, {speed:.4g} m/s; "
+            f"a hard impact at that speed reaches {100 * np.sqrt(self.compressibility):.3g} %"
         )
         return self.model_copy(update={"bulk_modulus": modulus}), [note]
 
