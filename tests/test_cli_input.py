@@ -1,5 +1,6 @@
 """Bad input to the real command: exit code 2, one clear sentence on stderr, and nothing written."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -143,17 +144,25 @@ def test_no_command_at_all_shows_the_help():
     assert "simulate" in outcome.stderr
 
 
-@pytest.mark.parametrize("command", ["simulate", "info"])
-def test_too_many_particles_are_refused_before_any_is_made(refused, monkeypatch, command):
+# (0.5 m / 1e-6 m)^2 cells of 4 particles each.
+HUGE = SCENE.replace("cells = [16, 16]", "spacing = 1e-6")
+
+
+def test_too_many_particles_are_refused_before_any_is_made(refused, monkeypatch):
     def unreachable(*_: object) -> None:
         raise AssertionError("particles were made")
 
-    monkeypatch.setattr("mpmcli.solver.run.sample_bodies", unreachable)
     monkeypatch.setattr("mpmcli.solver.run.Solver", unreachable)
-    # (0.5 m / 1e-6 m)^2 cells of 4 particles each.
-    said = refused(command, "scene.toml", scene=SCENE.replace("cells = [16, 16]", "spacing = 1e-6"))
+    said = refused("simulate", "scene.toml", scene=HUGE)
     assert said.startswith("the scene needs 1e+12 particles and 1e+12 grid nodes, 2")
     assert " TB of memory, and " in said and said.endswith("fewer particles_per_cell needs less.")
+
+
+def test_info_describes_even_a_scene_that_is_too_large(tmp_path):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(HUGE, encoding="utf-8")
+    outcome = run_here("info", scene, "--json")
+    assert outcome.status == 0 and json.loads(outcome.stdout)["particles"] == pytest.approx(1e12)
 
 
 # Root may write everywhere but below a file and in /proc.

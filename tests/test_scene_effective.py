@@ -115,7 +115,7 @@ walls = { default = "separate" }
 end = 1.5
 frames = 150
 step = "auto"
-safety = 0.9
+safety = 0.8
 
 [[bodies]]
 name = "column"

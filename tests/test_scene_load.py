@@ -63,7 +63,7 @@ def test_a_good_scene_is_complete(load):
     assert scene.domain.origin == (0.0, 0.0)
     assert scene.domain.cells == (200, 100)
     assert scene.domain.walls.faces(2) == (("separate", "separate"), ("separate", "separate"))
-    assert scene.time.step == "auto" and scene.time.safety == 0.9
+    assert scene.time.step == "auto" and scene.time.safety == 0.8
     assert [body.particles_per_cell for body in scene.bodies] == [4, 4]
     assert scene.bodies[1].velocity == (0.0, 0.0)
     assert scene.bodies[1].material.density == 1100.0

@@ -2,13 +2,19 @@
 
 import json
 import math
-
-import click
+import os
+import sys
 
 
 def print_json(content: object) -> None:
     """Print one JSON document on stdout; what is not finite becomes null, as JSON has no infinity."""
-    click.echo(json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False))
+    text = json.dumps(_finite(content), indent=2, ensure_ascii=False, allow_nan=False)
+    try:
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader went away, which is its right; what is still buffered must not fail at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _finite(value: object) -> object:

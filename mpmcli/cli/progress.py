@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import Any
 
@@ -90,7 +91,8 @@ class Progress:
     def close(self, summary: RunSummary) -> None:
         """Say how the run went and where its result is; why it ended early even when quiet."""
         if summary.message:
-            click.echo(f"error: {summary.message}", err=True)
+            with suppress(OSError):
+                click.echo(f"error: {summary.message}", err=True)
         timings = summary.timings
         rate = f", {summary.rate / 1e6:.1f} M particle-steps/s" if summary.rate else ""
         self._say(
@@ -124,4 +126,8 @@ class Progress:
         if not self._quiet:
             # A terminal gets its lines broken between words, but a path that can be copied.
             whole = whole or not self._console.is_terminal
-            self._console.print(line, markup=False, highlight=False, soft_wrap=whole)
+            try:
+                self._console.print(line, markup=False, highlight=False, soft_wrap=whole)
+            except (OSError, SystemExit):
+                # Nobody reads along any more (rich exits on a broken pipe): no reason to end the run.
+                self._quiet = True

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from mpmcli.materials.law import Law, StateBound
 from mpmcli.scene.material import MaterialParameters, SceneBounds
+from mpmcli.scene.quantity import LARGEST, Positive
 
 # The speed that "auto" assumes where nothing in the scene moves or falls, m/s.
 QUIET_SPEED = 1.0
@@ -18,7 +19,7 @@ class FluidParameters(MaterialParameters):
 
     law: Literal["fluid"] = "fluid"
     bulk_modulus: Annotated[
-        Annotated[float, Field(gt=0)] | Literal["auto"],
+        Positive | Literal["auto"],
         Field(
             description='Bulk modulus K = density c^2, Pa; "auto" picks the softest that keeps the density '
             "variation under `compressibility` at the highest speed the scene can reach."
@@ -39,7 +40,7 @@ class FluidParameters(MaterialParameters):
         if self.bulk_modulus != "auto":
             return self, []
         speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
-        modulus = self.density * speed**2 / self.compressibility
+        modulus = min(max(self.density * speed**2 / self.compressibility, 1 / LARGEST), LARGEST)
         note = (
             f"bulk_modulus = {modulus:.4g} Pa (sound speed {np.sqrt(modulus / self.density):.4g} m/s) lets the density "
             f"of smooth flow vary by {100 * self.compressibility:.3g} % at the highest speed, {speed:.4g} m/s; "

@@ -9,13 +9,14 @@ from pydantic import Field
 from mpmcli.materials.law import Law, StateBound
 from mpmcli.materials.tensors import determinant
 from mpmcli.scene.material import MaterialParameters
+from mpmcli.scene.quantity import Positive
 
 
 class NeoHookeanParameters(MaterialParameters):
     """Parameters of the neo-Hookean solid."""
 
     law: Literal["neo_hookean"] = "neo_hookean"
-    youngs_modulus: Annotated[float, Field(gt=0, description="Young's modulus E, Pa.")]
+    youngs_modulus: Annotated[Positive, Field(description="Young's modulus E, Pa.")]
     poissons_ratio: Annotated[
         float, Field(gt=-1, lt=0.5, description="Poisson's ratio, between -1 and 0.5, both excluded.")
     ] = 0.3

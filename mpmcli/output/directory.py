@@ -44,6 +44,13 @@ def check_directory(directory: Path, overwrite: bool) -> None:
         InputError: as `prepare_directory`.
     """
     directory = Path(directory)
+    try:
+        directory.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"{directory} cannot be made ({reason}): give another place with -o.") from error
     if directory.is_dir():
         _refuse_unwritable(directory)
         if not overwrite and any(directory.iterdir()):

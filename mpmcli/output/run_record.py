@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mpmcli import __version__
+from mpmcli.errors import RunError
 from mpmcli.output.durable import write_text
 from mpmcli.stability.ledger import LedgerRow
 
@@ -85,13 +86,21 @@ class RunRecord:
         self.write()
 
     def write(self) -> None:
-        """Replace run.json by the present state, in one durable step."""
+        """Replace run.json by the present state, in one durable step.
+
+        Raises:
+            RunError: the disk is full or refuses.
+        """
         content = asdict(self)
         del content["directory"]
         content["command"] = [Path(word).name if i == 0 else word for i, word in enumerate(self.command)]
         content = {"program": PROGRAM, "version": __version__, **content, "host": host_facts()}
         text = json.dumps(_plain(content), indent=2, ensure_ascii=False)
-        write_text(Path(self.directory) / RECORD, text + "\n")
+        try:
+            write_text(Path(self.directory) / RECORD, text + "\n")
+        except OSError as error:
+            reason = error.strerror or error
+            raise RunError(f"{RECORD} could not be written to {self.directory} ({reason}).") from error
 
 
 def host_facts() -> dict[str, Any]:

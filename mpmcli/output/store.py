@@ -114,7 +114,9 @@ class SegmentStore:
             return None
         packed = self._directory / PACKED
         pack_segments(segments, packed, compress=self._compress)
-        remove_segments(self._directory)
+        # The result is complete; a segment that somebody holds open may stay beside it.
+        with suppress(OSError):
+            remove_segments(self._directory)
         return packed
 
     def _start(self, folder: Path) -> None:

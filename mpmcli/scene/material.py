@@ -5,6 +5,8 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from mpmcli.scene.quantity import Positive
+
 
 @dataclass(frozen=True)
 class SceneBounds:
@@ -35,7 +37,7 @@ class MaterialParameters(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
     law: Annotated[str, Field(description="Name of the constitutive law.")]
-    density: Annotated[float, Field(gt=0, description="Density at rest, kg/m^3.")]
+    density: Annotated[Positive, Field(description="Density at rest, kg/m^3.")]
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
         """Return these parameters with every "auto" replaced, and a sentence for each choice."""

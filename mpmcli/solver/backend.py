@@ -5,7 +5,9 @@ import io
 import multiprocessing
 import os
 import platform
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import taichi as ti
@@ -14,6 +16,9 @@ from mpmcli.errors import InputError
 
 Arch = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
 ARCHES: tuple[str, ...] = ("auto", "cpu", "cuda", "vulkan", "metal")
+
+# That many threads may be asked for anywhere; more than twice the cores gains nothing.
+FEW_THREADS = 64
 
 _started: "Backend | None" = None
 
@@ -56,13 +61,14 @@ def start_backend(
         raise InputError(f'--arch "{arch}" is not a backend; use one of {", ".join(ARCHES)}.')
     if precision not in ("f32", "f64"):
         raise InputError(f'precision "{precision}" is not known; use f32 or f64.')
-    wanted = _available() if arch == "auto" else arch
+    wanted = _best(precision) if arch == "auto" else arch
     if wanted in ("vulkan", "metal") and precision == "f64":
         raise InputError(f"precision f64 is not available on {wanted}; use --arch cpu or cuda, or f32.")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else multiprocessing.cpu_count()
     count = (threads or cores) if wanted == "cpu" else 1
-    if count < 1:
-        raise InputError(f"--threads {count} is not possible; give 1 or more.")
+    most = max(FEW_THREADS, 2 * cores)
+    if not 1 <= count <= most:
+        raise InputError(f"--threads {count} is not possible; give 1 to {most}, best {cores} on this machine.")
     backend = Backend(wanted, count, precision, compile_cache)
     if _started is not None:
         if _started != backend:
@@ -83,9 +89,21 @@ def stop_backend() -> None:
     _started = None
 
 
-def _available() -> str:
-    """Name the fastest backend that this machine has."""
-    if platform.system() == "Darwin":
+def _settle_cache() -> None:
+    """Give Taichi a cache that it can write: it crashes at its end where it has none."""
+    os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError:
+        os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="mpmcli-cache-")
+
+
+def _best(precision: str) -> str:
+    """Name the fastest backend that this machine has for this precision."""
+    if platform.system() == "Darwin" and precision == "f32" and _has("metal"):
         return "metal"
     return "cuda" if _has("cuda") else "cpu"
 
@@ -105,14 +123,15 @@ def _initialise(backend: Backend) -> None:
     arch = getattr(ti, backend.arch)
     # Taichi lets this variable override what it is asked for, and announces its start on standard output.
     os.environ.pop("TI_ARCH", None)
+    _settle_cache()
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
             arch=arch,
             default_fp=ti.f64 if backend.precision == "f64" else ti.f32,
             cpu_max_num_threads=backend.threads,
             offline_cache=backend.compile_cache,
-            # On the CPU strict arithmetic is as fast, and a NaN stays a NaN in every comparison.
-            fast_math=not backend.on_cpu,
+            # Strict arithmetic is as fast on the CPU, and a NaN stays a NaN in every comparison.
+            fast_math=False,
             log_level=ti.ERROR,
         )
     came = ti.lang.impl.current_cfg().arch

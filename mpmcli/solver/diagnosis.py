@@ -17,7 +17,7 @@ class Diagnosis:
     Attributes:
         step: number of the step after which it was seen; time: s.
         particle: row of the particle in every frame; body: its name; position: last one inside the domain, m.
-        cause: what happened to it.
+        cause: what happened to it; suggestion: what may help.
         limit: name of the bound on the step that was nearest; step_size: of that step, s.
     """
 
@@ -49,6 +49,23 @@ class UnstableRunError(RunError):
         self.diagnosis = diagnosis
 
 
+# What can happen to a particle, and what may help.
+NOT_FINITE = "has a state that is not finite"
+INVERTED = "was turned inside out"
+CRUSHED = "was crushed to nothing"
+LEFT = "left the domain"
+OUTRAN = "outran the nodes prepared for it"
+STIFFER = "a stiffer material, a finer domain.spacing or a lower time.safety may keep it from that"
+SUGGESTIONS = {
+    NOT_FINITE: "lower time.safety, or look for a number in the scene that is far from what you mean",
+    INVERTED: STIFFER,
+    CRUSHED: STIFFER,
+    LEFT: "check the speeds and forces of the scene, or lower time.safety or time.step",
+    OUTRAN: "lower time.step, so that speeds are measured more often",
+}
+OTHERWISE = "check the speeds, forces and materials of the scene"
+
+
 def first_unsound(snapshot: Snapshot) -> int | None:
     """Return the first particle (in solver order) that is crushed, inverted or not finite, None where all are sound."""
     sound = snapshot.volume_ratio > SMALLEST_J
@@ -64,17 +81,21 @@ def rate_of_change(snapshot: Snapshot, spacing: float) -> np.ndarray:
     return speed / spacing + np.abs(snapshot.C.astype(np.float64)).sum((1, 2))
 
 
-def cause_of(snapshot: Snapshot, p: int) -> str:
-    """Say what happened to particle p (in solver order), read off its state."""
+def cause_of(snapshot: Snapshot, p: int, dt: float, size: tuple[float, ...]) -> str:
+    """Say what happened to particle p (in solver order) in a step of dt (s) in a domain of this size, m."""
     values = (snapshot.x[p], snapshot.v[p], snapshot.C[p], snapshot.deformation[p])
     if not all(np.isfinite(value).all() for value in values):
-        return "has a state that is not finite"
+        return NOT_FINITE
     J = float(snapshot.volume_ratio[p])
     if not J > 0:
-        return f"was turned inside out (J = {J:.3g})"
+        return f"{INVERTED} (J = {J:.3g})"
     if J <= SMALLEST_J:
-        return f"was crushed to nothing (J = {J:.3g})"
-    return f"left the domain at {float(np.linalg.norm(snapshot.v[p])):.4g} m/s"
+        return f"{CRUSHED} (J = {J:.3g})"
+    speed = float(np.linalg.norm(snapshot.v[p].astype(np.float64)))
+    going = snapshot.x[p].astype(np.float64) + dt * snapshot.v[p]
+    if (going < 0).any() or (going > np.array(size)).any():
+        return f"{LEFT} at {speed:.4g} m/s"
+    return f"{OUTRAN} at {speed:.4g} m/s"
 
 
 def diagnose(
@@ -98,5 +119,5 @@ def diagnose(
         cause,
         limit.name,
         step_size,
-        "lower time.safety or time.step, or check that its material and speed are what you mean",
+        next((advice for start, advice in SUGGESTIONS.items() if cause.startswith(start)), OTHERWISE),
     )

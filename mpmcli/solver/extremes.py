@@ -7,7 +7,7 @@ import taichi as ti
 
 from mpmcli.materials.law import StateBound
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.ordering import CHUNK
+from mpmcli.solver.ordering import CHUNK, share_start
 from mpmcli.solver.particles import ParticleGroup
 
 SPEED_SQUARED, GRADIENT, J_MIN, J_MAX, STRETCH_SQUARED = range(5)
@@ -107,7 +107,8 @@ def build_extremes(groups: Sequence[ParticleGroup], backend: Backend) -> Callabl
                     if q % CHUNK == 0:
                         own = nothing()
                         t = q // CHUNK
-                        for p in range(group.count * t // backend.threads, group.count * (t + 1) // backend.threads):
+                        first = share_start(group.count, t, backend.threads)
+                        for p in range(first, share_start(group.count, t + 1, backend.threads)):
                             widen(own, group, p)
                         merge(own, g)
                 else:

@@ -1,5 +1,7 @@
 """The background grid: nodes of mass and momentum, and the box of them that is in use."""
 
+import math
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -8,9 +10,10 @@ import taichi as ti
 # Nodes beyond each wall: ghost nodes that the wall folds, and the reach of the kernel.
 PAD = 3
 # Edge of a tile, cells: same-coloured tiles write disjoint nodes as long as no particle has drifted
-# more than one cell out of the tile that it was sorted into (4 + 4 cells apart, 3 + 1 + 1 nodes reach).
+# more than one cell out of the tile that it was sorted into (4 + 4 cells apart, 3 + 1 + 1 nodes reach). A little less
+# leaves room for the rounding of positions.
 TILE = 4
-DRIFT = 1.0
+DRIFT = 0.98
 
 
 def node_width(dimension: int, *, on_cpu: bool) -> int:
@@ -42,7 +45,7 @@ class Grid:
         self.width = width
         self.spacing = spacing
         self.cells = tuple(cells)
-        self.tiles = tuple(-(-(n + 1 + 2 * PAD) // TILE) for n in cells)
+        self.tiles = self.tile_counts(cells)
         self.shape = tuple(TILE * n for n in self.tiles)
         self.strides = tuple(int(np.prod(self.shape[a + 1 :])) for a in range(dimension))
         self.lines = tuple(
@@ -54,12 +57,14 @@ class Grid:
         self.box = ti.field(int, shape=(2, dimension))
 
     @staticmethod
-    def bytes_needed(cells: tuple[int, ...], width: int, real_bytes: int) -> int:
-        """Return the bytes that the nodes of such a grid take."""
-        count = 1
-        for n in cells:
-            count *= TILE * (-(-(n + 1 + 2 * PAD) // TILE))
-        return count * width * real_bytes
+    def tile_counts(cells: Sequence[int]) -> tuple[int, ...]:
+        """Return the tiles per axis of a grid over so many cells."""
+        return tuple(-(-(n + 1 + 2 * PAD) // TILE) for n in cells)
+
+    @staticmethod
+    def nodes_needed(cells: Sequence[int]) -> int:
+        """Return the number of nodes of such a grid."""
+        return math.prod(TILE * n for n in Grid.tile_counts(cells))
 
     @ti.func
     def first_node(self, base: ti.template()):

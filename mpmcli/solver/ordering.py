@@ -19,6 +19,12 @@ CHUNK = 512
 SPAN = 256
 
 
+@ti.func
+def share_start(count: int, t: int, threads: int):
+    """Return where the t-th of about equal shares of `count` things begins; count * t would overflow."""
+    return count // threads * t + ti.min(t, count % threads)
+
+
 def entry_count(field: ti.Field) -> int:
     """Return the numbers that one particle has in a field."""
     return field.n * field.m if hasattr(field, "n") else 1
@@ -69,10 +75,10 @@ class TileOrder:
         self.work = ti.field(int, shape=(self.colours, threads + 1))
 
     @staticmethod
-    def bytes_needed(grid_tiles: Sequence[int], threads: int) -> int:
+    def bytes_needed(cells: Sequence[int], threads: int) -> int:
         """Return the bytes that the tables of one group take."""
         tiles = 1
-        for n in grid_tiles:
+        for n in Grid.tile_counts(cells):
             tiles *= n
         return 4 * tiles * (threads + 1)
 
@@ -130,7 +136,7 @@ def build_sort(order: TileOrder) -> Callable[[], None]:
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
                 t = q // CHUNK
-                for p in range(n * t // threads, n * (t + 1) // threads):
+                for p in range(share_start(n, t, threads), share_start(n, t + 1, threads)):
                     order.cursor[key[p], t] = order.cursor[key[p], t] + 1
 
     @ti.kernel
@@ -171,7 +177,7 @@ def build_sort(order: TileOrder) -> Callable[[], None]:
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
                 t = q // CHUNK
-                for p in range(n * t // threads, n * (t + 1) // threads):
+                for p in range(share_start(n, t, threads), share_start(n, t + 1, threads)):
                     place = order.cursor[key[p], t]
                     source[place] = p
                     order.cursor[key[p], t] = place + 1
@@ -224,7 +230,7 @@ def build_sort(order: TileOrder) -> Callable[[], None]:
                     first = order.pencil_start(colour, q)
                     size = order.start[first + order.pencil] - order.start[first]
                     # The boundary falls where more than half of the pencil lies beyond the share.
-                    while thread < threads and (2 * done + size) * threads > 2 * total * thread:
+                    while thread < threads and done + size // 2 >= share_start(total, thread, threads):
                         order.work[colour, thread] = q
                         thread += 1
                     done += size

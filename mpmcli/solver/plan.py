@@ -1,5 +1,6 @@
 """What a scene will take, known before anything is allocated."""
 
+from collections import Counter
 from dataclasses import dataclass
 
 import psutil
@@ -8,10 +9,12 @@ from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
 from mpmcli.scene import Scene, estimate_particles
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.grid import PAD, TILE, Grid, node_width
+from mpmcli.solver.grid import Grid, node_width
+from mpmcli.solver.ordering import TileOrder
 
-# Taichi counts particles and nodes with 32-bit integers.
-MOST_PARTICLES = 2**31 - 1
+# Taichi addresses fields with 32-bit integers, and a particle has at most 3 x 4 numbers in one field.
+LARGEST_INDEX = 2**31 - 1
+WIDEST_FIELD = 12
 # Share of the free memory that a run may plan for.
 MEMORY_SHARE = 0.8
 
@@ -22,6 +25,7 @@ class Plan:
 
     Attributes:
         particles: number of particles (an estimate for curved shapes before sampling).
+        nodes: number of grid nodes.
         bytes_per_particle: of the device, sort buffers included; the largest over the laws.
         bytes_per_node: of the grid.
         grid_bytes: of all nodes and the tables of the sort.
@@ -29,6 +33,7 @@ class Plan:
     """
 
     particles: int
+    nodes: int
     bytes_per_particle: int
     bytes_per_node: int
     grid_bytes: int
@@ -45,43 +50,45 @@ def bytes_per_particle(deformation: str, dimension: int, backend: Backend, *, se
     real = 8 if backend.precision == "f64" else 4
     width = node_width(dimension, on_cpu=True) if backend.on_cpu else dimension
     gradient = dimension * width
-    state = dimension + width + gradient + (1 if deformation == "J" else dimension**2)
+    state = dimension + width + gradient + (1 if deformation == "J" else dimension * width)
     labels = 2 if several_bodies else 1
     return (state + gradient) * real + 4 * labels + 8
 
 
 def make_plan(scene: Scene, backend: Backend) -> Plan:
-    """Return the memory that a scene needs.
-
-    Raises:
-        InputError: it is more than this machine has free.
-    """
+    """Return the memory that a scene needs."""
     dimension = scene.dimension
+    cells = scene.domain.cells
     real = 8 if backend.precision == "f64" else 4
     width = node_width(dimension, on_cpu=backend.on_cpu)
     particles = estimate_particles(scene)
-    by_law: dict[str, int] = {}
-    for body in scene.bodies:
-        by_law[body.material.law] = by_law.get(body.material.law, 0) + 1
+    by_law = Counter(body.material.law for body in scene.bodies)
     per_particle = max(
         bytes_per_particle(laws()[law].deformation, dimension, backend, several_bodies=count > 1)
         for law, count in by_law.items()
     )
-    tiles = 1
-    for n in scene.domain.cells:
-        tiles *= -(-(n + 1 + 2 * PAD) // TILE)
-    grid_bytes = Grid.bytes_needed(scene.domain.cells, width, real) + 4 * tiles * (backend.threads + 1) * len(by_law)
-    state_bytes = 8 * (2 * dimension + dimension**2)
-    plan = Plan(particles, per_particle, real * width, grid_bytes, particles * 2 * state_bytes)
+    nodes = Grid.nodes_needed(cells)
+    tables = len(by_law) * TileOrder.bytes_needed(cells, backend.threads)
+    # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
+    host_bytes = 2 * particles * 8 * (2 * dimension + dimension**2)
+    return Plan(particles, nodes, per_particle, real * width, nodes * real * width + tables, host_bytes)
+
+
+def require_room(plan: Plan) -> None:
+    """Refuse a plan that cannot be carried out.
+
+    Raises:
+        InputError: it takes more memory than this machine has free, or more than 32-bit indices reach.
+    """
     total = plan.device_bytes + plan.host_bytes
-    free = psutil.virtual_memory().available
-    if total > MEMORY_SHARE * free or particles > MOST_PARTICLES:
-        raise InputError(
-            f"the scene needs {particles:.3g} particles and {tiles * TILE**dimension:.3g} grid nodes, "
-            f"{_size(total)} of memory, and {_size(MEMORY_SHARE * free)} may be used here; a larger domain.spacing "
-            "or fewer particles_per_cell needs less."
-        )
-    return plan
+    free = MEMORY_SHARE * psutil.virtual_memory().available
+    need = f"the scene needs {plan.particles:.3g} particles and {plan.nodes:.3g} grid nodes"
+    cure = "a larger domain.spacing or fewer particles_per_cell needs less"
+    if total > free:
+        raise InputError(f"{need}, {_size(total)} of memory, and {_size(free)} may be used here; {cure}.")
+    # The widest field of the sort is addressed by one index.
+    if max(plan.nodes, plan.particles * WIDEST_FIELD) > LARGEST_INDEX:
+        raise InputError(f"{need}, more than 32-bit indices can address; {cure}.")
 
 
 def _size(count: float) -> str:

@@ -10,10 +10,10 @@ from mpmcli import __version__
 from mpmcli.errors import MpmcliError, RunError
 from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, check_directory, prepare_directory
 from mpmcli.output.durable import write_text
-from mpmcli.scene import LoadedScene, sample_bodies, scene_to_toml
+from mpmcli.scene import LoadedScene, scene_to_toml
 from mpmcli.solver.backend import Arch, start_backend
 from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.plan import Plan, make_plan
+from mpmcli.solver.plan import Plan, make_plan, require_room
 from mpmcli.solver.solver import Solver
 from mpmcli.stability.ledger import LedgerRow
 
@@ -121,14 +121,14 @@ def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda 
         settings.arch, settings.threads, scene.solver.precision, compile_cache=settings.compile_cache
     )
     plan = make_plan(scene, backend)
-    particles = sample_bodies(scene)
+    require_room(plan)
+    solver = Solver(scene, backend)
+    # Last, since it removes an earlier result.
     prepare_directory(settings.directory, settings.overwrite)
-    solver = Solver(scene, backend, particles)
 
     facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
     summary = RunSummary(settings.directory, solver.particle_count, facts, loaded.notes, plan)
     text = scene_to_toml(scene)
-    write_text(settings.directory / SCENE, text)
     record = RunRecord(
         settings.directory,
         command=settings.command,
@@ -138,6 +138,10 @@ def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda 
         particles=solver.particle_count,
         notes=loaded.notes,
     )
+    try:
+        write_text(settings.directory / SCENE, text)
+    except OSError as error:
+        raise RunError(f"{settings.directory / SCENE} could not be written ({error.strerror or error}).") from error
     record.write()
     header = {
         "version": __version__,
@@ -200,7 +204,8 @@ def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda 
             )
         except RunError as error:
             if summary.status == "finished":
-                summary.status, summary.message = "failed", str(error)
+                summary.status = "failed"
+            summary.message = f"{summary.message} {error}".strip()
     clock.stop()
     record.timings = summary.timings
     record.close(summary.status, summary.message, **facts_of_failure)

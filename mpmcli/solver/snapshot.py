@@ -8,7 +8,7 @@ import numpy as np
 
 from mpmcli.materials.tensors import determinant
 from mpmcli.output.frame import Frame
-from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.particles import MASS, VOLUME, ParticleGroup
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,7 @@ class Snapshot:
     def per_body(self, column: int) -> np.ndarray:
         """Return an entry of the group's table for every particle, (n,) float64."""
         table = self.group.table.to_numpy()[:, column].astype(np.float64)
-        values = np.empty(len(self.id))
-        for rows, place in self.each_body():
-            values[rows] = table[place]
-        return values
+        return table[np.searchsorted(self.group.bodies, self.body)]
 
 
 def read_group(group: ParticleGroup) -> Snapshot:
@@ -81,9 +78,9 @@ def _field(name: str, snapshot: Snapshot) -> np.ndarray:
     if name == "volume_ratio":
         return snapshot.volume_ratio
     if name == "density":
-        return snapshot.per_body(0) / snapshot.per_body(1) / snapshot.volume_ratio
+        return snapshot.per_body(MASS) / snapshot.per_body(VOLUME) / snapshot.volume_ratio
     if name == "mass":
-        return snapshot.per_body(0)
+        return snapshot.per_body(MASS)
     if name == "affine":
         return snapshot.C.reshape(group.count, -1)
     if name == "deformation_gradient":
@@ -100,11 +97,12 @@ def build_frame(
     snapshots: Sequence[Snapshot],
     fields: Sequence[str],
     origin: np.ndarray,
+    position_type: type,
     index: int,
     time: float,
     step: int,
 ) -> Frame:
-    """Put the groups together, each particle in the row of its id."""
+    """Put the groups together, each particle in the row of its id; `position_type` is numpy's of the positions."""
     ids = np.concatenate([s.id for s in snapshots])
 
     def ordered(parts: Sequence[np.ndarray]) -> np.ndarray:
@@ -118,7 +116,7 @@ def build_frame(
         index=index,
         time=time,
         step=step,
-        position=ordered([(s.x.astype(np.float64) + origin).astype(real) for s in snapshots]),
+        position=ordered([(s.x.astype(np.float64) + origin).astype(position_type) for s in snapshots]),
         velocity=ordered([s.v for s in snapshots]),
         body=ordered([s.body for s in snapshots]),
         material=ordered([np.full(len(s.id), m, np.int32) for m, s in enumerate(snapshots)]),
@@ -128,30 +126,19 @@ def build_frame(
     )
 
 
-@dataclass(frozen=True)
-class Sums:
-    """Conserved quantities of all particles, in float64 (see `LedgerRow`)."""
+def measure(snapshots: Sequence[Snapshot], gravity: np.ndarray, spacing: float) -> dict[str, float | tuple[float, ...]]:
+    """Sum what a run conserves; the affine velocity carries energy and angular momentum too (Jiang et al. 2017).
 
-    mass: float
-    kinetic: float
-    elastic: float
-    potential: float
-    linear_momentum: tuple[float, ...]
-    angular_momentum: tuple[float, ...]
-    speed_max: float
-    volume_ratio_min: float
-    volume_ratio_max: float
-
-
-def measure(snapshots: Sequence[Snapshot], gravity: np.ndarray, spacing: float) -> Sums:
-    """Sum what a run conserves; the affine velocity carries energy and angular momentum too (Jiang et al. 2017)."""
+    Returns:
+        The entries of a `LedgerRow` that belong to the state alone, by name, summed in float64.
+    """
     d = len(gravity)
     mass = kinetic = elastic = potential = 0.0
     linear = np.zeros(d)
     angular = np.zeros(1 if d == 2 else 3)
     inertia = 0.25 * spacing**2
     for s in snapshots:
-        m = s.per_body(0)
+        m, V0 = s.per_body(MASS), s.per_body(VOLUME)
         x, v, C = (a.astype(np.float64) for a in (s.x, s.v, s.C))
         mass += m.sum()
         kinetic += 0.5 * (m @ (v * v).sum(1)) + 0.5 * inertia * (m @ (C * C).sum((1, 2)))
@@ -164,16 +151,16 @@ def measure(snapshots: Sequence[Snapshot], gravity: np.ndarray, spacing: float) 
             angular[k] += inertia * (m @ (C[:, b, a] - C[:, a, b]))
         for rows, place in s.each_body():
             density = s.group.law.energy_density(s.group.parameters[place], s.deformation[rows].astype(np.float64))
-            elastic += s.per_body(1)[rows] @ density
+            elastic += V0[rows] @ density
     J = [s.volume_ratio for s in snapshots]
-    return Sums(
-        float(mass),
-        float(kinetic),
-        float(elastic),
-        float(potential),
-        tuple(linear.tolist()),
-        tuple(angular.tolist()),
-        float(np.sqrt(max(float((s.v * s.v).sum(1).max()) for s in snapshots))),
-        float(min(j.min() for j in J)),
-        float(max(j.max() for j in J)),
-    )
+    return {
+        "mass": float(mass),
+        "kinetic": float(kinetic),
+        "elastic": float(elastic),
+        "potential": float(potential),
+        "linear_momentum": tuple(linear.tolist()),
+        "angular_momentum": tuple(angular.tolist()),
+        "speed_max": float(np.sqrt(max(float((s.v * s.v).sum(1).max()) for s in snapshots))),
+        "volume_ratio_min": float(min(j.min() for j in J)),
+        "volume_ratio_max": float(max(j.max() for j in J)),
+    }

@@ -22,10 +22,12 @@ from mpmcli.solver.step import NOT_LOST, SMALLEST_J, build_step
 from mpmcli.stability.ledger import LedgerRow
 from mpmcli.stability.limits import Limit, deformation_limit, speed_limit, wave_limit
 
-# The state is measured, and the limits with it, once in so many steps at most, and more often where it may
-# deform by more than this fraction in between; the margin of time.safety covers that.
+# The state is measured, and the limits with it, once in so many steps at most, and earlier where something may have
+# deformed by more than this fraction since; the margin of time.safety covers that.
 MOST_UNWATCHED_STEPS = 16
 UNWATCHED_CHANGE = 0.1
+# Largest rounding of a stored position, in cells.
+POSITION_ERROR = 1e-3
 # Cells that a particle of a GPU run may move in a step beyond what was expected.
 UNSEEN = 0.05
 # A stable step this much smaller than the first one will not recover: the run stops instead of crawling on.
@@ -41,6 +43,8 @@ class Solver:
         particle_count: number of particles.
         laws: names of the laws, in the order of `Frame.material`.
         first_step_seconds: wall time of the first step, which compiles the kernels; 0 before it.
+        courant: largest displacement in the last step, cells: that of the fastest node, which no particle
+            exceeds; on a GPU an estimate from the last measurement and gravity.
         frame_seconds: wall time spent so far on building frames and ledger rows.
     """
 
@@ -52,10 +56,16 @@ class Solver:
         self.step_count = 0
         self.first_step_seconds = 0.0
         self.frame_seconds = 0.0
+        self.courant = 0.0
         self.spacing = scene.domain.spacing
         self._gravity = np.array(scene.domain.gravity)
         self._pull = float(np.linalg.norm(self._gravity))
         self._origin = np.array(scene.domain.origin)
+        # Far from zero single precision cannot tell neighbours apart, though the solver, which counts from the
+        # origin of the domain, can.
+        farthest = float(np.abs([self._origin, scene.domain.upper]).max())
+        coarse = farthest * np.finfo(np.float32).eps > POSITION_ERROR * self.spacing
+        self._position_type = np.float64 if coarse or backend.precision == "f64" else np.float32
         self._names = tuple(body.name for body in scene.bodies)
 
         particles = particles or sample_bodies(scene)
@@ -93,7 +103,7 @@ class Solver:
             orders,
             self._gravity.tolist(),
             on_cpu=backend.on_cpu,
-            drift=int(self._drift_allowed),
+            drift=math.ceil(self._drift_allowed),
         )
         self._measure = build_extremes(self.groups, backend)
         self._drift = math.inf
@@ -103,6 +113,7 @@ class Solver:
 
     def _use_extremes(self) -> None:
         self._unwatched = 0
+        self._change = 0.0
         self._speed = max(extremes.speed for extremes in self._extremes)
         self._slow_limit = min(self._slow_limits())
 
@@ -158,17 +169,18 @@ class Solver:
             if not fastest >= 0:
                 self._stop(dt)
             self._speed = float(fastest)
-            self._drift += dt * self._speed / self.spacing
-            unseen = 0.0
         else:
-            # Not read back: gravity counts in full, and whatever else may push is allowed to double the speed.
+            # Not read back: what is known of it is gravity.
             self._speed += dt * self._pull
-            unseen = 2 * dt * self._speed / self.spacing + UNSEEN
-            self._drift += unseen
+        self.courant = dt * self._speed / self.spacing
+        # Whatever else pushes on a GPU is allowed to double the speed; `advance` flags what went further.
+        unseen = 2 * self.courant + UNSEEN if fastest is None else 0.0
+        self._drift += max(self.courant, unseen)
         self._unwatched += 1
-        change = dt * self._unwatched * max(extremes.gradient for extremes in self._extremes)
+        # What moves through a fifth of a cell may meet something that deforms it by about as much.
+        self._change += max(dt * max(extremes.gradient for extremes in self._extremes), 0.5 * self.courant)
         blind = unseen > 0 and self._drift + unseen >= self._drift_allowed
-        if self._unwatched >= MOST_UNWATCHED_STEPS or change >= UNWATCHED_CHANGE or blind:
+        if self._unwatched >= MOST_UNWATCHED_STEPS or self._change >= UNWATCHED_CHANGE or blind:
             self.watch(dt)
 
     def watch(self, dt: float) -> None:
@@ -193,7 +205,9 @@ class Solver:
             snapshot = read_group(group)
             p = int(lost) if lost != NOT_LOST else first_unsound(snapshot)
             if p is not None:
-                raise UnstableRunError(self._diagnose(snapshot, p, cause_of(snapshot, p), dt))
+                raise UnstableRunError(
+                    self._diagnose(snapshot, p, cause_of(snapshot, p, dt, self.scene.domain.size), dt)
+                )
         raise AssertionError("a step reported a lost particle and kept no trace of it")
 
     def _stop_collapsed(self, step: float) -> None:
@@ -233,7 +247,7 @@ class Solver:
                 splits = max(1, math.ceil(left / largest - 1e-6))
                 dt = left / splits
                 self.step(dt)
-                taken.append((dt, self._speed * dt / self.spacing, limit.name))
+                taken.append((dt, self.courant, limit.name))
                 if splits == 1:
                     break
             self.time = target
@@ -244,7 +258,9 @@ class Solver:
         """Return the state as a frame, and the ledger row for the steps (size, Courant number, limit) taken."""
         began = time.perf_counter()
         snapshots = [read_group(group) for group in self.groups]
-        frame = build_frame(snapshots, self.scene.output.fields, self._origin, index, self.time, self.step_count)
+        frame = build_frame(
+            snapshots, self.scene.output.fields, self._origin, self._position_type, index, self.time, self.step_count
+        )
         sums = measure(snapshots, self._gravity, self.spacing)
         smallest = min(taken, default=(0.0, 0.0, ""))
         row = LedgerRow(
@@ -254,7 +270,7 @@ class Solver:
             step_max=max(taken, default=(0.0,))[0],
             limit=smallest[2],
             courant_max=max((courant for _, courant, _ in taken), default=0.0),
-            **vars(sums),
+            **sums,
         )
         self.frame_seconds += time.perf_counter() - began
         return frame, row

@@ -14,7 +14,7 @@ class LedgerRow:
         limit: name of the bound that set the smallest step, "" at frame 0.
         speed_max: largest particle speed, m/s.
         courant_max: largest displacement in one step since the previous frame, in cells: that of the fastest
-            node, which no particle exceeds.
+            node, which no particle exceeds (on a GPU an estimate between measurements).
         volume_ratio_min, volume_ratio_max: range of J = det F.
         mass: kg (kg per metre of depth in 2D, and so for all that follows).
         kinetic: sum m (|v|^2 + h^2/4 |C|^2)/2, J (Jiang et al. 2015: the affine part included).
