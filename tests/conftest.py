@@ -85,6 +85,12 @@ def run_module() -> Callable[..., PythonRun]:
     return run
 
 
+@pytest.fixture
+def record_property(record_property: Callable[[str, object], None]) -> Callable[[str, object], None]:
+    """Return pytest's own, for numbers of numpy too, which a worker could not send to the process that reports."""
+    return lambda name, value: record_property(name, value.item() if hasattr(value, "item") else value)
+
+
 @pytest.fixture(scope="session")
 def backend_of() -> "Iterator[Callable[..., Backend]]":
     """Return `start(precision, threads=2, arch="cpu")`: it ends the running backend and starts a fresh one.

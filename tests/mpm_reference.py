@@ -121,7 +121,7 @@ def update(momentum: np.ndarray, mass: np.ndarray, box: Box, dt: float) -> np.nd
                     place[a] = 2 * box.cells[a] * side - place[a]
                     flip = flip * sign(a, side)
             at = tuple(i + MARGIN for i in place)
-            total += flip[axis] * raw_momentum[at][axis] + raw_mass[at] * g[axis]
+            total += flip[axis] * (raw_momentum[at][axis] + raw_mass[at] * g[axis])
         return total
 
     def sign(axis: int, side: int) -> np.ndarray:
@@ -144,11 +144,11 @@ def update(momentum: np.ndarray, mass: np.ndarray, box: Box, dt: float) -> np.nd
                     place[axis] = 2 * box.cells[axis] * side - place[axis]
                     flip = flip * sign(axis, side)
             images.append((tuple(i + MARGIN for i in place), flip))
-        total = sum(flip * raw_momentum[at] for at, flip in images)
+        total = sum(flip * (raw_momentum[at] + raw_mass[at] * g) for at, flip in images)
         weight = sum(raw_mass[at] for at, _ in images)
         if weight <= 0:
             continue
-        v = total / weight + g
+        v = total / weight
         for axis, side, depth in faces:
             if depth == 0:
                 v = np.where(sign(axis, side) < 0, 0.0, v)

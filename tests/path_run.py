@@ -59,7 +59,8 @@ def scene_of(dimension: int, precision: str) -> Scene:
         },
         {
             "name": "oil",
-            "material": {**fluid, "density": 500.0, "bulk_modulus": 5000.0},
+            # With suction, so that both kinds are stepped.
+            "material": {**fluid, "density": 500.0, "bulk_modulus": 5000.0, "tension_cutoff": False},
             "shape": box((0.65, 0.1, 0.1), (0.9, 0.4, 0.45)),
             "velocity": [-3.0, 2.0, -2.0][:d],
             **per_cell,

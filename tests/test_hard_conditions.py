@@ -87,6 +87,20 @@ def test_a_run_needs_no_home(scene: Path, surroundings: str) -> None:
     assert open_result(scene.parent / "result").frame_count == 5
 
 
+def test_kernels_are_kept_although_a_killed_process_left_its_lock(scene: Path) -> None:
+    """A lock that is minutes old belongs to nobody, and would keep every later run compiling from the start."""
+    scene.write_text(SCENE, encoding="utf-8")
+    cache = scene.parent / "cache"
+    lock = cache / "taichi" / "ticache" / "ticache.lock"
+    lock.parent.mkdir(parents=True)
+    lock.touch()
+    os.utime(lock, (0, 0))
+    command = [sys.executable, "-m", "mpmcli", "simulate", scene, "-o", scene.parent / "result", "-q"]
+    subprocess.run(command, env={**os.environ, "XDG_CACHE_HOME": str(cache)}, check=True, timeout=120)
+    assert not lock.exists()
+    assert len(list(lock.parent.glob("*.tic"))) > 3
+
+
 @pytest.mark.parametrize("arguments", [[], ["--json"]])
 def test_a_reader_may_go_away(scene: Path, arguments: list[str]) -> None:
     """`mpmcli simulate ... 2>&1 | head -1`: the run goes on to its end."""

@@ -1,25 +1,30 @@
 """The memory that a scene is said to take is the memory that its fields take."""
 
+from collections import Counter
 from collections.abc import Callable
 
 import pytest
 from solver_state import scene_of
 
 from mpmcli.errors import InputError
+from mpmcli.materials.registry import laws
+from mpmcli.scene import Scene
 from mpmcli.solver.ordering import entry_count
-from mpmcli.solver.plan import Plan, make_plan, require_room
+from mpmcli.solver.plan import LawPlan, Plan, make_plan, require_room
 from mpmcli.solver.solver import Solver
 
 MATERIALS = {
     "fluid": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},
     "solid": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5},
+    "sand": {"law": "sand", "density": 1600.0, "youngs_modulus": 1e5, "friction_angle": 30.0},
 }
 
 
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-@pytest.mark.parametrize("material", MATERIALS)
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("bodies", [1, 2])
+@pytest.mark.parametrize(
+    ("bodies", "material", "precision"),
+    [(1, "fluid", "f32"), (2, "fluid", "f64"), (1, "solid", "f64"), (2, "solid", "f32"), (1, "sand", "f32")],
+)
 def test_the_plan_counts_every_field(
     backend_of: Callable, dimension: int, material: str, bodies: int, precision: str
 ) -> None:
@@ -52,8 +57,77 @@ def test_the_plan_counts_every_field(
         assert plan.bytes_per_particle <= 160
 
 
+def scene_with(*materials: str, dimension: int = 2) -> Scene:
+    """Return a scene of one small block for each material, side by side."""
+    d, h = dimension, 0.1
+    return scene_of(
+        domain={"size": [h * (2 + 4 * len(materials))] + [8 * h] * (d - 1), "spacing": h, "gravity": [0.0] * d},
+        time={"end": 1.0, "frames": 1},
+        bodies=[
+            {
+                "name": f"body {k}",
+                "material": MATERIALS[material],
+                "shape": {
+                    "box": {"min": [h + 4 * h * k] + [h] * (d - 1), "max": [3 * h + 4 * h * k] + [3 * h] * (d - 1)}
+                },
+            }
+            for k, material in enumerate(materials)
+        ],
+    )
+
+
+def test_a_scene_of_fluid_plans_nothing_of_other_laws(backend_of: Callable) -> None:
+    """No deformation gradient, no internal variable, and no pass but the fluid's; with sand beside it, sand's too."""
+    backend = backend_of("f32")
+    plan = make_plan(scene_with("fluid", "fluid"), backend)
+    (fluid,) = plan.laws
+    assert fluid.fields.keys() == {"position", "velocity", "velocity_gradient", "volume_ratio", "id", "body"}
+    assert plan.passes == ("clear grid", "scatter fluid", "find contact", "update grid", "gather fluid")
+    mixed = make_plan(scene_with("fluid", "sand", "fluid"), backend)
+    names = [law.law for law in mixed.laws]
+    assert names == ["fluid", "sand"]
+    assert mixed.laws[0].fields == fluid.fields
+    assert {"deformation_gradient", "plastic_volume_strain"} <= mixed.laws[1].fields.keys()
+    assert [name for name in mixed.passes if "sand" in name] == ["scatter sand", "gather sand"]
+    assert "body" not in mixed.laws[1].fields
+    solver = Solver(scene_with("fluid", "sand", "fluid"), backend)
+    for group, law in zip(solver.groups, mixed.laws, strict=True):
+        assert len(group.state) + len(group.labels) == len(law.fields)
+        assert group.count == law.particles
+
+
+@pytest.mark.filterwarnings("ignore:.*Calling non-taichi function:SyntaxWarning")
+def test_a_law_is_compiled_once_for_all_its_bodies_and_not_at_all_without_one(
+    backend_of: Callable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The times that each law's response is traced into kernels: those of one body of fluid, whatever the bodies."""
+    traced = Counter[str]()
+    for name, law in laws().items():
+        original = law.respond
+
+        def counted(self: object, *arguments: object, name: str = name, original: Callable = original) -> object:
+            traced[name] += 1
+            return original(self, *arguments)
+
+        monkeypatch.setattr(law, "respond", counted)
+
+    def compiled(*materials: str) -> Counter[str]:
+        traced.clear()
+        solver = Solver(scene_with(*materials), backend_of("f32", 1))
+        next(solver.frames())
+        solver.step(1e-5)
+        return Counter(traced)
+
+    alone = compiled("fluid")
+    assert alone.keys() == {"fluid"}
+    assert compiled("fluid", "fluid") == alone
+    together = compiled("fluid", "sand", "fluid", "sand")
+    assert together.keys() == {"fluid", "sand"}
+    assert together["fluid"] == together["sand"] == alone["fluid"]
+
+
 def test_more_than_an_index_reaches_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """3 x 4 numbers of 2^28 particles are 3 x 2^30 entries of one field."""
     monkeypatch.setattr("mpmcli.solver.plan.MEMORY_SHARE", 1e6)
     with pytest.raises(InputError, match="more than 32-bit indices can address"):
-        require_room(Plan(2**28, 1000, 140, 16, 16000, 1))
+        require_room(Plan((LawPlan("fluid", 2**28, {"position": 140}),), 1000, 0, 16, 16000, 1, ()))

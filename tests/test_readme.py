@@ -24,6 +24,9 @@ SHORTER = {
     "mpmcli bench --json > results/bench.json": (
         "mpmcli bench --case 2d-64 --seconds 0.1 --blocks 1 --json > results/bench.json"
     ),
+    "mpmcli bench --materials --json > results/materials.json": (
+        "mpmcli bench --materials --case 2d-128 --seconds 0.1 --blocks 1 --json > results/materials.json"
+    ),
 }
 # scripts/test is what runs this test.
 NOT_RUN = {"scripts/test"}

@@ -76,6 +76,11 @@ def reference_groups(scene: Scene, arrays: Arrays, k: int) -> list[reference.Par
         x, v, C, deformation = (
             arrays[f"{k}_{law}_{name}"].astype(np.float64) for name in ("x", "v", "C", "deformation")
         )
+        if law == "fluid":
+            # The step begins by forgetting what a fluid without suction was opened by.
+            deformation = np.minimum(
+                deformation, per_particle([1.0 if m.tension_cutoff else np.inf for m in materials])
+            )
         mass = per_particle([sample.mass for _, sample in bodies])
         volume = per_particle([sample.volume for _, sample in bodies])
         groups.append(reference.Particles(x, v, C, deformation, mass, volume, stress))

@@ -112,6 +112,25 @@ def _processor_name() -> str:
     return platform.processor() or platform.machine()
 
 
+def heading(machine: dict, arch: str, threads: int, precision: str) -> str:
+    """Return the line above a table that says what it was measured on."""
+    count = f"{threads} {'thread' if threads == 1 else 'threads'}"
+    return f"{machine['processor']}, {arch}, {count}, {precision}, taichi {machine['taichi']}"
+
+
+def text_table(head: tuple[str, ...], rows: list[tuple[str, ...]], left: set[int]) -> str:
+    """Write rows below their head and a line; columns are aligned to the right but for those numbered in `left`."""
+    widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
+    lines = [
+        "  ".join(
+            text.ljust(width) if column in left else text.rjust(width)
+            for column, (text, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in [head, *rows]
+    ]
+    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
+
+
 @dataclass(frozen=True)
 class BenchReport:
     """Every case of one run of the benchmark, and what it ran with.
@@ -154,21 +173,8 @@ class BenchReport:
             "start+compile s",
             "memory MB",
         )
-        rows = [head, *(_row(result) for result in self.results)]
-        widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
-        # The names of case and peer to the left, numbers to the right.
-        lines = [
-            "  ".join(
-                text.ljust(width) if column in (0, 3) else text.rjust(width)
-                for column, (text, width) in enumerate(zip(row, widths, strict=True))
-            ).rstrip()
-            for row in rows
-        ]
-        machine = self.machine
-        title = (
-            f"{machine['processor']}, {self.arch}, {self.threads} "
-            f"{'thread' if self.threads == 1 else 'threads'}, {self.precision}, taichi {machine['taichi']}"
-        )
+        table = text_table(head, [_row(result) for result in self.results], left={0, 3})
+        title = heading(self.machine, self.arch, self.threads, self.precision)
         notes = [
             "M steps/s: million particle-steps per second, median of the blocks.",
             "ratio: ours over the peer's; range: of neighbouring blocks.",
@@ -191,7 +197,7 @@ class BenchReport:
             for who, side in (("mpmcli", result.ours), (result.case.peer, result.peer))
             if not side.sound
         ]
-        return "\n".join([title, "", lines[0], "-" * len(lines[0]), *lines[1:], "", *notes, *held, *smaller, *broken])
+        return "\n".join([title, "", table, "", *notes, *held, *smaller, *broken])
 
 
 def _row(result: CaseResult) -> tuple[str, ...]:

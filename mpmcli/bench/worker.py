@@ -1,6 +1,6 @@
 """One contestant in a process of its own, told what to do line by line.
 
-    python -m mpmcli.bench.worker ours|peer --dimension 3 --cells 128 --particles 524288 --step 8e-5
+    python -m mpmcli.bench.worker ours|peer|LAW,LAW,... --dimension 3 --cells 128 --particles 524288 --step 8e-5
                                   [--threads 2] [--precision f32] [--arch cpu]
 
 It answers on stdout, one JSON object per line, and waits for commands on stdin without using the processor:
@@ -9,6 +9,13 @@ It answers on stdout, one JSON object per line, and waits for commands on stdin 
     first          {"seconds": 2.9}                                            one step, kernels compiled
     run SECONDS    {"steps": 31, "seconds": 1.02}                              steps for about that long
     finish         {"sound": true, "smallest_step": 8e-5, "peak_memory": 219152384}    and ends
+
+Of laws, the contestant is the column of `mpmcli.bench.materials`, which obeys three commands more:
+
+    keep STEPS              {}                       so many steps, and remembers the state
+    repeat STEPS SECONDS    {"steps": 400, "seconds": 1.1, "processor_seconds": 1.05}
+                                                     so many steps from that state, again until the time is up
+    flowing                 {"share": 0.93}          of the particles
 
 What cannot go on is told as {"error": "a sentence"} and ends the process with status 1.
 """
@@ -59,6 +66,39 @@ def run_block(contestant: Contestant, seconds: float) -> tuple[int, float]:
     return steps, elapsed
 
 
+class Rewinding(Contestant, Protocol):
+    """A contestant that can take the same steps again."""
+
+    def keep(self) -> None:
+        """Remember the state."""
+
+    def rewind(self) -> None:
+        """Return to the state that was kept."""
+
+    def flowing(self) -> float:
+        """Return the share of particles that flow."""
+
+
+def repeat_stretch(contestant: Rewinding, stretch: int, seconds: float) -> dict[str, float]:
+    """Take `stretch` steps from the state that was kept, until `seconds` have gone into steps, at least once.
+
+    Returns:
+        "steps" taken, and without those of the rewinding "seconds" and "processor_seconds", the latter of all
+        threads of this process.
+    """
+    steps, elapsed, busy = 0, 0.0, 0.0
+    while not steps or elapsed < seconds:
+        contestant.rewind()
+        start, busy_before = time.perf_counter(), time.process_time()
+        for _ in range(stretch):
+            contestant.step()
+        contestant.sync()
+        elapsed += time.perf_counter() - start
+        busy += time.process_time() - busy_before
+        steps += stretch
+    return {"steps": steps, "seconds": elapsed, "processor_seconds": busy}
+
+
 def peak_memory() -> int:
     """Return the largest resident memory that this process has had, in bytes."""
     status = Path("/proc/self/status")
@@ -96,6 +136,16 @@ def serve(start: Callable[[], Contestant], commands: Iterable[str], answers: IO[
                 case ["run", seconds]:
                     steps, elapsed = run_block(contestant, float(seconds))
                     answer(steps=steps, seconds=elapsed)
+                case ["keep", steps]:
+                    for _ in range(int(steps)):
+                        contestant.step()
+                    contestant.sync()
+                    contestant.keep()
+                    answer()
+                case ["repeat", stretch, seconds]:
+                    answer(**repeat_stretch(contestant, int(stretch), float(seconds)))
+                case ["flowing"]:
+                    answer(share=contestant.flowing())
                 case ["finish"]:
                     answer(
                         sound=contestant.is_sound(),
@@ -114,14 +164,18 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
         from mpmcli.bench.peers import Peer
 
         return Peer(case, **options)
-    from mpmcli.bench.ours import Ours
+    if who == "ours":
+        from mpmcli.bench.ours import Ours
 
-    return Ours(case, **options)
+        return Ours(case, **options)
+    from mpmcli.bench.materials import Column
+
+    return Column(who.split(","), case, **options)
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m mpmcli.bench.worker")
-    parser.add_argument("who", choices=["ours", "peer"])
+    parser.add_argument("who", help="ours, peer, or the names of laws, with commas between them")
     parser.add_argument("--dimension", type=int, choices=[2, 3], required=True)
     parser.add_argument("--cells", type=int, required=True)
     parser.add_argument("--particles", type=int, required=True)

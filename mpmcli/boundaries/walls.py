@@ -86,7 +86,7 @@ class Walls:
             inside = rest == 0
             low = grid.box[0, axis]
             if inside and node[axis] >= low and node[axis] < low + grid.box[1, axis]:
-                value = grid.nodes[grid.first_node(node)]
+                value = self.pulled(grid.nodes[grid.first_node(node)], gravity_step)
                 if ti.static(self.crossed[axis]):
                     # What other walls fold onto this node is pressed or pulled with it.
                     depth, mirror, upper_side = self.place(node)
@@ -94,8 +94,8 @@ class Walls:
                     for b in ti.static(self.lateral[axis]):
                         separates = self.face_is("separate", b, upper_side[b])
                         acts[b] = ti.cast(depth[b] <= REACH and not separates, int)
-                    value = self.folded(grid, node, mirror, acts, depth, upper_side)
-                outward = value[axis] + value[self.dimension] * gravity_step[axis]
+                    value = self.folded(grid, node, mirror, acts, depth, upper_side, gravity_step)
+                outward = value[axis]
                 if ti.static(not upper):
                     outward = -outward
                 self.contact[f, self.plane_index(node, axis)] = ti.cast(outward >= 0, int)
@@ -129,13 +129,27 @@ class Walls:
         acts: ti.template(),
         depth: ti.template(),
         upper: ti.template(),
+        gravity_step: ti.template(),
     ):
-        """Return the momentum and mass of a node with those of its images behind the walls that act."""
+        """Return the momentum, gravity's included, and mass of a node with those of its images behind the walls.
+
+        Gravity acts before the fold, so that it pulls mirror images the mirrored way, as everything else does with
+        them: after it, matter on a floor would weigh more than its stress can balance, and be squeezed for ever.
+        """
         total = ti.Vector.zero(float, grid.width)
         for images in range(ti.static(2**self.dimension)):
             if self.mirrored(images, acts, depth):
-                total += self.flip(grid.nodes[self.image(grid, node, mirror, images)], images, upper)
+                value = self.pulled(grid.nodes[self.image(grid, node, mirror, images)], gravity_step)
+                total += self.flip(value, images, upper)
         return total
+
+    @ti.func
+    def pulled(self, value: ti.template(), gravity_step: ti.template()):
+        """Return the momentum and mass of a node after a step of gravity."""
+        result = value
+        for a in ti.static(range(self.dimension)):
+            result[a] += value[self.dimension] * gravity_step[a]
+        return result
 
     @ti.func
     def near(self, node: ti.template()):
@@ -170,12 +184,10 @@ class Walls:
             if acts[a] == 1 and depth[a] < 0:
                 owned = False
         if owned:
-            total = self.folded(grid, node, mirror, acts, depth, upper)
+            total = self.folded(grid, node, mirror, acts, depth, upper, gravity_step)
             if total[d] > 0:
                 velocity = total / total[d]
                 velocity[d] = total[d]
-                for a in ti.static(range(d)):
-                    velocity[a] += gravity_step[a]
                 for a in ti.static(range(d)):
                     if acts[a] == 1 and depth[a] == 0:
                         velocity = self.stop(velocity, a, upper[a])

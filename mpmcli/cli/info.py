@@ -5,22 +5,24 @@ from pathlib import Path
 import click
 
 from mpmcli.cli.json_output import print_json
-from mpmcli.cli.options import json_option, set_option
+from mpmcli.cli.options import json_option, plugin_option, set_option
 
 
 @click.command("info")
 @click.argument("path", type=click.Path(path_type=Path))
 @set_option
+@plugin_option
 @json_option
-def command(path: Path, overrides: tuple[str, ...], as_json: bool) -> None:
+def command(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], as_json: bool) -> None:
     """Say what PATH holds: a scene (.toml), or a result (its directory, particles.vtkhdf or particles.pvd)."""
     from mpmcli.errors import InputError
 
     if path.suffix == ".toml":
-        facts = _of_scene(path, overrides)
+        facts = _of_scene(path, overrides, plugins)
     else:
-        if overrides:
-            raise InputError(f"--set changes scenes, and {path} is none; leave it out.")
+        if overrides or plugins:
+            option = "--set changes" if overrides else "--plugin is for"
+            raise InputError(f"{option} scenes, and {path} is none; leave it out.")
         facts = _of_result(path)
     if as_json:
         print_json(facts)
@@ -31,13 +33,13 @@ def command(path: Path, overrides: tuple[str, ...], as_json: bool) -> None:
         click.echo(f"{name.replace('_', ' '):<{width}}  {_plain(value)}", err=True)
 
 
-def _of_scene(path: Path, overrides: tuple[str, ...]) -> dict:
-    from mpmcli.materials.registry import parameter_models
+def _of_scene(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...]) -> dict:
+    from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
     from mpmcli.solver.backend import Backend
     from mpmcli.solver.plan import make_plan
 
-    loaded = load_scene(path, overrides, laws=parameter_models())
+    loaded = load_scene(path, overrides, laws=load_plugins(plugins))
     scene = loaded.scene
     plan = make_plan(scene, Backend("cpu", 1, scene.solver.precision, True))
     return {

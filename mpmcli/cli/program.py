@@ -15,6 +15,7 @@ from mpmcli.errors import MpmcliError
 COMMANDS = {
     "simulate": "Run a scene and store its particles.",
     "info": "Say what a result or a scene holds.",
+    "materials": "List laws, presets, their parameters and knobs.",
     "schema": "Print the JSON Schema of scenes, for editors.",
     "bench": "Compare speed with the MPM examples that Taichi ships.",
     "completion": "Print the script that completes commands in a shell.",

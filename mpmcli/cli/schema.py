@@ -1,17 +1,21 @@
 """`mpmcli schema`."""
 
+from pathlib import Path
+
 import click
 
 from mpmcli.cli.json_output import print_json
+from mpmcli.cli.options import plugin_option
 
 
 @click.command("schema")
-def command() -> None:
+@plugin_option
+def command(plugins: tuple[Path, ...]) -> None:
     """Print the JSON Schema of scenes on stdout.
 
     Editors with TOML support complete and check a scene that begins with `#:schema ./scene.schema.json`.
     """
-    from mpmcli.materials.registry import parameter_models
+    from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import json_schema
 
-    print_json(json_schema(parameter_models()))
+    print_json(json_schema(load_plugins(plugins)))

@@ -8,7 +8,7 @@ import click
 
 from mpmcli.cli.interrupt import interrupt_came
 from mpmcli.cli.json_output import print_json
-from mpmcli.cli.options import json_option, quiet_option, set_option, threads_option
+from mpmcli.cli.options import json_option, plugin_option, quiet_option, set_option, threads_option
 
 if TYPE_CHECKING:
     from mpmcli.solver.run import RunSummary
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     help="Where the result goes; results/<name of the scene> by default.",
 )
 @set_option
+@plugin_option
 @click.option(
     "--arch",
     type=click.Choice(["auto", "cpu", "cuda", "vulkan", "metal"]),
@@ -50,6 +51,7 @@ def command(
     scene: Path,
     output: Path | None,
     overrides: tuple[str, ...],
+    plugins: tuple[Path, ...],
     arch: str,
     threads: int | None,
     precision: str | None,
@@ -61,13 +63,13 @@ def command(
 ) -> int:
     """Run SCENE, a TOML file, and store its particles for ParaView, h5py and learners."""
     from mpmcli.cli.progress import Progress
-    from mpmcli.materials.registry import parameter_models
+    from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
     from mpmcli.solver.run import RunSettings, run_scene
 
     overrides += (f'solver.precision="{precision}"',) if precision else ()
     overrides += ("output.compress=true",) if compress else ()
-    loaded = load_scene(scene, overrides, laws=parameter_models())
+    loaded = load_scene(scene, overrides, laws=load_plugins(plugins))
     settings = RunSettings(
         directory=output or Path("results") / scene.stem,
         arch=arch,

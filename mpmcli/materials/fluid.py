@@ -1,4 +1,4 @@
-"""Weakly compressible inviscid fluid: pressure from the volume ratio alone."""
+"""Weakly compressible fluid: pressure from the volume ratio alone, and Newtonian viscosity."""
 
 from typing import Annotated, Literal, Self
 
@@ -6,12 +6,24 @@ import numpy as np
 import taichi as ti
 from pydantic import Field
 
-from mpmcli.materials.law import Law, StateBound
+from mpmcli.materials.law import Law, Mode, StateBound
+from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import MaterialParameters, SceneBounds
-from mpmcli.scene.quantity import LARGEST, Positive
+from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
 
 # The speed that "auto" assumes where nothing in the scene moves or falls, m/s.
 QUIET_SPEED = 1.0
+# The pressure of a nonlinear equation of state grows no further below this J: the largest power stays a number of
+# 32 bits. Far beyond what weak compressibility means, but a crushed particle must not turn into infinities.
+CRUSHED = 0.05
+# Of every law whose bulk modulus may be "auto".
+STIFFNESS = Knob(
+    "stiffness",
+    0.1,
+    1e-4,
+    "0 lets the density vary by 10 %, 1 by 0.01 %, in steps 30 times as many",
+    excludes=("bulk_modulus",),
+)
 
 
 class FluidParameters(MaterialParameters):
@@ -28,54 +40,165 @@ class FluidParameters(MaterialParameters):
     compressibility: Annotated[
         float,
         Field(gt=0, le=0.1, description='Density variation that bulk_modulus = "auto" allows, a fraction.'),
+        STIFFNESS,
     ] = 0.01
+    exponent: Annotated[
+        float,
+        Field(
+            ge=1,
+            le=15,
+            description="Exponent g of the equation of state p = K/g (J^-g - 1): 1 is linear in the density, "
+            "7 the Tait equation of water.",
+        ),
+    ] = 1.0
+    viscosity: Annotated[
+        NotNegative,
+        Field(description="Shear (dynamic) viscosity, Pa s; water 1e-3."),
+        Knob("thickness", 1e-3, 1e2, "0 is water, 0.4 olive oil, 0.8 honey, 1 cold treacle"),
+    ] = 0.0
+    bulk_viscosity: Annotated[
+        NotNegative, Field(description="Bulk viscosity, Pa s: resists changes of volume, and damps sound.")
+    ] = 0.0
+    tension_cutoff: Annotated[
+        Flag,
+        Field(
+            description="Whether the fluid takes no tension: below the density at rest its pressure is 0. "
+            "False holds droplets together by suction."
+        ),
+    ] = True
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
-        """Replace "auto" by K = density v^2 / compressibility, with v the highest speed of the scene.
-
-        Weakly compressible flow varies in density by v^2/c^2 (Monaghan 1994); a column that is let
-        go uncompressed presses with up to 2 density g H = density v^2, the same bound. Where fluid hits
-        fluid or a wall head on, the pressure is density c v for a moment (water hammer), and so v/c.
-        """
+        """Replace "auto" by K = density v^2 / compressibility, with v the highest speed of the scene."""
         if self.bulk_modulus != "auto":
             return self, []
-        speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
-        modulus = min(max(self.density * speed**2 / self.compressibility, 1 / LARGEST), LARGEST)
-        note = (
-            f"bulk_modulus = {modulus:.4g} Pa (sound speed {np.sqrt(modulus / self.density):.4g} m/s) lets the density "
-            f"of smooth flow vary by {100 * self.compressibility:.3g} % at the highest speed, {speed:.4g} m/s; "
-            f"a hard impact at that speed reaches {100 * np.sqrt(self.compressibility):.3g} %"
-        )
+        modulus, note = soft_bulk_modulus(self.density, self.compressibility, bounds)
         return self.model_copy(update={"bulk_modulus": modulus}), [note]
+
+
+def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBounds) -> tuple[float, str]:
+    """Return K = density v^2 / compressibility, Pa, with v the highest speed of the scene, and a sentence on it.
+
+    The density is the largest of any body, as a denser one may press on the fluid.
+
+    Weakly compressible flow varies in density by v^2/c^2 (Monaghan 1994); a column that is let
+    go uncompressed presses with up to 2 density g H = density v^2, the same bound. Where fluid hits
+    fluid or a wall head on, the pressure is density c v for a moment (water hammer), and so v/c.
+    """
+    speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
+    modulus = min(max(max(density, bounds.density) * speed**2 / compressibility, 1 / LARGEST), LARGEST)
+    note = (
+        f"bulk_modulus = {modulus:.4g} Pa (sound speed {np.sqrt(modulus / density):.4g} m/s) lets the density "
+        f"of smooth flow vary by {100 * compressibility:.3g} % at the highest speed, {speed:.4g} m/s; "
+        f"a hard impact at that speed reaches {100 * np.sqrt(compressibility):.3g} %"
+    )
+    return modulus, note
 
 
 @ti.data_oriented
 class Fluid(Law):
-    """p = K (1/J - 1), linear in the density: tau = -K (1 - J) I, energy K (J - 1 - ln J)."""
+    """p = K/g (J^-g - 1), and tau = -J p I + viscosity (C + C^T - (2/3) tr C I) + bulk_viscosity tr C I.
+
+    With tension_cutoff, J is never remembered above 1: the fluid that opens in a splash has no pressure,
+    and has it again as soon as it closes.
+    """
 
     name = "fluid"
     parameters = FluidParameters
     deformation = "J"
 
+    def __init__(self, members: tuple[FluidParameters, ...], dimension: int) -> None:
+        super().__init__(members, dimension)
+        self.linear = all(member.exponent == 1 for member in members)
+        self.viscous = any(member.viscosity > 0 or member.bulk_viscosity > 0 for member in members)
+        self.projects = any(member.tension_cutoff for member in members)
+
     def constants(self, parameters: FluidParameters) -> tuple[float, ...]:
-        return (parameters.bulk_modulus,)
+        largest = 1.0 if parameters.tension_cutoff else LARGEST
+        return (
+            parameters.bulk_modulus,
+            parameters.exponent,
+            parameters.viscosity,
+            parameters.bulk_viscosity - 2 / 3 * parameters.viscosity,
+            largest,
+        )
 
-    def stiffness(self, parameters: FluidParameters, bound: StateBound, dimension: int) -> float:
-        """d K J: tau changes by K J tr(C) dt, and tr(C) by d entries (verification: 10.1)."""
-        return dimension * parameters.bulk_modulus * bound.volume_ratio_max
+    def modes(self, parameters: FluidParameters, bound: StateBound) -> list[Mode]:
+        """d K ((g - 1) J^(1-g) + J) / g for volume, where viscosity adds (2 - 2d/3) mu + d zeta; 2 mu for shear.
 
-    def cauchy_stress(self, parameters: FluidParameters, deformation: np.ndarray) -> np.ndarray:
-        pressure = parameters.bulk_modulus * (1.0 / deformation - 1.0)
-        return -pressure[:, None, None] * np.eye(3, dtype=deformation.dtype)
+        -J p changes by that K-term times tr(C) dt, and tr(C) by d entries. It is convex in J, and so
+        largest at an end of its range.
+        """
+        d, g, K = self.dimension, parameters.exponent, parameters.bulk_modulus
+        largest = min(bound.volume_ratio_max, 1.0) if parameters.tension_cutoff else bound.volume_ratio_max
+        ends = (max(min(bound.volume_ratio_min, largest), CRUSHED), max(largest, CRUSHED))
+        stiffness = max(d * K * ((g - 1) * J ** (1 - g) + J) / g for J in ends)
+        volumetric = (2 - 2 * d / 3) * parameters.viscosity + d * parameters.bulk_viscosity
+        modes = [Mode(stiffness, volumetric)]
+        return modes + [Mode(0.0, 2 * parameters.viscosity)] * (parameters.viscosity > 0)
 
-    def energy_density(self, parameters: FluidParameters, deformation: np.ndarray) -> np.ndarray:
-        # log1p keeps the difference of nearly equal numbers near J = 1.
-        strain = deformation - 1.0
-        return parameters.bulk_modulus * (strain - np.log1p(strain))
+    def stiffest(self, parameters: FluidParameters, bounds: SceneBounds) -> StateBound:
+        """Water hammer, density c v, and the column's weight compress it."""
+        c = (parameters.bulk_modulus / parameters.density) ** 0.5
+        strain = bounds.speed / c + bounds.gravity * bounds.height / c**2
+        largest = 1.0 if parameters.tension_cutoff else 1 + strain
+        return StateBound(1 / (1 + strain), largest, largest**2)
 
     @ti.func
-    def kirchhoff_stress(self, deformation: ti.template(), C: ti.template(), constants: ti.template()):
-        return constants[0] * (deformation - 1.0) * ti.Matrix.identity(float, C.n)
+    def respond(
+        self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
+    ):
+        J = deformation
+        if ti.static(self.projects):
+            J = ti.min(J, constants[4])
+        # -J p, which is K (J - 1) for g = 1.
+        spherical = constants[0] * (J - 1.0)
+        if ti.static(not self.linear):
+            crushed = J
+            if J < CRUSHED:
+                crushed = CRUSHED
+            spherical = constants[0] * crushed * (1.0 - crushed ** (-constants[1])) / constants[1]
+        if ti.static(self.viscous):
+            spherical += constants[3] * C.trace()
+        tau = spherical * ti.Matrix.identity(float, C.n)
+        if ti.static(self.viscous):
+            tau += constants[2] * (C + C.transpose())
+        return tau, spherical, J, internal
+
+    @ti.func
+    def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
+        """K/g (J - 1 + (J^(1-g) - 1)/(g - 1)), and K (J - 1 - ln J) for g = 1."""
+        J = deformation
+        result = volume_energy(J)
+        if ti.static(not self.linear):
+            g = constants[1]
+            if g > 1.0:
+                if J < CRUSHED:
+                    J = CRUSHED
+                # J^(1-g) - 1, as the exponential of a small number.
+                power = exponential_strain((1.0 - g) * ti.log(J))
+                result = (J - 1.0 + power / (g - 1.0)) / g
+        return constants[0] * result
+
+
+@ti.func
+def volume_energy(J: float):
+    """Return J - 1 - ln J, without its cancellation near 1: with y = x/(2 + x), ln(1 + x) = 2 (y + y^3/3 + ...)."""
+    x = J - 1.0
+    result = x - ti.log(ti.max(J, 1e-9))
+    if ti.abs(x) < 0.05:
+        y = x / (2.0 + x)
+        square = y * y
+        result = y * (x - square * (2.0 / 3.0 + square * (2.0 / 5.0 + square * (2.0 / 7.0 + square * (2.0 / 9.0)))))
+    return result
+
+
+@ti.func
+def exponential_strain(x: float):
+    """Return exp(x) - 1, accurate for small x too."""
+    result = ti.exp(x) - 1.0
+    if ti.abs(x) < 0.02:
+        result = x * (1.0 + x / 2.0 * (1.0 + x / 3.0 * (1.0 + x / 4.0 * (1.0 + x / 5.0))))
+    return result
 
 
 LAW = Fluid

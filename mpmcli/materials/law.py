@@ -1,13 +1,15 @@
-"""What every constitutive law states, once for the host and once for the kernels."""
+"""What every constitutive law states: its parameters, its state, its response to deformation, and how stiff it is."""
 
+import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 import taichi as ti
 
-from mpmcli.scene.material import MaterialParameters
+from mpmcli.scene.material import Internal, MaterialParameters, SceneBounds
 
 
 @dataclass(frozen=True)
@@ -15,51 +17,107 @@ class StateBound:
     """How far the particles of one law have gone from rest, as bounds over all of them.
 
     Attributes:
-        volume_ratio_min, volume_ratio_max: range of J = det F.
+        volume_ratio_min, volume_ratio_max: range of J, or of det F, as stored.
         stretch_squared_max: bound on the largest eigenvalue of b = F F^T (J^2 for a law that keeps J).
+        internal: (smallest, largest) value of each internal variable, by name.
     """
 
     volume_ratio_min: float = 1.0
     volume_ratio_max: float = 1.0
     stretch_squared_max: float = 1.0
+    internal: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+class Mode(NamedTuple):
+    """One independent way in which an isolated particle answers a velocity gradient C.
+
+    Attributes:
+        stiffness: by how much tau changes per strain C dt, Pa: an eigenvalue of d tau / d(C dt).
+        viscosity: by how much tau changes with C itself, Pa s: an eigenvalue of d tau / dC.
+    """
+
+    stiffness: float
+    viscosity: float = 0.0
 
 
 class Law(ABC):
-    """One constitutive law: parameters, state, stress, energy and stiffness.
+    """One constitutive law for the particles of some bodies.
 
-    Instances are handed to kernels as templates and compare by identity, so that two laws never
-    share a compiled kernel.
+    A particle stores J or F (of a law with plastic flow: the elastic part) and the law's internal variables.
+    A step deforms it, J <- J (1 + dt tr C) or F <- (I + dt C) F; the next one begins with `respond`, which
+    returns the stress, and the state after plastic flow where there is any.
+
+    Instances are handed to kernels as templates and compare by identity, so that two laws never share a
+    compiled kernel. What no member needs, such as viscosity, is decided at construction and not compiled.
 
     Attributes:
         name: the word for it in a scene.
-        parameters: the pydantic model of its parameters.
+        parameters: the pydantic model of its parameters, which also lists its internal variables.
         deformation: what a particle stores, "J" (the volume ratio) or "F" (the deformation gradient).
+        projects: whether `respond` may change the state.
+        sensitivity: growth of the logarithm of the largest stiffness per strain: how closely it is watched.
+        members: parameters of the bodies that follow this law.
+        dimension: 2 (plane strain) or 3.
+        internal: the internal variables that a particle stores.
     """
 
     name: ClassVar[str]
     parameters: ClassVar[type[MaterialParameters]]
     deformation: ClassVar[Literal["J", "F"]]
+    projects: bool = False
+    sensitivity: float = 1.0
+
+    def __init__(self, members: Sequence[MaterialParameters], dimension: int) -> None:
+        self.members = tuple(members)
+        self.dimension = dimension
+        self.internal: tuple[Internal, ...] = self.parameters.internal_in(dimension)
 
     @abstractmethod
     def constants(self, parameters: MaterialParameters) -> tuple[float, ...]:
-        """Return the numbers that `kirchhoff_stress` reads, in its order."""
+        """Return the numbers that `respond` and `energy` read, in their order; one at least."""
 
     @abstractmethod
-    def stiffness(self, parameters: MaterialParameters, bound: StateBound, dimension: int) -> float:
-        """Return the largest eigenvalue of d tau / d(velocity gradient dt), Pa, over states within `bound`.
+    def modes(self, parameters: MaterialParameters, bound: StateBound) -> list[Mode]:
+        """Return the modes of an isolated particle, each with the largest values over states within `bound`.
 
-        It is what an isolated particle feels: its step limit is h sqrt(density / stiffness).
+        The step is stable while dt^2 stiffness + 2 dt viscosity <= density h^2 for each (verification: 10.1).
         """
 
-    @abstractmethod
-    def cauchy_stress(self, parameters: MaterialParameters, deformation: np.ndarray) -> np.ndarray:
-        """Return the Cauchy stress (n, 3, 3), Pa, of J (n,) or F (n, d, d); plane strain in 2D."""
+    def stiffest(self, parameters: MaterialParameters, bounds: SceneBounds) -> StateBound:
+        """Return the state that the scene can drive the material to, for limits before the run.
 
-    @abstractmethod
-    def energy_density(self, parameters: MaterialParameters, deformation: np.ndarray) -> np.ndarray:
-        """Return the stored energy per volume at rest (n,), J/m^3, of J (n,) or F (n, d, d)."""
+        An impact at speed v strains an elastic material by about v / c, and a column H high by
+        g H / c^2; a law whose stiffness grows otherwise, by hardening say, states its own.
+        """
+        stiffness = max(mode.stiffness for mode in self.modes(parameters, StateBound()))
+        wave_speed = math.sqrt(stiffness / parameters.density)
+        strain = bounds.speed / wave_speed + bounds.gravity * bounds.height / wave_speed**2
+        return StateBound(1 / (1 + strain), 1 + strain, (1 + strain) ** 2)
+
+    def total_volume_ratio(self, J: np.ndarray, internal: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return volume over volume at rest, (n,), of the stored J or det F and the internal variables, (n,) each."""
+        return J
 
     @ti.func
-    def kirchhoff_stress(self, deformation: ti.template(), C: ti.template(), constants: ti.template()):
-        """Return tau = J sigma, d x d, Pa, of J or F and the velocity gradient C (1/s)."""
+    def respond(
+        self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
+    ):
+        """Return (tau, tau_zz, deformation, internal): the stress, and the state after plastic flow.
+
+        Args:
+            deformation: J, or F as a d x d matrix, after the last step's deformation.
+            internal: vector of the internal variables in their order; one meaningless 0 where there are none.
+            C: velocity gradient, d x d, 1/s.
+            dt: the step, s; only rates need it.
+            constants: vector of what `constants` returned.
+
+        Returns:
+            tau = J sigma per volume at rest, d x d, Pa; its component out of the plane (0.0 in 3D); the
+            deformation and the internal variables, as given or projected.
+        """
+        raise NotImplementedError
+
+    @ti.func
+    def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
+        """Return the stored energy per volume at rest, J/m^3, of a state that `respond` returned."""
         raise NotImplementedError

@@ -1,6 +1,7 @@
-"""Small tensors on the host, many at a time."""
+"""Small tensors: determinants of many at once on the host, and strains that keep their digits on the device."""
 
 import numpy as np
+import taichi as ti
 
 
 def determinant(F: np.ndarray) -> np.ndarray:
@@ -14,3 +15,24 @@ def determinant(F: np.ndarray) -> np.ndarray:
             - F[:, 0, 1] * (F[:, 1, 0] * F[:, 2, 2] - F[:, 1, 2] * F[:, 2, 0])
             + F[:, 0, 2] * (F[:, 1, 0] * F[:, 2, 1] - F[:, 1, 1] * F[:, 2, 0])
         )
+
+
+@ti.func
+def volume_strain(H: ti.template()):
+    """Return det(I + H) - 1 from the displacement gradient H, without the cancellation near H = 0."""
+    minors = H.determinant()
+    if ti.static(H.n == 3):
+        square = H @ H
+        minors += 0.5 * (H.trace() ** 2 - square.trace())
+    return H.trace() + minors
+
+
+@ti.func
+def log_ratio(x: float):
+    """Return ln(1 + x), accurate for small x too (Kahan's correction of the rounding in 1 + x)."""
+    ratio = 1.0 + x
+    rounded = ratio - 1.0
+    result = x
+    if rounded != 0.0:
+        result = ti.log(ratio) * (x / rounded)
+    return result

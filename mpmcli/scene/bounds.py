@@ -1,4 +1,4 @@
-"""What a scene can reach, from its initial state alone: the highest speed, and the deepest column."""
+"""What a scene can reach, from its initial state alone: the highest speed, the deepest column, the densest body."""
 
 from itertools import product
 
@@ -9,7 +9,7 @@ from mpmcli.scene.schema import Body, Scene
 
 
 def scene_bounds(scene: Scene) -> SceneBounds:
-    """Return bounds on the speed and the depth of a scene.
+    """Return bounds on the speed, the depth and the density of a scene.
 
     speed = sqrt(v0^2 + 2 g H), with v0 the highest initial speed of any body and H the height of the
     highest matter above the lowest point of the domain, both measured against gravity; v0 alone where
@@ -31,6 +31,7 @@ def scene_bounds(scene: Scene) -> SceneBounds:
         gravity=g,
         speed=float(np.sqrt(initial**2 + 2 * g * height)),
         height=height,
+        density=max(body.material.density for body in scene.bodies),
     )
 
 

@@ -1,14 +1,16 @@
-"""Checks that need the whole scene: bodies inside the domain, apart from each other, and not empty."""
+"""Checks that need the whole scene: bodies inside the domain, apart and not empty; fields that are stored."""
 
 import math
 from collections.abc import Iterator
+from typing import get_args
 
 import numpy as np
 
 from mpmcli.scene.problem import Problem
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sampling import holds_particles, lattice_points, lattice_spacing, no_particles
-from mpmcli.scene.schema import Body, Scene
+from mpmcli.scene.schema import Body, ParticleField, Scene
+from mpmcli.scene.sentences import listed
 from mpmcli.scene.shapes import Box
 
 # Lengths below this fraction of the grid spacing are round-off.
@@ -24,7 +26,7 @@ def problems_in(scene: Scene) -> list[Problem]:
     outside = list(_outside(scene))
     # A body that is much too large is told so, not filled.
     empty = [] if outside else _empty(scene)
-    return [*_repeated_names(scene), *outside, *_overlaps(scene), *empty]
+    return [*_repeated_names(scene), *outside, *_overlaps(scene), *empty, *_unstored(scene)]
 
 
 def _repeated_names(scene: Scene) -> Iterator[Problem]:
@@ -99,3 +101,15 @@ def _empty(scene: Scene) -> Iterator[Problem]:
             continue  # its lattice is fitted to it, and has a point at least
         if lattice_points(body, h) <= _MOST_SEARCHED and not holds_particles(body, i, h):
             yield Problem(("bodies", i, "shape"), no_particles(body, h))
+
+
+def _unstored(scene: Scene) -> Iterator[Problem]:
+    """Find output fields that are internal variables of laws which no body follows."""
+    stored = {variable.name for body in scene.bodies for variable in body.material.internal_in(scene.dimension)}
+    available = [*get_args(ParticleField), *sorted(stored)]
+    for k, name in enumerate(scene.output.fields):
+        if name not in available:
+            sentence = (
+                f'no body of this {scene.dimension}D scene stores "{name}"; it can store {listed(available, "and")}'
+            )
+            yield Problem(("output", "fields", k), sentence)

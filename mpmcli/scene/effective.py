@@ -12,14 +12,17 @@ _WIDTH = 100
 def scene_to_toml(scene: Scene) -> str:
     """Write a scene as TOML; loading the text again gives an equal scene.
 
-    Only `domain.spacing` is written, as `domain.cells` says the same.
+    Only `domain.spacing` is written, as `domain.cells` says the same. Materials are laws with physical
+    parameters, whatever presets and knobs they came from.
     """
     data = scene.model_dump(exclude_none=True, exclude={"domain": {"cells"}})
     bodies = data.pop("bodies")
     title = data.pop("title")
     blocks = [f"title = {_value(title)}"]
     blocks += [_table(f"[{name}]", data.pop(name)) for name in ("domain", "time")]
-    blocks += [_table("[[bodies]]", body) for body in bodies]
+    for body in bodies:
+        material = body.pop("material")
+        blocks += [_table("[[bodies]]", body), _table("[bodies.material]", material)]
     blocks += [_table(f"[{name}]", table) for name, table in data.items()]
     return "\n\n".join(blocks) + "\n"
 

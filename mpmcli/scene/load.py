@@ -13,16 +13,14 @@ from pydantic import ValidationError
 from mpmcli.errors import InputError
 from mpmcli.scene.bounds import scene_bounds
 from mpmcli.scene.checks import problems_in
+from mpmcli.scene.expand import Laws, expand_materials
 from mpmcli.scene.locate import key_lines, line_of
-from mpmcli.scene.material import MaterialParameters
 from mpmcli.scene.overrides import apply_overrides
 from mpmcli.scene.problem import Path, Problem, path_text
 from mpmcli.scene.quantity import dimension_of
 from mpmcli.scene.repair import Renames, original_path, repaired
 from mpmcli.scene.schema import Scene, scene_model
 from mpmcli.scene.sentences import problems_of
-
-Laws = tuple[type[MaterialParameters], ...]
 
 _POSITION = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 # What tomllib says, where a plainer sentence helps more.
@@ -87,43 +85,52 @@ def parse_scene(
         InputError: as for `load_scene`.
     """
     data, overridden = apply_overrides(data, overrides)
-    scene, problems, renames = _validate(data, scene_model(laws))
-    if scene is not None:
-        problems += problems_in(scene)
+    scene, problems, notes = _validate(data, laws)
     if problems or scene is None:
         lines = key_lines(text)
-        original = [Problem(original_path(p.path, renames), p.sentence) for p in problems]
-        original.sort(key=lambda p: line_of(p.path, lines) or 0)
-        raise InputError("\n".join(_report(p, source, lines, overridden) for p in original))
-    return _resolve(scene, source)
+        problems.sort(key=lambda p: line_of(p.path, lines) or 0)
+        raise InputError("\n".join(_report(p, source, lines, overridden) for p in problems))
+    return _resolve(scene, notes, source)
 
 
-def _validate(data: dict[str, Any], model: type[Scene]) -> tuple[Scene | None, list[Problem], Renames]:
-    """Validate until no key is unknown, so that a misspelled key does not hide other faults."""
+def _validate(data: dict[str, Any], laws: Laws) -> tuple[Scene | None, list[Problem], dict[int, list[str]]]:
+    """Expand and validate until no key is unknown, so that a misspelled key does not hide other faults.
+
+    Returns the scene, what is wrong with it at the user's own paths, and what the knobs of each body did.
+    """
+    model = scene_model(laws)
     problems: list[Problem] = []
     renames: Renames = {}
     while True:
+        expansion = expand_materials(data, laws)
+
+        def as_written(path: Path, expanded: Renames = expansion.renames, repaired: Renames = renames) -> Path:
+            return original_path(original_path(path, expanded), repaired)
+
+        unknown: list[Path] = []
+        found: list[Problem] = []
+        scene = None
         try:
-            scene = model.model_validate(data, context={"dimension": dimension_of(data)})
-            return scene, problems, renames
+            scene = model.model_validate(expansion.data, context={"dimension": dimension_of(data)})
         except ValidationError as error:
             unknown = [one["loc"] for one in error.errors() if one["type"] == "extra_forbidden"]
-            found = problems_of(error, data, model)
+            found = [p for p in problems_of(error, expansion.data, model) if not expansion.hides(p.path)]
         if not unknown:
-            return None, problems + found, renames
+            found += expansion.problems + (problems_in(scene) if scene is not None else [])
+            return scene, problems + [Problem(as_written(p.path), p.sentence) for p in found], expansion.notes
         unknown_paths, data, new = repaired(data, unknown, model)
-        problems += [Problem(original_path(p.path, renames), p.sentence) for p in found if p.path in unknown_paths]
+        problems += [Problem(as_written(p.path), p.sentence) for p in found if p.path in unknown_paths]
         renames = {**renames, **{p: original_path(old, renames) for p, old in new.items()}}
 
 
-def _resolve(scene: Scene, source: str) -> LoadedScene:
+def _resolve(scene: Scene, knobs: dict[int, list[str]], source: str) -> LoadedScene:
     """Let every material choose what it was left to choose, from what the scene can reach."""
     bounds = scene_bounds(scene)
     bodies, notes = [], []
-    for body in scene.bodies:
+    for i, body in enumerate(scene.bodies):
         material, sentences = body.material.resolve(bounds)
         bodies.append(body.model_copy(update={"material": material}))
-        notes += [f"{body.name}: {sentence}" for sentence in sentences]
+        notes += [f"{body.name}: {sentence}" for sentence in (*knobs.get(i, []), *sentences)]
     return LoadedScene(scene.model_copy(update={"bodies": tuple(bodies)}), tuple(notes), source)
 
 

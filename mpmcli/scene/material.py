@@ -1,7 +1,7 @@
 """What a scene says of a material: the base class of every law's parameters."""
 
 from dataclasses import dataclass
-from typing import Annotated, Self
+from typing import Annotated, ClassVar, NamedTuple, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -18,6 +18,7 @@ class SceneBounds:
         gravity: magnitude of gravity, m/s^2.
         speed: highest speed that any particle can reach, m/s, from initial speeds and fall height.
         height: extent of the matter along gravity that can press on its lowest point, m.
+        density: the largest at rest of any body, kg/m^3: what may press on the others.
     """
 
     dimension: int
@@ -25,6 +26,23 @@ class SceneBounds:
     gravity: float
     speed: float
     height: float
+    density: float = 0.0
+
+
+class Internal(NamedTuple):
+    """One internal variable of a law, a number that each particle stores beside its deformation.
+
+    Attributes:
+        name: of the output field that shows it.
+        at_rest: its value at the start, and in that field for particles of laws without it.
+        description: what it is, with its unit.
+        dimensions: where a particle has it.
+    """
+
+    name: str
+    at_rest: float
+    description: str
+    dimensions: tuple[int, ...] = (2, 3)
 
 
 class MaterialParameters(BaseModel):
@@ -32,12 +50,22 @@ class MaterialParameters(BaseModel):
 
     A subclass narrows `law` to a Literal with a default and adds its own parameters, each with a
     range and a description that names its unit. Validation is strict: "1000" and true are no numbers.
+
+    Attributes:
+        internal: what a particle stores beside its deformation.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
     law: Annotated[str, Field(description="Name of the constitutive law.")]
     density: Annotated[Positive, Field(description="Density at rest, kg/m^3.")]
+
+    internal: ClassVar[tuple[Internal, ...]] = ()
+
+    @classmethod
+    def internal_in(cls, dimension: int) -> tuple[Internal, ...]:
+        """Return the internal variables that a particle has in 2D or 3D."""
+        return tuple(variable for variable in cls.internal if dimension in variable.dimensions)
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
         """Return these parameters with every "auto" replaced, and a sentence for each choice."""

@@ -78,11 +78,19 @@ def _place(data: dict[str, Any], parts: list[str], value: object) -> Path:
         path += (key,)
         if position == len(parts) - 1:
             at[key] = value
+        elif _is_material(path) and isinstance(at.get(key), str):
+            # A preset that was written as one word becomes a table, so that something can be added to it.
+            at[key] = {"preset": at[key]}
+            at = at[key]
         elif isinstance(at, dict):
             at = at.setdefault(part, {})
         else:
             at = at[key]
     return path
+
+
+def _is_material(path: Path) -> bool:
+    return len(path) == 3 and path[0] == "bodies" and path[2] == "material"
 
 
 def _index(entries: list[Any], part: str, path: Path) -> int:

@@ -79,6 +79,7 @@ Positive = Annotated[
     AfterValidator(_not_enormous),
     AfterValidator(_not_minute),
 ]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0), AfterValidator(_not_enormous)]
 Integer = Annotated[int, Field(strict=True)]
 Flag = Annotated[bool, Field(strict=True)]
 

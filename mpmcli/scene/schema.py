@@ -1,7 +1,7 @@
 """What a scene may say: one frozen model per table, each key with its unit, range and default."""
 
 from functools import lru_cache
-from typing import Annotated, Any, Literal, Union
+from typing import Annotated, Any, Literal, Union, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, create_model
 
@@ -76,7 +76,10 @@ class Body(Table):
     name: Annotated[
         str, Field(pattern=r"^[^\W\d_][\w -]*$", description="Name of the body, used in messages and --set.")
     ]
-    material: Annotated[MaterialParameters, Field(description="Constitutive law and its parameters.")]
+    material: Annotated[
+        MaterialParameters,
+        Field(description="A preset in quotes, or a table: a law or a preset, with parameters and knobs."),
+    ]
     shape: Annotated[OneShape, Field(description="Exactly one of box, ball, cylinder (3D), polygon (2D).")]
     velocity: Annotated[
         Vector, Field(validate_default=True, description="Initial velocity, m/s. Default: at rest.")
@@ -162,7 +165,8 @@ class Scene(Table):
 def scene_model(laws: tuple[type[MaterialParameters], ...]) -> type[Scene]:
     """Return the scene whose materials are one of the given laws, told apart by their key `law`.
 
-    Cached, so that two scenes of the same laws have the same type and can be compared.
+    Its output fields are those of every scene and the internal variables of these laws. Cached, so that
+    two scenes of the same laws have the same type and can be compared.
     """
     material: Any = laws[0] if len(laws) == 1 else Annotated[Union[laws], Field(discriminator="law")]  # noqa: UP007
     described = Annotated[material, Field(description=Body.model_fields["material"].description)]
@@ -171,4 +175,24 @@ def scene_model(laws: tuple[type[MaterialParameters], ...]) -> type[Scene]:
         tuple[body, ...],  # type: ignore[valid-type]
         Field(min_length=1, description=Scene.model_fields["bodies"].description),
     ]
-    return create_model("Scene", __base__=Scene, __doc__=Scene.__doc__, bodies=(bodies, ...))
+    output = _output_model(laws)
+    described_output = Annotated[output, Field(description=Scene.model_fields["output"].description)]
+    return create_model(
+        "Scene", __base__=Scene, __doc__=Scene.__doc__, bodies=(bodies, ...), output=(described_output, output())
+    )
+
+
+def _output_model(laws: tuple[type[MaterialParameters], ...]) -> type[Output]:
+    """Return the output table that accepts the internal variables of the given laws as fields, too."""
+    variables = {variable.name: variable for law in laws for variable in law.internal}
+    if not variables:
+        return Output
+    field = Output.model_fields["fields"]
+    also = "; ".join(f"{name}: {variable.description.rstrip('.')}" for name, variable in variables.items())
+    names = Literal[(*get_args(ParticleField), *variables)]  # type: ignore[valid-type]
+    annotation = Annotated[
+        tuple[names, ...],
+        AfterValidator(_no_repeats),
+        Field(description=f"{field.description} Where a body stores it, also {also}."),
+    ]
+    return create_model("Output", __base__=Output, __doc__=Output.__doc__, fields=(annotation, field.default))

@@ -7,6 +7,8 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from mpmcli.scene.knobs import knobs_of
+from mpmcli.scene.material import MaterialParameters
 from mpmcli.scene.problem import Path, Problem, value_at
 
 _KINDS = {
@@ -55,9 +57,16 @@ def listed(words: list[str], last: str = "or") -> str:
     return f" {last} ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
+def quoted(words: list[str]) -> list[str]:
+    """Write each word as text in TOML."""
+    return [f'"{word}"' for word in words]
+
+
 def known_keys(model: type[BaseModel], loc: Path) -> list[str]:
-    """Return the keys of the table that pydantic's location leads to, union tags included."""
-    return sorted({name for table in _tables_at(model, loc) for name in table.model_fields})
+    """Return the keys of the table that pydantic's location leads to, union tags, knobs and presets included."""
+    tables = list(_tables_at(model, loc))
+    keys = {name for table in tables for name in (*table.model_fields, *knobs_of(table))}
+    return sorted(keys | {"preset" for table in tables if issubclass(table, MaterialParameters)})
 
 
 def written(value: object) -> str:
@@ -109,19 +118,6 @@ def _problem(path: Path, errors: list[Any], model: type[BaseModel]) -> Problem:
             return Problem(path, _unknown_key(first["loc"], model))
         case "missing":
             return Problem(path, _missing_key(first["loc"], model))
-        case "union_tag_not_found":
-            laws = listed(_quoted(_laws_at(first["loc"], model)))
-            if not isinstance(value, dict):
-                return Problem(path, f"must be a table with the law and its parameters; found {written(value)}")
-            return Problem((*path, "law"), f"missing key: Name of the constitutive law, {laws}")
-        case "union_tag_invalid":
-            laws = _laws_at(first["loc"], model)
-            guess = nearest(ctx["tag"], laws)
-            hint = f'did you mean "{guess}"? ' if guess else ""
-            return Problem(
-                (*path, "law"),
-                f"unknown law {written(value['law'])}; {hint}The laws are {listed(_quoted(laws), 'and')}",
-            )
         case "string_pattern_mismatch":
             right = "must begin with a letter and hold only letters, digits, spaces, - and _"
             return Problem(path, f"{right}; found {written(value)}")
@@ -144,7 +140,9 @@ def _missing_key(loc: Path, model: type[BaseModel]) -> str:
     for table in _tables_at(model, loc[:-1]):
         field = table.model_fields.get(str(loc[-1]))
         if field and field.description:
-            return f"missing key: {field.description.rstrip('.')}"
+            knobs = [name for name, (parameter, _) in knobs_of(table).items() if parameter == loc[-1]]
+            instead = "".join(f"; or its knob {name}, 0 to 1" for name in knobs)
+            return f"missing key: {field.description.rstrip('.')}{instead}"
     return "missing key"
 
 
@@ -172,16 +170,7 @@ def _wrong_value(errors: list[Any], value: object) -> str:
             right.append(phrase)
     guess = nearest(value, choices) if isinstance(value, str) else None
     hint = f'; did you mean "{guess}"?' if guess else ""
-    return f"must be {listed(right + _quoted(choices))}; found {written(value)}{hint}"
-
-
-def _laws_at(loc: Path, model: type[BaseModel]) -> list[str]:
-    """Return the names of the laws that the union at pydantic's location tells apart."""
-    return sorted(str(table.model_fields["law"].default) for table in _tables_at(model, loc))
-
-
-def _quoted(words: list[str]) -> list[str]:
-    return [f'"{word}"' for word in words]
+    return f"must be {listed(right + quoted(choices))}; found {written(value)}{hint}"
 
 
 def _tables_at(model: type[BaseModel], loc: Path) -> list[type[BaseModel]]:

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import platform
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,6 +20,8 @@ ARCHES: tuple[str, ...] = ("auto", "cpu", "cuda", "vulkan", "metal")
 
 # That many threads may be asked for anywhere; more than twice the cores gains nothing.
 FEW_THREADS = 64
+# Seconds after which the lock on the compiled kernels belongs to a process that is gone; it is held for a moment.
+LONGEST_LOCK = 60.0
 
 _started: "Backend | None" = None
 
@@ -90,13 +93,19 @@ def stop_backend() -> None:
 
 
 def _settle_cache() -> None:
-    """Give Taichi a cache that it can write: it crashes at its end where it has none."""
+    """Give Taichi a cache that it can write: it crashes at its end where it has none.
+
+    A process that is killed while it writes leaves its lock behind, and no later one would keep a kernel again.
+    """
     os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
+        lock = folder / "ticache" / "ticache.lock"
+        if lock.exists() and time.time() - lock.stat().st_mtime > LONGEST_LOCK:
+            lock.unlink(missing_ok=True)
     except OSError:
         os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="mpmcli-cache-")
 

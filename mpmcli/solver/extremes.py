@@ -1,6 +1,6 @@
 """Measures how far the particles of each law have gone: what the limits of the next steps depend on."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import taichi as ti
@@ -10,8 +10,10 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.ordering import CHUNK, share_start
 from mpmcli.solver.particles import ParticleGroup
 
-SPEED_SQUARED, GRADIENT, J_MIN, J_MAX, STRETCH_SQUARED = range(5)
+# Of the smallest values the negative is kept, so that all are maxima. Internal variables follow, both of each.
+SPEED_SQUARED, GRADIENT, J_MAX, MINUS_J_MIN, STRETCH_SQUARED = range(5)
 ENTRIES = 5
+NOTHING = -1e30
 # Workers of a measurement on a GPU, each with every so-manieth particle.
 GPU_WORKERS = 16384
 
@@ -23,7 +25,7 @@ class Extremes:
     Attributes:
         speed: largest speed, m/s.
         gradient: bound on the rate of deformation, 1/s: |tr C| where J is stored, else the largest row sum of |C|.
-        bound: range of J and of stretches.
+        bound: range of J, of stretches and of the internal variables.
     """
 
     speed: float
@@ -57,10 +59,9 @@ def row_sum(matrix: ti.template()):
     return largest
 
 
-def build_extremes(groups: Sequence[ParticleGroup], backend: Backend) -> Callable[[], list[Extremes]]:
-    """Compile-ready measurement of all groups: call the result to measure."""
-    numbered = tuple(enumerate(groups))
-    size = ENTRIES * len(groups)
+def build_extremes(group: ParticleGroup, backend: Backend) -> Callable[[], Extremes]:
+    """Compile-ready measurement of a group: call the result to measure."""
+    size = ENTRIES + 2 * len(group.internal)
     vector = ti.types.vector(size, float)
     found = ti.field(float, shape=size)
     # Each worker keeps its own extremes and merges them once: an atomic per particle costs more than the rest.
@@ -68,13 +69,13 @@ def build_extremes(groups: Sequence[ParticleGroup], backend: Backend) -> Callabl
     on_cpu = backend.on_cpu
 
     @ti.func
-    def widen(own: ti.template(), group: ti.template(), p: int):
+    def widen(own: ti.template(), p: int):
         v, C = group.motion(p)
         deformation = group.stored(p)
         J = volume_ratio(group, deformation)
         own[SPEED_SQUARED] = ti.max(own[SPEED_SQUARED], v.norm_sqr())
-        own[J_MIN] = ti.min(own[J_MIN], J)
         own[J_MAX] = ti.max(own[J_MAX], J)
+        own[MINUS_J_MIN] = ti.max(own[MINUS_J_MIN], -J)
         if ti.static(group.law.deformation == "F"):
             # The largest eigenvalue of b = F F^T, exact at rest in any rotation.
             own[STRETCH_SQUARED] = ti.max(own[STRETCH_SQUARED], row_sum(deformation @ deformation.transpose()))
@@ -82,60 +83,45 @@ def build_extremes(groups: Sequence[ParticleGroup], backend: Backend) -> Callabl
         else:
             own[STRETCH_SQUARED] = ti.max(own[STRETCH_SQUARED], J * J)
             own[GRADIENT] = ti.max(own[GRADIENT], ti.abs(C.trace()))
-
-    @ti.func
-    def merge(own: ti.template(), g: ti.template()):
-        for i in ti.static(range(ENTRIES)):
-            if ti.static(i == J_MIN):
-                ti.atomic_min(found[ENTRIES * g + i], own[i])
-            else:
-                ti.atomic_max(found[ENTRIES * g + i], own[i])
-
-    @ti.func
-    def nothing():
-        own = ti.Vector.zero(float, ENTRIES)
-        own[J_MIN] = 1e30
-        return own
+        for i in ti.static(range(len(group.internal))):
+            value = group.internal[i][p]
+            own[ENTRIES + 2 * i] = ti.max(own[ENTRIES + 2 * i], value)
+            own[ENTRIES + 2 * i + 1] = ti.max(own[ENTRIES + 2 * i + 1], -value)
 
     @ti.kernel
     def measure() -> vector:
         for i in ti.static(range(size)):
-            found[i] = 1e30 if ti.static(i % ENTRIES == J_MIN) else 0.0
-        for g, group in ti.static(numbered):
-            for q in range(workers):
-                if ti.static(on_cpu):
-                    if q % CHUNK == 0:
-                        own = nothing()
-                        t = q // CHUNK
-                        first = share_start(group.count, t, backend.threads)
-                        for p in range(first, share_start(group.count, t + 1, backend.threads)):
-                            widen(own, group, p)
-                        merge(own, g)
-                else:
-                    own = nothing()
-                    p = q
-                    while p < group.count:
-                        widen(own, group, p)
-                        p += workers
-                    merge(own, g)
+            found[i] = NOTHING
+        for q in range(workers):
+            if ti.static(on_cpu):
+                if q % CHUNK == 0:
+                    own = ti.Vector([NOTHING] * size)
+                    t = q // CHUNK
+                    start = share_start(group.count, t, backend.threads)
+                    for p in range(start, share_start(group.count, t + 1, backend.threads)):
+                        widen(own, p)
+                    for i in ti.static(range(size)):
+                        ti.atomic_max(found[i], own[i])
+            else:
+                own = ti.Vector([NOTHING] * size)
+                p = q
+                while p < group.count:
+                    widen(own, p)
+                    p += workers
+                for i in ti.static(range(size)):
+                    ti.atomic_max(found[i], own[i])
         result = vector(0.0)
         for i in ti.static(range(size)):
             result[i] = found[i]
         return result
 
-    def measured() -> list[Extremes]:
+    def measured() -> Extremes:
         values = [float(value) for value in measure()]
-        return [
-            Extremes(
-                speed=values[ENTRIES * g + SPEED_SQUARED] ** 0.5,
-                gradient=values[ENTRIES * g + GRADIENT],
-                bound=StateBound(
-                    values[ENTRIES * g + J_MIN],
-                    values[ENTRIES * g + J_MAX],
-                    values[ENTRIES * g + STRETCH_SQUARED],
-                ),
-            )
-            for g in range(len(groups))
-        ]
+        internal = {
+            variable.name: (-values[ENTRIES + 2 * i + 1], values[ENTRIES + 2 * i])
+            for i, variable in enumerate(group.law.internal)
+        }
+        bound = StateBound(-values[MINUS_J_MIN], values[J_MAX], values[STRETCH_SQUARED], internal)
+        return Extremes(values[SPEED_SQUARED] ** 0.5, values[GRADIENT], bound)
 
     return measured

@@ -27,6 +27,7 @@ class ParticleGroup:
         v: velocity, (n) Vector, m/s, as wide as a node of the grid; the first d entries count.
         gradient: of the velocity, (n) matrix of d rows as wide, 1/s: row a holds dv/dx_a, the transpose of C.
         deformation: J, (n), or F, (n) matrix of d rows as wide as a node, as the law says.
+        internal: the law's internal variables, (n) each.
         id: (n) int, row of the particle in every frame.
         body: (n) int, place in `bodies`; None where the group has one body.
         real: numpy's type of the real fields.
@@ -56,6 +57,7 @@ class ParticleGroup:
             self.deformation = ti.Matrix.field(d, width, float, shape=n, layout=layout)
         else:
             self.deformation = ti.field(float, shape=n)
+        self.internal = tuple(ti.field(float, shape=n) for _ in law.internal)
         self.id = ti.field(int, shape=n)
         self.several = len(self.bodies) > 1
         self.body = ti.field(int, shape=n) if self.several else None
@@ -67,6 +69,8 @@ class ParticleGroup:
         self.x.from_numpy(np.concatenate([b.position - origin for b in particles]).astype(host))
         self.set_motion(np.concatenate([b.velocity for b in particles]), np.concatenate([b.affine for b in particles]))
         self.set_deformation(np.ones(n) if law.deformation == "J" else np.tile(np.eye(d), (n, 1, 1)))
+        for variable, values in zip(law.internal, self.internal, strict=True):
+            values.fill(variable.at_rest)
         ids = [first + np.arange(len(b.position)) for b, first in zip(particles, first_ids, strict=True)]
         self.id.from_numpy(np.concatenate(ids).astype(np.int32))
         if self.body is not None:
@@ -76,7 +80,7 @@ class ParticleGroup:
     @property
     def state(self) -> tuple[ti.Field, ...]:
         """Every real field that the sort must move."""
-        return (self.x, self.v, self.gradient, self.deformation)
+        return (self.x, self.v, self.gradient, self.deformation, *self.internal)
 
     @property
     def labels(self) -> tuple[ti.Field, ...]:
@@ -123,6 +127,32 @@ class ParticleGroup:
             return F
         else:
             return self.deformation[p]
+
+    @ti.func
+    def inner(self, p: int):
+        """Return the internal variables of particle p; one 0 where the law has none."""
+        values = ti.Vector.zero(float, ti.static(max(len(self.internal), 1)))
+        for i in ti.static(range(len(self.internal))):
+            values[i] = self.internal[i][p]
+        return values
+
+    @ti.func
+    def store(self, p: int, deformation: ti.template(), inner: ti.template()):
+        """Replace what particle p stores of its deformation, and its internal variables."""
+        if ti.static(self.law.deformation == "F"):
+            for i in ti.static(range(self.dimension)):
+                for j in ti.static(range(self.dimension)):
+                    self.deformation[p][i, j] = deformation[i, j]
+        else:
+            self.deformation[p] = deformation
+        for i in ti.static(range(len(self.internal))):
+            self.internal[i][p] = inner[i]
+
+    @ti.func
+    def constants(self, p: int):
+        """Return the constants of the law for particle p."""
+        row = self.row(p)
+        return ti.Vector([row[CONSTANTS + c] for c in ti.static(range(row.n - CONSTANTS))])
 
     @ti.func
     def motion(self, p: int):

@@ -1,13 +1,16 @@
 """What a scene will take, known before anything is allocated."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import psutil
 
 from mpmcli.errors import InputError
+from mpmcli.materials.law import Law
 from mpmcli.materials.registry import laws
-from mpmcli.scene import Scene, estimate_particles
+from mpmcli.scene import Scene
+from mpmcli.scene.sampling import estimate_body
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.grid import Grid, node_width
 from mpmcli.solver.ordering import TileOrder
@@ -20,58 +23,119 @@ MEMORY_SHARE = 0.8
 
 
 @dataclass(frozen=True)
-class Plan:
-    """Memory of a run.
+class LawPlan:
+    """What the particles of one law take.
 
     Attributes:
-        particles: number of particles (an estimate for curved shapes before sampling).
+        law: its name.
+        particles: number of them (an estimate for curved shapes before sampling).
+        fields: bytes of each field per particle, by name.
+    """
+
+    law: str
+    particles: int
+    fields: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Memory of a run, and the passes of its time step.
+
+    Attributes:
+        laws: the particles, law by law.
         nodes: number of grid nodes.
-        bytes_per_particle: of the device, sort buffers included; the largest over the laws.
+        scratch_bytes: per particle, of the sort buffers.
         bytes_per_node: of the grid.
         grid_bytes: of all nodes and the tables of the sort.
         host_bytes: of the arrays of one frame and of the initial state.
+        passes: the loops of a step in their order; those over particles name the law that they are compiled for.
     """
 
-    particles: int
+    laws: tuple[LawPlan, ...]
     nodes: int
-    bytes_per_particle: int
+    scratch_bytes: int
     bytes_per_node: int
     grid_bytes: int
     host_bytes: int
+    passes: tuple[str, ...]
+
+    @property
+    def particles(self) -> int:
+        """Number of particles."""
+        return sum(law.particles for law in self.laws)
+
+    @property
+    def bytes_per_particle(self) -> int:
+        """Bytes of a particle of the law that takes most, sort buffers included."""
+        return max(sum(law.fields.values()) for law in self.laws) + self.scratch_bytes
 
     @property
     def device_bytes(self) -> int:
-        """Bytes on the device."""
-        return self.particles * self.bytes_per_particle + self.grid_bytes
+        """Bytes on the device; the sort buffers hold the largest group."""
+        state = sum(law.particles * sum(law.fields.values()) for law in self.laws)
+        return state + max(law.particles for law in self.laws) * self.scratch_bytes + self.grid_bytes
+
+    def as_dict(self) -> dict:
+        """Return all of it as JSON can hold it."""
+        return {
+            "particles": self.particles,
+            "laws": {law.law: {"particles": law.particles, "bytes_per_particle": law.fields} for law in self.laws},
+            "scratch_bytes_per_particle": self.scratch_bytes,
+            "nodes": self.nodes,
+            "bytes_per_node": self.bytes_per_node,
+            "device_bytes": self.device_bytes,
+            "passes": list(self.passes),
+        }
 
 
-def bytes_per_particle(deformation: str, dimension: int, backend: Backend, *, several_bodies: bool) -> int:
-    """Return the device bytes of one particle of a law that stores `deformation`, sort buffers included."""
+def fields_of(law: type[Law], dimension: int, backend: Backend, *, several_bodies: bool) -> dict[str, int]:
+    """Return the bytes of each field of one particle of a law, by name."""
     real = 8 if backend.precision == "f64" else 4
     width = node_width(dimension, on_cpu=True) if backend.on_cpu else dimension
-    gradient = dimension * width
-    state = dimension + width + gradient + (1 if deformation == "J" else dimension * width)
-    labels = 2 if several_bodies else 1
-    return (state + gradient) * real + 4 * labels + 8
+    matrix = dimension * width * real
+    fields = {"position": dimension * real, "velocity": width * real, "velocity_gradient": matrix}
+    if law.deformation == "F":
+        fields["deformation_gradient"] = matrix
+    else:
+        fields["volume_ratio"] = real
+    fields |= {variable.name: real for variable in law.parameters.internal_in(dimension)}
+    return fields | {"id": 4} | ({"body": 4} if several_bodies else {})
+
+
+def passes_of(names: Sequence[str], scene: Scene) -> tuple[str, ...]:
+    """Return the loops of one step: the particles of each law, and the grid."""
+    separate = any("separate" in pair for pair in scene.domain.walls.faces(scene.dimension))
+    return (
+        "clear grid",
+        *(f"scatter {name}" for name in names),
+        *(("find contact",) if separate else ()),
+        "update grid",
+        *(f"gather {name}" for name in names),
+    )
 
 
 def make_plan(scene: Scene, backend: Backend) -> Plan:
-    """Return the memory that a scene needs."""
+    """Return what a scene needs."""
     dimension = scene.dimension
     cells = scene.domain.cells
     real = 8 if backend.precision == "f64" else 4
     width = node_width(dimension, on_cpu=backend.on_cpu)
-    particles = estimate_particles(scene)
-    by_law = Counter(body.material.law for body in scene.bodies)
-    per_particle = max(
-        bytes_per_particle(laws()[law].deformation, dimension, backend, several_bodies=count > 1)
-        for law, count in by_law.items()
+    bodies = Counter(body.material.law for body in scene.bodies)
+    counts = Counter[str]()
+    for body in scene.bodies:
+        counts[body.material.law] += estimate_body(body, scene.domain.spacing)
+    groups = tuple(
+        LawPlan(name, counts[name], fields_of(laws()[name], dimension, backend, several_bodies=bodies[name] > 1))
+        for name in sorted(bodies)
     )
+    # The widest field is a matrix; sources and keys are integers.
+    widest = max(size for group in groups for size in group.fields.values())
     nodes = Grid.nodes_needed(cells)
-    tables = len(by_law) * TileOrder.bytes_needed(cells, backend.threads)
+    tables = len(groups) * TileOrder.bytes_needed(cells, backend.threads)
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
-    host_bytes = 2 * particles * 8 * (2 * dimension + dimension**2)
-    return Plan(particles, nodes, per_particle, real * width, nodes * real * width + tables, host_bytes)
+    host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)
+    passes = passes_of(sorted(bodies), scene)
+    return Plan(groups, nodes, widest + 8, real * width, nodes * real * width + tables, host_bytes, passes)
 
 
 def require_room(plan: Plan) -> None:

@@ -89,8 +89,7 @@ class RunSummary:
             "particle_steps_per_s": self.rate,
             "backend": self.backend,
             "bytes_per_particle": self.plan.bytes_per_particle,
-            "bytes_per_node": self.plan.bytes_per_node,
-            "device_bytes": self.plan.device_bytes,
+            "plan": self.plan.as_dict(),
             "timings": self.timings,
             "energy": None
             if self.first is None or self.last is None

@@ -8,7 +8,11 @@ import numpy as np
 
 from mpmcli.materials.tensors import determinant
 from mpmcli.output.frame import Frame
+from mpmcli.solver.observe import Observation
 from mpmcli.solver.particles import MASS, VOLUME, ParticleGroup
+
+# Fields that need the stress of every particle.
+STRESSES = ("stress", "pressure")
 
 
 @dataclass(frozen=True)
@@ -30,12 +34,8 @@ class Snapshot:
 
     @cached_property
     def volume_ratio(self) -> np.ndarray:
-        """J of each particle, (n,)."""
+        """J of each particle as stored, (n,)."""
         return self.deformation if self.deformation.ndim == 1 else determinant(self.deformation)
-
-    def each_body(self) -> list[tuple[np.ndarray, int]]:
-        """Return (rows, place in the group) of each body of the group."""
-        return [(np.flatnonzero(self.body == b), place) for place, b in enumerate(self.group.bodies)]
 
     def per_body(self, column: int) -> np.ndarray:
         """Return an entry of the group's table for every particle, (n,) float64."""
@@ -57,44 +57,42 @@ def read_group(group: ParticleGroup) -> Snapshot:
     )
 
 
-def _stress(snapshot: Snapshot) -> np.ndarray:
-    """Return the Cauchy stress, (n, 3, 3), Pa."""
-    stress = np.empty((len(snapshot.id), 3, 3), snapshot.deformation.dtype)
-    for rows, place in snapshot.each_body():
-        stress[rows] = snapshot.group.law.cauchy_stress(snapshot.group.parameters[place], snapshot.deformation[rows])
-    return stress
-
-
-def _full_gradient(snapshot: Snapshot) -> np.ndarray:
+def _full_gradient(deformation: np.ndarray, dimension: int) -> np.ndarray:
     """Return F, (n, d, d); a law that keeps J has the isotropic F of that volume."""
-    if snapshot.deformation.ndim == 3:
-        return snapshot.deformation
-    d = snapshot.x.shape[1]
-    return snapshot.deformation[:, None, None] ** (1 / d) * np.eye(d, dtype=snapshot.deformation.dtype)
+    if deformation.ndim == 3:
+        return deformation
+    return deformation[:, None, None] ** (1 / dimension) * np.eye(dimension, dtype=deformation.dtype)
 
 
-def _field(name: str, snapshot: Snapshot) -> np.ndarray:
+def _volume_ratio(snapshot: Snapshot, seen: Observation) -> np.ndarray:
+    """Return volume over volume at rest, (n,)."""
+    J = seen.deformation if seen.deformation.ndim == 1 else determinant(seen.deformation)
+    return snapshot.group.law.total_volume_ratio(J, seen.internal)
+
+
+def _field(name: str, snapshot: Snapshot, seen: Observation, at_rest: dict[str, float]) -> np.ndarray:
     group = snapshot.group
-    if name == "volume_ratio":
-        return snapshot.volume_ratio
-    if name == "density":
-        return snapshot.per_body(MASS) / snapshot.per_body(VOLUME) / snapshot.volume_ratio
-    if name == "mass":
-        return snapshot.per_body(MASS)
-    if name == "affine":
-        return snapshot.C.reshape(group.count, -1)
-    if name == "deformation_gradient":
-        return _full_gradient(snapshot).reshape(group.count, -1)
-    stress = _stress(snapshot)
-    if name == "stress":
-        return stress.reshape(group.count, 9)
-    if name == "pressure":
-        return -np.trace(stress, axis1=1, axis2=2) / 3
-    raise KeyError(name)
+    match name:
+        case "volume_ratio":
+            return _volume_ratio(snapshot, seen)
+        case "density":
+            return snapshot.per_body(MASS) / snapshot.per_body(VOLUME) / _volume_ratio(snapshot, seen)
+        case "mass":
+            return snapshot.per_body(MASS)
+        case "affine":
+            return snapshot.C.reshape(group.count, -1)
+        case "deformation_gradient":
+            return _full_gradient(seen.deformation, group.dimension).reshape(group.count, -1)
+        case "stress":
+            return (seen.tau / _volume_ratio(snapshot, seen)[:, None, None]).reshape(group.count, 9)
+        case "pressure":
+            return -np.trace(seen.tau, axis1=1, axis2=2) / (3 * _volume_ratio(snapshot, seen))
+    return seen.internal[name] if name in seen.internal else np.full(group.count, at_rest[name])
 
 
 def build_frame(
     snapshots: Sequence[Snapshot],
+    seen: Sequence[Observation],
     fields: Sequence[str],
     origin: np.ndarray,
     position_type: type,
@@ -111,6 +109,8 @@ def build_frame(
         result[ids] = joined
         return result
 
+    # What particles of other laws show of an internal variable.
+    at_rest = {variable.name: variable.at_rest for s in snapshots for variable in s.group.law.internal}
     real = snapshots[0].x.dtype
     return Frame(
         index=index,
@@ -121,12 +121,16 @@ def build_frame(
         body=ordered([s.body for s in snapshots]),
         material=ordered([np.full(len(s.id), m, np.int32) for m, s in enumerate(snapshots)]),
         fields={
-            name: ordered([_field(name, s).astype(real) for s in snapshots]) for name in fields if name != "velocity"
+            name: ordered([_field(name, s, o, at_rest).astype(real) for s, o in zip(snapshots, seen, strict=True)])
+            for name in fields
+            if name != "velocity"
         },
     )
 
 
-def measure(snapshots: Sequence[Snapshot], gravity: np.ndarray, spacing: float) -> dict[str, float | tuple[float, ...]]:
+def measure(
+    snapshots: Sequence[Snapshot], seen: Sequence[Observation], gravity: np.ndarray, spacing: float
+) -> dict[str, float | tuple[float, ...]]:
     """Sum what a run conserves; the affine velocity carries energy and angular momentum too (Jiang et al. 2017).
 
     Returns:
@@ -137,7 +141,7 @@ def measure(snapshots: Sequence[Snapshot], gravity: np.ndarray, spacing: float) 
     linear = np.zeros(d)
     angular = np.zeros(1 if d == 2 else 3)
     inertia = 0.25 * spacing**2
-    for s in snapshots:
+    for s, o in zip(snapshots, seen, strict=True):
         m, V0 = s.per_body(MASS), s.per_body(VOLUME)
         x, v, C = (a.astype(np.float64) for a in (s.x, s.v, s.C))
         mass += m.sum()
@@ -149,10 +153,8 @@ def measure(snapshots: Sequence[Snapshot], gravity: np.ndarray, spacing: float) 
         for k, (a, b) in enumerate(pairs):
             angular[k] += m @ (x[:, a] * v[:, b] - x[:, b] * v[:, a])
             angular[k] += inertia * (m @ (C[:, b, a] - C[:, a, b]))
-        for rows, place in s.each_body():
-            density = s.group.law.energy_density(s.group.parameters[place], s.deformation[rows].astype(np.float64))
-            elastic += V0[rows] @ density
-    J = [s.volume_ratio for s in snapshots]
+        elastic += V0 @ o.energy.astype(np.float64)
+    J = [_volume_ratio(s, o) for s, o in zip(snapshots, seen, strict=True)]
     return {
         "mass": float(mass),
         "kinetic": float(kinetic),

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import taichi as ti
@@ -15,12 +15,13 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError, cause_of, diagnose, first_unsound, rate_of_change
 from mpmcli.solver.extremes import build_extremes
 from mpmcli.solver.grid import DRIFT, PAD, TILE, Grid, node_width
+from mpmcli.solver.observe import build_observation
 from mpmcli.solver.ordering import SortBuffers, TileOrder, build_sort
 from mpmcli.solver.particles import ParticleGroup
-from mpmcli.solver.snapshot import Snapshot, build_frame, measure, read_group
+from mpmcli.solver.snapshot import STRESSES, Snapshot, build_frame, measure, read_group
 from mpmcli.solver.step import NOT_LOST, SMALLEST_J, build_step
 from mpmcli.stability.ledger import LedgerRow
-from mpmcli.stability.limits import Limit, deformation_limit, speed_limit, wave_limit
+from mpmcli.stability.limits import Limit, deformation_limit, mode_limit, speed_limit
 
 # The state is measured, and the limits with it, once in so many steps at most, and earlier where something may have
 # deformed by more than this fraction since; the margin of time.safety covers that.
@@ -77,11 +78,12 @@ class Solver:
         self.groups = []
         for name in self.laws:
             members = [i for i, body in enumerate(scene.bodies) if body.material.law == name]
+            materials = [scene.bodies[i].material for i in members]
             self.groups.append(
                 ParticleGroup(
-                    laws()[name](),
+                    laws()[name](materials, scene.dimension),
                     members,
-                    [scene.bodies[i].material for i in members],
+                    materials,
                     [particles[i] for i in members],
                     [int(first_ids[i]) for i in members],
                     self._origin,
@@ -105,33 +107,37 @@ class Solver:
             on_cpu=backend.on_cpu,
             drift=math.ceil(self._drift_allowed),
         )
-        self._measure = build_extremes(self.groups, backend)
+        self._measure = [build_extremes(group, backend) for group in self.groups]
+        self._observe = [build_observation(group) for group in self.groups]
+        self._last_step = 0.0
         self._drift = math.inf
-        self._extremes = self._measure()
-        self._use_extremes()
+        self._extremes = [measure() for measure in self._measure]
+        # Per group, since its last measurement: steps, and how far its stiffness may have changed.
+        self._unwatched = [0] * len(self.groups)
+        self._change = [0.0] * len(self.groups)
+        self._use_speeds()
+        self._slow_limits = [self._limits_of(g) for g in range(len(self.groups))]
+        self._slow_limit = min(min(limits) for limits in self._slow_limits)
         self._first_stable_step = self.stable_step()[0]
 
-    def _use_extremes(self) -> None:
-        self._unwatched = 0
-        self._change = 0.0
+    def _use_speeds(self) -> None:
         self._speed = max(extremes.speed for extremes in self._extremes)
-        self._slow_limit = min(self._slow_limits())
 
     def limits(self) -> list[Limit]:
         """Return every bound on the next step: of the speed as it is, of the rest as last measured."""
-        return [self._speed_limit(), *self._slow_limits()]
+        return [self._speed_limit(), *(limit for limits in self._slow_limits for limit in limits)]
 
     def _speed_limit(self) -> Limit:
         return Limit(speed_limit(self.spacing, self._speed, self._pull), "speed", "")
 
-    def _slow_limits(self) -> list[Limit]:
-        bounds = []
-        for group, extremes in zip(self.groups, self._extremes, strict=True):
-            bounds.append(Limit(deformation_limit(extremes.gradient), "deformation", ""))
-            for place, parameters in zip(group.bodies, group.parameters, strict=True):
-                stiffness = group.law.stiffness(parameters, extremes.bound, self.scene.dimension)
-                bound = wave_limit(self.spacing, parameters.density, stiffness)
-                bounds.append(Limit(bound, "wave", self._names[place]))
+    def _limits_of(self, g: int) -> list[Limit]:
+        """Return the bounds that the g-th group sets, as last measured."""
+        group, extremes = self.groups[g], self._extremes[g]
+        bounds = [Limit(deformation_limit(extremes.gradient), "deformation", "")]
+        for place, parameters in zip(group.bodies, group.parameters, strict=True):
+            for mode in group.law.modes(parameters, extremes.bound):
+                value, cause = mode_limit(self.spacing, parameters.density, mode.stiffness, mode.viscosity)
+                bounds.append(Limit(value, cause, self._names[place]))
         return bounds
 
     @property
@@ -162,6 +168,7 @@ class Solver:
             self._drift = 0.0
         fastest = self._kernels.step(dt)
         self.time += dt
+        self._last_step = dt
         self.step_count += 1
         if self.step_count == 1:
             self.first_step_seconds = time.perf_counter() - began
@@ -176,18 +183,25 @@ class Solver:
         # Whatever else pushes on a GPU is allowed to double the speed; `advance` flags what went further.
         unseen = 2 * self.courant + UNSEEN if fastest is None else 0.0
         self._drift += max(self.courant, unseen)
-        self._unwatched += 1
-        # What moves through a fifth of a cell may meet something that deforms it by about as much.
-        self._change += max(dt * max(extremes.gradient for extremes in self._extremes), 0.5 * self.courant)
+        due = []
+        for g, (group, extremes) in enumerate(zip(self.groups, self._extremes, strict=True)):
+            self._unwatched[g] += 1
+            # What moves through a fifth of a cell may meet something that deforms it by about as much.
+            self._change[g] += group.law.sensitivity * max(dt * extremes.gradient, 0.5 * self.courant)
+            if self._unwatched[g] >= MOST_UNWATCHED_STEPS or self._change[g] >= UNWATCHED_CHANGE:
+                due.append(g)
         blind = unseen > 0 and self._drift + unseen >= self._drift_allowed
-        if self._unwatched >= MOST_UNWATCHED_STEPS or self._change >= UNWATCHED_CHANGE or blind:
+        if blind:
             self.watch(dt)
+        elif due:
+            self.watch(dt, due)
 
-    def watch(self, dt: float) -> None:
+    def watch(self, dt: float, due: Sequence[int] | None = None) -> None:
         """Measure the device's state, and the limits with it.
 
         Args:
             dt: the step last taken, s.
+            due: the groups to measure, all of them where None.
 
         Raises:
             UnstableRunError: a particle is lost.
@@ -195,11 +209,23 @@ class Solver:
         # On the CPU every step says so itself.
         if not self.backend.on_cpu and self._kernels.any_lost():
             self._stop(dt)
-        self._extremes = self._measure()
-        if not min(extremes.bound.volume_ratio_min for extremes in self._extremes) > SMALLEST_J:
-            # Crushed or inverted by the last step: the next one would have refused to scatter it.
-            self._stop(dt)
-        self._use_extremes()
+        for g in range(len(self.groups)) if due is None else due:
+            self._extremes[g] = self._measure[g]()
+            self._unwatched[g] = 0
+            self._change[g] = 0.0
+            if not self._extremes[g].bound.volume_ratio_min > SMALLEST_J:
+                # Crushed or inverted by the last step: the next one would have refused to scatter it.
+                self._stop(dt)
+            self._slow_limits[g] = self._limits_of(g)
+        # Otherwise the fastest node of the last step bounds the speeds of all.
+        if max(self._unwatched) == 0:
+            self._use_speeds()
+        self._slow_limit = min(min(limits) for limits in self._slow_limits)
+
+    def state_was_replaced(self) -> None:
+        """Sort and measure particles whose state was set from outside, as tests and benchmarks do."""
+        self._drift = math.inf
+        self.watch(self._last_step)
 
     def _stop(self, dt: float) -> None:
         for group, lost in zip(self.groups, self._kernels.lost.to_numpy(), strict=True):
@@ -259,10 +285,19 @@ class Solver:
         """Return the state as a frame, and the ledger row for the steps (size, Courant number, limit) taken."""
         began = time.perf_counter()
         snapshots = [read_group(group) for group in self.groups]
+        stress = any(name in STRESSES for name in self.scene.output.fields)
+        seen = [observe(self._last_step, stress=stress) for observe in self._observe]
         frame = build_frame(
-            snapshots, self.scene.output.fields, self._origin, self._position_type, index, self.time, self.step_count
+            snapshots,
+            seen,
+            self.scene.output.fields,
+            self._origin,
+            self._position_type,
+            index,
+            self.time,
+            self.step_count,
         )
-        sums = measure(snapshots, self._gravity, self.spacing)
+        sums = measure(snapshots, seen, self._gravity, self.spacing)
         smallest = min(taken, default=(0.0, 0.0, ""))
         row = LedgerRow(
             time=self.time,

@@ -9,12 +9,14 @@ instructions; that halves the time of the gather in 3D.
 import taichi as ti
 
 from mpmcli.solver.kernel import stencil, weights
-from mpmcli.solver.particles import CONSTANTS, MASS, VOLUME
+from mpmcli.solver.particles import MASS, VOLUME
 
 
 @ti.func
 def scatter(group: ti.template(), grid: ti.template(), p: int, dt: float, atomic: ti.template()):
     """Add the mass and the momentum of particle p, stress included, to the nodes around it.
+
+    A law with plastic flow returns the particle's state to what it can bear first.
 
     Node i receives w_i (m v + A (x_i - x_p)) with A = m C - dt V0 (4/h^2) tau (Hu et al. 2018, eq. 18
     with the quadratic D = h^2/4), and w_i m. Without `atomic` the caller owns those nodes.
@@ -24,8 +26,9 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, dt: float, atomic
     row = group.row(p)
     mass = row[MASS]
     v, C = group.motion(p)
-    constants = ti.Vector([row[CONSTANTS + c] for c in ti.static(range(row.n - CONSTANTS))])
-    stress = group.law.kirchhoff_stress(group.stored(p), C, constants)
+    stress, _, deformation, inner = group.law.respond(group.stored(p), group.inner(p), C, dt, group.constants(p))
+    if ti.static(group.law.projects):
+        group.store(p, deformation, inner)
     base, distance = stencil(group.x[p], 1 / h)
     w = weights(distance)
 

@@ -14,12 +14,14 @@ DEFORMATION = 0.5
 
 WHY = {
     "wave": "a pressure or shear wave must not cross more than one cell in a step, even for a lone particle",
+    "viscosity": "momentum must not diffuse across more than a quarter of a cell's square in a step",
     "speed": "a particle must not move more than half a cell in a step",
     "deformation": "a particle must not be compressed by more than half in a step",
     "maximum": "time.step in the scene sets it",
 }
 FIX = {
     "wave": "a softer material or a coarser grid allows a larger step",
+    "viscosity": "a thinner fluid or a coarser grid allows a larger step",
     "speed": "a coarser grid or a slower scene allows a larger step",
     "deformation": "a coarser grid or a stiffer material deforms less in a step",
     "maximum": 'a larger time.step, or "auto", allows a larger step',
@@ -31,7 +33,7 @@ class Limit(NamedTuple):
 
     Attributes:
         value: the largest step that it allows, s.
-        name: "wave", "speed", "deformation" or "maximum".
+        name: "wave", "viscosity", "speed", "deformation" or "maximum".
         body: name of the body that sets it, "" where no single one does.
     """
 
@@ -50,19 +52,28 @@ class Limit(NamedTuple):
         return FIX[self.name]
 
 
-def wave_limit(spacing: float, density: float, stiffness: float) -> float:
-    """Return h sqrt(density / stiffness), s: an isolated particle's bound.
+def mode_limit(spacing: float, density: float, stiffness: float, viscosity: float = 0.0) -> tuple[float, str]:
+    """Return the step that one mode of an isolated particle allows, s, and which of the two binds.
 
-    Its velocity gradient obeys C' = C - dt 4/(h^2 density) tau, and tau changes by at most
-    stiffness |C| dt, so dt^2 (4/h^2) stiffness / density <= 4. At rest the stiffness is d lambda + 2 mu for
-    a solid and d K for a fluid.
+    With a = 4 dt / (h^2 density) its velocity gradient obeys C' = C - a tau, where tau = stiffness e + viscosity C,
+    and then e' = e + dt C'. That is stable while dt^2 stiffness + 2 dt viscosity <= density h^2; at rest the
+    stiffness is d lambda + 2 mu for a solid and d K for a fluid, and the viscosity 2 density nu in shear.
 
     Args:
         spacing: h, m.
         density: kg/m^3, at rest.
-        stiffness: Pa, see `Law.stiffness`.
+        stiffness, viscosity: Pa and Pa s, see `Mode`.
+
+    Returns:
+        The step, and "wave" or "viscosity", whichever term is the larger one at that step.
     """
-    return spacing * math.sqrt(density / stiffness) if stiffness > 0 else math.inf
+    inertia = density * spacing**2
+    # The root in the form that neither cancels nor overflows.
+    root = viscosity + math.sqrt(viscosity**2 + stiffness * inertia)
+    if root == 0:
+        return math.inf, "wave"
+    step = inertia / root
+    return step, "wave" if step * stiffness >= 2 * viscosity else "viscosity"
 
 
 def speed_limit(spacing: float, speed: float, gravity: float) -> float:

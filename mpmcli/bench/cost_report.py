@@ -1,0 +1,246 @@
+"""What laws cost, as tables for people and as a dictionary for JSON."""
+
+import statistics
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from mpmcli.bench.cases import BenchCase
+from mpmcli.bench.report import describe_machine, heading, text_table
+
+# (law, its measure, how many times as much it may cost).
+TARGETS = (("fixed_corotated", "neo_hookean", 2.0), ("sand", "fluid", 5.0), ("snow", "fluid", 5.0))
+# How many times the sum of its parts a scene with two laws may cost.
+MIX_TARGET = 1.05
+# What every law is compared with.
+MEASURES = ("fluid", "neo_hookean")
+
+
+@dataclass(frozen=True)
+class CostResult:
+    """One law, or several in one scene, at one case.
+
+    Attributes:
+        case: sizes and step.
+        names: of the laws, each with an equal share of the particles.
+        costs: s per particle and step of each measured block, in order.
+        compile_seconds: what the first step took beyond a usual one, with nothing cached on disk.
+        bytes_per_particle: device memory, sort buffers included, of a particle of the law that takes most.
+        flowing: share of the particles whose state the last step projected: those in plastic flow, or torn.
+        smallest_step: smallest time step that was taken, s.
+        sound: whether every particle was still where it can be.
+    """
+
+    case: BenchCase
+    names: tuple[str, ...]
+    costs: tuple[float, ...]
+    compile_seconds: float
+    bytes_per_particle: int
+    flowing: float
+    smallest_step: float
+    sound: bool
+
+    @property
+    def name(self) -> str:
+        """The laws, like "fluid + sand"."""
+        return " + ".join(self.names)
+
+    @property
+    def nanoseconds(self) -> float:
+        """Median of the blocks, ns per particle and step."""
+        return 1e9 * statistics.median(self.costs)
+
+    def as_dict(self) -> dict:
+        """Return it with SI units in the names, but for the cost, which is in ns."""
+        return {
+            "case": self.case.name,
+            "laws": list(self.names),
+            "particles": self.case.particles,
+            "step_s": self.case.step,
+            "ns_per_particle_step": self.nanoseconds,
+            "ns_per_particle_step_blocks": [1e9 * cost for cost in self.costs],
+            "compile_s": self.compile_seconds,
+            "device_bytes_per_particle": self.bytes_per_particle,
+            "flowing": self.flowing,
+            "smallest_step_s": self.smallest_step,
+            "sound": self.sound,
+        }
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A cost over another, or over the mean of several.
+
+    Attributes:
+        value: of the medians.
+        low, high: of the blocks of each round, which were measured right beside each other.
+    """
+
+    value: float
+    low: float
+    high: float
+
+
+def ratio_of(result: CostResult, *parts: CostResult) -> Ratio:
+    """Return what a result costs over the mean of its parts, which is their sum with an equal share of particles."""
+    rounds = [
+        cost / statistics.fmean(beside)
+        for cost, *beside in zip(result.costs, *(part.costs for part in parts), strict=True)
+    ]
+    return Ratio(result.nanoseconds / statistics.fmean(p.nanoseconds for p in parts), min(rounds), max(rounds))
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a cost should be: at most `limit` times another.
+
+    Attributes:
+        case: name of the case.
+        text: what is compared.
+        ratio: what was found.
+        limit: the most that it should be.
+    """
+
+    case: str
+    text: str
+    ratio: Ratio
+    limit: float
+
+    @property
+    def met(self) -> bool:
+        """Whether it is."""
+        return self.ratio.value <= self.limit
+
+    def as_dict(self) -> dict:
+        """Return it as JSON can hold it."""
+        found = {"ratio": self.ratio.value, "ratio_min": self.ratio.low, "ratio_max": self.ratio.high}
+        return {"case": self.case, "target": self.text, **found, "limit": self.limit, "met": self.met}
+
+    def sentence(self) -> str:
+        """Say what was found, and what should be."""
+        verdict = "" if self.met else ", MISSED"
+        return f"{self.case}: {self.text}: {self.ratio.value:.3f}, should be at most {self.limit:g}{verdict}."
+
+
+@dataclass(frozen=True)
+class CostReport:
+    """Every law and every mix of one run of the benchmark.
+
+    Attributes:
+        results: laws and then mixes of each case.
+        flaws: a sentence for each law that could not be measured.
+        threads, precision: as all used them.
+        seconds: length of one block, s.
+        machine: see `describe_machine`.
+    """
+
+    results: tuple[CostResult, ...]
+    flaws: tuple[str, ...]
+    threads: int
+    precision: str
+    seconds: float
+    machine: dict = field(default_factory=describe_machine)
+
+    @property
+    def clock(self) -> str:
+        """What time is counted."""
+        return "processor time" if self.threads == 1 else "wall time"
+
+    def of(self, result: CostResult, *names: str) -> Ratio | None:
+        """Return a cost over that of other laws at the same case, or None where those were not measured."""
+        alone = {other.names[0]: other for other in self.results if other.case == result.case and len(other.names) == 1}
+        if not all(name in alone for name in names):
+            return None
+        return ratio_of(result, *(alone[name] for name in names))
+
+    @property
+    def targets(self) -> tuple[Target, ...]:
+        """What the costs should be, as far as it was measured."""
+        return tuple(self._targets())
+
+    def _targets(self) -> Iterator[Target]:
+        for result in self.results:
+            if result.names == ("fluid",):
+                others = [r for r in self.results if r.case == result.case and len(r.names) == 1 and r is not result]
+                if others:
+                    cheapest = min(others, key=lambda other: other.nanoseconds)
+                    text = f"fluid over the next cheapest, {cheapest.name}"
+                    yield Target(result.case.name, text, ratio_of(result, cheapest), 1.0)
+            for law, measure, limit in TARGETS:
+                if result.names == (law,) and (ratio := self.of(result, measure)):
+                    yield Target(result.case.name, f"{law} over {measure}", ratio, limit)
+            if len(result.names) > 1 and (ratio := self.of(result, *result.names)):
+                yield Target(result.case.name, f"{result.name} over the sum of its parts", ratio, MIX_TARGET)
+
+    def as_dict(self) -> dict:
+        """Return everything measured, ready for JSON."""
+        return {
+            "machine": self.machine,
+            "threads": self.threads,
+            "precision": self.precision,
+            "arch": "cpu",
+            "block_s": self.seconds,
+            "clock": self.clock,
+            "results": [self._result_dict(result) for result in self.results],
+            "targets": [target.as_dict() for target in self.targets],
+            "flaws": list(self.flaws),
+        }
+
+    def _result_dict(self, result: CostResult) -> dict:
+        if len(result.names) > 1:
+            ratios = {"over_sum_of_parts": self.of(result, *result.names)}
+        else:
+            ratios = {f"over_{name}": self.of(result, name) for name in MEASURES}
+        return result.as_dict() | {key: ratio.value if ratio else None for key, ratio in ratios.items()}
+
+    def table(self) -> str:
+        """Return the report as text: laws, mixes, targets, and what the columns mean."""
+        head = ("case", "law", "ns", "range", "/ fluid", "/ neo_hookean", "bytes", "compile s", "flowing")
+        rows = [
+            (
+                *_cost_cells(result),
+                *(_times(self.of(result, name)) for name in MEASURES),
+                str(result.bytes_per_particle),
+                f"{result.compile_seconds:.1f}",
+                f"{100 * result.flowing:.0f} %",
+            )
+            for result in self.results
+            if len(result.names) == 1
+        ]
+        parts = [text_table(head, rows, left={0, 1})]
+        mixes = [
+            (*_cost_cells(result), _times(self.of(result, *result.names)), f"{result.compile_seconds:.1f}")
+            for result in self.results
+            if len(result.names) > 1
+        ]
+        if mixes:
+            parts.append(text_table(("case", "two laws", "ns", "range", "/ sum", "compile s"), mixes, left={0, 1}))
+        parts.append("\n".join(target.sentence() for target in self.targets))
+        notes = [
+            f"ns: {self.clock} per particle and step, median of the blocks; range: of the blocks.",
+            "sum: half of what each of the two laws costs alone, for half of the particles each.",
+            "bytes: on the device per particle, sort buffers included; compile: with no kernel cached on disk.",
+            "flowing: particles in plastic flow, or torn, at the end of what was measured.",
+        ]
+        return "\n\n".join(
+            filter(None, [heading(self.machine, "cpu", self.threads, self.precision), *parts, "\n".join(notes)])
+        ) + "".join(f"\nBeware: {warning}" for warning in [*self._warnings(), *self.flaws])
+
+    def _warnings(self) -> Iterator[str]:
+        for result in self.results:
+            where = f"{result.name} at {result.case.name}"
+            if result.smallest_step < result.case.step:
+                yield (
+                    f"the limits of {where} asked for steps down to {result.smallest_step:.3g} s, "
+                    f"below the {result.case.step:.3g} s of the others."
+                )
+            if not result.sound:
+                yield f"{where} broke down (a particle left the box or is not a number)."
+
+
+def _cost_cells(result: CostResult) -> tuple[str, ...]:
+    low, high = 1e9 * min(result.costs), 1e9 * max(result.costs)
+    return result.case.name, result.name, f"{result.nanoseconds:.1f}", f"{low:.1f}-{high:.1f}"
+
+
+def _times(ratio: Ratio | None) -> str:
+    return "" if ratio is None else f"{ratio.value:.2f}"

@@ -1,0 +1,118 @@
+"""Measures what laws cost: a process for each law and each mix, all alive, measured in turn (A B C ... A B C ...)."""
+
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+
+from mpmcli.bench.cases import BenchCase
+from mpmcli.bench.compare import BLOCKS, Setting, Worker, start_worker
+from mpmcli.bench.cost_report import CostReport, CostResult
+from mpmcli.bench.materials import MATERIAL_CASES, MIXES, steps_of
+from mpmcli.errors import RunError
+from mpmcli.materials.registry import laws
+
+Contender = tuple[str, ...]
+Start = Callable[[str, BenchCase, Setting], Worker]
+
+
+def run_costs(
+    cases: Iterable[BenchCase] = MATERIAL_CASES,
+    threads: int = 1,
+    seconds: float = 1.0,
+    progress: Callable[[str], None] | None = None,
+    *,
+    names: Sequence[str] | None = None,
+    mixes: Sequence[Contender] = MIXES,
+    blocks: int = BLOCKS,
+    precision: str = "f32",
+    start: Start = start_worker,
+) -> CostReport:
+    """Measure every law, and mixes of two, and return the report.
+
+    Args:
+        cases: of mpmcli.bench.materials.
+        threads: of the processor, for all.
+        seconds: length of one block; a block takes the same steps from the same state as often as that needs. With
+            one thread the processor's time counts, with more the time that goes by.
+        progress: told one line of text as each law starts and each round of blocks is done.
+        names: laws to measure; by default every law of the package.
+        mixes: pairs of laws to measure in one scene.
+        blocks: measured blocks of each law and mix.
+        precision: "f32" or "f64".
+        start: makes the process of a law, or of a mix with commas between its laws; tests replace it.
+
+    A law that cannot start, or breaks down, is left out, and the report says why.
+    """
+    setting = Setting(threads, precision)
+    # One thread works all the time, unless another process takes its place: its own time leaves that out.
+    clock = "processor_seconds" if threads == 1 else "seconds"
+    tell = progress or (lambda line: None)
+    singles = sorted(laws()) if names is None else names
+    contenders = [*((name,) for name in singles), *mixes]
+    results: list[CostResult] = []
+    flaws: list[str] = []
+    for case in cases:
+        tell(f"{case.name}: {case.particles:,} particles, {case.cells}^{case.dimension} cells")
+        with ExitStack() as stack:
+            columns = [_Column(case, contender, clock) for contender in contenders]
+            columns = _lasting(columns, lambda column: column.begin(stack, setting, start, tell), flaws)
+            for block in range(blocks):
+                columns = _lasting(columns, lambda column: column.measure(seconds), flaws)
+                last = ", ".join(f"{column.name} {1e9 * column.costs[-1]:.0f}" for column in columns)
+                tell(f"{case.name}: block {block + 1} of {blocks}, ns: {last}")
+            _lasting(columns, lambda column: results.append(column.finish()), flaws)
+    return CostReport(tuple(results), tuple(flaws), threads=threads, precision=precision, seconds=seconds)
+
+
+class _Column:
+    """One law, or a mix, at one case, and the process that runs it."""
+
+    worker: Worker
+    first_seconds: float
+
+    def __init__(self, case: BenchCase, names: Contender, clock: str) -> None:
+        self.case, self.names, self.name, self.clock = case, names, " + ".join(names), clock
+        self.costs: list[float] = []
+
+    def begin(self, stack: ExitStack, setting: Setting, start: Start, tell: Callable[[str], None]) -> None:
+        """Start, compile, and step to the state that is measured."""
+        self.worker = stack.enter_context(start(",".join(self.names), self.case, setting))
+        count = self.worker.ready["particles"]
+        if count != self.case.particles:
+            raise RunError(f"It has {count} particles instead of {self.case.particles}.")
+        self.first_seconds = self.worker.ask("first")["seconds"]
+        self.worker.ask(f"keep {steps_of(self.case)[0]}")
+        tell(f"{self.case.name}: {self.name} is ready")
+
+    def measure(self, seconds: float) -> None:
+        """Measure one block."""
+        answer = self.worker.ask(f"repeat {steps_of(self.case)[1]} {seconds}")
+        self.costs.append(answer[self.clock] / answer["steps"] / self.case.particles)
+
+    def finish(self) -> CostResult:
+        """Return what was found, and end the process."""
+        flowing = self.worker.ask("flowing")["share"]
+        end = self.worker.ask("finish")
+        return CostResult(
+            self.case,
+            self.names,
+            costs=tuple(self.costs),
+            compile_seconds=max(0.0, self.first_seconds - self.case.particles * statistics.median(self.costs)),
+            bytes_per_particle=self.worker.ready["bytes_per_particle"],
+            flowing=flowing,
+            smallest_step=end["smallest_step"],
+            sound=end["sound"],
+        )
+
+
+def _lasting(columns: list[_Column], act: Callable[[_Column], None], flaws: list[str]) -> list[_Column]:
+    """Do something to each in turn, and return those that did not fail at it."""
+    lasting = []
+    for column in columns:
+        try:
+            act(column)
+        except RunError as error:
+            flaws.append(f"{column.name} at {column.case.name} could not be measured. {error}")
+        else:
+            lasting.append(column)
+    return lasting

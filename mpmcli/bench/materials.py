@@ -1,0 +1,169 @@
+"""What a law costs: one column, the same for every law, that lands, shears and collapses while it is measured."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mpmcli.bench.cases import BenchCase
+from mpmcli.errors import RunError
+from mpmcli.materials.registry import laws, parameter_models
+from mpmcli.scene import parse_scene
+from mpmcli.scene.knobs import Knob
+from mpmcli.scene.material import MaterialParameters
+
+# Parameters by the names that laws share, so that a new law needs no entry: one density, one stiffness, and strengths
+# well below what the weight (up to 7 kPa) and the impact (some 20 kPa) press with, so that plastic laws flow.
+# What else a law needs is taken from the middle of its knob.
+VALUES = {
+    "density": 1000.0,
+    "youngs_modulus": 4e5,
+    "poissons_ratio": 0.3,
+    "bulk_modulus": 4e5,
+    "yield_stress": 1e3,
+    "consistency": 10.0,
+    "friction_angle": 35.0,
+}
+GRAVITY = 9.81
+# At the start: downward, m/s, so that the column lands within 30 ms, and dv_x/dy, 1/s.
+SPEED = 1.0
+SHEAR = 10.0
+# Edges of the column and its height above the floor, in a unit box.
+EDGES = {2: (0.75, 0.75), 3: (0.25, 0.5, 0.25)}
+CLEARANCE = 1 / 32
+
+# A fifth or less of the step that the stiffness at rest allows leaves room for hardening and impact. The particles are
+# 4 (2D) and 8 (3D) per cell, as scenes have by default.
+MATERIAL_CASES = (
+    BenchCase(dimension=2, cells=128, particles=36_864, step=4e-5),
+    BenchCase(dimension=3, cells=64, particles=65_536, step=1e-4),
+)
+# The cheapest pair, where what a second law adds to a step weighs most, and two that scenes would have.
+MIXES = (("fluid", "neo_hookean"), ("fluid", "sand"), ("neo_hookean", "snow"))
+# What is measured begins so long after the start, s, and takes so long: the wave of the impact, at some 25 m/s, is
+# then on its way through the column, which leans and spreads, and nothing has come to rest.
+SETTLING = 0.05
+STRETCH = 0.01
+
+
+def steps_of(case: BenchCase) -> tuple[int, int]:
+    """Return the number of steps before the state that is measured, and of the stretch that is."""
+    return round(SETTLING / case.step), round(STRETCH / case.step)
+
+
+def material_of(model: type[MaterialParameters]) -> dict[str, object]:
+    """Return the material that stands for a law, as a scene says it: VALUES, then knobs, then defaults.
+
+    Raises:
+        RunError: the law needs a parameter that has neither a value here nor a knob.
+    """
+    law = model.model_fields["law"].default
+    material: dict[str, object] = {"law": law}
+    for name, field in model.model_fields.items():
+        if name in VALUES:
+            material[name] = VALUES[name]
+        elif field.is_required() and name != "law":
+            knob = next((entry for entry in field.metadata if isinstance(entry, Knob)), None)
+            if knob is None:
+                raise RunError(f'The law "{law}" needs {name}, for which the benchmark has no value and it no knob.')
+            material[name] = knob.value(0.5)
+    return material
+
+
+def scene_of(names: Sequence[str], case: BenchCase, precision: str) -> dict:
+    """Return the column as the dictionary of a scene file: slices of equal size side by side, one for each law."""
+    d, edges = case.dimension, EDGES[case.dimension]
+    lower = [CLEARANCE if axis == 1 else (1 - edge) / 2 for axis, edge in enumerate(edges)]
+    shear = [[SHEAR if (row, column) == (0, 1) else 0.0 for column in range(d)] for row in range(d)]
+    slices = []
+    for index, name in enumerate(names):
+        first = lower[0] + edges[0] * index / len(names)
+        size = (edges[0] / len(names), *edges[1:])
+        corner = [first, *lower[1:]]
+        slices.append(
+            {
+                "name": name,
+                "material": material_of(laws()[name].parameters),
+                "shape": {"box": {"min": corner, "max": [c + s for c, s in zip(corner, size, strict=True)]}},
+                "velocity": [0.0, -SPEED, 0.0][:d],
+                "velocity_gradient": shear,
+                "particles_per_cell": 2**d,
+            }
+        )
+    return {
+        "title": f"Column of {' and '.join(names)}, {case.name}",
+        "domain": {
+            "size": [1.0] * d,
+            "cells": [case.cells] * d,
+            "gravity": [0.0, -GRAVITY, 0.0][:d],
+            "walls": "separate",
+        },
+        "time": {"end": 1.0, "frames": 1, "step": case.step},
+        "bodies": slices,
+        "solver": {"precision": precision},
+    }
+
+
+class Column:
+    """The solver on the column of some laws, running in this process, which it takes over (taichi starts once).
+
+    The column starts with a shear just above the floor, lands, leans and spreads; SETTLING later most particles of
+    a plastic law flow (`flowing` says how many). Every stretch that is measured takes the same steps from the same
+    state, so that blocks differ by the machine alone: `keep` remembers the state, `rewind` returns to it.
+    """
+
+    def __init__(self, names: Sequence[str], case: BenchCase, *, threads: int, precision: str, arch: str) -> None:
+        from mpmcli.solver.backend import start_backend
+        from mpmcli.solver.plan import make_plan
+        from mpmcli.solver.solver import Solver
+
+        if unknown := set(names) - set(laws()):
+            raise RunError(f"There is no law {min(unknown)}.")
+        name = f"{' + '.join(names)}, {case.name}"
+        scene = parse_scene(scene_of(names, case, precision), laws=parameter_models(), source=name).scene
+        backend = start_backend(arch, threads, precision, compile_cache=False)
+        self._solver = Solver(scene, backend)
+        self._waits = not backend.on_cpu
+        self._dt = self.smallest_step = case.step
+        self._kept: list[list[np.ndarray]] = []
+        self.particles: int = self._solver.particle_count
+        self.bytes_per_particle: int | None = make_plan(scene, backend).bytes_per_particle
+
+    def step(self) -> None:
+        """Advance by one step, as `frames` does: of the case's size, unless the limits ask for less."""
+        self._dt, _ = self._solver.stable_step()
+        self.smallest_step = min(self.smallest_step, self._dt)
+        self._solver.step(self._dt)
+
+    def sync(self) -> None:
+        """Wait until every step asked for is done; on the CPU each step has waited by itself."""
+        if self._waits:
+            self._solver.watch(self._dt)
+
+    def keep(self) -> None:
+        """Remember the state of all particles."""
+        self._kept = [[field.to_numpy() for field in (*g.state, *g.labels)] for g in self._solver.groups]
+
+    def rewind(self) -> None:
+        """Return to the state that was kept, and take the one step that sorts the particles again."""
+        for group, arrays in zip(self._solver.groups, self._kept, strict=True):
+            for field, values in zip((*group.state, *group.labels), arrays, strict=True):
+                field.from_numpy(values)
+        self._solver.state_was_replaced()
+        self.step()
+        self.sync()
+
+    def flowing(self) -> float:
+        """Return the share of particles whose state the next step projects: those that flow, or that were torn."""
+        from mpmcli.solver.observe import build_observation
+
+        count = 0
+        for group in self._solver.groups:
+            before = group.deformation_to_numpy().reshape(group.count, -1)
+            after = build_observation(group)(self._dt, stress=False).deformation.reshape(group.count, -1)
+            count += int((after != before).any(axis=1).sum())
+        return count / self.particles
+
+    def is_sound(self) -> bool:
+        """Whether every particle is where it can be."""
+        position = self._solver.frame(0, [])[0].position
+        return bool(((position >= 0) & (position <= 1)).all())

@@ -1,0 +1,142 @@
+"""`mpmcli materials`."""
+
+import inspect
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from mpmcli.cli.json_output import print_json
+from mpmcli.cli.options import json_option, plugin_option
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+# Columns of text where there is no terminal that says its width.
+WIDTH = 140
+
+
+@click.command("materials")
+@click.argument("name", required=False)
+@plugin_option
+@json_option
+def command(name: str | None, plugins: tuple[Path, ...], as_json: bool) -> None:
+    """List the laws and presets that a material may follow, or show the one called NAME.
+
+    Parameters come with their units, ranges and defaults, presets with their sources, and knobs with the
+    values that they stand for.
+    """
+    from mpmcli.errors import InputError
+    from mpmcli.materials.registry import laws, load_plugins
+    from mpmcli.scene.catalogue import law_facts, preset_facts
+    from mpmcli.scene.expand import available_presets
+    from mpmcli.scene.presets import PRESETS
+    from mpmcli.scene.sentences import listed, nearest, quoted
+
+    models = load_plugins(plugins)
+    known, presets = laws(), available_presets(models)
+    if name is not None and name not in known and name not in presets:
+        guess = nearest(name, [*known, *presets])
+        hint = f'did you mean "{guess}"?' if guess else f"there are {listed(quoted([*sorted(known), *presets]), 'and')}"
+        raise InputError(f'there is no law or preset "{name}"; {hint}')
+    facts: dict[str, list[dict[str, Any]]] = {
+        "laws": [
+            {"summary": _summary(known[law]), **law_facts(known[law].parameters)}
+            for law in sorted(known)
+            if name in (None, law)
+        ],
+        "presets": [
+            preset_facts(preset, known[PRESETS[preset].law].parameters) for preset in presets if name in (None, preset)
+        ],
+    }
+    if as_json:
+        print_json(facts)
+    else:
+        _print(facts, in_full=name is not None)
+
+
+def _summary(law: type) -> str:
+    """Return the first line of what a law's module says of itself, or else its class."""
+    module = sys.modules.get(law.__module__)
+    text = getattr(module, "__doc__", None) or inspect.getdoc(law) or ""
+    return next(iter(text.strip().splitlines()), "").rstrip(".")
+
+
+def _print(facts: dict[str, list[dict[str, Any]]], in_full: bool) -> None:
+    from rich.console import Console
+
+    console = Console(stderr=True, highlight=False)
+    if not console.is_terminal:
+        console.width = WIDTH
+    if facts["presets"] and not in_full:
+        _say(console, 'Presets: material = "honey", or { preset = "honey", thickness = 0.7, density = 1400 }')
+        _say_table(
+            console, ["preset", "law", "what it shows"], [[p["name"], p["law"], p["shows"]] for p in facts["presets"]]
+        )
+        _say(console, "\nLaws: material = { law = ..., with these parameters, or a knob in place of one }")
+    for law in facts["laws"]:
+        _say_law(console, law)
+    for preset in facts["presets"] if in_full else []:
+        _say_preset(console, preset)
+
+
+def _say_law(console: "Console", law: dict[str, Any]) -> None:
+    _say(console, f"\n{law['name']}: {law['summary']}")
+    rows = [
+        [p["name"], p["unit"], p["range"], "needed" if p["default"] is None else _plain(p["default"]), p["description"]]
+        for p in law["parameters"]
+    ]
+    rows += [[f"{k['name']} (knob)", "", "0 to 1", "", _knob_text(k)] for k in law["knobs"]]
+    _say_table(console, ["parameter", "unit", "range", "default", "meaning"], rows)
+    for field in law["fields"]:
+        where = "" if len(field["dimensions"]) == 2 else f" ({field['dimensions'][0]}D only)"
+        _say(console, f"output field {field['name']}{where}: {field['description']}")
+
+
+def _say_preset(console: "Console", preset: dict[str, Any]) -> None:
+    _say(console, f"\npreset {preset['name']}, of the law {preset['law']}: {preset['shows']}")
+    rows = [[v["name"], _plain(v["value"]), v["unit"], v["source"]] for v in preset["values"]]
+    _say_table(console, ["parameter", "value", "unit", "source"], rows)
+    knobs = [
+        [k["name"], "" if k["position"] is None else f"{k['position']:.2g}", _knob_text(k)] for k in preset["knobs"]
+    ]
+    if knobs:
+        _say_table(console, ["knob", "position", "meaning"], knobs)
+
+
+def _knob_text(knob: dict[str, Any]) -> str:
+    ends = f"{knob['low']:g} to {knob['high']:g} {knob['unit']}".rstrip()
+    return f"Sets {knob['sets']}: {ends}, {knob['scale']}; {knob['meaning']}."
+
+
+def _plain(value: object) -> str:
+    from mpmcli.scene.sentences import written
+
+    return f"{value:g}" if isinstance(value, float) else written(value)
+
+
+def _say(console: "Console", text: str) -> None:
+    _show(console, text)
+
+
+def _say_table(console: "Console", head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print columns, of which the last one wraps."""
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="")
+    for column in head[:-1]:
+        table.add_column(column, no_wrap=True)
+    table.add_column(head[-1])
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    _show(console, table)
+
+
+def _show(console: "Console", content: object) -> None:
+    with console.capture() as captured:
+        console.print(content, markup=False)
+    # Tables are padded to the full width.
+    click.echo("\n".join(line.rstrip() for line in captured.get().split("\n")), nl=False, err=True)

@@ -1,0 +1,81 @@
+"""Fixed corotated solid: linear in the stretches, and so as soft under large strain as at rest."""
+
+import math
+from typing import Literal
+
+import taichi as ti
+
+from mpmcli.materials.elasticity import ElasticParameters
+from mpmcli.materials.law import Law, Mode, StateBound
+from mpmcli.materials.polar import polar_rotation
+from mpmcli.materials.tensors import volume_strain
+
+
+class FixedCorotatedParameters(ElasticParameters):
+    """Parameters of the fixed corotated solid."""
+
+    law: Literal["fixed_corotated"] = "fixed_corotated"
+
+
+@ti.data_oriented
+class FixedCorotated(Law):
+    """tau = 2 mu (F - R) F^T + lambda (J - 1) J I (Stomakhin et al. 2012); plane strain in 2D.
+
+    R is the rotation nearest to F, for inverted states too (see `polar_rotation`), which pull back. Crushed
+    to nothing the solid resists with finite energy alone, and its stress vanishes with F.
+    """
+
+    name = "fixed_corotated"
+    parameters = FixedCorotatedParameters
+    deformation = "F"
+
+    def constants(self, parameters: FixedCorotatedParameters) -> tuple[float, ...]:
+        return (parameters.shear_modulus, parameters.lame_lambda)
+
+    def modes(self, parameters: FixedCorotatedParameters, bound: StateBound) -> list[Mode]:
+        return [Mode(corotated_stiffness(parameters.shear_modulus, parameters.lame_lambda, self.dimension, bound))]
+
+    @ti.func
+    def respond(
+        self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
+    ):
+        F = deformation
+        # F^T = S R^T, so that R F^T is symmetric but for rounding.
+        stretched = (F - polar_rotation(F)) @ F.transpose()
+        J = F.determinant()
+        pressure_part = constants[1] * (J - 1.0) * J
+        tau = constants[0] * (stretched + stretched.transpose()) + pressure_part * ti.Matrix.identity(float, F.n)
+        # Out of plane F is 1 and R is 1.
+        return tau, pressure_part, deformation, internal
+
+    @ti.func
+    def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
+        return corotated_energy(deformation, constants[0], constants[1])
+
+
+@ti.func
+def corotated_energy(F: ti.template(), mu: float, lame_lambda: float):
+    """Return mu |F - R|^2 + lambda/2 (J - 1)^2, J/m^3."""
+    stretch = F - polar_rotation(F)
+    volume = volume_strain(F - ti.Matrix.identity(float, F.n))
+    return mu * (stretch * stretch).sum() + 0.5 * lame_lambda * volume * volume
+
+
+def corotated_stiffness(mu: float, lame_lambda: float, dimension: int, bound: StateBound) -> float:
+    """Return d lambda J (2J - 1) + 2 mu s (2s - 1), Pa, at the worst J and stretch s within `bound`, and at rest.
+
+    Under C dt, the normal entries of tau in the principal frame see the matrix diag(2 mu s_i (2 s_i - 1)) +
+    lambda J (2J - 1) (1 1^T), and a pair of shear entries 2 mu (s_i^2 + s_j^2)(1 - 1/(s_i + s_j)), which is largest
+    where both stretches are. The sum bounds all, and is exact at rest: d lambda + 2 mu. Of an inverted state
+    (J < 0) one stretch is negative, and s (2s - 1) at most s (2s + 1) of its size.
+    """
+    ends = {1.0, bound.volume_ratio_min, bound.volume_ratio_max}
+    if bound.volume_ratio_min < 0.25 < bound.volume_ratio_max:
+        ends.add(0.25)
+    volumetric = max(0.0, *(dimension * lame_lambda * J * (2 * J - 1) for J in ends))
+    stretch = math.sqrt(max(bound.stretch_squared_max, 1.0))
+    turn = -1 if bound.volume_ratio_min >= 0 else 1
+    return volumetric + 2 * mu * stretch * (2 * stretch + turn)
+
+
+LAW = FixedCorotated

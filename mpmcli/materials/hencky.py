@@ -1,0 +1,95 @@
+"""Hencky elasticity, linear in the logarithms of the principal stretches: what the laws of soil and metal share."""
+
+import math
+from typing import Annotated, Literal
+
+import taichi as ti
+from pydantic import Field
+
+from mpmcli.materials.elasticity import ElasticParameters, lame_lambda, shear_modulus
+from mpmcli.materials.fluid import QUIET_SPEED
+from mpmcli.materials.law import Law, Mode, StateBound
+from mpmcli.materials.principal import from_principal
+from mpmcli.scene.knobs import Knob
+from mpmcli.scene.material import SceneBounds
+from mpmcli.scene.quantity import LARGEST, Positive
+
+# Below it a stretch counts as this much: its logarithm stays finite where a particle is flat.
+STRETCH_MIN = 1e-4
+# Young's modulus over strength that "auto" keeps at least: half a percent of strain at yield.
+MODULUS_PER_STRENGTH = 200.0
+
+Compressibility = Annotated[
+    float,
+    Field(gt=0, le=0.1, description='Density variation that youngs_modulus = "auto" allows, a fraction.'),
+    Knob(
+        "stiffness",
+        0.1,
+        1e-4,
+        "0 lets the density vary by 10 %, 1 by 0.01 %, in steps 30 times as many",
+        excludes=("youngs_modulus",),
+    ),
+]
+
+
+YoungsModulus = Annotated[
+    Positive | Literal["auto"],
+    Field(
+        description='Young\'s modulus E, Pa; "auto" picks the softest that keeps the density variation under '
+        "`compressibility` in the deepest column and at the highest speed of the scene."
+    ),
+]
+
+
+class HenckyParameters(ElasticParameters):
+    """Parameters of a solid whose Young's modulus the scene may choose."""
+
+    youngs_modulus: YoungsModulus
+    compressibility: Compressibility = 0.01
+
+
+def soft_youngs_modulus(parameters: HenckyParameters, bounds: SceneBounds) -> float:
+    """Return the E, Pa, with which the scene's weight and speed strain the volume by `compressibility`.
+
+    The pressure of the deepest column and of the fastest flow is density (g H + v^2), with the largest density of
+    any body, and volume feels K = lambda + 2 mu / d (in 2D that of the plane), which is proportional to E.
+    """
+    speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
+    pressure = max(parameters.density, bounds.density) * (bounds.gravity * bounds.height + speed**2)
+    nu = parameters.poissons_ratio
+    bulk = lame_lambda(1.0, nu) + 2 * shear_modulus(1.0, nu) / bounds.dimension
+    return min(max(pressure / (parameters.compressibility * bulk), 1 / LARGEST), LARGEST)
+
+
+class HenckyLaw(Law):
+    """tau_i = 2 mu e_i + lambda tr e in the principal frame of F F^T, with e_i = ln s_i (Hencky 1928)."""
+
+    deformation = "F"
+
+    def modes(self, parameters: HenckyParameters, bound: StateBound) -> list[Mode]:
+        """d lambda + 2 mu for normal strain, in any state; 2 mu x coth x for shear, x = ln(s_i / s_j).
+
+        Under C dt the normal strains change by the normal entries of C dt. In a pair of shear entries
+        tau_ij = (tau_i - tau_j) / (s_i^2 - s_j^2) b_ij, where b_ij changes by (C_ij s_j^2 + C_ji s_i^2) dt.
+        Plastic flow only lessens the differences tau_i - tau_j.
+        """
+        mu, d = parameters.shear_modulus, self.dimension
+        largest = max(math.sqrt(bound.stretch_squared_max), STRETCH_MIN)
+        smallest = min(max(bound.volume_ratio_min / largest ** (d - 1), STRETCH_MIN), largest)
+        x = math.log(largest / smallest)
+        return [
+            Mode(d * max(parameters.lame_lambda, 0.0) + 2 * mu),
+            Mode(2 * mu * (x / math.tanh(x) if x > 0 else 1.0)),
+        ]
+
+
+@ti.func
+def hencky_strains(s: ti.template()):
+    """Return ln s_i of the principal stretches."""
+    return ti.log(ti.max(s, STRETCH_MIN))
+
+
+@ti.func
+def stretch_tensor(Q: ti.template(), strains: ti.template()):
+    """Return Q diag(exp e_i) Q^T, which is I exactly where the strains are 0."""
+    return ti.Matrix.identity(float, Q.n) + from_principal(Q, ti.exp(strains) - 1.0)

@@ -1,0 +1,178 @@
+"""Principal stretches on the device, in closed form: no sweeps, no trigonometry, one branch.
+
+In 3D the characteristic cubic of F F^T is solved for its best separated root alone, whose eigenvector is
+well conditioned whatever F is. The plane across it is left to one rotation that looks at F itself, not at
+F F^T, so that small stretches keep their digits.
+
+Measured on one core, ns a call, F = I + 0.1 noise, f32 (f64): 75 (97) in 3D and 12 (16) in 2D, against 440 (690)
+and 37 (48) of ti.svd; cyclic Jacobi rotations of F F^T, or of the rows of F, take 200 (250) in 3D. Errors reach
+2.3 roundings of the largest stretch in f32, whatever F; those of ti.svd 9 near F = I, and all digits for some F
+with stretches from 1e-8 to 1.
+"""
+
+import taichi as ti
+
+# 2 cos(arccos(h) / 3) in powers of h, interpolated at Chebyshev nodes of 0 <= h <= 1: within 2.8e-8.
+ROOT = (1.73205083, 0.333330086, -0.0961547007, 0.0487847677, -0.0285791297, 0.0153286035, -0.005845661, 0.00108521542)
+
+
+@ti.func
+def principal_stretches(F: ti.template()):
+    """Return (Q, s): F F^T = Q diag(s_i^2) Q^T, with s_i >= 0 in no particular order and Q orthogonal.
+
+    Any finite F will do, inverted and singular ones too. Where F F^T is diagonal to rounding, Q is I exactly.
+
+    Args:
+        F: d x d, d = 2 or 3.
+    """
+    G = F
+    scale = 1.0
+    # Within this range no power of F that is taken below leaves that of f32.
+    size = (F * F).sum()
+    if not (size > 1e-3 and size < 1e3):
+        scale = ti.max(ti.abs(F).max(), 1e-37)
+        G = F / scale
+    Q = ti.Matrix.identity(float, F.n)
+    s = ti.Vector.zero(float, F.n)
+    if ti.static(F.n == 2):
+        Q, s = _stretches_2d(G)
+    else:
+        Q, s = _stretches_3d(G)
+    return Q, s * scale
+
+
+@ti.func
+def from_principal(Q: ti.template(), values: ti.template()):
+    """Return Q diag(values) Q^T, symmetric to the last bit; Q is d x d, values d."""
+    result = ti.Matrix.zero(float, Q.n, Q.n)
+    for i in ti.static(range(Q.n)):
+        for j in ti.static(range(i + 1)):
+            for k in ti.static(range(Q.n)):
+                result[i, j] += Q[i, k] * Q[j, k] * values[k]
+            result[j, i] = result[i, j]
+    return result
+
+
+@ti.func
+def _stretches_2d(F: ti.template()):
+    Q = ti.Matrix.identity(float, 2)
+    b00 = F[0, 0] * F[0, 0] + F[0, 1] * F[0, 1]
+    b11 = F[1, 0] * F[1, 0] + F[1, 1] * F[1, 1]
+    b01 = F[0, 0] * F[1, 0] + F[0, 1] * F[1, 1]
+    s = ti.Vector([ti.sqrt(b00), ti.sqrt(b11)])
+    trace = b00 + b11
+    if trace + ti.abs(b01) > trace:
+        r, cos, sin = _rotation(b00 - b11, 2.0 * b01, 1.0)
+        first = ti.sqrt(0.5 * (trace + r))
+        s = ti.Vector([first, ti.abs(F.determinant()) / first])
+        Q = ti.Matrix([[cos, -sin], [sin, cos]])
+    return Q, s
+
+
+@ti.func
+def _rotation(d: float, e: float, weight: float):
+    """Return (r, cos, sin): of [[a, c], [c, b]], the distance of its eigenvalues, and its larger eigenvector.
+
+    Args:
+        d, e: a - b and 2 c, 0 both where it does not matter.
+        weight: 1 over the square of the length that the eigenvector shall have.
+    """
+    r = ti.sqrt(d * d + e * e)
+    # (d + r, e), or the parallel (e, r - d): the one that does not cancel.
+    f = ti.abs(d) + r + 1e-18
+    g = e
+    scale = 1.0 / ti.sqrt((f * f + g * g) * weight)
+    f *= scale
+    g *= scale
+    return r, ti.select(d < 0.0, g, f), ti.select(d < 0.0, f, g)
+
+
+def _polishing_steps() -> int:
+    """How often Newton's method must sharpen ROOT for the precision that kernels are compiled in."""
+    return 1 if ti.lang.impl.current_cfg().default_fp == ti.f64 else 0
+
+
+@ti.func
+def _stretches_3d(F: ti.template()):
+    f0 = ti.Vector([F[0, 0], F[0, 1], F[0, 2]])
+    f1 = ti.Vector([F[1, 0], F[1, 1], F[1, 2]])
+    f2 = ti.Vector([F[2, 0], F[2, 1], F[2, 2]])
+    b00 = f0.dot(f0)
+    b11 = f1.dot(f1)
+    b22 = f2.dot(f2)
+    b01 = f0.dot(f1)
+    b02 = f0.dot(f2)
+    b12 = f1.dot(f2)
+    Q = ti.Matrix.identity(float, 3)
+    s = ti.Vector([ti.sqrt(b00), ti.sqrt(b11), ti.sqrt(b22)])
+    trace = b00 + b11 + b22
+    if trace + (ti.abs(b01) + ti.abs(b02) + ti.abs(b12)) > trace:
+        # The deviator D of F F^T has the eigenvalues p x with x^3 - 3 x = 2 h, where p^2 = tr D^2 / 6 and
+        # h = det D / (2 p^3). The one of D and -D with h >= 0 has a root x between sqrt(3) and 2, which is
+        # at least sqrt(3) away from the others.
+        e0 = b00 - b11
+        e1 = b11 - b22
+        e2 = b22 - b00
+        c01 = b01 * b01
+        c02 = b02 * b02
+        c12 = b12 * b12
+        p_squared = (e0 * e0 + e1 * e1 + e2 * e2) * (1.0 / 18.0) + (c01 + c02 + c12) * (1.0 / 3.0)
+        d0 = (e0 - e2) * (1.0 / 3.0)
+        d1 = (e1 - e0) * (1.0 / 3.0)
+        d2 = (e2 - e1) * (1.0 / 3.0)
+        det = d0 * (d1 * d2 - c12) - d2 * c01 - d1 * c02 + 2.0 * b01 * b02 * b12
+        inverse = 1.0 / ti.sqrt(p_squared)
+        h = ti.min(ti.abs(det) * (0.5 / p_squared) * inverse, 1.0)
+        h2 = h * h
+        # Grouped so that the processor works on several terms at once.
+        low = ROOT[0] + ROOT[1] * h + h2 * (ROOT[2] + ROOT[3] * h)
+        high = ROOT[4] + ROOT[5] * h + h2 * (ROOT[6] + ROOT[7] * h)
+        x = low + h2 * h2 * high
+        for _ in ti.static(range(_polishing_steps())):
+            x = (x * x * x + h) / (1.5 * x * x - 1.5)
+        # The adjugate of M = +-D/p - x I is c v v^T with 6 <= c <= 9: its longest column is v.
+        inverse = ti.select(det < 0.0, -inverse, inverse)
+        d0 = d0 * inverse - x
+        d1 = d1 * inverse - x
+        d2 = d2 * inverse - x
+        b01 *= inverse
+        b02 *= inverse
+        b12 *= inverse
+        a00 = d1 * d2 - b12 * b12
+        a11 = d0 * d2 - b02 * b02
+        a22 = d0 * d1 - b01 * b01
+        a01 = b02 * b12 - b01 * d2
+        a02 = b01 * b12 - b02 * d1
+        a12 = b01 * b02 - b12 * d0
+        first = a00 > a11
+        last = a22 > ti.max(a00, a11)
+        v0 = ti.select(last, a02, ti.select(first, a00, a01))
+        v1 = ti.select(last, a12, ti.select(first, a01, a11))
+        v2 = ti.select(last, a22, ti.select(first, a02, a12))
+        # u and w = v x u span the plane across v. None has length 1 yet: their roots are taken meanwhile.
+        wide = v0 * v0 > v2 * v2
+        v = ti.Vector([v0, v1, v2])
+        u = ti.Vector([ti.select(wide, -v1, 0.0), ti.select(wide, v0, -v2), ti.select(wide, 0.0, v1)])
+        w = v.cross(u)
+        vv = v.dot(v)
+        uu = u.dot(u)
+        v_length = ti.sqrt(vv)
+        Fv = v[0] * f0 + v[1] * f1 + v[2] * f2
+        Fu = u[0] * f0 + u[1] * f1 + u[2] * f2
+        Fw = w[0] * f0 + w[1] * f1 + w[2] * f2
+        # One rotation in that plane, of u |v| and w, which are equally long.
+        a = Fu.dot(Fu) * vv
+        b = Fw.dot(Fw)
+        r, cos, sin = _rotation(a - b, Fu.dot(Fw) * 2.0 * v_length, uu)
+        larger = 0.5 * (a + b + r) + 1e-36
+        # The area that F^T u and F^T w span is the product of the two stretches.
+        span = Fu.cross(Fw)
+        area = span.dot(span) * vv
+        inverse_vv = 1.0 / vv
+        unit = inverse_vv / uu
+        s = ti.Vector([ti.sqrt(Fv.dot(Fv) * inverse_vv), ti.sqrt(larger * unit), ti.sqrt(area / larger * unit)])
+        inverse_v = v_length * inverse_vv
+        Q = ti.Matrix.cols(
+            [v * inverse_v, cos * u + (sin * inverse_v) * w, (cos * inverse_v) * w - sin * u],
+        )
+    return Q, s

@@ -1,0 +1,172 @@
+"""Sand: elastic grains under pressure that slide on each other with friction, and fly apart without any."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+import taichi as ti
+from pydantic import Field, ValidationInfo, field_validator
+
+from mpmcli.materials.hencky import (
+    MODULUS_PER_STRENGTH,
+    STRETCH_MIN,
+    Compressibility,
+    HenckyLaw,
+    HenckyParameters,
+    YoungsModulus,
+    hencky_strains,
+    soft_youngs_modulus,
+    stretch_tensor,
+)
+from mpmcli.materials.principal import from_principal, principal_stretches
+from mpmcli.scene.knobs import Knob
+from mpmcli.scene.material import Internal, SceneBounds
+from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, flaw, scene_dimension
+
+# Dense sand, 24 to 96 MPa (US Army Corps of Engineers, EM 1110-1-1904, Settlement analysis, 1990).
+REAL_MODULUS = 5e7
+# ln J beyond which grains are scattered, and open no further: a lone one would, without end, and owe the way back.
+SCATTERED = 2.0
+# In 3D the cone lets a principal stress turn to tension above it.
+STEEPEST_3D = 60.0
+
+
+class SandParameters(HenckyParameters):
+    """Parameters of sand."""
+
+    law: Literal["sand"] = "sand"
+    youngs_modulus: YoungsModulus = "auto"
+    compressibility: Compressibility = 0.002
+    friction_angle: Annotated[
+        float,
+        Field(
+            gt=0,
+            lt=90,
+            description="Friction angle that acts in plane strain, degrees; glass beads 22, dry sand 30 to 40.",
+        ),
+        Knob("grip", 20.0, 45.0, "0 is smooth beads, 0.4 loose sand, 0.6 packed sand, 1 crushed rock", scale="linear"),
+    ]
+    cohesion: Annotated[
+        NotNegative, Field(description="Shear strength that is left without pressure, Pa; dry sand 0, damp sand 1e3.")
+    ] = 0.0
+    volume_correction: Annotated[
+        Flag,
+        Field(
+            description="Whether sand that has come apart must close up again before it bears pressure. False makes "
+            "it gain volume each time it is stirred."
+        ),
+    ] = True
+
+    internal: ClassVar[tuple[Internal, ...]] = (
+        Internal(
+            "plastic_volume_strain", 0.0, "Volume gained by coming apart, as the logarithm of a ratio, dimensionless."
+        ),
+    )
+
+    @field_validator("friction_angle")
+    @classmethod
+    def _within_the_cone(cls, value: float, info: ValidationInfo) -> float:
+        """Refuse what a circular cone in 3D cannot be: triaxial extension reaches p (1 - 2 sin(phi) / sqrt(3))."""
+        in_3d = isinstance(info.context, dict) and scene_dimension(info) == 3
+        if in_3d and value > STEEPEST_3D:
+            raise flaw(
+                f"must be at most {STEEPEST_3D:g} degrees in 3D, above which the yield cone lets sand be pulled; "
+                f"found {value:g}"
+            )
+        return value
+
+    def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
+        """Replace "auto" by the softest modulus that the scene allows, real sand's at most."""
+        if self.youngs_modulus != "auto":
+            return self, []
+        soft = soft_youngs_modulus(self, bounds)
+        modulus = min(max(min(soft, REAL_MODULUS), MODULUS_PER_STRENGTH * self.cohesion), LARGEST)
+        varies = f"the density vary by {100 * self.compressibility * soft / modulus:.3g} %"
+        under = f"under a column of {bounds.height:.4g} m and at the highest speed, {bounds.speed:.4g} m/s"
+        if modulus < soft:
+            said = f"youngs_modulus = {modulus:.4g} Pa, that of real sand, lets {varies} {under}"
+        elif modulus > soft:
+            said = f"youngs_modulus = {modulus:.4g} Pa keeps the strain at which the cohesion gives way near 0.5 %"
+        else:
+            said = f"youngs_modulus = {modulus:.4g} Pa lets {varies} {under}"
+        return self.model_copy(update={"youngs_modulus": modulus}), [said]
+
+
+@ti.data_oriented
+class Sand(HenckyLaw):
+    """Drucker-Prager plasticity on Hencky strain (Klar et al. 2016), matched to Mohr-Coulomb in plane strain.
+
+    With p = -(lambda + 2 mu / d) tr e, the mean pressure, and s the deviator of tau, both in d dimensions,
+
+        |s| <= sqrt(2) (p sin(phi) + c cos(phi)):
+
+    the largest shear stress in the plane is p sin(phi) + c cos(phi), so that phi is the friction angle that acts, in
+    2D and in 3D under plane strain. (Klar's alpha would match triaxial compression, and never yield in plane
+    strain from phi = 42.2 on; here, phi acts in triaxial compression as asin(3 sin(phi) / (2 sqrt(3) + sin(phi))).)
+    Sliding keeps tr e, and so makes no volume. Past the tip of the cone, at a tension of c cot(phi), the grains
+    come apart: the strain goes back to the tip, and what was taken is added to the plastic volume strain v.
+    Pressed together, the sand uses v up first and has pressure only then (after Tampubolon et al. 2017), so that
+    ln J = tr e + v, J being the total volume ratio, until it is scattered at v = 2. In 2D the stress out of the
+    plane is reported as the mean of those in it, which is what flow in plane strain takes it to.
+    """
+
+    name = "sand"
+    parameters = SandParameters
+    projects = True
+
+    def __init__(self, members: tuple[SandParameters, ...], dimension: int) -> None:
+        super().__init__(members, dimension)
+        self.closes = any(member.volume_correction for member in members)
+
+    def constants(self, parameters: SandParameters) -> tuple[float, ...]:
+        """mu, lambda, the volume strain at the tip, |dev e| per volume strain below it, and whether v is closed."""
+        mu, lam = parameters.shear_modulus, parameters.lame_lambda
+        bulk = lam + 2 * mu / self.dimension
+        phi = math.radians(parameters.friction_angle)
+        tip = parameters.cohesion / (math.tan(phi) * bulk)
+        slope = math.sqrt(2) * math.sin(phi) * bulk / (2 * mu)
+        return (mu, lam, tip, slope, float(parameters.volume_correction))
+
+    def total_volume_ratio(self, J: np.ndarray, internal: Mapping[str, np.ndarray]) -> np.ndarray:
+        return J * np.exp(internal["plastic_volume_strain"])
+
+    @ti.func
+    def respond(
+        self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
+    ):
+        F = deformation
+        v = internal
+        Q, s = principal_stretches(deformation)
+        e = hencky_strains(s)
+        volume = e.sum()
+        deviator = e - volume / ti.static(float(self.dimension))
+        closed = 0.0
+        if ti.static(self.closes):
+            if volume < 0.0:
+                closed = ti.min(constants[4] * v[0], -volume)
+        kept = ti.min(volume + closed, constants[2])
+        shear = ti.sqrt(deviator.dot(deviator))
+        strength = constants[3] * (constants[2] - kept)
+        if kept != volume or shear > strength or s.min() < STRETCH_MIN:
+            if shear > strength:
+                deviator *= strength / shear
+            e = deviator + kept / ti.static(float(self.dimension))
+            F = stretch_tensor(Q, e)
+            v[0] = ti.min(v[0] + ti.max(volume - constants[2], 0.0) - closed, SCATTERED)
+        spherical = constants[1] * kept
+        tau = from_principal(Q, 2.0 * constants[0] * e + spherical)
+        tau_zz = 0.0
+        if ti.static(self.dimension == 2):
+            tau_zz = spherical + constants[0] * kept
+        return tau, tau_zz, F, v
+
+    @ti.func
+    def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
+        """mu |e|^2 + lambda/2 (tr e)^2."""
+        _Q, s = principal_stretches(deformation)
+        e = hencky_strains(s)
+        return constants[0] * e.dot(e) + 0.5 * constants[1] * e.sum() ** 2
+
+
+LAW = Sand

@@ -1,0 +1,271 @@
+"""Viscoplastic fluid: rests below its yield stress and flows above, as lava, mud and paste do."""
+
+from typing import Annotated, Literal, Self
+
+import taichi as ti
+from pydantic import Field
+
+from mpmcli.materials.fluid import STIFFNESS, soft_bulk_modulus, volume_energy
+from mpmcli.materials.law import Law, Mode, StateBound
+from mpmcli.materials.polar import rounding
+from mpmcli.scene.knobs import Knob
+from mpmcli.scene.material import MaterialParameters, SceneBounds
+from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
+
+# The elastic shear strain at yield that shear_modulus = "auto" allows.
+YIELD_STRAIN = 0.05
+# The opening, as ln J, that leaves a torn particle 1/e of its shear stress.
+TEAR_STRAIN = 0.1
+# J below which a particle counts as inverted, and mean of the isochoric b above which it counts as flat.
+CRUSHED, FLAT = 1e-9, 100.0
+ITERATIONS_MAX = 30
+
+
+class ViscoplasticParameters(MaterialParameters):
+    """Parameters of the Bingham and of the Herschel-Bulkley fluid."""
+
+    law: Literal["viscoplastic"] = "viscoplastic"
+    bulk_modulus: Annotated[
+        Positive | Literal["auto"],
+        Field(
+            description='Bulk modulus K = density c^2, Pa; "auto" picks the softest that keeps the density '
+            "variation under `compressibility` at the highest speed the scene can reach."
+        ),
+    ] = "auto"
+    compressibility: Annotated[
+        float,
+        Field(gt=0, le=0.1, description='Density variation that bulk_modulus = "auto" allows, a fraction.'),
+        STIFFNESS,
+    ] = 0.01
+    yield_stress: Annotated[
+        NotNegative,
+        Field(description="Shear stress below which the material does not flow, Pa; mud 10 to 1000."),
+        Knob("strength", 1.0, 1e5, "0 is thin slurry, 0.3 ketchup, 0.4 mud, 0.6 lava, 1 stiff clay"),
+    ]
+    consistency: Annotated[
+        Positive,
+        Field(description="Stress above yield at a shear rate of 1/s, Pa s^n; for n = 1 the plastic viscosity, Pa s."),
+        Knob("thickness", 0.1, 1e5, "0 is paint, 0.3 mud, 0.6 runny lava, 1 lava that is about to set"),
+    ]
+    flow_index: Annotated[
+        float,
+        Field(
+            ge=0.1, le=2, description="Exponent n of the shear rate: 1 Bingham, below 1 thinning, above 1 thickening."
+        ),
+    ] = 1.0
+    shear_modulus: Annotated[
+        Positive | Literal["auto"],
+        Field(
+            description='Elastic shear modulus below yield, Pa; "auto" takes the larger of a quarter of the bulk '
+            "modulus, which leaves the time step alone, and 20 yield stresses, which keep elastic strain under 5 %."
+        ),
+    ] = "auto"
+    tension_cutoff: Annotated[
+        Flag,
+        Field(
+            description="Whether the material takes no tension: below the density at rest its pressure is 0, "
+            "and it forgets its shear stress as it opens. Pastes hang together, and swell where they cannot."
+        ),
+    ] = False
+
+    def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
+        """Replace "auto" by the fluid's bulk modulus, and by a shear modulus that hardly shows."""
+        bulk, shear, notes = self.bulk_modulus, self.shear_modulus, []
+        if bulk == "auto":
+            bulk, note = soft_bulk_modulus(self.density, self.compressibility, bounds)
+            notes.append(note)
+        if shear == "auto":
+            shear = min(max(bulk / 4, self.yield_stress / YIELD_STRAIN), LARGEST)
+            notes.append(
+                f"shear_modulus = {shear:.4g} Pa lets the material at rest give way elastically by "
+                f"{100 * self.yield_stress / shear:.3g} % before it yields"
+            )
+        return self.model_copy(update={"bulk_modulus": bulk, "shear_modulus": shear}), notes
+
+
+@ti.data_oriented
+class Viscoplastic(Law):
+    """tau = K (J - 1) I + G dev(b) with b = J^(-2/d) F F^T, relaxing by ((q - yield_stress)/consistency)^(1/n).
+
+    An elastic solid up to the shear stress q = |dev tau|/sqrt(2) = yield_stress, which therefore stands still for
+    ever, and above it a fluid of shear stress yield_stress + consistency rate^n in steady flow, like the foam of Yue
+    et al. 2015. Relaxation is implicit over the step, so that no viscosity shortens the step. A particle stores the
+    lower triangular factor of its elastic F F^T, of which rotations say nothing, with det F the total volume ratio.
+
+    With tension_cutoff J is never remembered above 1, as in the fluid, and shear stress falls by J^(-1/TEAR_STRAIN):
+    what has opened by a tenth is torn and forgets, while the tremble of matter at rest costs it little. In 2D dev is
+    taken in the plane, with nothing deviatoric across it. Inverted and flat particles forget their shape.
+    """
+
+    name = "viscoplastic"
+    parameters = ViscoplasticParameters
+    deformation = "F"
+    projects = True
+
+    def __init__(self, members: tuple[ViscoplasticParameters, ...], dimension: int) -> None:
+        super().__init__(members, dimension)
+        self.bingham = all(member.flow_index == 1 for member in members)
+        self.tears = any(member.tension_cutoff for member in members)
+
+    def constants(self, parameters: ViscoplasticParameters) -> tuple[float, ...]:
+        return (
+            parameters.bulk_modulus,
+            parameters.shear_modulus,
+            parameters.yield_stress,
+            parameters.consistency,
+            parameters.flow_index,
+            1.0 if parameters.tension_cutoff else LARGEST,
+        )
+
+    def modes(self, parameters: ViscoplasticParameters, bound: StateBound) -> list[Mode]:
+        """d K J for volume, and 2 G b_max for shear, with b_max the largest eigenvalue of the isochoric b.
+
+        The two do not couple: C = c I leaves the isochoric b alone, and the rest of C changes dev b only, by
+        G (b_i + b_j) at most for a pair of shear entries and by diag(2 G b_i) without its trace for the normal ones.
+        Relaxation shrinks what results, for any step.
+        """
+        largest = min(bound.volume_ratio_max, 1.0) if parameters.tension_cutoff else bound.volume_ratio_max
+        smallest = max(bound.volume_ratio_min, CRUSHED)
+        isochoric = bound.stretch_squared_max * smallest ** (-2 / self.dimension)
+        isochoric = min(max(isochoric, 1.0), self.dimension * FLAT)
+        bulk = self.dimension * parameters.bulk_modulus * max(largest, 0.0)
+        return [Mode(bulk), Mode(2 * parameters.shear_modulus * isochoric)]
+
+    @ti.func
+    def respond(
+        self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
+    ):
+        F = deformation
+        J = F.determinant()
+        size = length_ratio(ti.max(J, CRUSHED), F.n)
+        dev, mean = isochoric_parts(F, size)
+        if J <= CRUSHED or mean > FLAT:
+            J = ti.max(J, CRUSHED)
+            mean = 1.0
+            dev = ti.Matrix.zero(float, F.n, F.n)
+            F = size * ti.Matrix.identity(float, F.n)
+        share = self.remaining(constants[1] * ti.sqrt(0.5 * (dev * dev).sum()), constants[1] * mean * dt, constants)
+        if ti.static(self.tears):
+            largest = constants[5]
+            if largest < J:
+                # What rounding opens must not add up.
+                opened = ti.static(1.0 + 8.0 * rounding())
+                if opened < J:
+                    share *= J ** (-1.0 / TEAR_STRAIN)
+                J = 1.0
+                size = 1.0
+        if share < 1.0:
+            dev *= share
+            F = triangular_factor(dev, isochoric_mean(dev, mean), J, size)
+        pressure_part = constants[0] * (J - 1.0)
+        tau = pressure_part * ti.Matrix.identity(float, F.n) + constants[1] * dev
+        return tau, pressure_part, F, internal
+
+    @ti.func
+    def remaining(self, q: float, modulus_time: float, constants: ti.template()):
+        """Return by which factor the shear stress q, Pa, relaxes: 1 below yield, else (yield_stress + x) / q.
+
+        x solves x = over - G dt (x/consistency)^(1/n) with over = q - yield_stress, where for G stands G mean(b),
+        the modulus at finite strain (Simo and Hughes 1998, box 9.1); modulus_time is its product with dt, Pa s.
+        """
+        over = q - constants[2]
+        share = 1.0
+        if over > 0.0:
+            rest = 0.0
+            if ti.static(self.bingham):
+                rest = over / (1.0 + modulus_time / constants[3])
+            else:
+                # As w + D w^n = 1, of the part w = 1 - x / over that relaxes, D = consistency (over / G dt)^n / over.
+                n = constants[4]
+                D = ti.min(constants[3] * (over / modulus_time) ** n / over, 1e30)
+                if n > 1.0:
+                    rest = over * D * convex_root(1.0, D, n) ** n
+                else:
+                    # With v = w^n: D v + v^(1/n) = 1.
+                    rest = over * D * convex_root(D, 1.0, 1.0 / n)
+            share = (constants[2] + ti.min(rest, over)) / q
+        return share
+
+    @ti.func
+    def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
+        """K (J - 1 - ln J) + G/2 (tr b - d)."""
+        J = ti.max(deformation.determinant(), CRUSHED)
+        dev, mean = isochoric_parts(deformation, length_ratio(J, deformation.n))
+        # Of det(dev + mean I) = 1, so that small strains keep their digits.
+        excess = 0.5 * (dev * dev).sum() / (mean + 1.0)
+        if ti.static(deformation.n == 3):
+            excess = (0.5 * (dev * dev).sum() * mean - dev.determinant()) / (mean * mean + mean + 1.0)
+        return constants[0] * volume_energy(J) + 0.5 * deformation.n * constants[1] * excess
+
+
+@ti.func
+def length_ratio(J: float, dimension: ti.template()):
+    """Return J^(1/d)."""
+    result = ti.sqrt(J)
+    if ti.static(dimension == 3):
+        result = J ** (1.0 / 3.0)
+    return result
+
+
+@ti.func
+def isochoric_parts(F: ti.template(), size: float):
+    """Return dev(b) and the mean of its diagonal tr(b)/d for b = F F^T / size^2, with size = J^(1/d)."""
+    b = F @ F.transpose() / (size * size)
+    mean = b.trace() / F.n
+    return b - mean * ti.Matrix.identity(float, F.n), mean
+
+
+@ti.func
+def isochoric_mean(dev: ti.template(), above: float):
+    """Return m with det(dev + m I) = 1 and dev + m I positive definite, starting from some larger m."""
+    square = 0.5 * (dev * dev).sum()
+    m = ti.sqrt(1.0 + square)
+    if ti.static(dev.n == 3):
+        # m^3 - square m + det dev = 1, convex from the root on: Newton's steps go down, and stop there.
+        m = above
+        constant = dev.determinant() - 1.0
+        resolution = ti.static(4.0 * rounding())
+        step = above
+        count = 0
+        while step > resolution * m and count < ITERATIONS_MAX:
+            step = ((m * m - square) * m + constant) / (3.0 * m * m - square)
+            m -= step
+            count += 1
+    return m
+
+
+@ti.func
+def triangular_factor(dev: ti.template(), mean: float, J: float, size: float):
+    """Return the lower triangular F with det F = J = size^d and F F^T = size^2 (dev + mean I) (Cholesky)."""
+    F = ti.Matrix.zero(float, dev.n, dev.n)
+    F[0, 0] = ti.sqrt(dev[0, 0] + mean)
+    F[1, 0] = dev[1, 0] / F[0, 0]
+    # The last entry is that of a determinant which rounding does not change.
+    if ti.static(dev.n == 2):
+        F *= size
+        F[1, 1] = J / F[0, 0]
+    else:
+        F[2, 0] = dev[2, 0] / F[0, 0]
+        F[1, 1] = ti.sqrt(ti.max(dev[1, 1] + mean - F[1, 0] ** 2, 1e-7))
+        F[2, 1] = (dev[2, 1] - F[2, 0] * F[1, 0]) / F[1, 1]
+        F *= size
+        F[2, 2] = J / (F[0, 0] * F[1, 1])
+    return F
+
+
+@ti.func
+def convex_root(a: float, b: float, power: float):
+    """Return the root of a v + b v^power = 1 for a, b > 0 and power >= 1, by Newton's method from above."""
+    v = ti.min(1.0 / a, b ** (-1.0 / power))
+    resolution = ti.static(4.0 * rounding())
+    step = v
+    count = 0
+    while step > resolution * v and count < ITERATIONS_MAX:
+        part = b * v ** (power - 1.0)
+        step = ((a + part) * v - 1.0) / (a + power * part)
+        v -= step
+        count += 1
+    return v
+
+
+LAW = Viscoplastic

@@ -1,0 +1,141 @@
+"""Metal and clay: elastic up to a yield stress, and plastic flow at constant volume beyond it."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal, Self
+
+import numpy as np
+import taichi as ti
+from pydantic import Field
+
+from mpmcli.materials.hencky import (
+    MODULUS_PER_STRENGTH,
+    STRETCH_MIN,
+    HenckyLaw,
+    HenckyParameters,
+    hencky_strains,
+    soft_youngs_modulus,
+    stretch_tensor,
+)
+from mpmcli.materials.principal import from_principal, principal_stretches
+from mpmcli.scene.knobs import Knob
+from mpmcli.scene.material import Internal, SceneBounds
+from mpmcli.scene.quantity import LARGEST, NotNegative, Positive
+
+
+class VonMisesParameters(HenckyParameters):
+    """Parameters of the elastic-plastic solid."""
+
+    law: Literal["von_mises"] = "von_mises"
+    yield_stress: Annotated[
+        Positive,
+        Field(
+            description="Stress at which a bar that is pulled begins to flow, Pa; clay 1e4 to 1e5, metal 1e7 to 1e9."
+        ),
+        Knob("strength", 1e3, 1e9, "0 is soft putty, 0.3 clay, 0.75 soft aluminium, 0.9 mild steel, 1 tool steel"),
+    ]
+    hardening_modulus: Annotated[
+        NotNegative,
+        Field(description="Growth of the yield stress per plastic strain, Pa; 0 is perfectly plastic."),
+        Knob("hardness", 1e3, 1e9, "0 goes on as soft as it begins, 1 hardens like steel"),
+    ] = 0.0
+
+    internal: ClassVar[tuple[Internal, ...]] = (
+        Internal("plastic_strain", 0.0, "Equivalent plastic strain, dimensionless."),
+        Internal("elastic_strain_zz", 0.0, "Elastic Hencky strain out of the plane, dimensionless.", (2,)),
+    )
+
+    def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
+        """Replace "auto" by the softest modulus that the scene allows and that yields at a small strain."""
+        if self.youngs_modulus != "auto":
+            return self, []
+        soft = soft_youngs_modulus(self, bounds)
+        modulus = min(max(soft, MODULUS_PER_STRENGTH * self.yield_stress), LARGEST)
+        if modulus > soft:
+            said = f"youngs_modulus = {modulus:.4g} Pa lets it yield at a strain of {100 / MODULUS_PER_STRENGTH:.3g} %"
+        else:
+            said = (
+                f"youngs_modulus = {modulus:.4g} Pa lets the density vary by {100 * self.compressibility:.3g} % under "
+                f"a column of {bounds.height:.4g} m and at the highest speed, {bounds.speed:.4g} m/s"
+            )
+        return self.model_copy(update={"youngs_modulus": modulus}), [said]
+
+
+@ti.data_oriented
+class VonMises(HenckyLaw):
+    """J2 plasticity on Hencky strain with linear isotropic hardening: sqrt(3/2) |dev tau| <= yield_stress + H a.
+
+    a is the equivalent plastic strain. The return is radial, and exact for linear hardening (Simo 1992; de Souza
+    Neto, Peric and Owen 2008, box 7.5); it keeps the volume. 2D is true plane strain: plastic flow along z is
+    made up by elastic strain along z, which the particle stores beside the elastic F of the plane.
+    """
+
+    name = "von_mises"
+    parameters = VonMisesParameters
+    projects = True
+
+    def constants(self, parameters: VonMisesParameters) -> tuple[float, ...]:
+        return (
+            parameters.shear_modulus,
+            parameters.lame_lambda,
+            parameters.yield_stress,
+            parameters.hardening_modulus,
+        )
+
+    def total_volume_ratio(self, J: np.ndarray, internal: Mapping[str, np.ndarray]) -> np.ndarray:
+        return J * np.exp(internal["elastic_strain_zz"]) if self.dimension == 2 else J
+
+    @ti.func
+    def strains(self, s: ti.template(), internal: ti.template()):
+        """Return the three principal Hencky strains, that out of the plane last in 2D."""
+        in_frame = hencky_strains(s)
+        e = ti.Vector([in_frame[0], in_frame[1], 0.0])
+        if ti.static(self.dimension == 2):
+            e[2] = internal[1]
+        else:
+            e[2] = in_frame[2]
+        return e
+
+    @ti.func
+    def respond(
+        self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
+    ):
+        F = deformation
+        variables = internal
+        mu = constants[0]
+        Q, s = principal_stretches(deformation)
+        e = self.strains(s, internal)
+        volume = e.sum()
+        deviator = e - volume / 3.0
+        # sqrt(3/2) |dev tau|
+        stress = ti.static(math.sqrt(6.0)) * mu * ti.sqrt(deviator.dot(deviator))
+        excess = stress - (constants[2] + constants[3] * variables[0])
+        if excess > 0.0 or s.min() < STRETCH_MIN:
+            if excess > 0.0:
+                flow = excess / (3.0 * mu + constants[3])
+                variables[0] += flow
+                e = volume / 3.0 + (1.0 - 3.0 * mu * flow / stress) * deviator
+            if ti.static(self.dimension == 2):
+                variables[1] = e[2]
+                F = stretch_tensor(Q, ti.Vector([e[0], e[1]]))
+            else:
+                F = stretch_tensor(Q, e)
+        principal = 2.0 * mu * e + constants[1] * volume
+        tau = ti.Matrix.zero(float, F.n, F.n)
+        tau_zz = 0.0
+        if ti.static(self.dimension == 2):
+            tau = from_principal(Q, ti.Vector([principal[0], principal[1]]))
+            tau_zz = principal[2]
+        else:
+            tau = from_principal(Q, principal)
+        return tau, tau_zz, F, variables
+
+    @ti.func
+    def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
+        """mu |e|^2 + lambda/2 (tr e)^2, of all three strains."""
+        _Q, s = principal_stretches(deformation)
+        e = self.strains(s, internal)
+        return constants[0] * e.dot(e) + 0.5 * constants[1] * e.sum() ** 2
+
+
+LAW = VonMises

@@ -1,0 +1,92 @@
+"""Asks the laws what a frame shows: stress, energy, and the state after plastic flow, as the next step will see it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from mpmcli.solver.particles import ParticleGroup
+
+# Rows and columns of the entries of a symmetric 3 x 3 matrix, in the order of the arrays below; 2D leaves two out.
+ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What one law says of its n particles, in the solver's order.
+
+    Attributes:
+        tau: Kirchhoff stress, (n, 3, 3), Pa per volume at rest; None where it was not asked for.
+        energy: stored energy per volume at rest, (n,), J/m^3.
+        deformation: J, (n,), or F, (n, d, d), after plastic flow.
+        internal: internal variables after plastic flow, (n,) each, by name.
+    """
+
+    tau: np.ndarray | None
+    energy: np.ndarray
+    deformation: np.ndarray
+    internal: dict[str, np.ndarray]
+
+
+def build_observation(group: ParticleGroup) -> Callable[..., Observation]:
+    """Compile-ready observation of a group: call the result with the last step (s), and `stress=False` to do without.
+
+    The device's state stays as it is: plastic flow is booked by the next step.
+    """
+    d, law = group.dimension, group.law
+    kept = [e for e, (i, j) in enumerate(ENTRIES) if d == 3 or {i, j} <= {0, 1} or i == j == 2]
+    placed = tuple((column, *ENTRIES[e]) for column, e in enumerate(kept))
+    keeps_F = law.deformation == "F"
+    inner_count = len(group.internal)
+
+    @ti.kernel
+    def observe(
+        dt: float,
+        with_stress: ti.template(),
+        tau: ti.types.ndarray(),
+        energy: ti.types.ndarray(),
+        state: ti.types.ndarray(),
+    ):
+        for p in range(group.count):
+            _, C = group.motion(p)
+            constants = group.constants(p)
+            stress, stress_zz, deformation, inner = law.respond(group.stored(p), group.inner(p), C, dt, constants)
+            energy[p] = law.energy(deformation, inner, constants)
+            if ti.static(with_stress):
+                for column, i, j in ti.static(placed):
+                    if ti.static(i < d and j < d):
+                        tau[p, column] = stress[i, j]
+                    else:
+                        tau[p, column] = stress_zz
+            if ti.static(law.projects):
+                if ti.static(keeps_F):
+                    for i, j in ti.static(ti.ndrange(d, d)):
+                        state[p, i * d + j] = deformation[i, j]
+                else:
+                    state[p, 0] = deformation
+                for i in ti.static(range(inner_count)):
+                    state[p, (d * d if keeps_F else 1) + i] = inner[i]
+
+    def observed(dt: float, *, stress: bool) -> Observation:
+        n, real = group.count, group.real
+        first = d * d if keeps_F else 1
+        entries = np.empty((n if stress else 1, len(kept)), real)
+        energy = np.empty(n, real)
+        state = np.empty((n if law.projects else 1, first + inner_count), real)
+        observe(dt, stress, entries, energy, state)
+        tau = None
+        if stress:
+            tau = np.zeros((n, 3, 3), real)
+            for column, i, j in placed:
+                tau[:, i, j] = tau[:, j, i] = entries[:, column]
+        if not law.projects:
+            internal = [values.to_numpy() for values in group.internal]
+            deformation = group.deformation_to_numpy()
+        else:
+            internal = list(state[:, first:].T)
+            deformation = state[:, :first].reshape(n, d, d) if keeps_F else state[:, 0]
+        names = [variable.name for variable in law.internal]
+        return Observation(tau, energy, deformation, dict(zip(names, internal, strict=True)))
+
+    return observed

@@ -1,0 +1,103 @@
+"""What tests ask of a law: its response and its energy, as the kernels compute them, of many states at once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from mpmcli.materials.law import Law
+from mpmcli.scene.material import MaterialParameters
+
+
+@dataclass(frozen=True)
+class Response:
+    """n answers: tau (n, 3, 3), with tau_zz in its place in 2D; the state after plastic flow; energy (n,), float64."""
+
+    tau: np.ndarray
+    deformation: np.ndarray
+    internal: np.ndarray
+    energy: np.ndarray
+
+
+class LawProbe:
+    """One law on a running backend; needs `backend_of("f64")` or f32 first, and dies with that backend.
+
+    The kernel is compiled once per probe: keep one per law and parameters, and give it many states.
+    """
+
+    def __init__(self, law: type[Law], parameters: MaterialParameters, dimension: int) -> None:
+        self.law = law([parameters], dimension)
+        self.dimension = d = dimension
+        constants = self.law.constants(parameters)
+        real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
+        self._real = real
+        table = ti.Vector.field(len(constants), float, shape=())
+        table.from_numpy(np.array(constants, real))
+        bound_law, keeps_F, names = self.law, self.law.deformation == "F", len(self.law.internal)
+
+        @ti.kernel
+        def run(
+            deformation: ti.types.ndarray(),
+            internal: ti.types.ndarray(),
+            gradient: ti.types.ndarray(),
+            dt: float,
+            out: ti.types.ndarray(),
+        ):
+            for p in range(out.shape[0]):
+                C = ti.Matrix.zero(float, d, d)
+                for i, j in ti.static(ti.ndrange(d, d)):
+                    C[i, j] = gradient[p, i, j]
+                variables = ti.Vector.zero(float, ti.static(max(names, 1)))
+                for i in ti.static(range(names)):
+                    variables[i] = internal[p, i]
+                if ti.static(keeps_F):
+                    F = ti.Matrix.zero(float, d, d)
+                    for i, j in ti.static(ti.ndrange(d, d)):
+                        F[i, j] = deformation[p, i, j]
+                    tau, tau_zz, new, inner = bound_law.respond(F, variables, C, dt, table[None])
+                    for i, j in ti.static(ti.ndrange(d, d)):
+                        out[p, i * 3 + j] = tau[i, j]
+                        out[p, 9 + i * d + j] = new[i, j]
+                    out[p, 18] = tau_zz
+                    out[p, 19] = bound_law.energy(new, inner, table[None])
+                    for i in ti.static(range(names)):
+                        out[p, 20 + i] = inner[i]
+                else:
+                    J = deformation[p, 0, 0]
+                    tau, tau_zz, new, inner = bound_law.respond(J, variables, C, dt, table[None])
+                    for i, j in ti.static(ti.ndrange(d, d)):
+                        out[p, i * 3 + j] = tau[i, j]
+                    out[p, 9] = new
+                    out[p, 18] = tau_zz
+                    out[p, 19] = bound_law.energy(new, inner, table[None])
+                    for i in ti.static(range(names)):
+                        out[p, 20 + i] = inner[i]
+
+        self._run = run
+
+    def at_rest(self, count: int) -> np.ndarray:
+        """Return the internal variables of `count` particles at rest, (count, number of variables)."""
+        return np.tile([variable.at_rest for variable in self.law.internal], (count, 1)).reshape(count, -1)
+
+    def __call__(
+        self, F: np.ndarray, internal: np.ndarray | None = None, C: np.ndarray | None = None, dt: float = 1e-3
+    ) -> Response:
+        """Return the response to states F (n, d, d), of which a law that keeps J gets det F.
+
+        `internal` is (n, number of internal variables), at rest where None; C is (n, d, d), 0 where None.
+        """
+        n, d = len(F), self.dimension
+        internal = self.at_rest(n) if internal is None else internal
+        keeps_F = self.law.deformation == "F"
+        given = F if keeps_F else np.linalg.det(F)[:, None, None]
+        padded = np.zeros((n, max(internal.shape[1], 1)))
+        padded[:, : internal.shape[1]] = internal
+        out = np.zeros((n, 20 + max(internal.shape[1], 1)), self._real)
+        gradient = np.zeros((n, d, d)) if C is None else C
+        self._run(*(np.ascontiguousarray(a, self._real) for a in (given, padded, gradient)), dt, out)
+        values = out.astype(np.float64)
+        tau = values[:, :9].reshape(n, 3, 3).copy()
+        if d == 2:
+            tau[:, 2, 2] = values[:, 18]
+        deformation = values[:, 9 : 9 + d * d].reshape(n, d, d) if keeps_F else values[:, 9]
+        return Response(tau, deformation, values[:, 20 : 20 + internal.shape[1]], values[:, 19])

@@ -1,0 +1,125 @@
+"""Set-ups that tests of whole runs share: scenes in few words, starts of their own, and runs."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from solver_state import scene_of
+
+from mpmcli.scene import BodyParticles, Scene
+from mpmcli.solver.snapshot import measure, read_group
+from mpmcli.solver.solver import Solver
+from mpmcli.solver.step import NOT_LOST
+
+GRAVITY = 9.81
+
+
+def block(name: str, material: dict, low: Sequence[float], high: Sequence[float], **more: object) -> dict:
+    """Return the table of a body that is a box."""
+    box = {"min": [float(x) for x in low], "max": [float(x) for x in high]}
+    return {"name": name, "material": material, "shape": {"box": box}, **more}
+
+
+def scene(
+    cells: Sequence[int],
+    spacing: float,
+    bodies: Sequence[dict],
+    end: float,
+    *,
+    frames: int = 1,
+    gravity: Sequence[float] = (),
+    walls: object = "separate",
+    precision: str = "f32",
+    fields: Sequence[str] = ("velocity",),
+) -> Scene:
+    """Return a scene on so many cells."""
+    domain = {"size": [n * spacing for n in cells], "spacing": spacing, "walls": walls}
+    if len(gravity) > 0:
+        domain["gravity"] = [float(g) for g in gravity]
+    return scene_of(
+        domain=domain,
+        time={"end": float(end), "frames": frames},
+        output={"fields": list(fields)},
+        solver={"precision": precision},
+        bodies=list(bodies),
+    )
+
+
+def tilted(degrees: float) -> list[float]:
+    """Return gravity in the axes of a slope: x down the slope, y away from it."""
+    theta = math.radians(degrees)
+    return [GRAVITY * math.sin(theta), -GRAVITY * math.cos(theta)]
+
+
+def moved(sample: BodyParticles, position: np.ndarray) -> BodyParticles:
+    """Return the particles at other places, (n, d)."""
+    return replace(sample, position=position)
+
+
+def column_start(Y: np.ndarray, weight: float, modulus: float, top: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the particles of a resting column lie and their J, both (n,), for p = K (1/J - 1).
+
+    In one dimension the stress carries the weight of what was above at the start, p = weight (top - Y), with
+    weight = density g; y is the integral of J = 1 / (1 + p / K) from 0 to Y.
+    """
+    a = weight / modulus
+    return np.log((1 + a * top) / (1 + a * (top - Y))) / a, 1 / (1 + a * (top - Y))
+
+
+def row_means(values: np.ndarray, rows: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return the mean of the chosen values in each row of particles; rows (n,) are their heights at the start."""
+    keys = np.round(rows, 9)
+    return np.array([values[chosen & (keys == key)].mean(0) for key in np.unique(keys)])
+
+
+def stresses(fields: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the Cauchy stress of a frame as matrices, (n, 3, 3), Pa."""
+    return fields["stress"].reshape(-1, 3, 3)
+
+
+def period_of(times: np.ndarray, signal: np.ndarray) -> float:
+    """Return the period of a signal about 0: twice the mean distance of its zeros."""
+    i = np.flatnonzero(np.sign(signal[1:]) != np.sign(signal[:-1]))
+    zeros = times[i] - signal[i] * (times[i + 1] - times[i]) / (signal[i + 1] - signal[i])
+    return 2 * float(np.polyfit(np.arange(len(zeros)), zeros, 1)[0])
+
+
+def restart(solver: Solver, sample: BodyParticles, end: float) -> None:
+    """Begin a run of a scene of one body again, with other particles, as many: its kernels stay compiled."""
+    group = solver.groups[0]
+    group.x.from_numpy(sample.position.astype(group.real))
+    group.set_motion(sample.velocity, sample.affine)
+    d = group.dimension
+    group.set_deformation(
+        np.ones(group.count) if group.law.deformation == "J" else np.tile(np.eye(d), (group.count, 1, 1))
+    )
+    for variable, values in zip(group.law.internal, group.internal, strict=True):
+        values.fill(variable.at_rest)
+    group.id.from_numpy(np.arange(group.count, dtype=np.int32))
+    solver.scene = solver.scene.model_copy(update={"time": solver.scene.time.model_copy(update={"end": end})})
+    solver.time, solver.step_count = 0.0, 0
+    # What only a new Solver sets: no particle is lost, the tiles are out of order, and the limits unknown.
+    solver._kernels.lost.fill(NOT_LOST)
+    solver._drift = math.inf
+    solver.watch(0.0)
+    solver._first_stable_step = solver.stable_step()[0]
+
+
+def sums(solver: Solver) -> dict:
+    """Return what the ledger sums at this moment, in float64."""
+    seen = [observe(solver._last_step, stress=False) for observe in solver._observe]
+    gravity = np.array(solver.scene.domain.gravity)
+    return measure([read_group(group) for group in solver.groups], seen, gravity, solver.spacing)
+
+
+def centred_energy(solver: Solver) -> float:
+    """Take one step and return the energy in the middle of it, J.
+
+    Velocities of the symplectic Euler method belong to the middle of the step that positions take with them: the
+    sum at one moment is off by half a step's exchange between kinetic and other energy, which is no growth.
+    """
+    before = sums(solver)
+    solver.step(solver.stable_step()[0])
+    after = sums(solver)
+    return after["kinetic"] + sum(before[part] + after[part] for part in ("elastic", "potential")) / 2
