@@ -111,6 +111,8 @@ class Fluid(Law):
         self.linear = all(member.exponent == 1 for member in members)
         self.viscous = any(member.viscosity > 0 or member.bulk_viscosity > 0 for member in members)
         self.projects = any(member.tension_cutoff for member in members)
+        softens = self.linear and all(member.tension_cutoff for member in members)
+        self.sensitivity = 0.0 if softens else max(member.exponent for member in members)
 
     def constants(self, parameters: FluidParameters) -> tuple[float, ...]:
         largest = 1.0 if parameters.tension_cutoff else LARGEST

@@ -65,6 +65,8 @@ class HenckyLaw(Law):
     """tau_i = 2 mu e_i + lambda tr e in the principal frame of F F^T, with e_i = ln s_i (Hencky 1928)."""
 
     deformation = "F"
+    # d lambda + 2 mu at any strain; x coth x = 1 + x^2/3 for shear.
+    sensitivity = 0.0
 
     def modes(self, parameters: HenckyParameters, bound: StateBound) -> list[Mode]:
         """d lambda + 2 mu for normal strain, in any state; 2 mu x coth x for shear, x = ln(s_i / s_j).

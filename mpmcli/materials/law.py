@@ -55,7 +55,8 @@ class Law(ABC):
         parameters: the pydantic model of its parameters, which also lists its internal variables.
         deformation: what a particle stores, "J" (the volume ratio) or "F" (the deformation gradient).
         projects: whether `respond` may change the state.
-        sensitivity: growth of the logarithm of the largest stiffness per strain: how closely it is watched.
+        sensitivity: growth of the logarithm of the largest stiffness per strain: how closely it is watched; 0 where
+            no state is stiffer than rest.
         members: parameters of the bodies that follow this law.
         dimension: 2 (plane strain) or 3.
         internal: the internal variables that a particle stores.

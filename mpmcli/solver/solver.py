@@ -27,6 +27,9 @@ from mpmcli.stability.limits import Limit, deformation_limit, mode_limit, speed_
 # deformed by more than this fraction since; the margin of time.safety covers that.
 MOST_UNWATCHED_STEPS = 16
 UNWATCHED_CHANGE = 0.1
+# Cells per step below which a sudden stop, which turns speed into a velocity gradient of up to two speeds a cell,
+# stays clear of the bound on the deformation in a step.
+SLOW = 0.1
 # Largest rounding of a stored position, in cells.
 POSITION_ERROR = 1e-3
 # Cells that a particle of a GPU run may move in a step beyond what was expected.
@@ -186,8 +189,10 @@ class Solver:
         due = []
         for g, (group, extremes) in enumerate(zip(self.groups, self._extremes, strict=True)):
             self._unwatched[g] += 1
-            # What moves through a fifth of a cell may meet something that deforms it by about as much.
-            self._change[g] += group.law.sensitivity * max(dt * extremes.gradient, 0.5 * self.courant)
+            # What moves through a fifth of a cell may meet something that deforms it by about as much. Where stiffness
+            # does not grow with it, only the deformation itself bounds the step, and slow steps deform little.
+            closely = group.law.sensitivity if self.courant < SLOW else max(group.law.sensitivity, 1.0)
+            self._change[g] += closely * max(dt * extremes.gradient, 0.5 * self.courant)
             if self._unwatched[g] >= MOST_UNWATCHED_STEPS or self._change[g] >= UNWATCHED_CHANGE:
                 due.append(g)
         blind = unseen > 0 and self._drift + unseen >= self._drift_allowed
