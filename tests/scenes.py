@@ -99,10 +99,9 @@ def restart(solver: Solver, sample: BodyParticles, end: float) -> None:
     group.id.from_numpy(np.arange(group.count, dtype=np.int32))
     solver.scene = solver.scene.model_copy(update={"time": solver.scene.time.model_copy(update={"end": end})})
     solver.time, solver.step_count = 0.0, 0
-    # What only a new Solver sets: no particle is lost, the tiles are out of order, and the limits unknown.
+    # What only a new Solver sets: no particle is lost.
     solver._kernels.lost.fill(NOT_LOST)
-    solver._drift = math.inf
-    solver.watch(0.0)
+    solver.state_was_replaced()
     solver._first_stable_step = solver.stable_step()[0]
 
 

@@ -85,7 +85,7 @@ class TestOurs:
         after n symplectic Euler steps the mean is at y0 - V n dt - g dt^2 n (n + 1) / 2.
         """
         steps = 20
-        for module, name in (("ours", "Ours"), ("peers", "Peer")):
+        for module, name in (("ours", "falling_block"), ("peers", "Peer")):
             run_python(f"""
 import numpy as np
 from mpmcli.bench.cases import BenchCase

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from mpmcli.bench.cases import BenchCase
+from mpmcli.bench.ours import Ours
 from mpmcli.errors import RunError
-from mpmcli.materials.registry import laws, parameter_models
-from mpmcli.scene import parse_scene
+from mpmcli.materials.registry import laws
 from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import MaterialParameters
 
@@ -103,8 +103,8 @@ def scene_of(names: Sequence[str], case: BenchCase, precision: str) -> dict:
     }
 
 
-class Column:
-    """The solver on the column of some laws, running in this process, which it takes over (taichi starts once).
+class Column(Ours):
+    """The solver on the column of some laws.
 
     The column starts with a shear just above the floor, lands, leans and spreads; SETTLING later most particles of
     a plastic law flow (`flowing` says how many). Every stretch that is measured takes the same steps from the same
@@ -112,32 +112,11 @@ class Column:
     """
 
     def __init__(self, names: Sequence[str], case: BenchCase, *, threads: int, precision: str, arch: str) -> None:
-        from mpmcli.solver.backend import start_backend
-        from mpmcli.solver.plan import make_plan
-        from mpmcli.solver.solver import Solver
-
         if unknown := set(names) - set(laws()):
             raise RunError(f"There is no law {min(unknown)}.")
-        name = f"{' + '.join(names)}, {case.name}"
-        scene = parse_scene(scene_of(names, case, precision), laws=parameter_models(), source=name).scene
-        backend = start_backend(arch, threads, precision, compile_cache=False)
-        self._solver = Solver(scene, backend)
-        self._waits = not backend.on_cpu
-        self._dt = self.smallest_step = case.step
+        data = scene_of(names, case, precision)
+        super().__init__(data, case.step, threads=threads, precision=precision, arch=arch)
         self._kept: list[list[np.ndarray]] = []
-        self.particles: int = self._solver.particle_count
-        self.bytes_per_particle: int | None = make_plan(scene, backend).bytes_per_particle
-
-    def step(self) -> None:
-        """Advance by one step, as `frames` does: of the case's size, unless the limits ask for less."""
-        self._dt, _ = self._solver.stable_step()
-        self.smallest_step = min(self.smallest_step, self._dt)
-        self._solver.step(self._dt)
-
-    def sync(self) -> None:
-        """Wait until every step asked for is done; on the CPU each step has waited by itself."""
-        if self._waits:
-            self._solver.watch(self._dt)
 
     def keep(self) -> None:
         """Remember the state of all particles."""
@@ -162,8 +141,3 @@ class Column:
             after = build_observation(group)(self._dt, stress=False).deformation.reshape(group.count, -1)
             count += int((after != before).any(axis=1).sum())
         return count / self.particles
-
-    def is_sound(self) -> bool:
-        """Whether every particle is where it can be."""
-        position = self._solver.frame(0, [])[0].position
-        return bool(((position >= 0) & (position <= 1)).all())

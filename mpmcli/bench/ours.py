@@ -46,19 +46,28 @@ def particles_of(case: BenchCase) -> BodyParticles:
 
 
 class Ours:
-    """The solver on a case, running in this process, which it takes over (taichi starts once)."""
+    """The solver on a scene, running in this process, which it takes over (taichi starts once)."""
 
-    def __init__(self, case: BenchCase, *, threads: int, precision: str, arch: str) -> None:
+    def __init__(
+        self,
+        data: dict,
+        step: float,
+        particles: list[BodyParticles] | None = None,
+        *,
+        threads: int,
+        precision: str,
+        arch: str,
+    ) -> None:
         # Here rather than above: a scene can be described without starting taichi.
         from mpmcli.solver.backend import start_backend
         from mpmcli.solver.plan import make_plan
         from mpmcli.solver.solver import Solver
 
-        scene = parse_scene(scene_of(case, precision), laws=parameter_models(), source=case.name).scene
+        scene = parse_scene(data, laws=parameter_models(), source=data["title"]).scene
         backend = start_backend(arch, threads, precision, compile_cache=False)
-        self._solver = Solver(scene, backend, particles=[particles_of(case)])
+        self._solver = Solver(scene, backend, particles=particles)
         self._waits = not backend.on_cpu
-        self._dt = self.smallest_step = case.step
+        self._dt = self.smallest_step = step
         self.particles: int = self._solver.particle_count
         self.bytes_per_particle: int | None = make_plan(scene, backend).bytes_per_particle
 
@@ -81,3 +90,9 @@ class Ours:
         """Whether every particle is where it can be."""
         position = self.positions()
         return bool(((position >= 0) & (position <= 1)).all())
+
+
+def falling_block(case: BenchCase, *, threads: int, precision: str, arch: str) -> Ours:
+    """Return the solver on the block that the peer runs, too."""
+    data, particles = scene_of(case, precision), [particles_of(case)]
+    return Ours(data, case.step, particles, threads=threads, precision=precision, arch=arch)

@@ -165,9 +165,9 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
 
         return Peer(case, **options)
     if who == "ours":
-        from mpmcli.bench.ours import Ours
+        from mpmcli.bench.ours import falling_block
 
-        return Ours(case, **options)
+        return falling_block(case, **options)
     from mpmcli.bench.materials import Column
 
     return Column(who.split(","), case, **options)

@@ -16,20 +16,11 @@ QUIET_SPEED = 1.0
 # The pressure of a nonlinear equation of state grows no further below this J: the largest power stays a number of
 # 32 bits. Far beyond what weak compressibility means, but a crushed particle must not turn into infinities.
 CRUSHED = 0.05
-# Of every law whose bulk modulus may be "auto".
-STIFFNESS = Knob(
-    "stiffness",
-    0.1,
-    1e-4,
-    "0 lets the density vary by 10 %, 1 by 0.01 %, in steps 30 times as many",
-    excludes=("bulk_modulus",),
-)
 
 
-class FluidParameters(MaterialParameters):
-    """Parameters of the weakly compressible fluid."""
+class WeaklyCompressibleParameters(MaterialParameters):
+    """Parameters of a fluid whose bulk modulus the scene may choose."""
 
-    law: Literal["fluid"] = "fluid"
     bulk_modulus: Annotated[
         Positive | Literal["auto"],
         Field(
@@ -40,8 +31,20 @@ class FluidParameters(MaterialParameters):
     compressibility: Annotated[
         float,
         Field(gt=0, le=0.1, description='Density variation that bulk_modulus = "auto" allows, a fraction.'),
-        STIFFNESS,
+        Knob(
+            "stiffness",
+            0.1,
+            1e-4,
+            "0 lets the density vary by 10 %, 1 by 0.01 %, in steps 30 times as many",
+            excludes=("bulk_modulus",),
+        ),
     ] = 0.01
+
+
+class FluidParameters(WeaklyCompressibleParameters):
+    """Parameters of the weakly compressible fluid."""
+
+    law: Literal["fluid"] = "fluid"
     exponent: Annotated[
         float,
         Field(

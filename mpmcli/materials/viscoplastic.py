@@ -5,11 +5,11 @@ from typing import Annotated, Literal, Self
 import taichi as ti
 from pydantic import Field
 
-from mpmcli.materials.fluid import STIFFNESS, soft_bulk_modulus, volume_energy
+from mpmcli.materials.fluid import WeaklyCompressibleParameters, soft_bulk_modulus, volume_energy
 from mpmcli.materials.law import Law, Mode, StateBound
 from mpmcli.materials.polar import rounding
 from mpmcli.scene.knobs import Knob
-from mpmcli.scene.material import MaterialParameters, SceneBounds
+from mpmcli.scene.material import SceneBounds
 from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
 
 # The elastic shear strain at yield that shear_modulus = "auto" allows.
@@ -21,22 +21,10 @@ CRUSHED, FLAT = 1e-9, 100.0
 ITERATIONS_MAX = 30
 
 
-class ViscoplasticParameters(MaterialParameters):
+class ViscoplasticParameters(WeaklyCompressibleParameters):
     """Parameters of the Bingham and of the Herschel-Bulkley fluid."""
 
     law: Literal["viscoplastic"] = "viscoplastic"
-    bulk_modulus: Annotated[
-        Positive | Literal["auto"],
-        Field(
-            description='Bulk modulus K = density c^2, Pa; "auto" picks the softest that keeps the density '
-            "variation under `compressibility` at the highest speed the scene can reach."
-        ),
-    ] = "auto"
-    compressibility: Annotated[
-        float,
-        Field(gt=0, le=0.1, description='Density variation that bulk_modulus = "auto" allows, a fraction.'),
-        STIFFNESS,
-    ] = 0.01
     yield_stress: Annotated[
         NotNegative,
         Field(description="Shear stress below which the material does not flow, Pa; mud 10 to 1000."),

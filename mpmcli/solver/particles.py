@@ -7,7 +7,6 @@ import taichi as ti
 
 from mpmcli.materials.law import Law
 from mpmcli.scene import BodyParticles
-from mpmcli.scene.material import MaterialParameters
 
 # Entries of the per-body table that come before the constants of the law.
 MASS, VOLUME, CONSTANTS = 0, 1, 2
@@ -21,7 +20,6 @@ class ParticleGroup:
         law: the constitutive law.
         bodies: index in the scene of each body of the group.
         several: whether there is more than one.
-        parameters: of each body's material.
         count: number of particles n.
         x: position relative to the origin of the domain, (n) Vector(d), m.
         v: velocity, (n) Vector, m/s, as wide as a node of the grid; the first d entries count.
@@ -38,7 +36,6 @@ class ParticleGroup:
         self,
         law: Law,
         bodies: Sequence[int],
-        parameters: Sequence[MaterialParameters],
         particles: Sequence[BodyParticles],
         first_ids: Sequence[int],
         origin: np.ndarray,
@@ -47,7 +44,6 @@ class ParticleGroup:
     ) -> None:
         self.law = law
         self.bodies = tuple(bodies)
-        self.parameters = tuple(parameters)
         self.count = n = sum(len(b.position) for b in particles)
         self.dimension = d = particles[0].position.shape[1]
         self.x = ti.Vector.field(d, float, shape=n, layout=layout)
@@ -61,7 +57,7 @@ class ParticleGroup:
         self.id = ti.field(int, shape=n)
         self.several = len(self.bodies) > 1
         self.body = ti.field(int, shape=n) if self.several else None
-        rows = [(b.mass, b.volume, *law.constants(p)) for b, p in zip(particles, parameters, strict=True)]
+        rows = [(b.mass, b.volume, *law.constants(p)) for b, p in zip(particles, law.members, strict=True)]
         self.table = ti.Vector.field(len(rows[0]), float, shape=len(rows))
 
         self.real = host = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32

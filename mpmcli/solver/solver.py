@@ -86,7 +86,6 @@ class Solver:
                 ParticleGroup(
                     laws()[name](materials, scene.dimension),
                     members,
-                    materials,
                     [particles[i] for i in members],
                     [int(first_ids[i]) for i in members],
                     self._origin,
@@ -137,7 +136,7 @@ class Solver:
         """Return the bounds that the g-th group sets, as last measured."""
         group, extremes = self.groups[g], self._extremes[g]
         bounds = [Limit(deformation_limit(extremes.gradient), "deformation", "")]
-        for place, parameters in zip(group.bodies, group.parameters, strict=True):
+        for place, parameters in zip(group.bodies, group.law.members, strict=True):
             for mode in group.law.modes(parameters, extremes.bound):
                 value, cause = mode_limit(self.spacing, parameters.density, mode.stiffness, mode.viscosity)
                 bounds.append(Limit(value, cause, self._names[place]))
