@@ -46,6 +46,11 @@ class TestColumn:
         volumes = [body.shape.form.volume for body in column.bodies]
         assert volumes == pytest.approx([volumes[0]] * len(names))
 
+    def test_a_place_without_a_law_is_empty_and_the_rest_is_as_before(self) -> None:
+        whole, half = scene(("fluid", "sand"), SMALL), scene(("", "sand"), SMALL)
+        assert half.bodies == whole.bodies[1:]
+        assert half.domain == whole.domain
+
     @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
     @pytest.mark.parametrize("law", sorted(laws()))
     def test_the_step_is_far_from_the_limit_of_every_law_at_rest(self, law: str, case: BenchCase) -> None:
@@ -157,7 +162,7 @@ class TestWorker:
 
 
 # ns per particle and step.
-COSTS = {"fluid": 40.0, "neo_hookean": 60.0, "sand": 180.0, "fluid,sand": 121.0}
+COSTS = {"fluid": 40.0, "neo_hookean": 60.0, "sand": 180.0, "fluid,": 42.0, ",sand": 188.0, "fluid,sand": 126.5}
 
 
 class FakeWorker:
@@ -167,7 +172,9 @@ class FakeWorker:
 
     def __init__(self, who: str, log: list[tuple[str, str]], particles: int = SMALL.particles) -> None:
         self.who, self.log = who, log
-        self.step_seconds = 1e-9 * COSTS[who] * SMALL.particles
+        if "" in who.split(","):
+            particles //= 2
+        self.step_seconds = 1e-9 * COSTS[who] * particles
         self.ready = {"particles": particles, "bytes_per_particle": 100}
         self.closed = False
 
@@ -220,9 +227,10 @@ class TestRun:
         report, _ = self.run()
         assert [result.nanoseconds for result in report.results] == pytest.approx([*COSTS.values()])
         assert report.results[0].compile_seconds == pytest.approx(2.0)
-        *_, sand, mix = report.results
-        assert report.of(sand, "fluid").value == pytest.approx(4.5)
-        assert report.of(mix, "fluid", "sand").value == pytest.approx(1.1)
+        _, _, sand, _, _, mix = report.results
+        assert report.of(sand, ("fluid",)).value == pytest.approx(4.5)
+        assert mix.parts == (("fluid", ""), ("", "sand"))
+        assert report.of(mix, *mix.parts).value == pytest.approx(1.1)
 
     def test_several_threads_are_timed_by_the_wall(self) -> None:
         report, _ = self.run(threads=2)
@@ -232,15 +240,19 @@ class TestRun:
     def test_progress_is_told(self) -> None:
         lines = []
         self.run(progress=lines.append)
-        assert len(lines) == 7
-        assert lines[-1] == "2d-16: block 2 of 2, ns: fluid 40, neo_hookean 60, sand 180, fluid + sand 121"
+        assert len(lines) == 9
+        assert lines[-1] == (
+            "2d-16: block 2 of 2, ns: fluid 40, neo_hookean 60, sand 180, half of fluid 42, half of sand 188, "
+            "fluid + sand 126"
+        )
 
     def test_a_law_that_cannot_run_is_left_out_with_a_reason(self) -> None:
-        report, _ = self.run(fails="sand")
-        assert [result.name for result in report.results] == ["fluid", "neo_hookean", "fluid + sand"]
-        assert report.of(report.results[-1], "fluid", "sand") is None
-        assert report.flaws == ("sand at 2d-16 could not be measured. It has no stiffness.",)
-        assert "Beware: sand at 2d-16 could not be measured." in report.table()
+        report, _ = self.run(fails=",sand")
+        assert [result.name for result in report.results][3:] == ["half of fluid", "fluid + sand"]
+        mix = report.results[-1]
+        assert report.of(mix, *mix.parts) is None
+        assert report.flaws == ("half of sand at 2d-16 could not be measured. It has no stiffness.",)
+        assert "Beware: half of sand at 2d-16 could not be measured." in report.table()
 
     def test_another_number_of_particles_is_refused(self) -> None:
         report = run_costs(
@@ -289,10 +301,12 @@ class TestReport:
     )
     neo_hookean = replace(fluid, names=("neo_hookean",), costs=(30e-9, 33e-9, 40e-9))
     corotated = replace(fluid, names=("fixed_corotated",), costs=(60e-9, 72.6e-9, 80e-9))
+    left = replace(fluid, names=("fluid", ""), costs=(21e-9, 23e-9, 24e-9))
+    right = replace(fluid, names=("", "neo_hookean"), costs=(30e-9, 32e-9, 34e-9))
     mix = replace(fluid, names=("fluid", "neo_hookean"), costs=(25e-9, 27.5e-9, 34e-9))
 
     def report(self, *results: CostResult) -> CostReport:
-        results = results or (self.fluid, self.neo_hookean, self.corotated, self.mix)
+        results = results or (self.fluid, self.neo_hookean, self.corotated, self.left, self.right, self.mix)
         return CostReport(results, (), 1, "f32", 1.0, {"processor": "A processor", "taichi": "1.7.4"})
 
     def test_table(self) -> None:
@@ -314,10 +328,10 @@ class TestReport:
 
     def test_ratios_are_of_one_case(self) -> None:
         other = replace(self.neo_hookean, case=CASES[1])
-        assert self.report(self.fluid, other).of(other, "fluid") is None
+        assert self.report(self.fluid, other).of(other, ("fluid",)) is None
 
     def test_range_of_a_ratio_is_that_of_the_rounds(self) -> None:
-        ratio = self.report().of(self.neo_hookean, "fluid")
+        ratio = self.report().of(self.neo_hookean, ("fluid",))
         assert (ratio.low, ratio.high) == pytest.approx((4 / 3, 1.5))
 
     def test_table_warns_of_smaller_steps_and_of_a_run_that_broke_down(self) -> None:
@@ -327,7 +341,8 @@ class TestReport:
 
     def test_dictionary_is_json(self) -> None:
         found = json.loads(json.dumps(self.report().as_dict()))
-        *_, corotated, mix = found["results"]
+        _, _, corotated, left, _, mix = found["results"]
+        assert (left["laws"], left["share_of_column"], left["particles"]) == (["fluid"], 0.5, CASES[0].particles // 2)
         assert corotated["laws"] == ["fixed_corotated"]
         assert corotated["ns_per_particle_step"] == pytest.approx(72.6)
         assert corotated["over_neo_hookean"] == pytest.approx(2.2)

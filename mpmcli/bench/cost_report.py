@@ -1,7 +1,7 @@
 """What laws cost, as tables for people and as a dictionary for JSON."""
 
 import statistics
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from mpmcli.bench.cases import BenchCase
@@ -15,13 +15,18 @@ MIX_TARGET = 1.05
 MEASURES = ("fluid", "neo_hookean")
 
 
+def name_of(names: Sequence[str]) -> str:
+    """Return what to call the laws of a column, by place, like "fluid + sand" or "half of sand"."""
+    return ("" if all(names) else "half of ") + " + ".join(filter(None, names))
+
+
 @dataclass(frozen=True)
 class CostResult:
-    """One law, or several in one scene, at one case.
+    """One law, or several in one scene, or a part of such a scene, at one case.
 
     Attributes:
         case: sizes and step.
-        names: of the laws, each with an equal share of the particles.
+        names: of the laws, by place, each with an equal share of the column; "" where the place is empty.
         costs: s per particle and step of each measured block, in order.
         compile_seconds: what the first step took beyond a usual one, with nothing cached on disk.
         bytes_per_particle: device memory, sort buffers included, of a particle of the law that takes most.
@@ -42,7 +47,25 @@ class CostResult:
     @property
     def name(self) -> str:
         """The laws, like "fluid + sand"."""
-        return " + ".join(self.names)
+        return name_of(self.names)
+
+    @property
+    def laws(self) -> list[str]:
+        """The laws there are."""
+        return [*filter(None, self.names)]
+
+    @property
+    def parts(self) -> tuple[tuple[str, ...], ...]:
+        """The names of the same scene with one law left in it, for each of several laws."""
+        if len(self.laws) < 2:
+            return ()
+        places = range(len(self.names))
+        return tuple(tuple(name if i == place else "" for i, name in enumerate(self.names)) for place in places)
+
+    @property
+    def particles(self) -> int:
+        """The number of particles."""
+        return self.case.particles * len(self.laws) // len(self.names)
 
     @property
     def nanoseconds(self) -> float:
@@ -53,8 +76,9 @@ class CostResult:
         """Return it with SI units in the names, but for the cost, which is in ns."""
         return {
             "case": self.case.name,
-            "laws": list(self.names),
-            "particles": self.case.particles,
+            "laws": self.laws,
+            "share_of_column": len(self.laws) / len(self.names),
+            "particles": self.particles,
             "step_s": self.case.step,
             "ns_per_particle_step": self.nanoseconds,
             "ns_per_particle_step_blocks": [1e9 * cost for cost in self.costs],
@@ -145,12 +169,12 @@ class CostReport:
         """What time is counted."""
         return "processor time" if self.threads == 1 else "wall time"
 
-    def of(self, result: CostResult, *names: str) -> Ratio | None:
-        """Return a cost over that of other laws at the same case, or None where those were not measured."""
-        alone = {other.names[0]: other for other in self.results if other.case == result.case and len(other.names) == 1}
-        if not all(name in alone for name in names):
+    def of(self, result: CostResult, *others: Sequence[str]) -> Ratio | None:
+        """Return a cost over the mean of others at the same case, or None where those were not measured."""
+        found = {other.names: other for other in self.results if other.case == result.case}
+        if not others or not all(names in found for names in others):
             return None
-        return ratio_of(result, *(alone[name] for name in names))
+        return ratio_of(result, *(found[names] for names in others))
 
     @property
     def targets(self) -> tuple[Target, ...]:
@@ -166,9 +190,9 @@ class CostReport:
                     text = f"fluid over the next cheapest, {cheapest.name}"
                     yield Target(result.case.name, text, ratio_of(result, cheapest), 1.0)
             for law, measure, limit in TARGETS:
-                if result.names == (law,) and (ratio := self.of(result, measure)):
+                if result.names == (law,) and (ratio := self.of(result, (measure,))):
                     yield Target(result.case.name, f"{law} over {measure}", ratio, limit)
-            if len(result.names) > 1 and (ratio := self.of(result, *result.names)):
+            if ratio := self.of(result, *result.parts):
                 yield Target(result.case.name, f"{result.name} over the sum of its parts", ratio, MIX_TARGET)
 
     def as_dict(self) -> dict:
@@ -187,9 +211,9 @@ class CostReport:
 
     def _result_dict(self, result: CostResult) -> dict:
         if len(result.names) > 1:
-            ratios = {"over_sum_of_parts": self.of(result, *result.names)}
+            ratios = {"over_sum_of_parts": self.of(result, *result.parts)}
         else:
-            ratios = {f"over_{name}": self.of(result, name) for name in MEASURES}
+            ratios = {f"over_{name}": self.of(result, (name,)) for name in MEASURES}
         return result.as_dict() | {key: ratio.value if ratio else None for key, ratio in ratios.items()}
 
     def table(self) -> str:
@@ -198,7 +222,7 @@ class CostReport:
         rows = [
             (
                 *_cost_cells(result),
-                *(_times(self.of(result, name)) for name in MEASURES),
+                *(_times(self.of(result, (name,))) for name in MEASURES),
                 str(result.bytes_per_particle),
                 f"{result.compile_seconds:.1f}",
                 f"{100 * result.flowing:.0f} %",
@@ -208,16 +232,20 @@ class CostReport:
         ]
         parts = [text_table(head, rows, left={0, 1})]
         mixes = [
-            (*_cost_cells(result), _times(self.of(result, *result.names)), f"{result.compile_seconds:.1f}")
+            (*_cost_cells(result), _times(self.of(result, *result.parts)), f"{result.compile_seconds:.1f}")
             for result in self.results
             if len(result.names) > 1
         ]
         if mixes:
-            parts.append(text_table(("case", "two laws", "ns", "range", "/ sum", "compile s"), mixes, left={0, 1}))
+            parts.append(
+                text_table(
+                    ("case", "two laws, and each alone", "ns", "range", "/ sum", "compile s"), mixes, left={0, 1}
+                )
+            )
         parts.append("\n".join(target.sentence() for target in self.targets))
         notes = [
             f"ns: {self.clock} per particle and step, median of the blocks; range: of the blocks.",
-            "sum: half of what each of the two laws costs alone, for half of the particles each.",
+            "sum: what the same scene costs with only the one law's half of the column, plus with only the other's.",
             "bytes: on the device per particle, sort buffers included; compile: with no kernel cached on disk.",
             "flowing: particles in plastic flow, or torn, at the end of what was measured.",
         ]

@@ -6,11 +6,12 @@ from contextlib import ExitStack
 
 from mpmcli.bench.cases import BenchCase
 from mpmcli.bench.compare import BLOCKS, Setting, Worker, start_worker
-from mpmcli.bench.cost_report import CostReport, CostResult
+from mpmcli.bench.cost_report import CostReport, CostResult, name_of
 from mpmcli.bench.materials import MATERIAL_CASES, MIXES, steps_of
 from mpmcli.errors import RunError
 from mpmcli.materials.registry import laws
 
+# The laws of a column, by place; a place without a name is empty.
 Contender = tuple[str, ...]
 Start = Callable[[str, BenchCase, Setting], Worker]
 
@@ -27,7 +28,7 @@ def run_costs(
     precision: str = "f32",
     start: Start = start_worker,
 ) -> CostReport:
-    """Measure every law, and mixes of two, and return the report.
+    """Measure every law, and mixes of two beside each of their halves alone, and return the report.
 
     Args:
         cases: of mpmcli.bench.materials.
@@ -48,7 +49,10 @@ def run_costs(
     clock = "processor_seconds" if threads == 1 else "seconds"
     tell = progress or (lambda line: None)
     singles = sorted(laws()) if names is None else names
-    contenders = [*((name,) for name in singles), *mixes]
+    contenders = [*((name,) for name in singles)]
+    for first, second in mixes:
+        contenders += [part for part in ((first, ""), ("", second)) if part not in contenders]
+        contenders.append((first, second))
     results: list[CostResult] = []
     flaws: list[str] = []
     for case in cases:
@@ -71,15 +75,16 @@ class _Column:
     first_seconds: float
 
     def __init__(self, case: BenchCase, names: Contender, clock: str) -> None:
-        self.case, self.names, self.name, self.clock = case, names, " + ".join(names), clock
+        self.case, self.names, self.name, self.clock = case, names, name_of(names), clock
+        self.particles = case.particles * sum(map(bool, names)) // len(names)
         self.costs: list[float] = []
 
     def begin(self, stack: ExitStack, setting: Setting, start: Start, tell: Callable[[str], None]) -> None:
         """Start, compile, and step to the state that is measured."""
         self.worker = stack.enter_context(start(",".join(self.names), self.case, setting))
         count = self.worker.ready["particles"]
-        if count != self.case.particles:
-            raise RunError(f"It has {count} particles instead of {self.case.particles}.")
+        if count != self.particles:
+            raise RunError(f"It has {count} particles instead of {self.particles}.")
         self.first_seconds = self.worker.ask("first")["seconds"]
         self.worker.ask(f"keep {steps_of(self.case)[0]}")
         tell(f"{self.case.name}: {self.name} is ready")
@@ -87,7 +92,7 @@ class _Column:
     def measure(self, seconds: float) -> None:
         """Measure one block."""
         answer = self.worker.ask(f"repeat {steps_of(self.case)[1]} {seconds}")
-        self.costs.append(answer[self.clock] / answer["steps"] / self.case.particles)
+        self.costs.append(answer[self.clock] / answer["steps"] / self.particles)
 
     def finish(self) -> CostResult:
         """Return what was found, and end the process."""
@@ -97,7 +102,7 @@ class _Column:
             self.case,
             self.names,
             costs=tuple(self.costs),
-            compile_seconds=max(0.0, self.first_seconds - self.case.particles * statistics.median(self.costs)),
+            compile_seconds=max(0.0, self.first_seconds - self.particles * statistics.median(self.costs)),
             bytes_per_particle=self.worker.ready["bytes_per_particle"],
             flowing=flowing,
             smallest_step=end["smallest_step"],

@@ -70,12 +70,17 @@ def material_of(model: type[MaterialParameters]) -> dict[str, object]:
 
 
 def scene_of(names: Sequence[str], case: BenchCase, precision: str) -> dict:
-    """Return the column as the dictionary of a scene file: slices of equal size side by side, one for each law."""
+    """Return the column as the dictionary of a scene file.
+
+    Slices of equal size stand side by side, one for each law; the place of an empty name stays empty.
+    """
     d, edges = case.dimension, EDGES[case.dimension]
     lower = [CLEARANCE if axis == 1 else (1 - edge) / 2 for axis, edge in enumerate(edges)]
     shear = [[SHEAR if (row, column) == (0, 1) else 0.0 for column in range(d)] for row in range(d)]
     slices = []
     for index, name in enumerate(names):
+        if not name:
+            continue
         first = lower[0] + edges[0] * index / len(names)
         size = (edges[0] / len(names), *edges[1:])
         corner = [first, *lower[1:]]
@@ -90,7 +95,7 @@ def scene_of(names: Sequence[str], case: BenchCase, precision: str) -> dict:
             }
         )
     return {
-        "title": f"Column of {' and '.join(names)}, {case.name}",
+        "title": f"Column of {' and '.join(filter(None, names))}, {case.name}",
         "domain": {
             "size": [1.0] * d,
             "cells": [case.cells] * d,
@@ -112,7 +117,7 @@ class Column(Ours):
     """
 
     def __init__(self, names: Sequence[str], case: BenchCase, *, threads: int, precision: str, arch: str) -> None:
-        if unknown := set(names) - set(laws()):
+        if unknown := set(names) - {"", *laws()}:
             raise RunError(f"There is no law {min(unknown)}.")
         data = scene_of(names, case, precision)
         super().__init__(data, case.step, threads=threads, precision=precision, arch=arch)
