@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scenes import GRAVITY, block, centred_energy, restart, scene, sums
+from scenes import GRAVITY, block, restart, scene, sums, total_energy
 
 from mpmcli.materials.registry import laws
 from mpmcli.scene import BodyParticles, sample_bodies
@@ -100,7 +100,7 @@ def test_a_drop_gains_no_energy(bench: Bench, record_property: Callable) -> None
     bench.start(place)
     solver, energy = bench.solver, []
     while solver.time < 1.0:
-        energy.append(centred_energy(solver))
+        energy.append(total_energy(solver))
         for _ in range(4):
             solver.step(solver.stable_step()[0])
     scale = bench.cube.mass * bench.cube.count * GRAVITY * fall

@@ -22,6 +22,7 @@ LEVELS = {
     "cli": 6,
     "__main__": 6,
     "dataset": 5,
+    "check": 5,
     "validation": 5,
     "render": 5,
     "bench": 5,

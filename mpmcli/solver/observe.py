@@ -18,7 +18,7 @@ class Observation:
 
     Attributes:
         tau: Kirchhoff stress, (n, 3, 3), Pa per volume at rest; None where it was not asked for.
-        energy: stored energy per volume at rest, (n,), J/m^3.
+        energy: stored energy per volume at rest, (n,), J/m^3, half a step earlier: where the velocities are.
         deformation: J, (n,), or F, (n, d, d), after plastic flow.
         internal: internal variables after plastic flow, (n,) each, by name.
     """
@@ -51,22 +51,32 @@ def build_observation(group: ParticleGroup) -> Callable[..., Observation]:
         for p in range(group.count):
             _, C = group.motion(p)
             constants = group.constants(p)
-            stress, stress_zz, deformation, inner = law.respond(group.stored(p), group.inner(p), C, dt, constants)
-            energy[p] = law.energy(deformation, inner, constants)
-            if ti.static(with_stress):
-                for column, i, j in ti.static(placed):
-                    if ti.static(i < d and j < d):
-                        tau[p, column] = stress[i, j]
-                    else:
-                        tau[p, column] = stress_zz
-            if ti.static(law.projects):
+            # Once for the state half a step back and once for the state: a loop, so that the law is compiled once.
+            for k in range(2):
+                back = 0.5 * (k - 1) * dt
+                stored = group.stored(p)
                 if ti.static(keeps_F):
-                    for i, j in ti.static(ti.ndrange(d, d)):
-                        state[p, i * d + j] = deformation[i, j]
+                    stored += back * (C @ stored)
                 else:
-                    state[p, 0] = deformation
-                for i in ti.static(range(inner_count)):
-                    state[p, (d * d if keeps_F else 1) + i] = inner[i]
+                    stored *= 1.0 + back * C.trace()
+                stress, stress_zz, deformation, inner = law.respond(stored, group.inner(p), C, dt, constants)
+                if k == 0:
+                    energy[p] = law.energy(deformation, inner, constants)
+                else:
+                    if ti.static(with_stress):
+                        for column, i, j in ti.static(placed):
+                            if ti.static(i < d and j < d):
+                                tau[p, column] = stress[i, j]
+                            else:
+                                tau[p, column] = stress_zz
+                    if ti.static(law.projects):
+                        if ti.static(keeps_F):
+                            for i, j in ti.static(ti.ndrange(d, d)):
+                                state[p, i * d + j] = deformation[i, j]
+                        else:
+                            state[p, 0] = deformation
+                        for i in ti.static(range(inner_count)):
+                            state[p, (d * d if keeps_F else 1) + i] = inner[i]
 
     def observed(dt: float, *, stress: bool) -> Observation:
         n, real = group.count, group.real

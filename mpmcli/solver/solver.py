@@ -52,10 +52,23 @@ class Solver:
         frame_seconds: wall time spent so far on building frames and ledger rows.
     """
 
-    def __init__(self, scene: Scene, backend: Backend, particles: list[BodyParticles] | None = None) -> None:
-        """Allocate and fill the device; `particles`, one entry per body, replaces the scene's own sampling."""
+    def __init__(
+        self,
+        scene: Scene,
+        backend: Backend,
+        particles: list[BodyParticles] | None = None,
+        *,
+        force: bool = False,
+    ) -> None:
+        """Allocate and fill the device.
+
+        Args:
+            particles: one entry per body, in place of the scene's own sampling.
+            force: take time.step as it is, above the stable step too.
+        """
         self.scene = scene
         self.backend = backend
+        self._forced = force and scene.time.step != "auto"
         self.time = 0.0
         self.step_count = 0
         self.first_step_seconds = 0.0
@@ -154,6 +167,8 @@ class Solver:
         maximum = self.scene.time.step
         if maximum != "auto" and maximum < step:
             return maximum, Limit(maximum, "maximum", "")
+        if self._forced:
+            return maximum, Limit(maximum, "forced", "")
         return step, limit
 
     def step(self, dt: float) -> None:
@@ -301,7 +316,7 @@ class Solver:
             self.time,
             self.step_count,
         )
-        sums = measure(snapshots, seen, self._gravity, self.spacing)
+        sums = measure(snapshots, seen, self._gravity, self.spacing, self._last_step)
         smallest = min(taken, default=(0.0, 0.0, ""))
         row = LedgerRow(
             time=self.time,

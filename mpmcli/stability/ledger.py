@@ -18,8 +18,8 @@ class LedgerRow:
         volume_ratio_min, volume_ratio_max: range of J = det F.
         mass: kg (kg per metre of depth in 2D, and so for all that follows).
         kinetic: sum m (|v|^2 + h^2/4 |C|^2)/2, J (Jiang et al. 2015: the affine part included).
-        elastic: stored energy of every law that has one, J.
-        potential: -sum m g.x relative to the origin of the domain, J.
+        elastic: stored energy of every law that has one, J, half a step before `time`, where the velocities are.
+        potential: -sum m g.x relative to the origin of the domain, J, half a step before `time`, too.
         linear_momentum: sum m v, kg m/s, one number per axis.
         angular_momentum: sum m x cross v + m h^2/4 axl(C) about the origin of the domain,
             kg m^2/s, one number in 2D and three in 3D.

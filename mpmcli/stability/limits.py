@@ -18,6 +18,7 @@ WHY = {
     "speed": "a particle must not move more than half a cell in a step",
     "deformation": "a particle must not be compressed by more than half in a step",
     "maximum": "time.step in the scene sets it",
+    "forced": "time.step in the scene sets it, above what is stable, as --force allows",
 }
 FIX = {
     "wave": "a softer material or a coarser grid allows a larger step",
@@ -25,6 +26,7 @@ FIX = {
     "speed": "a coarser grid or a slower scene allows a larger step",
     "deformation": "a coarser grid or a stiffer material deforms less in a step",
     "maximum": 'a larger time.step, or "auto", allows a larger step',
+    "forced": 'time.step = "auto" takes the largest stable step',
 }
 
 
@@ -33,7 +35,7 @@ class Limit(NamedTuple):
 
     Attributes:
         value: the largest step that it allows, s.
-        name: "wave", "viscosity", "speed", "deformation" or "maximum".
+        name: "wave", "viscosity", "speed", "deformation", "maximum" or "forced".
         body: name of the body that sets it, "" where no single one does.
     """
 
