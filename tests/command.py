@@ -59,8 +59,8 @@ def run_here(*arguments: object) -> Outcome:
 def started(directory: Path, *arguments: object, ctrl_c_off: bool = False) -> Iterator[subprocess.Popen[str]]:
     """Start a command in a process of its own, as a shell does; `ctrl_c_off` as with an & at the end."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-    # A process that starts with an ignored signal keeps ignoring it.
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN) if ctrl_c_off else None
+    # A process that starts with an ignored signal keeps ignoring it, and so may these tests have been started.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN if ctrl_c_off else signal.default_int_handler)
     try:
         process = subprocess.Popen(
             [sys.executable, "-m", "mpmcli", *map(str, arguments)],
@@ -71,8 +71,7 @@ def started(directory: Path, *arguments: object, ctrl_c_off: bool = False) -> It
             text=True,
         )
     finally:
-        if before is not None:
-            signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, before)
     with process:
         try:
             yield process

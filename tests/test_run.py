@@ -112,7 +112,7 @@ class FakeSolver:
         self.first_step_seconds = self.frame_seconds = 0.0
         self.laws = ("fluid",)
 
-    def frames(self):
+    def frames(self, stop):
         for k in range(3):
             if k == 2 and self.fault is not None:
                 raise self.fault

@@ -269,3 +269,16 @@ def test_a_forced_step_is_taken_above_the_stable_one(backend_of: Callable) -> No
     assert (row.steps, row.step_max, row.limit) == (5, pytest.approx(2e-3), "forced")
     _, (_, row) = Solver(data, backend_of("f64")).frames()
     assert row.limit == "wave" and row.step_max < 2e-3
+
+
+def test_a_run_can_be_stopped_between_two_frames(backend_of: Callable) -> None:
+    """A frame may take hours: an interrupt does not wait for it, only for the step."""
+    solver, asked = Solver(scene_of(**falling(frames=1)), backend_of("f64")), []
+
+    def at_the_second_step() -> bool:
+        asked.append(solver.step_count)
+        return len(asked) == 2
+
+    with pytest.raises(KeyboardInterrupt):
+        list(solver.frames(at_the_second_step))
+    assert asked == [1, 2]

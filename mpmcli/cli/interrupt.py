@@ -1,9 +1,11 @@
 """Ctrl-C, and a batch system's request to end (SIGTERM), which is treated alike: what is written is sealed."""
 
 import signal
-from typing import NoReturn
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 _came = False
+_waits = False
 
 
 def catch_interrupts() -> None:
@@ -23,7 +25,24 @@ def interrupt_came() -> bool:
     return _came
 
 
-def _interrupt(*_: object) -> NoReturn:
+@contextmanager
+def interrupts_wait() -> Iterator[None]:
+    """Within this context the first signal raises nothing, for code that asks `interrupt_came` where it can stop.
+
+    An exception that comes between any two instructions may fall into a callback of a library, which loses it. A
+    second signal raises all the same.
+    """
+    global _waits
+    _waits = True
+    try:
+        yield
+    finally:
+        _waits = False
+
+
+def _interrupt(*_: object) -> None:
     global _came
+    first = not _came
     _came = True
-    raise KeyboardInterrupt
+    if not (_waits and first):
+        raise KeyboardInterrupt

@@ -2,17 +2,12 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from mpmcli.cli.interrupt import interrupt_came
+from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
 from mpmcli.cli.json_output import print_json
 from mpmcli.cli.options import json_option, plugin_option, quiet_option, set_option, threads_option
-
-if TYPE_CHECKING:
-    from mpmcli.solver.run import RunSummary
-    from mpmcli.stability.ledger import LedgerRow
 
 
 @click.command("simulate")
@@ -81,13 +76,8 @@ def command(
     progress = Progress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
     progress.notes(loaded.notes)
 
-    def watch(row: "LedgerRow", summary: "RunSummary") -> None:
-        progress.advance(row, summary)
-        if interrupt_came():
-            raise KeyboardInterrupt
-
-    with progress:
-        summary = run_scene(loaded, settings, watch)
+    with progress, interrupts_wait():
+        summary = run_scene(loaded, settings, progress.advance, interrupt_came)
     progress.close(summary)
     if as_json:
         print_json(summary.as_dict())

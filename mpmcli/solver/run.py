@@ -101,14 +101,20 @@ class RunSummary:
 Watch = Callable[[LedgerRow, RunSummary], None]
 
 
-def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda row, summary: None) -> RunSummary:
+def run_scene(
+    loaded: LoadedScene,
+    settings: RunSettings,
+    watch: Watch = lambda row, summary: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> RunSummary:
     """Run a scene to its end, or to where it stops, and store it.
 
     Everything that can be refused is refused before anything is written. A run that becomes unstable, is
-    interrupted (KeyboardInterrupt) or cannot write keeps its sealed frames; its summary says so.
+    interrupted (`stop`, or KeyboardInterrupt) or cannot write keeps its sealed frames; its summary says so.
 
     Args:
         watch: called after each stored frame with its ledger row and the summary so far.
+        stop: asked after every step and every stored frame whether to interrupt the run.
 
     Raises:
         InputError: the scene, the backend or the directory cannot be used; nothing was written.
@@ -161,7 +167,7 @@ def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda 
     clock = _Clock(summary.timings, began)
     facts_of_failure: dict = {}
     try:
-        frames = solver.frames()
+        frames = solver.frames(stop)
         while True:
             with clock.adding("solve_s"):
                 frame, row = next(frames, (None, None))
@@ -177,9 +183,11 @@ def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda 
                 record.timings = summary.timings
                 record.write()
             watch(row, summary)
+            if stop():
+                raise KeyboardInterrupt
         summary.status = "finished"
     except KeyboardInterrupt:
-        summary.status, summary.message = "interrupted", "the run was interrupted"
+        summary.status = "interrupted"
     except UnstableRunError as error:
         summary.status, summary.message = "unstable", str(error)
         facts_of_failure = vars(error.diagnosis)
@@ -189,6 +197,8 @@ def run_scene(loaded: LoadedScene, settings: RunSettings, watch: Watch = lambda 
         if summary.status == "running":
             # An error of ours: the record must not claim that the run goes on.
             record.close("failed", "an internal error ended the run")
+    if summary.status == "interrupted":
+        summary.message = "the run was interrupted"
     summary.steps = solver.step_count
     clock.book(solver.first_step_seconds, "compile_s")
     with clock.adding("output_s"):

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import taichi as ti
@@ -270,13 +270,17 @@ class Solver:
             snapshot, p, cause, self._names, self._origin, self.step_count, self.time, dt, self.nearest_limit
         )
 
-    def frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
+    def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield the state as it is and then one frame for each output time to come, with its ledger row.
 
         The time left to the next frame is split into equal steps, so that frames land on their times.
 
+        Args:
+            stop: asked after each step whether to end there.
+
         Raises:
             UnstableRunError: see `step`.
+            KeyboardInterrupt: `stop` said so.
         """
         count = self.scene.time.frames
         yield self.frame(0, [])
@@ -296,6 +300,8 @@ class Solver:
                 taken.append((dt, self.courant, limit.name))
                 if splits == 1:
                     break
+                if stop():
+                    raise KeyboardInterrupt
             self.time = target
             self.watch(dt)
             yield self.frame(index, taken)
