@@ -106,6 +106,10 @@ class Spring:
     def __init__(self) -> None:
         self.now, self.place, self.kept = 0.0, 0, -1
 
+    @property
+    def watch_seconds(self) -> float:
+        return 0.02 * self.now
+
     def step(self) -> None:
         self.place += 1
         self.now += 0.01 * self.place
@@ -140,6 +144,7 @@ class TestWorker:
         for block, times in zip(blocks, (3, 1), strict=True):
             assert block["steps"] == 3 * times
             assert block["seconds"] == block["processor_seconds"] == pytest.approx(0.15 * times)
+            assert block["watch_seconds"] == pytest.approx(0.02 * 0.15 * times)
         assert flowing == {"share": 0.5}
 
     def test_a_column_runs_in_its_own_process(self) -> None:
@@ -186,7 +191,7 @@ class FakeWorker:
             case ["repeat", stretch, _]:
                 steps = int(stretch)
                 busy = steps * self.step_seconds
-                return {"steps": steps, "seconds": 2 * busy, "processor_seconds": busy}
+                return {"steps": steps, "seconds": 2 * busy, "processor_seconds": busy, "watch_seconds": 0.02 * busy}
             case ["flowing"]:
                 return {"share": 0.25}
             case ["finish"]:
@@ -227,6 +232,7 @@ class TestRun:
         report, _ = self.run()
         assert [result.nanoseconds for result in report.results] == pytest.approx([*COSTS.values()])
         assert report.results[0].compile_seconds == pytest.approx(2.0)
+        assert report.results[0].watch_share == pytest.approx(0.01)
         _, _, sand, _, _, mix = report.results
         assert report.of(sand, ("fluid",)).value == pytest.approx(4.5)
         assert mix.parts == (("fluid", ""), ("", "sand"))
@@ -296,6 +302,7 @@ class TestReport:
         compile_seconds=1.94,
         bytes_per_particle=104,
         flowing=0.66,
+        watch_share=0.012,
         smallest_step=CASES[0].step,
         sound=True,
     )
@@ -312,7 +319,7 @@ class TestReport:
     def test_table(self) -> None:
         lines = [" ".join(line.split()) for line in self.report().table().splitlines()]
         assert lines[0] == "A processor, cpu, 1 thread, f32, taichi 1.7.4"
-        assert "2d-128 neo_hookean 33.0 30.0-40.0 1.50 1.00 104 1.9 66 %" in lines
+        assert "2d-128 neo_hookean 33.0 30.0-40.0 1.50 1.00 104 1.9 66 % 1.2 %" in lines
         assert "2d-128 fluid + neo_hookean 27.5 25.0-34.0 1.00 1.9" in lines
         assert "Beware" not in self.report().table()
 
@@ -359,6 +366,6 @@ class TestReport:
         loader.exec_module(script)
         lines = script.tables(self.report().as_dict()).splitlines()
         assert lines[0].startswith("A processor, cpu, 1 thread, f32, Taichi 1.7.4; 36,864 particles in 2D.")
-        assert "| `fixed_corotated` | 72.6 | 3.30 | 2.20 | 104 | 1.9 |" in lines
+        assert "| `fixed_corotated` | 72.6 | 3.30 | 2.20 | 104 | 1.9 | 1.2 |" in lines
         assert "| `fluid` + `neo_hookean` | 27.5 | 1.00 |" in lines
         assert lines[-1] == "* Missed, 2d-128: fixed_corotated over neo_hookean: 2.200 instead of 2."

@@ -45,7 +45,7 @@ def test_json_is_all_there_is_on_stdout(results):
     summary = json.loads(outcome.stdout)
     assert summary["status"] == "finished" and summary["frames"] == 5 and summary["particles"] == 256
     assert summary["path"] == str(results.directory / "packed" / "particles.vtkhdf")
-    assert set(summary["timings"]) == {"start_s", "compile_s", "solve_s", "output_s", "wall_s"}
+    assert set(summary["timings"]) == {"start_s", "compile_s", "solve_s", "watch_s", "output_s", "wall_s"}
     assert summary["notes"][0].startswith("drop: bulk_modulus = ")
     lines = outcome.stderr.splitlines()
     assert lines[0] == summary["notes"][0]

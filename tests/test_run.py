@@ -107,9 +107,9 @@ class FakeSolver:
 
     fault: BaseException | None = None
 
-    def __init__(self, *_: object) -> None:
+    def __init__(self, *_: object, force: bool) -> None:
         self.particle_count, self.step_count = 1, 0
-        self.first_step_seconds = self.frame_seconds = 0.0
+        self.first_step_seconds = self.frame_seconds = self.watch_seconds = 0.0
         self.laws = ("fluid",)
 
     def frames(self, stop):

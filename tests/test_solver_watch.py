@@ -7,7 +7,9 @@ from pathlib import Path
 import fall_run
 import path_run
 import pytest
+from scenes import block, scene
 
+from mpmcli.solver.solver import Solver
 from mpmcli.stability.limits import COURANT
 
 ARCHES = ["cpu", "vulkan"]
@@ -45,3 +47,44 @@ def test_a_lost_particle_ends_the_run_soon(outcome: dict) -> None:
     assert lost["particle"] == 10
     assert 20 < lost["step"] <= 37
     assert "particle 10" in lost["sentence"]
+
+
+def true_limit(solver: Solver) -> float:
+    """Return the bound on the next step by the state as it is, which the solver measured some steps ago."""
+    known = solver._extremes
+    solver._extremes = [measure.state() for measure in solver._measure]
+    limit = min(min(solver._limits_of(g)).value for g in range(len(solver.groups)))
+    solver._extremes = known
+    return limit
+
+
+@pytest.mark.parametrize("law", ["snow", "neo_hookean", "fixed_corotated", "viscoplastic"])
+def test_no_step_exceeds_the_limit_of_its_moment(law: str, backend_of: Callable, record_property: Callable) -> None:
+    """A block hits a wall at a fifth of its wave speed: no step is longer than the state then allows.
+
+    Snow hardens by e^10 per strain, and is measured once in several steps all the same.
+    """
+    wave_speed, density = 20.0, 400.0
+    stiffness = density * wave_speed**2
+    material = {"law": law, "density": density, "poissons_ratio": 0.2, "youngs_modulus": 0.9 * stiffness}
+    if law == "viscoplastic":
+        material = {
+            "law": law,
+            "density": density,
+            "yield_stress": 200.0,
+            "consistency": 5.0,
+            "bulk_modulus": stiffness,
+        }
+    body = block("block", material, [0.65, 0.05], [0.95, 0.25], velocity=[wave_speed / 5, 0.0])
+    solver = Solver(scene([32, 16], 1 / 32, [body], end=1.0), backend_of("f32", 1))
+    largest, at_start = 0.0, true_limit(solver)
+    smallest = at_start
+    while solver.time < 0.06:
+        dt, _ = solver.stable_step()
+        limit = true_limit(solver)
+        largest, smallest = max(largest, dt / limit), min(smallest, limit)
+        solver.step(dt)
+    record_property("step over limit", largest)
+    record_property("limit over first", smallest / at_start)
+    assert largest <= 1.0
+    assert smallest < 0.95 * at_start

@@ -31,6 +31,7 @@ class CostResult:
         compile_seconds: what the first step took beyond a usual one, with nothing cached on disk.
         bytes_per_particle: device memory, sort buffers included, of a particle of the law that takes most.
         flowing: share of the particles whose state the last step projected: those in plastic flow, or torn.
+        watch_share: share of the time that went into measuring the state, for the limits of the next steps.
         smallest_step: smallest time step that was taken, s.
         sound: whether every particle was still where it can be.
     """
@@ -41,6 +42,7 @@ class CostResult:
     compile_seconds: float
     bytes_per_particle: int
     flowing: float
+    watch_share: float
     smallest_step: float
     sound: bool
 
@@ -85,6 +87,7 @@ class CostResult:
             "compile_s": self.compile_seconds,
             "device_bytes_per_particle": self.bytes_per_particle,
             "flowing": self.flowing,
+            "watch_share": self.watch_share,
             "smallest_step_s": self.smallest_step,
             "sound": self.sound,
         }
@@ -218,7 +221,7 @@ class CostReport:
 
     def table(self) -> str:
         """Return the report as text: laws, mixes, targets, and what the columns mean."""
-        head = ("case", "law", "ns", "range", "/ fluid", "/ neo_hookean", "bytes", "compile s", "flowing")
+        head = ("case", "law", "ns", "range", "/ fluid", "/ neo_hookean", "bytes", "compile s", "flowing", "watch")
         rows = [
             (
                 *_cost_cells(result),
@@ -226,6 +229,7 @@ class CostReport:
                 str(result.bytes_per_particle),
                 f"{result.compile_seconds:.1f}",
                 f"{100 * result.flowing:.0f} %",
+                f"{100 * result.watch_share:.1f} %",
             )
             for result in self.results
             if len(result.names) == 1
@@ -248,6 +252,7 @@ class CostReport:
             "sum: what the same scene costs with only the one law's half of the column, plus with only the other's.",
             "bytes: on the device per particle, sort buffers included; compile: with no kernel cached on disk.",
             "flowing: particles in plastic flow, or torn, at the end of what was measured.",
+            "watch: share of the time that went into measuring the state, which the next steps follow.",
         ]
         return "\n\n".join(
             filter(None, [heading(self.machine, "cpu", self.threads, self.precision), *parts, "\n".join(notes)])

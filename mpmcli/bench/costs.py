@@ -78,6 +78,7 @@ class _Column:
         self.case, self.names, self.name, self.clock = case, names, name_of(names), clock
         self.particles = case.particles * sum(map(bool, names)) // len(names)
         self.costs: list[float] = []
+        self.watch_shares: list[float] = []
 
     def begin(self, stack: ExitStack, setting: Setting, start: Start, tell: Callable[[str], None]) -> None:
         """Start, compile, and step to the state that is measured."""
@@ -93,6 +94,7 @@ class _Column:
         """Measure one block."""
         answer = self.worker.ask(f"repeat {steps_of(self.case)[1]} {seconds}")
         self.costs.append(answer[self.clock] / answer["steps"] / self.particles)
+        self.watch_shares.append(answer["watch_seconds"] / answer["seconds"])
 
     def finish(self) -> CostResult:
         """Return what was found, and end the process."""
@@ -105,6 +107,7 @@ class _Column:
             compile_seconds=max(0.0, self.first_seconds - self.particles * statistics.median(self.costs)),
             bytes_per_particle=self.worker.ready["bytes_per_particle"],
             flowing=flowing,
+            watch_share=statistics.median(self.watch_shares),
             smallest_step=end["smallest_step"],
             sound=end["sound"],
         )

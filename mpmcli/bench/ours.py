@@ -71,6 +71,11 @@ class Ours:
         self.particles: int = self._solver.particle_count
         self.bytes_per_particle: int | None = make_plan(scene, backend).bytes_per_particle
 
+    @property
+    def watch_seconds(self) -> float:
+        """Wall time spent so far on measuring the state."""
+        return self._solver.watch_seconds
+
     def step(self) -> None:
         """Advance by one step, as `frames` does: of the case's size, unless the limits ask for less."""
         self._dt, _ = self._solver.stable_step()

@@ -69,6 +69,8 @@ def run_block(contestant: Contestant, seconds: float) -> tuple[int, float]:
 class Rewinding(Contestant, Protocol):
     """A contestant that can take the same steps again."""
 
+    watch_seconds: float
+
     def keep(self) -> None:
         """Remember the state."""
 
@@ -83,20 +85,22 @@ def repeat_stretch(contestant: Rewinding, stretch: int, seconds: float) -> dict[
     """Take `stretch` steps from the state that was kept, until `seconds` have gone into steps, at least once.
 
     Returns:
-        "steps" taken, and without those of the rewinding "seconds" and "processor_seconds", the latter of all
-        threads of this process.
+        "steps" taken, and without those of the rewinding "seconds", "watch_seconds", which are the part of them that
+        went into measuring the state for the limits, and "processor_seconds", of all threads of this process.
     """
-    steps, elapsed, busy = 0, 0.0, 0.0
+    steps, elapsed, busy, watching = 0, 0.0, 0.0, 0.0
     while not steps or elapsed < seconds:
         contestant.rewind()
+        watching -= contestant.watch_seconds
         start, busy_before = time.perf_counter(), time.process_time()
         for _ in range(stretch):
             contestant.step()
         contestant.sync()
         elapsed += time.perf_counter() - start
         busy += time.process_time() - busy_before
+        watching += contestant.watch_seconds
         steps += stretch
-    return {"steps": steps, "seconds": elapsed, "processor_seconds": busy}
+    return {"steps": steps, "seconds": elapsed, "processor_seconds": busy, "watch_seconds": watching}
 
 
 def peak_memory() -> int:

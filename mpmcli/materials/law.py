@@ -55,8 +55,9 @@ class Law(ABC):
         parameters: the pydantic model of its parameters, which also lists its internal variables.
         deformation: what a particle stores, "J" (the volume ratio) or "F" (the deformation gradient).
         projects: whether `respond` may change the state.
-        sensitivity: growth of the logarithm of the largest stiffness per strain: how closely it is watched; 0 where
-            no state is stiffer than rest.
+        sensitivity: growth of the logarithm of the largest stiffness per strain that is stored: how closely the state
+            is watched; 0 where none is stiffer than rest.
+        hardening: the same growth by way of the internal variables, which are watched by themselves: 0 without any.
         members: parameters of the bodies that follow this law.
         dimension: 2 (plane strain) or 3.
         internal: the internal variables that a particle stores.
@@ -67,6 +68,7 @@ class Law(ABC):
     deformation: ClassVar[Literal["J", "F"]]
     projects: bool = False
     sensitivity: float = 1.0
+    hardening: float = 0.0
 
     def __init__(self, members: Sequence[MaterialParameters], dimension: int) -> None:
         self.members = tuple(members)

@@ -87,7 +87,7 @@ class Snow(Law):
 
     def __init__(self, members: tuple[SnowParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)
-        self.sensitivity = max(1.0, *(member.hardening for member in members))
+        self.hardening = max(member.hardening for member in members)
 
     def constants(self, parameters: SnowParameters) -> tuple[float, ...]:
         return (

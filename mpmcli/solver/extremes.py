@@ -10,7 +10,7 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.ordering import CHUNK, share_start
 from mpmcli.solver.particles import ParticleGroup
 
-# Of the smallest values the negative is kept, so that all are maxima. Internal variables follow, both of each.
+# Of the smallest values the negative is kept, so that all are maxima.
 SPEED_SQUARED, GRADIENT, J_MAX, MINUS_J_MIN, STRETCH_SQUARED = range(5)
 ENTRIES = 5
 NOTHING = -1e30
@@ -24,7 +24,8 @@ class Extremes:
 
     Attributes:
         speed: largest speed, m/s.
-        gradient: bound on the rate of deformation, 1/s: |tr C| where J is stored, else the largest row sum of |C|.
+        gradient: bound on the rate of deformation, 1/s: |tr C| where J is stored, else the largest row sum of
+            |C + C^T| / 2.
         bound: range of J, of stretches and of the internal variables.
     """
 
@@ -59,14 +60,29 @@ def row_sum(matrix: ti.template()):
     return largest
 
 
-def build_extremes(group: ParticleGroup, backend: Backend) -> Callable[[], Extremes]:
-    """Compile-ready measurement of a group: call the result to measure."""
-    size = ENTRIES + 2 * len(group.internal)
-    vector = ti.types.vector(size, float)
-    found = ti.field(float, shape=size)
-    # Each worker keeps its own extremes and merges them once: an atomic per particle costs more than the rest.
-    workers = CHUNK * backend.threads if backend.on_cpu else GPU_WORKERS
-    on_cpu = backend.on_cpu
+@dataclass(frozen=True)
+class Measurement:
+    """Compiled measurements of a group.
+
+    Attributes:
+        state: () -> extremes of everything.
+        internal: () -> (smallest, largest) value of each internal variable, by name: for laws that harden, whose
+            stiffness follows these variables far more closely than anything else.
+    """
+
+    state: Callable[[], Extremes]
+    internal: Callable[[], dict[str, tuple[float, float]]]
+
+
+def build_extremes(group: ParticleGroup, backend: Backend) -> Measurement:
+    """Compile-ready measurements of a group."""
+
+    @ti.func
+    def widen_internal(own: ti.template(), p: int):
+        for i in ti.static(range(len(group.internal))):
+            value = group.internal[i][p]
+            own[2 * i] = ti.max(own[2 * i], value)
+            own[2 * i + 1] = ti.max(own[2 * i + 1], -value)
 
     @ti.func
     def widen(own: ti.template(), p: int):
@@ -79,17 +95,41 @@ def build_extremes(group: ParticleGroup, backend: Backend) -> Callable[[], Extre
         if ti.static(group.law.deformation == "F"):
             # The largest eigenvalue of b = F F^T, exact at rest in any rotation.
             own[STRETCH_SQUARED] = ti.max(own[STRETCH_SQUARED], row_sum(deformation @ deformation.transpose()))
-            own[GRADIENT] = ti.max(own[GRADIENT], row_sum(C))
+            # A rotation deforms nothing: |(I + dt C) a| >= (1 - dt |D|) |a|, D the symmetric part of C.
+            own[GRADIENT] = ti.max(own[GRADIENT], 0.5 * row_sum(C + C.transpose()))
         else:
             own[STRETCH_SQUARED] = ti.max(own[STRETCH_SQUARED], J * J)
             own[GRADIENT] = ti.max(own[GRADIENT], ti.abs(C.trace()))
-        for i in ti.static(range(len(group.internal))):
-            value = group.internal[i][p]
-            own[ENTRIES + 2 * i] = ti.max(own[ENTRIES + 2 * i], value)
-            own[ENTRIES + 2 * i + 1] = ti.max(own[ENTRIES + 2 * i + 1], -value)
+
+    measure_state = _build_maxima(group.count, ENTRIES, widen, backend)
+    measure_internal = _build_maxima(group.count, 2 * len(group.internal), widen_internal, backend)
+
+    def internal() -> dict[str, tuple[float, float]]:
+        if not group.internal:
+            return {}
+        values = measure_internal()
+        return {v.name: (-values[2 * i + 1], values[2 * i]) for i, v in enumerate(group.law.internal)}
+
+    def state() -> Extremes:
+        values = measure_state()
+        bound = StateBound(-values[MINUS_J_MIN], values[J_MAX], values[STRETCH_SQUARED], internal())
+        return Extremes(values[SPEED_SQUARED] ** 0.5, values[GRADIENT], bound)
+
+    return Measurement(state, internal)
+
+
+def _build_maxima(count: int, size: int, widen: Callable, backend: Backend) -> Callable[[], list[float]]:
+    """Compile-ready reduction over particles: `widen` (own, p) raises the maxima `own` to those of particle p."""
+    if size == 0:
+        return list
+    vector = ti.types.vector(size, float)
+    found = ti.field(float, shape=size)
+    # Each worker keeps its own extremes and merges them once: an atomic per particle costs more than the rest.
+    workers = CHUNK * backend.threads if backend.on_cpu else GPU_WORKERS
+    on_cpu = backend.on_cpu
 
     @ti.kernel
-    def measure() -> vector:
+    def reduce() -> vector:
         for i in ti.static(range(size)):
             found[i] = NOTHING
         for q in range(workers):
@@ -97,15 +137,15 @@ def build_extremes(group: ParticleGroup, backend: Backend) -> Callable[[], Extre
                 if q % CHUNK == 0:
                     own = ti.Vector([NOTHING] * size)
                     t = q // CHUNK
-                    start = share_start(group.count, t, backend.threads)
-                    for p in range(start, share_start(group.count, t + 1, backend.threads)):
+                    start = share_start(count, t, backend.threads)
+                    for p in range(start, share_start(count, t + 1, backend.threads)):
                         widen(own, p)
                     for i in ti.static(range(size)):
                         ti.atomic_max(found[i], own[i])
             else:
                 own = ti.Vector([NOTHING] * size)
                 p = q
-                while p < group.count:
+                while p < count:
                     widen(own, p)
                     p += workers
                 for i in ti.static(range(size)):
@@ -115,13 +155,4 @@ def build_extremes(group: ParticleGroup, backend: Backend) -> Callable[[], Extre
             result[i] = found[i]
         return result
 
-    def measured() -> Extremes:
-        values = [float(value) for value in measure()]
-        internal = {
-            variable.name: (-values[ENTRIES + 2 * i + 1], values[ENTRIES + 2 * i])
-            for i, variable in enumerate(group.law.internal)
-        }
-        bound = StateBound(-values[MINUS_J_MIN], values[J_MAX], values[STRETCH_SQUARED], internal)
-        return Extremes(values[SPEED_SQUARED] ** 0.5, values[GRADIENT], bound)
-
-    return measured
+    return lambda: [float(value) for value in reduce()]

@@ -29,6 +29,7 @@ class RunSettings:
         arch: backend to use; threads: CPU threads, all of them where None.
         form: "vtkhdf" for one packed file, "vtk" for a .vtu series.
         overwrite: whether an earlier result in the directory may be replaced.
+        force: whether time.step is taken as it is, above the stable step too.
         compile_cache: whether compiled kernels are kept for the next start.
         command: the command line, for the record.
     """
@@ -38,6 +39,7 @@ class RunSettings:
     threads: int | None = None
     form: Literal["vtkhdf", "vtk"] = "vtkhdf"
     overwrite: bool = False
+    force: bool = False
     compile_cache: bool = True
     command: Sequence[str] = ()
 
@@ -52,7 +54,8 @@ class RunSummary:
         message: why it ended early, "" where it did not.
         frames, steps, particles: counts.
         timings: seconds by name: start_s (load and allocate), compile_s (first step, compilation
-            included), solve_s (all further steps), output_s (frames and packing), wall_s.
+            included), solve_s (all further steps), watch_s (of these, measuring the state for the limits), output_s
+            (frames and packing), wall_s.
         first, last: ledger rows of the first and the last frame.
     """
 
@@ -127,7 +130,7 @@ def run_scene(
     )
     plan = make_plan(scene, backend)
     require_room(plan)
-    solver = Solver(scene, backend)
+    solver = Solver(scene, backend, force=settings.force)
     # Last, since it removes an earlier result.
     prepare_directory(settings.directory, settings.overwrite)
 
@@ -180,6 +183,7 @@ def run_scene(
                 summary.first, summary.last = summary.first or row, row
                 clock.book(solver.first_step_seconds, "compile_s")
                 clock.book(solver.frame_seconds, "output_s")
+                summary.timings["watch_s"] = solver.watch_seconds
                 record.timings = summary.timings
                 record.write()
             watch(row, summary)

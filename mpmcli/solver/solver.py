@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import taichi as ti
@@ -23,10 +24,12 @@ from mpmcli.solver.step import NOT_LOST, SMALLEST_J, build_step
 from mpmcli.stability.ledger import LedgerRow
 from mpmcli.stability.limits import Limit, deformation_limit, mode_limit, speed_limit
 
-# The state is measured, and the limits with it, once in so many steps at most, and earlier where something may have
-# deformed by more than this fraction since; the margin of time.safety covers that.
-MOST_UNWATCHED_STEPS = 16
-UNWATCHED_CHANGE = 0.1
+# The state is measured, and the limits with it, once in so many steps at least. It is earlier where a stiffness may
+# have grown since by more than this share of what time.safety leaves.
+MOST_UNWATCHED_STEPS = 32
+UNWATCHED_SHARE = 0.75
+# On a GPU the measurement is also what sees that a particle was lost.
+MOST_BLIND_STEPS = 16
 # Cells per step below which a sudden stop, which turns speed into a velocity gradient of up to two speeds a cell,
 # stays clear of the bound on the deformation in a step.
 SLOW = 0.1
@@ -50,6 +53,7 @@ class Solver:
         courant: largest displacement in the last step, cells: that of the fastest node, which no particle
             exceeds; on a GPU an estimate from the last measurement and gravity.
         frame_seconds: wall time spent so far on building frames and ledger rows.
+        watch_seconds: wall time spent so far on measuring the state for the limits.
     """
 
     def __init__(
@@ -73,6 +77,7 @@ class Solver:
         self.step_count = 0
         self.first_step_seconds = 0.0
         self.frame_seconds = 0.0
+        self.watch_seconds = 0.0
         self.courant = 0.0
         self.spacing = scene.domain.spacing
         self._gravity = np.array(scene.domain.gravity)
@@ -126,10 +131,15 @@ class Solver:
         self._observe = [build_observation(group) for group in self.groups]
         self._last_step = 0.0
         self._drift = math.inf
-        self._extremes = [measure() for measure in self._measure]
-        # Per group, since its last measurement: steps, and how far its stiffness may have changed.
+        self._extremes = [measure.state() for measure in self._measure]
+        # Per group, since its last measurement: steps, and growth of the logarithm of its stiffness: by deformation,
+        # and by hardening, which is measured by itself.
         self._unwatched = [0] * len(self.groups)
         self._change = [0.0] * len(self.groups)
+        self._hardened = [0.0] * len(self.groups)
+        self._most_unwatched = MOST_UNWATCHED_STEPS if backend.on_cpu else MOST_BLIND_STEPS
+        # A step of safety times the limit is stable until the stiffness has grown to safety^-2 of what it was.
+        self._growth_allowed = -2 * UNWATCHED_SHARE * math.log(scene.time.safety)
         self._use_speeds()
         self._slow_limits = [self._limits_of(g) for g in range(len(self.groups))]
         self._slow_limit = min(min(limits) for limits in self._slow_limits)
@@ -205,10 +215,19 @@ class Solver:
             self._unwatched[g] += 1
             # What moves through a fifth of a cell may meet something that deforms it by about as much. Where stiffness
             # does not grow with it, only the deformation itself bounds the step, and slow steps deform little.
-            closely = group.law.sensitivity if self.courant < SLOW else max(group.law.sensitivity, 1.0)
-            self._change[g] += closely * max(dt * extremes.gradient, 0.5 * self.courant)
-            if self._unwatched[g] >= MOST_UNWATCHED_STEPS or self._change[g] >= UNWATCHED_CHANGE:
+            strain = max(dt * extremes.gradient, 0.5 * self.courant)
+            self._change[g] += strain * (
+                group.law.sensitivity if self.courant < SLOW else max(group.law.sensitivity, 1.0)
+            )
+            # The internal variables alone do not know yet of the last step's strain.
+            pending = strain * group.law.hardening
+            self._hardened[g] += pending
+            hardened = self._hardened[g] >= self._growth_allowed
+            grown = self._change[g] >= self._growth_allowed or (hardened and 2 * pending > self._growth_allowed)
+            if grown or self._unwatched[g] >= self._most_unwatched:
                 due.append(g)
+            elif hardened:
+                self._watch_hardening(g, pending)
         blind = unseen > 0 and self._drift + unseen >= self._drift_allowed
         if blind:
             self.watch(dt)
@@ -225,13 +244,14 @@ class Solver:
         Raises:
             UnstableRunError: a particle is lost.
         """
+        began = time.perf_counter()
         # On the CPU every step says so itself.
         if not self.backend.on_cpu and self._kernels.any_lost():
             self._stop(dt)
         for g in range(len(self.groups)) if due is None else due:
-            self._extremes[g] = self._measure[g]()
+            self._extremes[g] = self._measure[g].state()
             self._unwatched[g] = 0
-            self._change[g] = 0.0
+            self._change[g] = self._hardened[g] = 0.0
             if not self._extremes[g].bound.volume_ratio_min > SMALLEST_J:
                 # Crushed or inverted by the last step: the next one would have refused to scatter it.
                 self._stop(dt)
@@ -240,6 +260,18 @@ class Solver:
         if max(self._unwatched) == 0:
             self._use_speeds()
         self._slow_limit = min(min(limits) for limits in self._slow_limits)
+        self.watch_seconds += time.perf_counter() - began
+
+    def _watch_hardening(self, g: int, pending: float) -> None:
+        """Measure the internal variables of a group alone; `pending` is what they do not know of yet."""
+        began = time.perf_counter()
+        extremes = self._extremes[g]
+        bound = replace(extremes.bound, internal=self._measure[g].internal())
+        self._extremes[g] = replace(extremes, bound=bound)
+        self._hardened[g] = pending
+        self._slow_limits[g] = self._limits_of(g)
+        self._slow_limit = min(min(limits) for limits in self._slow_limits)
+        self.watch_seconds += time.perf_counter() - began
 
     def state_was_replaced(self) -> None:
         """Sort and measure particles whose state was set from outside, as tests and benchmarks do."""
