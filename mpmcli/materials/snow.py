@@ -140,18 +140,20 @@ class Snow(Law):
 
         Behind a wave that stops the speed v and packs by the strain e the stress is density (v^2/e + g H), by the
         balance of momentum, and packs to the e where h(e) times the yield stress in confined compression is as much.
+        The density is the largest of any body, as a denser one may fall on the snow.
         """
         low, high = 1 - parameters.critical_compression, 1 + parameters.critical_stretch
         modulus = 2 * parameters.shear_modulus + parameters.lame_lambda
         yields_at = modulus * (1 - low) * low
-        weight = parameters.density * bounds.gravity * bounds.height
+        density = max(parameters.density, bounds.density)
+        weight = density * bounds.gravity * bounds.height
         packed, loose = parameters.plastic_range[0], 1.0
-        if packed == 1 or weight + bounds.speed * math.sqrt(parameters.density * modulus) <= yields_at:
+        if packed == 1 or weight + bounds.speed * math.sqrt(density * modulus) <= yields_at:
             packed = 1.0
         else:
             for _ in range(60):
                 middle = (packed + loose) / 2
-                stress = weight + parameters.density * bounds.speed**2 / (1 - middle)
+                stress = weight + density * bounds.speed**2 / (1 - middle)
                 if parameters.hardness(middle) * yields_at > stress:
                     packed = middle
                 else:
