@@ -12,7 +12,7 @@ from mpmcli.materials.registry import laws
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.grid import Grid, node_width
+from mpmcli.solver.grid import TILE, Grid, node_width
 from mpmcli.solver.ordering import TileOrder
 
 # Taichi addresses fields with 32-bit integers, and a particle has at most 3 x 4 numbers in one field.
@@ -46,7 +46,7 @@ class Plan:
         nodes: number of grid nodes.
         scratch_bytes: per particle, of the sort buffers.
         bytes_per_node: of the grid.
-        grid_bytes: of all nodes and the tables of the sort.
+        grid_bytes: of all nodes, the tables of the sort, and the contact that separating walls keep.
         host_bytes: of the arrays of one frame and of the initial state.
         passes: the loops of a step in their order; those over particles name the law that they are compiled for.
     """
@@ -131,11 +131,24 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     # The widest field is a matrix; sources and keys are integers.
     widest = max(size for group in groups for size in group.fields.values())
     nodes = Grid.nodes_needed(cells)
-    tables = len(groups) * TileOrder.bytes_needed(cells, backend.threads)
+    tables = len(groups) * TileOrder.bytes_needed(cells, backend.threads) + _contact_bytes(scene, nodes)
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
     host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)
     passes = passes_of(sorted(bodies), scene)
     return Plan(groups, nodes, widest + 8, real * width, nodes * real * width + tables, host_bytes, passes)
+
+
+def _contact_bytes(scene: Scene, nodes: int) -> int:
+    """Return the bytes of the contact of separating walls: an integer per face and node of the largest such plane."""
+    planes = [
+        nodes // (TILE * tiles)
+        for tiles, pair in zip(
+            Grid.tile_counts(scene.domain.cells), scene.domain.walls.faces(scene.dimension), strict=True
+        )
+        for wall in pair
+        if wall == "separate"
+    ]
+    return 4 * len(planes) * max(planes, default=0)
 
 
 def require_room(plan: Plan) -> None:
