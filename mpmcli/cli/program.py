@@ -14,6 +14,7 @@ from mpmcli.errors import MpmcliError
 # Name of each command, the module that holds it, and its line in the help: so that help loads no module.
 COMMANDS = {
     "simulate": "Run a scene and store its particles.",
+    "check": "Say which step is safe and why, or whether a result stayed stable.",
     "info": "Say what a result or a scene holds.",
     "materials": "List laws, presets, their parameters and knobs.",
     "schema": "Print the JSON Schema of scenes, for editors.",

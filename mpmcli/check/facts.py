@@ -1,0 +1,129 @@
+"""What the rules of a check read: the scene, and everything that is worked out of it once."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mpmcli.check.extent import height_along, spanned_axes, thickness
+from mpmcli.check.flight import Arrival, arrivals
+from mpmcli.check.scene_limits import SceneLimit, law_of, scene_limits, smallest
+from mpmcli.materials.law import Law, StateBound
+from mpmcli.scene import Body, Scene, SceneBounds, scene_bounds
+
+
+@dataclass(frozen=True, eq=False)
+class BodyFacts:
+    """One body.
+
+    Attributes:
+        body: as the scene has it; law: of this body alone.
+        arrival: where its free flight ends.
+        thickness: of its thinnest extent, m; that across the whole domain is none, where its walls let it slip.
+        height: extent along gravity, m; the largest one where there is no gravity.
+        stiffness, stiffest: largest of any mode at rest and in the stiffest state, Pa.
+    """
+
+    body: Body
+    law: Law
+    arrival: Arrival
+    thickness: float
+    height: float
+    stiffness: float
+    stiffest: float
+
+    @property
+    def name(self) -> str:
+        """Name of the body."""
+        return self.body.name
+
+    @property
+    def wave_speed(self) -> float:
+        """sqrt(S / (d density)) in the stiffest state, m/s: of a fluid the speed of sound, sqrt(K / density)."""
+        return float(np.sqrt(self.stiffest / (self.law.dimension * self.body.material.density)))
+
+    @property
+    def own_loss(self) -> float:
+        """Rate at which the material itself damps a wave across the body, 1/s: 2 nu k^2, k = pi / thickness.
+
+        That of plastic flow is not known before, and counts as infinite.
+        """
+        if self.law.deformation == "F" and self.law.projects:
+            return math.inf
+        modes = self.law.modes(self.body.material, StateBound())
+        # A mode has twice the viscosity.
+        viscosity = max(mode.viscosity for mode in modes) / self.body.material.density
+        return viscosity * (math.pi / self.thickness) ** 2
+
+    @property
+    def flows(self) -> bool:
+        """Whether the body may change its shape for good."""
+        return self.law.deformation == "J" or self.law.projects
+
+
+class SceneFacts:
+    """A scene, and what follows from it; cheap parts at once and the rest when it is asked for.
+
+    Attributes:
+        scene: the scene; bounds: what it can reach.
+        limits: every bound on its step.
+        bodies: facts of each body, in the scene's order.
+        binding, binding_at_start: the bound that is smallest throughout, and at the start.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.bounds: SceneBounds = scene_bounds(scene)
+        self.limits: tuple[SceneLimit, ...] = tuple(scene_limits(scene, self.bounds))
+        self.binding = smallest(self.limits)
+        self.binding_at_start = smallest(self.limits, at_rest=True)
+
+    @cached_property
+    def bodies(self) -> tuple[BodyFacts, ...]:
+        """Facts of each body."""
+        down = np.array(self.scene.domain.gravity)
+        g = float(np.linalg.norm(down))
+        found = []
+        for body, arrival in zip(self.scene.bodies, arrivals(self.scene), strict=True):
+            law, form = law_of(body, self.scene.dimension), body.shape.form
+            states = (StateBound(), law.stiffest(body.material, self.bounds))
+            stiffness, stiffest = (max(mode.stiffness for mode in law.modes(body.material, s)) for s in states)
+            height = height_along(form, down / g) if g > 0 else float(np.max(np.ptp(form.bounds(), axis=0)))
+            found.append(
+                BodyFacts(
+                    body,
+                    law,
+                    arrival,
+                    thickness(form, spanned_axes(self.scene, form)),
+                    height,
+                    stiffness,
+                    max(stiffness, stiffest),
+                )
+            )
+        return tuple(found)
+
+    @property
+    def step(self) -> float:
+        """safety times the smallest bound that the scene can reach, s."""
+        return self.scene.time.safety * self.binding.value
+
+    @property
+    def step_at_start(self) -> float:
+        """safety times the smallest bound at the start, s."""
+        return self.scene.time.safety * self.binding_at_start.value
+
+    def taken(self, step: float) -> float:
+        """Return the step that a run takes where `step` is stable, s: time.step and the frames' interval cap it."""
+        asked = self.scene.time.step
+        return min(step, self.interval, step if asked == "auto" else asked)
+
+    @property
+    def interval(self) -> float:
+        """Time between two frames, s."""
+        return self.scene.time.end / self.scene.time.frames
+
+    @property
+    def first_contact(self) -> float:
+        """Time of the first contact of any body, s: until then no material is stiffer than at rest."""
+        return min(facts.arrival.time for facts in self.bodies)

@@ -1,0 +1,152 @@
+"""What a run will take: steps, time, memory and disk, before it starts."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.check.facts import SceneFacts
+from mpmcli.check.probe import Probe
+from mpmcli.output.layout import POSITION, ArrayLayout, FrameLayout
+from mpmcli.scene import Scene, scene_to_toml
+from mpmcli.solver.plan import Plan
+from mpmcli.solver.solver import POSITION_ERROR
+
+# Bytes of a packed file beside its particles, measured on files of 51 to 151 frames in 2D and 3D: the headers of
+# its data sets, and per frame the tables of steps and ledger without momenta.
+HEADER_BYTES = 21_500
+FRAME_BYTES = 324
+# Base64 makes 4 bytes of 3. A particle is a cell of its own: number, offset and type; text around them.
+BASE64 = 4 / 3
+CELL_BYTES = 24
+VTU_BYTES = 1300
+# Seconds to make a frame durable, and bytes that a disk takes in a second; both are far from the solver's share.
+FRAME_SECONDS = 0.02
+DISK_BYTES_PER_SECOND = 1e8
+# A frame is written once as a segment, read, written into the packed file, and compared: four passes.
+DISK_PASSES = 4
+# Energy of a wave of wave number k that a step loses is this times (k h)^4 (verification: finding 2).
+DISSIPATION = 0.024
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a run will take.
+
+    Attributes:
+        steps: expected number of time steps; steps_range: if every step were as at the start, and if every one were
+            as in the stiffest state.
+        frames: stored frames, that at 0 included.
+        seconds: wall time of the run, None without a probe; compile_seconds: of it, for the kernels.
+        step_seconds: wall time of a step, None without a probe.
+        device_bytes: of all fields on the device; host_bytes: of the arrays of one frame and the initial state.
+        file_bytes: of the packed file, not compressed; vtk_bytes: of the series of --format vtk.
+        dissipation: share of its energy per second that a wave twice as long as the thinnest body loses, 1/s.
+    """
+
+    steps: int
+    steps_range: tuple[int, int]
+    frames: int
+    seconds: float | None
+    compile_seconds: float | None
+    step_seconds: float | None
+    device_bytes: int
+    host_bytes: int
+    file_bytes: int
+    vtk_bytes: int
+    dissipation: float
+
+    def as_dict(self) -> dict:
+        """Return it as JSON can hold it."""
+        return {**vars(self), "steps_range": list(self.steps_range)}
+
+
+def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
+    """Return what a run of the scene will take; times only where a probe has measured them."""
+    scene = facts.scene
+    steps = expected_steps(facts)
+    file_bytes = packed_bytes(scene, plan.particles)
+    frames = scene.time.frames + 1
+    seconds = None
+    if probe is not None and probe.step_seconds is not None:
+        seconds = (
+            probe.start_seconds
+            + probe.compile_seconds
+            + steps * probe.step_seconds
+            + frames * (probe.frame_seconds + FRAME_SECONDS)
+            + DISK_PASSES * file_bytes / DISK_BYTES_PER_SECOND
+        )
+    return Forecast(
+        steps=steps,
+        steps_range=(steps_at(facts, facts.step_at_start), steps_at(facts, facts.step)),
+        frames=frames,
+        seconds=seconds,
+        compile_seconds=None if probe is None else probe.compile_seconds,
+        step_seconds=None if probe is None else probe.step_seconds,
+        device_bytes=plan.device_bytes,
+        host_bytes=plan.host_bytes,
+        file_bytes=file_bytes,
+        vtk_bytes=series_bytes(scene, plan.particles),
+        dissipation=wave_loss(
+            min(body.thickness for body in facts.bodies), scene.domain.spacing, facts.taken(facts.step_at_start)
+        ),
+    )
+
+
+def steps_at(facts: SceneFacts, step: float) -> int:
+    """Return the steps of a run in which `step` (s) is stable throughout: equal ones end on each frame."""
+    # As the solver splits an interval, with its tolerance for round-off.
+    return facts.scene.time.frames * max(1, math.ceil(facts.interval / facts.taken(step) - 1e-6))
+
+
+def expected_steps(facts: SceneFacts) -> int:
+    """Return the expected number of steps: those of rest up to the first contact, then those of the stiffest state.
+
+    Elastic bodies go on ringing after they were hit, and what has hardened stays hard. Frames split both parts.
+    """
+    frames = facts.scene.time.frames
+    free = min(1.0, facts.first_contact / facts.scene.time.end)
+    before, after = (steps_at(facts, step) / frames for step in (facts.step_at_start, facts.step))
+    whole = math.floor(free * frames)
+    mixed = (free * frames - whole) * before + (1 - free * frames + whole) * after if whole < frames else 0.0
+    return round(whole * before + mixed + max(0, frames - whole - 1) * after)
+
+
+def wave_loss(thickness: float, spacing: float, step: float) -> float:
+    """Return the share of its energy that the longest wave across a body loses, 1/s, at a step (s).
+
+    0.024 (k h)^4 per step with k = pi / thickness: APIC damps per step, not per second (verification: finding 2).
+    """
+    return DISSIPATION * (math.pi * spacing / thickness) ** 4 / step
+
+
+def layout_of(scene: Scene) -> FrameLayout:
+    """Return the layout of the frames that a run will store."""
+    d = scene.dimension
+    real = "float64" if scene.solver.precision == "f64" else "float32"
+    far = float(np.abs([scene.domain.origin, scene.domain.upper]).max())
+    coarse = far * np.finfo(np.float32).eps > POSITION_ERROR * scene.domain.spacing
+    shapes: dict[str, tuple[str, tuple[int, ...]]] = {
+        POSITION: ("float64" if coarse else real, (d,)),
+        "id": ("int32", ()),
+        "body": ("int32", ()),
+        "material": ("int32", ()),
+        "velocity": (real, (d,)),
+    }
+    tensors = {"stress": (9,), "affine": (d * d,), "deformation_gradient": (d * d,)}
+    shapes |= {name: (real, tensors.get(name, ())) for name in scene.output.fields if name != "velocity"}
+    return FrameLayout(d, {name: ArrayLayout(name, kind, shape, d) for name, (kind, shape) in shapes.items()})
+
+
+def packed_bytes(scene: Scene, particles: int) -> int:
+    """Return the bytes of the packed file, not compressed."""
+    frames = scene.time.frames + 1
+    momenta = 8 * (3 if scene.dimension == 2 else 6)
+    data = particles * (frames * layout_of(scene).bytes_per_particle + 8)
+    return data + HEADER_BYTES + frames * (FRAME_BYTES + momenta) + len(scene_to_toml(scene))
+
+
+def series_bytes(scene: Scene, particles: int) -> int:
+    """Return the bytes of the .vtu files of --format vtk, not compressed."""
+    each = BASE64 * particles * (layout_of(scene).bytes_per_particle + CELL_BYTES) + VTU_BYTES
+    return round((scene.time.frames + 1) * each)

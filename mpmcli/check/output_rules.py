@@ -1,0 +1,61 @@
+"""Rules on what is stored, and where it has room: frames, the disk, memory."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from mpmcli.check.facts import SceneFacts
+from mpmcli.check.finding import Finding
+from mpmcli.check.forecast import Forecast
+from mpmcli.errors import InputError
+from mpmcli.solver.plan import Plan, require_room
+
+# More frames than this are as many files while the run goes on, and hours of writing.
+MOST_FRAMES = 100_000
+# While the frames are packed they lie on the disk twice.
+COPIES = 2
+
+
+def output_findings(facts: SceneFacts, plan: Plan, forecast: Forecast, directory: Path) -> Iterator[Finding]:
+    """Yield what is to be said of frames, disk and memory; `directory` is where results would go."""
+    scene = facts.scene
+    if facts.interval < facts.step_at_start:
+        yield Finding(
+            "note",
+            "frames",
+            f"Frames are {facts.interval:.3g} s apart, less than the stable step of {facts.step_at_start:.3g} s: every "
+            "step is stored, and steps are shorter than they need be.",
+            f"Set time.frames to {max(1, int(scene.time.end / facts.step_at_start))} or fewer.",
+            facts.interval,
+        )
+    if scene.time.frames > MOST_FRAMES:
+        yield Finding(
+            "warning",
+            "frames",
+            f"The run stores {forecast.frames:,} frames, each a file while it goes on.",
+            f"Set time.frames to {MOST_FRAMES:,} or fewer.",
+            forecast.frames,
+        )
+    free = shutil.disk_usage(directory).free
+    if COPIES * forecast.file_bytes > free:
+        yield Finding(
+            "warning",
+            "disk",
+            f"The result takes {forecast.file_bytes / 1e9:.3g} GB, twice that while it is packed, and the disk has "
+            f"{free / 1e9:.3g} GB left.",
+            "Store fewer frames or output.fields, or write to another disk with -o.",
+            forecast.file_bytes,
+        )
+    try:
+        require_room(plan)
+    except InputError as error:
+        what, _, fix = str(error).rstrip(".").rpartition("; ")
+        total = plan.device_bytes + plan.host_bytes
+        yield Finding("error", "memory", f"{what[:1].upper()}{what[1:]}.", f"{fix[:1].upper()}{fix[1:]}.", total)
+    if facts.bounds.speed == 0 and facts.bounds.gravity == 0:
+        yield Finding(
+            "note",
+            "at-rest",
+            "Nothing moves: there is no gravity, and no body has a velocity.",
+            "Give domain.gravity, or a velocity to a body.",
+        )

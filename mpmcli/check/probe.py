@@ -1,0 +1,80 @@
+"""Runs the beginning of a scene for a moment, to know what a step costs on this machine."""
+
+import time
+from dataclasses import dataclass
+
+from mpmcli.scene import LoadedScene
+from mpmcli.solver.backend import Arch, Backend, start_backend
+from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.plan import make_plan, require_room
+from mpmcli.solver.solver import Solver
+
+# Steps that are not counted: the first compiles, and the caches of the processor fill.
+WARM_UP = 3
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What a moment of a run cost.
+
+    Attributes:
+        backend: that it ran on.
+        start_seconds: to start the backend, sample and allocate.
+        compile_seconds: of the first step and frame beyond a usual one.
+        step_seconds: wall time of a step, None where the run became unstable at once.
+        frame_seconds: to build a frame and its ledger row.
+        steps: that were measured.
+        failure: the sentence of an unstable run, "" otherwise.
+    """
+
+    backend: Backend
+    start_seconds: float
+    compile_seconds: float
+    step_seconds: float | None
+    frame_seconds: float
+    steps: int
+    failure: str = ""
+
+
+def probe_scene(loaded: LoadedScene, *, arch: Arch = "auto", threads: int | None = None, seconds: float = 2.0) -> Probe:
+    """Run the scene for some seconds of stepping; it starts Taichi in this process and writes nothing.
+
+    Raises:
+        InputError: the backend cannot be had, or the scene does not fit into memory.
+    """
+    scene = loaded.scene
+    began = time.perf_counter()
+    backend = start_backend(arch, threads, scene.solver.precision)
+    require_room(make_plan(scene, backend))
+    solver = Solver(scene, backend)
+    start = time.perf_counter() - began
+    solver.frame(0, [])
+    first_frame = time.perf_counter() - began - start
+    solver.frame(0, [])
+    frame = time.perf_counter() - began - start - first_frame
+    compiled = max(0.0, first_frame - frame)
+    steps, spent, failure = 0, 0.0, ""
+    try:
+        warm = time.perf_counter()
+        for _ in range(WARM_UP):
+            _advance(solver)
+        solver.watch(0.0)
+        compiled += time.perf_counter() - warm
+        since = time.perf_counter()
+        while steps == 0 or (spent < seconds and solver.time < scene.time.end):
+            _advance(solver)
+            steps += 1
+            spent = time.perf_counter() - since
+        # A GPU answers only here.
+        solver.watch(0.0)
+        spent = time.perf_counter() - since
+    except UnstableRunError as error:
+        failure = str(error)
+    return Probe(backend, start, compiled, spent / steps if steps else None, frame, steps, failure)
+
+
+def _advance(solver: Solver) -> None:
+    """Take one step as the run would, but for the frames on whose times it lands."""
+    dt, _ = solver.stable_step()
+    interval = solver.scene.time.end / solver.scene.time.frames
+    solver.step(min(dt, interval))

@@ -1,0 +1,195 @@
+"""Every bound on the time step that a scene will meet, from its text alone: at rest, and in the stiffest state."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.materials.law import Law, StateBound
+from mpmcli.materials.registry import laws
+from mpmcli.scene import Body, Scene, SceneBounds, highest_speed
+from mpmcli.stability.limits import FIX, WHY, deformation_limit, mode_limit, speed_limit
+
+# In an impact a cell stops on one side while matter comes in on the other from two nodes: two speeds per cell.
+IMPACT_GRADIENT = 2.0
+# A wave that meets a free surface throws matter off at twice its speed, and jets out of a corner are about as fast:
+# 1.6 to 2.2 times the speed of the fall in six of seven scenes, 3 times in one where bodies splash each other.
+JET = 2.0
+# Parameters that set how stiff a material is, and how viscous, the first that it has.
+STIFFNESSES = ("bulk_modulus", "youngs_modulus", "shear_modulus")
+VISCOSITIES = ("viscosity", "consistency", "bulk_viscosity")
+
+
+@dataclass(frozen=True)
+class SceneLimit:
+    """One bound on the time step of a scene.
+
+    Attributes:
+        value: the largest step that it allows, s, without the safety.
+        name: "wave", "viscosity", "speed" or "deformation".
+        body: name of the body that sets it, "" where no single one does.
+        state: "rest", the scene as it starts; "stiffest", what the scene can drive it to.
+        meaning: the state in words.
+        why, fix: one sentence each, with the numbers of this scene.
+        bound: the state of the material, None where the bound does not depend on it.
+    """
+
+    value: float
+    name: str
+    body: str
+    state: str
+    meaning: str
+    why: str
+    fix: str
+    bound: StateBound | None = None
+
+    def as_dict(self) -> dict:
+        """Return it as JSON can hold it; `volume_ratio` and `internal` are ranges."""
+        bound = self.bound
+        return {
+            "value": self.value,
+            "name": self.name,
+            "body": self.body,
+            "state": self.state,
+            "meaning": self.meaning,
+            "volume_ratio": None if bound is None else [bound.volume_ratio_min, bound.volume_ratio_max],
+            "internal": {} if bound is None else {name: list(ends) for name, ends in bound.internal.items()},
+            "why": self.why,
+            "fix": self.fix,
+        }
+
+
+def law_of(body: Body, dimension: int) -> Law:
+    """Return the law of one body alone."""
+    return laws()[body.material.law]([body.material], dimension)
+
+
+def scene_limits(scene: Scene, bounds: SceneBounds) -> list[SceneLimit]:
+    """Return every bound: of each body at rest and in its stiffest state, then those of motion."""
+    found = []
+    for body in scene.bodies:
+        law = law_of(body, scene.dimension)
+        for state, bound in (("rest", StateBound()), ("stiffest", law.stiffest(body.material, bounds))):
+            found += _material_limits(body, law, state, bound, scene.domain.spacing)
+    return [*found, *_motion_limits(scene, bounds)]
+
+
+def _material_limits(body: Body, law: Law, state: str, bound: StateBound, spacing: float) -> Iterator[SceneLimit]:
+    """Yield the tightest bound of each name that the modes of one body set in one state."""
+    material = body.material
+    smallest: dict[str, tuple[float, float, float]] = {}
+    for mode in law.modes(material, bound):
+        value, name = mode_limit(spacing, material.density, mode.stiffness, mode.viscosity)
+        entry = (value, mode.stiffness, mode.viscosity)
+        smallest[name] = min(smallest.get(name, entry), entry)
+    for name, (value, stiffness, viscosity) in smallest.items():
+        if name == "wave":
+            numbers = (
+                f"its stiffness of {stiffness:.4g} Pa and density of {material.density:.4g} kg/m^3 make "
+                f"{math.sqrt(stiffness / material.density):.4g} m/s, and a cell is {spacing:.4g} m wide"
+            )
+            cure = f"a quarter of {_parameter(body, STIFFNESSES, 'the stiffness')} or cells twice as wide"
+        else:
+            numbers = (
+                f"its viscosity of {viscosity / 2:.4g} Pa s over a density of {material.density:.4g} kg/m^3 is "
+                f"{viscosity / 2 / material.density:.4g} m^2/s, and a cell is {spacing:.4g} m wide"
+            )
+            cure = f"half of {_parameter(body, VISCOSITIES, 'the viscosity')}, or cells 1.4 times as wide,"
+        yield SceneLimit(
+            value,
+            name,
+            body.name,
+            state,
+            "at rest" if state == "rest" else _state_text(bound),
+            f'In body "{body.name}" {WHY[name]}: {numbers}.',
+            f"{cure[:1].upper()}{cure[1:]} allow{'' if name == 'viscosity' else 's'} about twice the step.",
+            bound,
+        )
+
+
+def _motion_limits(scene: Scene, bounds: SceneBounds) -> Iterator[SceneLimit]:
+    """Yield the bounds of the speeds and velocity gradients that the scene starts with, and can reach."""
+    h = scene.domain.spacing
+    fastest = max(scene.bodies, key=highest_speed)
+    initial, reached = highest_speed(fastest), bounds.speed
+    gradients = {body.name: _initial_gradient(body, scene.dimension) for body in scene.bodies}
+    steepest = max(gradients, key=lambda name: gradients[name])
+    gradient = gradients[steepest]
+    impact = IMPACT_GRADIENT * reached / h
+    for value, name, state, body, meaning, cause in (
+        (
+            speed_limit(h, initial, bounds.gravity),
+            "speed",
+            "rest",
+            fastest.name if initial > 0 else "",
+            f"starting at {initial:.3g} m/s",
+            f"the fastest particle starts at {initial:.4g} m/s, and a cell is {h:.4g} m wide",
+        ),
+        (
+            deformation_limit(gradient),
+            "deformation",
+            "rest",
+            steepest,
+            f"starting at {gradient:.3g} /s",
+            f"its velocity gradient is {gradient:.4g} /s",
+        ),
+        (
+            speed_limit(h, JET * reached, bounds.gravity),
+            "speed",
+            "stiffest",
+            "",
+            f"jets at {JET * reached:.3g} m/s",
+            f"fall and initial speeds make {reached:.4g} m/s, jets {JET:g} times that, and a cell is {h:.4g} m wide",
+        ),
+        (
+            deformation_limit(impact),
+            "deformation",
+            "stiffest",
+            "",
+            f"an impact at {reached:.3g} m/s",
+            f"an impact at {reached:.4g} m/s stops within a cell, a velocity gradient of {impact:.4g} /s",
+        ),
+    ):
+        if math.isfinite(value):
+            why = f"{WHY[name][:1].upper()}{WHY[name][1:]}: {cause}."
+            yield SceneLimit(value, name, body, state, meaning, why, f"{FIX[name][:1].upper()}{FIX[name][1:]}.")
+
+
+def _initial_gradient(body: Body, dimension: int) -> float:
+    """Return the rate of deformation at the start as the solver measures it: |tr C|, or the largest row sum of |C|."""
+    if body.velocity_gradient is None:
+        return 0.0
+    C = np.array(body.velocity_gradient)
+    keeps_J = law_of(body, dimension).deformation == "J"
+    return float(abs(np.trace(C)) if keeps_J else np.abs(C).sum(axis=1).max())
+
+
+def _parameter(body: Body, names: tuple[str, ...], otherwise: str) -> str:
+    """Return the first of some parameters that a body has, with its value."""
+    for name in names:
+        value = getattr(body.material, name, 0)
+        if isinstance(value, int | float) and value > 0:
+            return f"{name} = {value:.4g}"
+    return otherwise
+
+
+def _state_text(bound: StateBound) -> str:
+    """Say what a state bound is: how far compressed or opened, and its internal variables where they moved."""
+    words = [
+        f"{name} = {low:.3g}" + ("" if low == high else f" to {high:.3g}")
+        for name, (low, high) in bound.internal.items()
+    ]
+    J = (bound.volume_ratio_min, bound.volume_ratio_max)
+    if J != (1.0, 1.0):
+        words.insert(0, f"J = {J[0]:.3g} to {J[1]:.3g}")
+    return ", ".join(words) or "as at rest"
+
+
+def smallest(limits: Sequence[SceneLimit], *, at_rest: bool = False) -> SceneLimit:
+    """Return the limit that binds, in any state or in that at the start.
+
+    A bound that is the same in both is said to be that at rest.
+    """
+    chosen = [limit for limit in limits if limit.state == "rest" or not at_rest]
+    return min(chosen, key=lambda limit: limit.value)

@@ -1,0 +1,75 @@
+"""`mpmcli check`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from mpmcli.cli.json_output import print_json
+from mpmcli.cli.options import json_option, plugin_option, set_option, threads_option
+
+if TYPE_CHECKING:
+    from mpmcli.check.result_check import ResultCheck
+    from mpmcli.check.scene_check import SceneCheck
+
+
+@click.command("check")
+@click.argument("path", type=click.Path(path_type=Path))
+@set_option
+@plugin_option
+@click.option("--no-probe", is_flag=True, help="Leave out the two seconds of the scene that time a step.")
+@click.option("--strict", is_flag=True, help="Let warnings fail the check as errors do.")
+@threads_option
+@json_option
+def command(
+    path: Path,
+    overrides: tuple[str, ...],
+    plugins: tuple[Path, ...],
+    no_probe: bool,
+    strict: bool,
+    threads: int | None,
+    as_json: bool,
+) -> int:
+    """Say which step is safe in a scene (PATH.toml) and why, and what the run will take.
+
+    Or say whether a result stayed stable: its directory, particles.vtkhdf or particles.pvd. Nothing is written.
+    Exit code 1 where an error is found, or with --strict a warning.
+    """
+    if path.suffix == ".toml":
+        check = _of_scene(path, overrides, plugins, threads, probing=not no_probe)
+    else:
+        check = _of_result(
+            path, {"--set": overrides, "--plugin": plugins, "--no-probe": no_probe, "--threads": threads}
+        )
+    if as_json:
+        print_json({**check.as_dict(), "ok": check.passes(strict=strict)})
+    else:
+        click.echo(check.text(), err=True)
+    return 0 if check.passes(strict=strict) else 1
+
+
+def _of_scene(
+    path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], threads: int | None, *, probing: bool
+) -> "SceneCheck":
+    from mpmcli.check.probe import probe_scene
+    from mpmcli.check.scene_check import check_scene
+    from mpmcli.materials.registry import load_plugins
+    from mpmcli.scene import load_scene
+
+    loaded = load_scene(path, overrides, laws=load_plugins(plugins))
+    check = check_scene(loaded, threads=threads)
+    # What cannot run is not tried.
+    if probing and not any(finding.rule == "memory" for finding in check.findings):
+        check = check_scene(loaded, probe=probe_scene(loaded, threads=threads))
+    return check
+
+
+def _of_result(path: Path, scene_only: dict[str, object]) -> "ResultCheck":
+    from mpmcli.errors import InputError
+
+    given = [option for option, value in scene_only.items() if value]
+    if given:
+        raise InputError(f"{given[0]} is for scenes, and {path} is none; leave it out.")
+    from mpmcli.check.result_check import check_result
+
+    return check_result(path)

@@ -1,0 +1,50 @@
+"""Scenes for the tests of checks, in few words: one block of a material, loaded as a file would be."""
+
+from typing import Any
+
+from solver_state import scene_of
+
+from mpmcli.check.finding import Finding
+from mpmcli.check.scene_check import SceneCheck, check_scene
+from mpmcli.scene import LoadedScene
+
+FLUID = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e6}
+SOLID = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e6}
+
+
+def box(low: list[float], high: list[float]) -> dict[str, Any]:
+    """Return the shape of a box."""
+    return {"box": {"min": low, "max": high}}
+
+
+def loaded(
+    bodies: list[dict[str, Any]] | None = None,
+    *,
+    material: dict[str, Any] = FLUID,
+    shape: dict[str, Any] | None = None,
+    domain: dict[str, Any] | None = None,
+    time: dict[str, Any] | None = None,
+    solver: dict[str, Any] | None = None,
+    output: dict[str, Any] | None = None,
+    **body: Any,
+) -> LoadedScene:
+    """Return a scene: by default a block of 16 x 16 cells of fluid on the floor of 64 x 64 cells, h = 1/64 m."""
+    block = {"name": "block", "material": material, "shape": shape or box([0.25, 0.0], [0.5, 0.25]), **body}
+    scene = scene_of(
+        domain={"size": [1.0, 1.0], "cells": [64, 64], "gravity": [0.0, -10.0], "walls": "slip"} | (domain or {}),
+        time={"end": 0.5, "frames": 10} | (time or {}),
+        solver=solver or {},
+        output=output or {},
+        bodies=bodies or [block],
+    )
+    return LoadedScene(scene, (), "scene.toml")
+
+
+def check(*arguments: Any, **keywords: Any) -> SceneCheck:
+    """Return the check of such a scene."""
+    return check_scene(loaded(*arguments, **keywords))
+
+
+def found(rule: str, *arguments: Any, **keywords: Any) -> list[Finding]:
+    """Return what one rule finds in such a scene."""
+    return [finding for finding in check(*arguments, **keywords).findings if finding.rule == rule]

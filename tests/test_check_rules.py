@@ -1,0 +1,256 @@
+"""Each rule of a scene's check fires on a scene made for it, and is quiet just beyond its threshold."""
+
+import math
+import shutil
+from types import SimpleNamespace
+
+import psutil
+import pytest
+from check_scenes import FLUID, SOLID, box, check, found, loaded
+
+from mpmcli.check.facts import SceneFacts
+from mpmcli.check.finding import SEVERITIES
+from mpmcli.check.rounding_rules import HALF_ULP, LOST_MOTION, STRESS_NOISE
+
+H = 1 / 64
+SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e7}
+REST_LIMIT = H / math.sqrt(2 * 1e3)
+WALL_3D = {"size": [1.0, 1.0, 1.0], "cells": [32, 32, 32], "gravity": [0.0, 0.0, -10.0]}
+
+
+def block(name: str, low: list[float], high: list[float], **more: object) -> dict:
+    """Return a body that is a box of fluid."""
+    return {"name": name, "material": FLUID, "shape": box(low, high), **more}
+
+
+def test_a_plain_scene_is_quiet() -> None:
+    """A block of fluid on the floor, and one of rubber: nothing to say."""
+    assert check().findings == ()
+    assert check(material=SOLID).findings == ()
+
+
+@pytest.mark.parametrize(
+    ("share", "rule", "severity"),
+    [
+        (1.001, "step-above-limit", "error"),
+        (0.999, "step-above-safety", "warning"),
+        (0.801, "step-above-safety", "warning"),
+        (0.799, None, None),
+        (0.201, None, None),
+        (0.199, "small-step", "warning"),
+    ],
+)
+def test_the_step_that_is_asked_for(share: float, rule: str | None, severity: str | None) -> None:
+    """The limit at rest is h / (c sqrt(2)); safety is 0.8, and a quarter of what it leaves is small."""
+    step = share * REST_LIMIT
+    findings = [one for one in check(time={"step": step}).findings if one.rule != "dissipation"]
+    assert [(one.rule, one.severity) for one in findings] == ([(rule, severity)] if rule else [])
+    if rule and rule != "small-step":
+        assert findings[0].value == pytest.approx(share)
+
+
+def test_a_step_that_only_rest_allows() -> None:
+    """Between what is safe at the start and what is safe throughout, the run will take smaller ones."""
+    material = FLUID | {"tension_cutoff": False}
+    checked = check(material=material)
+    assert checked.step < checked.step_at_start
+    (finding,) = found(
+        "step-above-safety", material=material, time={"step": 0.5 * (checked.step + checked.step_at_start)}
+    )
+    assert "J = " in finding.what
+    assert found("step-above-safety", material=material, time={"step": 0.999 * checked.step}) == []
+
+
+@pytest.mark.parametrize(("cells", "fires"), [(0.9, True), (2.9, True), (3.0, False)])
+def test_a_thin_body(cells: float, fires: bool) -> None:
+    """Fewer than three cells across."""
+    findings = found("thin-body", shape=box([0.25, 0.0], [0.75, cells * H]))
+    assert [finding.severity for finding in findings] == ["warning"] * fires
+    if fires:
+        assert findings[0].value == pytest.approx(cells)
+
+
+def test_a_slice_of_endless_matter_is_not_thin() -> None:
+    """A box from wall to wall in a domain of five cells is thin only where the walls hold it."""
+    domain = {"size": [1.0, 5 * H / 2], "cells": [128, 5 * 1], "gravity": [0.0, 0.0]}
+    domain["size"][1] = 5 / 128
+    shape = box([0.25, 0.0], [0.5, 5 / 128])
+    thin = {**domain, "size": [1.0, 5 / 128]}
+    facts = SceneFacts(loaded(domain={**thin, "walls": "slip"}, shape=shape).scene)
+    held = SceneFacts(loaded(domain={**thin, "walls": {"default": "slip", "y_min": "stick"}}, shape=shape).scene)
+    assert facts.bodies[0].thickness == 0.25
+    assert held.bodies[0].thickness == pytest.approx(5 / 128)
+
+
+@pytest.mark.parametrize(("cells", "fires"), [(0.0, False), (0.09, False), (0.11, True), (1.9, True), (2.01, False)])
+def test_a_gap(cells: float, fires: bool) -> None:
+    """Bodies between a tenth of a cell and two cells apart act on each other unseen; touching ones are meant to."""
+    bodies = [block("low", [0.25, 0.0], [0.5, 0.25]), block("high", [0.25, 0.25 + cells * H], [0.5, 0.75])]
+    findings = found("gap", bodies)
+    assert [finding.severity for finding in findings] == ["note"] * fires
+    bodies[1]["velocity"] = [1.0, 0.0]
+    assert [finding.severity for finding in found("gap", bodies)] == ["warning"] * fires
+
+
+@pytest.mark.parametrize(("cells", "fires"), [(0.0, False), (0.5, True), (1.0, False)])
+def test_a_wall_that_is_nearly_touched(cells: float, fires: bool) -> None:
+    """Less than a cell from a wall, but not on it."""
+    findings = found("wall-margin", shape=box([0.25, cells * H], [0.5, 0.5]))
+    assert [(one.severity, "y_min" in one.what) for one in findings] == [("note", True)] * fires
+
+
+@pytest.mark.parametrize(("count", "severity"), [(1, "warning"), (3, "warning"), (4, None), (16, None), (17, "note")])
+def test_particles_per_cell(count: int, severity: str | None) -> None:
+    """From 2^d to 4^d."""
+    findings = found("particles-per-cell", particles_per_cell=count, sampling="jittered")
+    assert [finding.severity for finding in findings] == ([severity] if severity else [])
+    assert ("one particle" in findings[0].what) == (count == 1) if findings else True
+
+
+def test_small_motions_in_a_wide_domain() -> None:
+    """Half an ulp of the extent over the way of the fastest particle in a step, 0.1; never in double precision."""
+    scene = loaded(shape=box([0.25, 0.0], [0.5, 0.25]))
+    v, dt = math.sqrt(2 * 10 * 0.25), 0.8 * REST_LIMIT
+    # A stiffness K makes steps of sqrt(1e6 / K) of that: the share grows with the square root of K.
+    share = HALF_ULP / (v * dt)
+    critical = 1e6 * (LOST_MOTION / share) ** 2
+    assert SceneFacts(scene.scene).bounds.speed == pytest.approx(v)
+    for factor, fires in ((1.02, True), (0.98, False)):
+        material = FLUID | {"bulk_modulus": factor * critical}
+        (one,) = found("rounding-positions", material=material) or [None]
+        assert (one is not None) == fires
+        if one:
+            assert one.value == pytest.approx(LOST_MOTION * math.sqrt(factor))
+        assert found("rounding-positions", material=material, solver={"precision": "f64"}) == []
+
+
+@pytest.mark.parametrize(("youngs_modulus", "fires"), [(2e9, True), (1e9, False)])
+def test_strains_of_a_stiff_cube(youngs_modulus: float, fires: bool) -> None:
+    """H9: a cube of 1 m under gravity; rounding makes 2^-24 (d lambda + 2 mu) beside density g H = 10 kPa."""
+    material = SOLID | {"youngs_modulus": youngs_modulus, "poissons_ratio": 0.0}
+    domain = {"size": [2.0, 2.0], "cells": [64, 64]}
+    findings = found("rounding-strains", material=material, domain=domain, shape=box([0.5, 0.0], [1.5, 1.0]))
+    noise = HALF_ULP * youngs_modulus / 1e4
+    assert [finding.value for finding in findings] == ([pytest.approx(noise)] if fires else [])
+    assert (noise > STRESS_NOISE) == fires
+
+
+@pytest.mark.parametrize(("ratio", "fires"), [(0.49, False), (0.495, True)])
+def test_locking(ratio: float, fires: bool) -> None:
+    """Poisson's ratio above 0.49."""
+    findings = found("locking", material=SOLID | {"poissons_ratio": ratio})
+    assert [finding.severity for finding in findings] == ["warning"] * fires
+
+
+@pytest.mark.parametrize(("light", "fires"), [(10.0, False), (9.9, True)])
+def test_density_ratio(light: float, fires: bool) -> None:
+    """More than 100 to 1."""
+    bodies = [block("heavy", [0.0, 0.0], [0.5, 0.25]), block("light", [0.0, 0.25], [0.5, 0.5])]
+    bodies[1]["material"] = FLUID | {"density": light}
+    findings = found("density-ratio", bodies)
+    assert [finding.body for finding in findings] == ["light"] * fires
+
+
+def test_the_friction_angle_that_acts() -> None:
+    """In 3D asin(3 s / (2 sqrt(3) + s)) in compression and - s in extension, s = sin(phi); in 2D the one given."""
+    low = box([0.25, 0.25, 0.0], [0.5, 0.5, 0.25])
+    assert found("friction", material=SAND | {"friction_angle": 45.0}) == []
+    (one,) = found("friction", material=SAND | {"friction_angle": 45.0}, domain=WALL_3D, shape=low)
+    assert (one.severity, "30.6 degrees" in one.what, "50.3 degrees" in one.what) == ("note", True, True)
+    (one,) = found("friction", material=SAND | {"friction_angle": 55.0}, domain=WALL_3D, shape=low)
+    assert one.severity == "warning"
+    # At 60 degrees the cone has no strength in extension left to lose.
+    (one,) = found("friction", material=SAND | {"friction_angle": 60.0}, domain=WALL_3D, shape=low)
+    assert "90.0 degrees in extension" in one.what
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.32, None), (0.35, "varies"), (1.1, "shocks")])
+def test_a_fluid_that_is_too_soft_for_its_speed(share: float, said: str | None) -> None:
+    """v / c above 1/3, where the density varies by more than the tenth that "auto" allows, and above 1."""
+    speed = math.sqrt(2 * 10 * 0.25)
+    material = FLUID | {"bulk_modulus": 1000.0 * (speed / share) ** 2}
+    findings = found("impact-speed", material=material, time={"step": "auto"})
+    # c is that of the compressed fluid, a little lower than at rest.
+    assert [said in finding.what for finding in findings] == ([True] if said else [])
+    if said:
+        assert findings[0].value == pytest.approx(share, rel=0.5)
+    assert found("impact-speed", material={"law": "fluid", "density": 1000.0, "compressibility": 0.1}) == []
+
+
+def test_a_solid_is_hit_as_fast_as_it_falls() -> None:
+    """A block that stands is not hit at all, and one that falls 0.5 m arrives at sqrt(2 g 0.5)."""
+    soft = SOLID | {"youngs_modulus": 2e4, "poissons_ratio": 0.0}
+    assert found("impact-speed", material=soft) == []
+    (one,) = found("impact-speed", material=soft, shape=box([0.25, 0.5], [0.5, 0.75]))
+    assert f"at {math.sqrt(10.0):.3g} m/s" in one.what
+
+
+@pytest.mark.parametrize(("factor", "fires"), [(0.98, False), (1.02, True)])
+def test_a_solid_that_cannot_carry_itself(factor: float, fires: bool) -> None:
+    """density g H over E above 0.3, for what has a shape to lose."""
+    weight = 1000.0 * 10 * 0.25
+    material = SOLID | {"youngs_modulus": weight / 0.3 / factor}
+    assert [one.value for one in found("soft", material=material)] == ([pytest.approx(0.3 * factor)] if fires else [])
+    assert found("soft", material=FLUID | {"bulk_modulus": 5e3}) == []
+
+
+def test_the_energy_that_the_transfers_take() -> None:
+    """0.024 (pi h / thickness)^4 per step; told where it makes a tenth in the run, not where viscosity takes more."""
+    thin = box([0.25, 0.25], [0.75, 0.25 + 4 * H])
+    (one,) = found("dissipation", shape=thin)
+    assert one.value == pytest.approx(0.024 * (math.pi / 4) ** 4 / (0.8 * REST_LIMIT))
+    assert found("dissipation", shape=thin, material=FLUID | {"viscosity": 200.0}) == []
+    rate = 0.024 * (math.pi / 16) ** 4 / (0.8 * REST_LIMIT)
+    critical = -math.log(0.9) / rate
+    assert found("dissipation", time={"end": 0.98 * critical}) == []
+    assert len(found("dissipation", time={"end": 1.02 * critical})) == 1
+
+
+def test_frames_closer_than_steps_and_too_many() -> None:
+    """An interval below the stable step is a note, more than 100,000 frames a warning."""
+    step = 0.8 * REST_LIMIT
+    assert found("frames", time={"end": 10.1 * step, "frames": 10}) == []
+    (one,) = found("frames", time={"end": 9.9 * step, "frames": 10})
+    assert (one.severity, "time.frames to 9" in one.fix) == ("note", True)
+    assert found("frames", time={"end": 1e3, "frames": 100_000}) == []
+    (one,) = found("frames", time={"end": 1e3, "frames": 100_001})
+    assert one.severity == "warning"
+
+
+def test_a_full_disk_and_too_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twice the file has to fit on the disk, and the plan into 0.8 of the free memory."""
+    checked = check()
+    need = checked.forecast.file_bytes
+    for free, fires in ((2 * need - 1, True), (2 * need, False)):
+        monkeypatch.setattr(shutil, "disk_usage", lambda _path, free=free: SimpleNamespace(free=free))
+        assert [one.severity for one in found("disk")] == ["warning"] * fires
+    total = checked.plan.device_bytes + checked.plan.host_bytes
+    for available, fires in ((1.24 * total, True), (1.26 * total, False)):
+        monkeypatch.setattr(psutil, "virtual_memory", lambda available=available: SimpleNamespace(available=available))
+        assert [one.severity for one in found("memory")] == ["error"] * fires
+
+
+def test_a_scene_in_which_nothing_moves() -> None:
+    """Neither gravity nor a velocity (H22)."""
+    still = {"gravity": [0.0, 0.0]}
+    (one,) = found("at-rest", domain=still)
+    assert one.severity == "note"
+    assert found("at-rest", domain=still, velocity=[0.1, 0.0]) == []
+
+
+def test_findings_are_sentences_and_sorted() -> None:
+    """The gravest first; what and fix are sentences with a capital and a full stop."""
+    material = SOLID | {"youngs_modulus": 2e3, "poissons_ratio": 0.495}
+    findings = check(
+        material=material,
+        shape=box([0.25, 0.5 * H], [0.5, 2 * H]),
+        time={"step": 1.0},
+        particles_per_cell=1,
+        velocity=[0.0, -9.0],
+    ).findings
+    assert len({finding.rule for finding in findings}) >= 5
+    ranks = [SEVERITIES.index(finding.severity) for finding in findings]
+    assert ranks == sorted(ranks) and ranks[0] == 0
+    for finding in findings:
+        for sentence in (finding.what, finding.fix):
+            assert sentence[0].isupper() and sentence.endswith(".") and ".." not in sentence
