@@ -146,7 +146,7 @@ def test_version(run):
     assert outcome.status == 0 and outcome.stdout == f"mpmcli, version {__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["simulate", "info", "materials", "schema", "bench", "completion"])
+@pytest.mark.parametrize("command", ["simulate", "check", "info", "materials", "schema", "bench", "completion"])
 def test_every_command_explains_itself(run, command):
     outcome = run(command, "--help")
     assert outcome.status == 0 and outcome.stdout.startswith(f"Usage: mpmcli {command}")

@@ -33,6 +33,7 @@ LEVELS = {
     "materials": 2,
     "scene": 1,
     "errors": 0,
+    "plain_text": 0,
     "__init__": 0,
 }
 TAICHI_ROOMS = {"solver", "materials", "boundaries"}

@@ -5,7 +5,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from mpmcli.bench.cases import BenchCase
-from mpmcli.bench.report import describe_machine, heading, text_table
+from mpmcli.bench.report import describe_machine, heading
+from mpmcli.plain_text import text_table
 
 # (law, its measure, how many times as much it may cost).
 TARGETS = (("fixed_corotated", "neo_hookean", 2.0), ("sand", "fluid", 5.0), ("snow", "fluid", 5.0))

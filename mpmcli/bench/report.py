@@ -9,6 +9,7 @@ from pathlib import Path
 
 from mpmcli import __version__
 from mpmcli.bench.cases import BenchCase
+from mpmcli.plain_text import text_table
 
 
 @dataclass(frozen=True)
@@ -116,19 +117,6 @@ def heading(machine: dict, arch: str, threads: int, precision: str) -> str:
     """Return the line above a table that says what it was measured on."""
     count = f"{threads} {'thread' if threads == 1 else 'threads'}"
     return f"{machine['processor']}, {arch}, {count}, {precision}, taichi {machine['taichi']}"
-
-
-def text_table(head: tuple[str, ...], rows: list[tuple[str, ...]], left: set[int]) -> str:
-    """Write rows below their head and a line; columns are aligned to the right but for those numbered in `left`."""
-    widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
-    lines = [
-        "  ".join(
-            text.ljust(width) if column in left else text.rjust(width)
-            for column, (text, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in [head, *rows]
-    ]
-    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
 
 
 @dataclass(frozen=True)

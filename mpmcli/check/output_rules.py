@@ -36,7 +36,9 @@ def output_findings(facts: SceneFacts, plan: Plan, forecast: Forecast, directory
             f"Set time.frames to {MOST_FRAMES:,} or fewer.",
             forecast.frames,
         )
-    free = shutil.disk_usage(directory).free
+    # Where results would go need not exist yet.
+    place = next(place for place in (directory.absolute(), *directory.absolute().parents) if place.exists())
+    free = shutil.disk_usage(place).free
     if COPIES * forecast.file_bytes > free:
         yield Finding(
             "warning",

@@ -1,6 +1,5 @@
 """The check of a scene before it runs: which step is safe and why, what will go wrong, and what it will take."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from mpmcli.check.scene_table import scene_text
 from mpmcli.check.shape_rules import shape_findings
 from mpmcli.check.step_rules import step_findings
 from mpmcli.scene import LoadedScene
-from mpmcli.solver.backend import Backend
+from mpmcli.solver.backend import Backend, available_cores
 from mpmcli.solver.plan import Plan, make_plan
 
 
@@ -86,7 +85,7 @@ def check_scene(
     scene = loaded.scene
     facts = SceneFacts(scene)
     if probe is None:
-        backend = Backend("cpu", threads or _cores(), scene.solver.precision, compile_cache=True)
+        backend = Backend("cpu", threads or available_cores(), scene.solver.precision, compile_cache=True)
     else:
         backend = probe.backend
     plan = make_plan(scene, backend)
@@ -121,8 +120,3 @@ def check_scene(
         forecast=forecast,
         notes=loaded.notes,
     )
-
-
-def _cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -14,7 +14,7 @@ from mpmcli.stability.limits import FIX, WHY, deformation_limit, mode_limit, spe
 # In an impact a cell stops on one side while matter comes in on the other from two nodes: two speeds per cell.
 IMPACT_GRADIENT = 2.0
 # A wave that meets a free surface throws matter off at twice its speed, and jets out of a corner are about as fast:
-# 1.6 to 2.2 times the speed of the fall in six of seven scenes, 3 times in one where bodies splash each other.
+# 1.6 to 2.5 times the speed of the fall in seven scenes of eight, 3 times in one where bodies splash each other.
 JET = 2.0
 # Parameters that set how stiff a material is, and how viscous, the first that it has.
 STIFFNESSES = ("bulk_modulus", "youngs_modulus", "shear_modulus")

@@ -3,9 +3,9 @@
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from mpmcli.bench.report import text_table
 from mpmcli.check.finding import SEVERITIES
 from mpmcli.check.scene_limits import SceneLimit
+from mpmcli.plain_text import size_text, text_table
 
 if TYPE_CHECKING:
     from mpmcli.check.scene_check import SceneCheck
@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 MOST_ROWS = 16
 # Findings of one rule that are told.
 MOST_ALIKE = 5
-SIZES = ("B", "kB", "MB", "GB", "TB")
 
 
 def scene_text(check: "SceneCheck") -> str:
@@ -103,8 +102,8 @@ def _forecast(check: "SceneCheck") -> str:
         took = f", {_time(forecast.seconds)} here, {forecast.compile_seconds:.2g} s of it compilation"
     return (
         f"{steps}, {forecast.frames:,} frames{took}\n"
-        f"{_size(forecast.device_bytes)} on the device, {_size(forecast.file_bytes)} on the disk before compression "
-        f"({_size(forecast.vtk_bytes)} as .vtu series)"
+        f"{size_text(forecast.device_bytes)} on the device, {size_text(forecast.file_bytes)} on the disk before "
+        f"compression ({size_text(forecast.vtk_bytes)} as .vtu series)"
     )
 
 
@@ -112,14 +111,6 @@ def _outcome(check: "SceneCheck") -> str:
     counts = Counter(finding.severity for finding in check.findings)
     found = [f"{counts[word]} {word}{'s' if counts[word] > 1 else ''}" for word in SEVERITIES if counts[word]]
     return ("ok" if check.passes() else "not ok") + (f": {', '.join(found)}" if found else ": nothing found")
-
-
-def _size(count: float) -> str:
-    for unit in SIZES[:-1]:
-        if count < 1000:
-            return f"{count:.3g} {unit}"
-        count /= 1000
-    return f"{count:.3g} {SIZES[-1]}"
 
 
 def _time(seconds: float) -> str:

@@ -1,6 +1,7 @@
 """`mpmcli simulate`."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -40,6 +41,9 @@ from mpmcli.cli.options import json_option, plugin_option, quiet_option, set_opt
 )
 @click.option("--compress", is_flag=True, help="Compress the stored file with gzip.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier result in the output directory.")
+@click.option(
+    "--force", is_flag=True, help="Run although `mpmcli check` finds errors, and take time.step above the stable step."
+)
 @quiet_option
 @json_option
 def command(
@@ -53,11 +57,15 @@ def command(
     form: str,
     compress: bool,
     overwrite: bool,
+    force: bool,
     quiet: bool,
     as_json: bool,
 ) -> int:
     """Run SCENE, a TOML file, and store its particles for ParaView, h5py and learners."""
+    from mpmcli.check.finding import passes
+    from mpmcli.check.scene_check import check_scene
     from mpmcli.cli.progress import Progress
+    from mpmcli.errors import InputError
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
     from mpmcli.solver.run import RunSettings, run_scene
@@ -65,12 +73,20 @@ def command(
     overrides += (f'solver.precision="{precision}"',) if precision else ()
     overrides += ("output.compress=true",) if compress else ()
     loaded = load_scene(scene, overrides, laws=load_plugins(plugins))
+    directory = output or Path("results") / scene.stem
+    findings = check_scene(loaded, threads=threads, directory=directory).findings
+    if not (force or passes(findings)):
+        errors = [f"{loaded.source}: {f.what} {f.fix}" for f in findings if f.severity == "error"]
+        raise InputError("\n".join([*errors, "--force runs it all the same."]))
+    grave = tuple(finding.line for finding in findings if finding.severity != "note")
+    loaded = replace(loaded, notes=(*loaded.notes, *grave))
     settings = RunSettings(
-        directory=output or Path("results") / scene.stem,
+        directory=directory,
         arch=arch,
         threads=threads,
         form=form,
         overwrite=overwrite,
+        force=force,
         command=["mpmcli", *sys.argv[1:]],
     )
     progress = Progress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)

@@ -48,6 +48,11 @@ class Backend:
         return self.arch == "cpu"
 
 
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else multiprocessing.cpu_count()
+
+
 def start_backend(
     arch: Arch = "auto", threads: int | None = None, precision: str = "f32", *, compile_cache: bool = True
 ) -> Backend:
@@ -67,7 +72,7 @@ def start_backend(
     wanted = _best(precision) if arch == "auto" else arch
     if wanted in ("vulkan", "metal") and precision == "f64":
         raise InputError(f"precision f64 is not available on {wanted}; use --arch cpu or cuda, or f32.")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else multiprocessing.cpu_count()
+    cores = available_cores()
     count = (threads or cores) if wanted == "cpu" else 1
     most = max(FEW_THREADS, 2 * cores)
     if not 1 <= count <= most:

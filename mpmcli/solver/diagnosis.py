@@ -63,6 +63,7 @@ SUGGESTIONS = {
     LEFT: "check the speeds and forces of the scene, or lower time.safety or time.step",
     OUTRAN: "lower time.step, so that speeds are measured more often",
 }
+FORCED = 'time.step = "auto" would have taken steps that are stable'
 OTHERWISE = "check the speeds, forces and materials of the scene"
 
 
@@ -108,8 +109,11 @@ def diagnose(
     time: float,
     step_size: float,
     limit: Limit,
+    *,
+    forced: bool,
 ) -> Diagnosis:
     """Describe particle p (in solver order) of a group, which stopped the run for this cause."""
+    advice = next((advice for start, advice in SUGGESTIONS.items() if cause.startswith(start)), OTHERWISE)
     return Diagnosis(
         step,
         time,
@@ -119,5 +123,5 @@ def diagnose(
         cause,
         limit.name,
         step_size,
-        next((advice for start, advice in SUGGESTIONS.items() if cause.startswith(start)), OTHERWISE),
+        FORCED if forced else advice,
     )

@@ -9,6 +9,7 @@ import psutil
 from mpmcli.errors import InputError
 from mpmcli.materials.law import Law
 from mpmcli.materials.registry import laws
+from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
 from mpmcli.solver.backend import Backend
@@ -162,15 +163,7 @@ def require_room(plan: Plan) -> None:
     need = f"the scene needs {plan.particles:.3g} particles and {plan.nodes:.3g} grid nodes"
     cure = "a larger domain.spacing or fewer particles_per_cell needs less"
     if total > free:
-        raise InputError(f"{need}, {_size(total)} of memory, and {_size(free)} may be used here; {cure}.")
+        raise InputError(f"{need}, {size_text(total)} of memory, and {size_text(free)} may be used here; {cure}.")
     # The widest field of the sort is addressed by one index.
     if max(plan.nodes, plan.particles * WIDEST_FIELD) > LARGEST_INDEX:
         raise InputError(f"{need}, more than 32-bit indices can address; {cure}.")
-
-
-def _size(count: float) -> str:
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if count < 1000:
-            return f"{count:.3g} {unit}"
-        count /= 1000
-    return f"{count:.3g} PB"

@@ -299,7 +299,16 @@ class Solver:
 
     def _diagnose(self, snapshot: Snapshot, p: int, cause: str, dt: float) -> Diagnosis:
         return diagnose(
-            snapshot, p, cause, self._names, self._origin, self.step_count, self.time, dt, self.nearest_limit
+            snapshot,
+            p,
+            cause,
+            self._names,
+            self._origin,
+            self.step_count,
+            self.time,
+            dt,
+            self.nearest_limit,
+            forced=self._forced and dt > self.nearest_limit.value,
         )
 
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:

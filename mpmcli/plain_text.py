@@ -1,0 +1,25 @@
+"""Tables and sizes as plain text."""
+
+SIZES = ("B", "kB", "MB", "GB", "TB", "PB")
+
+
+def text_table(head: tuple[str, ...], rows: list[tuple[str, ...]], left: set[int]) -> str:
+    """Write rows below their head and a line; columns are aligned to the right but for those numbered in `left`."""
+    widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
+    lines = [
+        "  ".join(
+            text.ljust(width) if column in left else text.rjust(width)
+            for column, (text, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in [head, *rows]
+    ]
+    return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
+
+
+def size_text(count: float) -> str:
+    """Write a number of bytes with three digits and its unit."""
+    for unit in SIZES[:-1]:
+        if count < 1000:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} {SIZES[-1]}"
