@@ -33,6 +33,7 @@ class Result(ABC):
         path: the packed file, the directory of the segments, or the .pvd.
         kind: "packed", "segments" (running, or ended before packing) or "series".
         times: (T,) float64, s.
+        numbers: (T,) frame numbers.
         particle_counts: (T,) particles of each frame.
         ledger: T rows.
         header: facts about the run, among them "scene", the TOML text.
@@ -47,6 +48,7 @@ class Result(ABC):
         self.path = path
         self._index = index
         self.times = index.times
+        self.numbers = index.frames
         self.particle_counts = index.counts
         self.ledger: list[LedgerRow] = index.ledger
         self.header: dict[str, Any] = index.header
@@ -80,6 +82,16 @@ class Result(ABC):
         stored = self._read(k, names)
         index = self._index
         return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
+
+    def numbered_frame(self, k: int) -> tuple[Frame, np.ndarray]:
+        """Read the k-th frame with all its fields, and the particle number that the file gives to each row.
+
+        The numbers are 0, 1, 2, ... unless something has changed the file.
+        """
+        stored = self._read(k, [POSITION, *STANDARD, *self.field_names])
+        index = self._index
+        frame = index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
+        return frame, stored["id"]
 
     def frames(self, fields: Sequence[str] | None = None) -> Iterator[Frame]:
         """Read all frames, one at a time."""

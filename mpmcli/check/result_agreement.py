@@ -1,0 +1,104 @@
+"""Holds the ledger against the frames: sums that can be taken again from what is stored must be the same."""
+
+import numpy as np
+
+from mpmcli.check.result_findings import FrameFindings
+from mpmcli.check.result_scene import SceneFacts
+from mpmcli.check.result_state import TOUCHED
+from mpmcli.output.frame import Frame
+from mpmcli.stability.ledger import LedgerRow
+
+# Relative, of numbers that are taken in single precision once more.
+SINGLE = 1e-5
+# Sums in double precision of the very numbers that the ledger was summed from.
+DOUBLE = 1e-9
+
+
+class AgreementCheck:
+    """Checks frames one after the other; the masses of the particles come from the frames or from the scene.
+
+    Attributes:
+        largest: largest relative difference found.
+    """
+
+    def __init__(self, facts: SceneFacts, findings: FrameFindings) -> None:
+        self._facts = facts
+        self._findings = findings
+        self._masses: np.ndarray | None = None
+        self._body: np.ndarray | None = None
+        self.largest = 0.0
+
+    def check(self, number: int, frame: Frame, row: LedgerRow, J: np.ndarray | None, steps: int | None) -> None:
+        """Check a frame of finite numbers.
+
+        Args:
+            J: volume ratio of each particle, (n,), None where it is not stored.
+            steps: taken since the frame before, by the frames; None where that one is not known.
+        """
+        if len(frame.position) == 0:
+            return
+        if steps is not None and steps != row.steps:
+            self._differs(number, "steps", steps, row.steps, 1.0)
+        speed = float(np.sqrt(np.einsum("ij,ij->i", frame.velocity, frame.velocity).max()))
+        self._compare(number, "speed_max", speed, row.speed_max, SINGLE * max(speed, row.speed_max))
+        if J is not None and np.isfinite(J).all():
+            for name, found in (("volume_ratio_min", float(J.min())), ("volume_ratio_max", float(J.max()))):
+                self._compare(number, name, found, getattr(row, name), SINGLE * abs(found))
+        self._sums(number, frame, row)
+
+    def _sums(self, number: int, frame: Frame, row: LedgerRow) -> None:
+        m = self._masses_of(frame)
+        if m is None:
+            return
+        total = float(m.sum())
+        off = abs(total - row.mass) / row.mass if row.mass > 0 else 1.0
+        if "mass" in frame.fields:
+            self._compare(number, "mass", total, row.mass, SINGLE * row.mass)
+        if off > SINGLE:
+            return  # a run that was filled otherwise than its scene says, or one whose mass has its own finding
+        # Masses that are not quite those of the solver leave the sums as wrong as they are.
+        precision = max(DOUBLE, 10 * off)
+        # No BLAS: its threads would fight with those of the other processes that a data set is checked by.
+        momentum = np.array([np.einsum("i,i->", m, column) for column in frame.velocity.T])
+        speeds = np.sqrt(np.einsum("ij,ij->i", frame.velocity, frame.velocity))
+        moving = float(np.einsum("i,i->", m, speeds))
+        for axis, found in enumerate(momentum.tolist()):
+            told = row.linear_momentum[axis]
+            self._compare(number, f"linear_momentum along {'xyz'[axis]}", found, told, precision * moving)
+        self._potential(number, frame, row, m, momentum, precision)
+
+    def _potential(
+        self, number: int, frame: Frame, row: LedgerRow, m: np.ndarray, momentum: np.ndarray, precision: float
+    ) -> None:
+        """The ledger takes it half a step back, and the last step lies between the smallest and the largest."""
+        facts = self._facts
+        if facts.gravity is None or facts.origin is None or not facts.gravity.any():
+            return
+        # Positions that were moved by an origin were rounded once more.
+        rounding = 0.0 if not facts.origin.any() else float(np.finfo(frame.position.dtype).eps) * facts.farthest
+        weight = float(m.sum()) * float(np.linalg.norm(facts.gravity))
+        tolerance = weight * (rounding + precision * float(np.linalg.norm(facts.upper - facts.origin)))
+        moments = [np.einsum("i,i->", m, x - x0) for x, x0 in zip(frame.position.T, facts.origin, strict=True)]
+        power = 0.5 * float(momentum @ facts.gravity)
+        found = -float(moments @ facts.gravity) + np.array([row.step_min, row.step_max]) * power
+        nearest = float(np.clip(row.potential, found.min(), found.max()))
+        self._compare(number, "potential", nearest, row.potential, tolerance)
+
+    def _masses_of(self, frame: Frame) -> np.ndarray | None:
+        if "mass" in frame.fields:
+            return frame.fields["mass"].astype(np.float64)
+        if self._body is None or not np.array_equal(self._body, frame.body):
+            self._body, self._masses = frame.body, self._facts.masses(frame.body)
+        return self._masses
+
+    def _compare(self, number: int, name: str, found: float, told: float, tolerance: float) -> None:
+        difference = abs(found - told)
+        # Below the smallest normal number of single precision nothing is compared.
+        if difference > max(tolerance, 1e-37) or not np.isfinite(difference):
+            self._differs(number, name, found, told, difference)
+
+    def _differs(self, number: int, name: str, found: float, told: float, difference: float) -> None:
+        scale = max(abs(found), abs(told))
+        self.largest = max(self.largest, difference / scale if scale > 0 else 0.0)
+        what = f"In frame {number} {name} is {found:.9g} by the particles and {told:.9g} by the ledger"
+        self._findings.add("error", "ledger", number, what, TOUCHED, value=difference, kind=name)

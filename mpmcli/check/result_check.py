@@ -1,0 +1,208 @@
+"""`mpmcli check RESULT`: whether a run stayed stable and its frames are whole, and where they are not."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from mpmcli.check.finding import Finding, passes
+from mpmcli.check.result_agreement import AgreementCheck
+from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, arrays_of, open_entries
+from mpmcli.check.result_findings import FrameFindings
+from mpmcli.check.result_ledger import check_ledger
+from mpmcli.check.result_motion import MomentumCheck, MotionCheck
+from mpmcli.check.result_order import check_order, frames_expected
+from mpmcli.check.result_scene import SceneFacts, scene_facts
+from mpmcli.check.result_state import StateCheck
+from mpmcli.errors import InputError
+from mpmcli.output.store import PACKED
+
+Verdict = Literal["stable", "suspect", "unstable"]
+# How the figures are told to people.
+TOLD = {
+    "energy_growth": "energy growth / turned over",
+    "energy_lost": "energy lost / turned over",
+    "mass_change": "mass change",
+    "momentum_drift": "momentum drift",
+    "courant_max": "largest Courant number",
+    "deformation_max": "largest deformation in a step",
+    "displacement_ratio": "displacement / reach",
+    "speed_max": "largest speed, m/s",
+    "volume_ratio_min": "smallest J",
+    "volume_ratio_max": "largest J",
+    "step_min": "smallest step, s",
+    "step_max": "largest step, s",
+}
+
+
+@dataclass(frozen=True)
+class ResultCheck:
+    """What was found in a result.
+
+    Attributes:
+        path: what was read; kind: "packed", "segments", "series", or "none" where nothing can be read.
+        status: how the run ended by its record, "unknown" where there is none.
+        findings: the gravest first.
+        first_bad_frame: number of the first frame that an error or a warning is about; None where there is none.
+        limit: name of the bound on the step that was nearest at that frame, "" where it is not known.
+        frames: number of frames read; frames_expected: of the whole run, None where it is not known.
+        particles: number of particles.
+        figures: numbers by name, None where there is none to tell: energy_growth and energy_lost (relative to the
+            energy turned over), mass_change (relative), momentum_drift (relative, far from walls), momentum_frames
+            (in which it was sure), courant_max (cells), deformation_max (in a step, where affine is stored),
+            displacement_ratio (largest displacement between frames over what the ledger allows),
+            ledger_difference (largest relative difference between ledger and frames that was found), speed_max (m/s),
+            volume_ratio_min, volume_ratio_max, step_min, step_max (s), step_ratio (smallest over first),
+            bytes (of particle data read).
+    """
+
+    path: Path
+    kind: str
+    status: str
+    findings: tuple[Finding, ...]
+    first_bad_frame: int | None
+    limit: str
+    frames: int
+    frames_expected: int | None
+    particles: int
+    figures: dict[str, float | None]
+
+    @property
+    def verdict(self) -> Verdict:
+        """ "unstable" with an error, "suspect" with a warning, "stable" without either."""
+        if not passes(self.findings):
+            return "unstable"
+        return "stable" if passes(self.findings, strict=True) else "suspect"
+
+    def passes(self, strict: bool = False) -> bool:
+        """Return whether the result can be used: no error, and with `strict` no warning."""
+        return passes(self.findings, strict=strict)
+
+    def as_dict(self) -> dict:
+        """Return all of it as JSON can hold it."""
+        return {
+            "ok": self.passes(),
+            "verdict": self.verdict,
+            "first_bad_frame": self.first_bad_frame,
+            "limit": self.limit,
+            "findings": [_plain(finding.as_dict()) for finding in self.findings],
+            "frames": self.frames,
+            "frames_expected": self.frames_expected,
+            "particles": self.particles,
+            "figures": _plain(self.figures),
+            "kind": self.kind,
+            "status": self.status,
+            "path": str(self.path),
+        }
+
+    def text(self) -> str:
+        """Return it for people: the verdict, the figures, and a line for each finding."""
+        bad = "" if self.first_bad_frame is None else f", first bad frame {self.first_bad_frame}"
+        limit = f', nearest limit "{self.limit}"' if bad and self.limit else ""
+        expected = "" if self.frames_expected is None else f" of {self.frames_expected}"
+        told = {"frames": f"{self.frames}{expected}", "particles": str(self.particles), "status": self.status}
+        for name, words in TOLD.items():
+            value = self.figures.get(name)
+            if value is not None:
+                told[words] = f"{value:.4g}"
+        width = max(len(words) for words in told)
+        lines = [f"{self.path}: {self.verdict}{bad}{limit}"]
+        lines += [f"  {words:<{width}}  {value}" for words, value in told.items()]
+        return "\n".join([*lines, *(finding.line for finding in self.findings)])
+
+
+def check_result(path: Path) -> ResultCheck:
+    """Read the ledger and the frames of a result, one frame at a time, and say what is wrong with it.
+
+    Args:
+        path: a packed file, a directory, its segments, or the .pvd of a series; of a run that has ended or not.
+
+    Raises:
+        InputError: there is nothing at `path`, or nothing that this version of mpmcli wrote.
+    """
+    findings = FrameFindings()
+    opened = open_entries(path, findings)
+    facts = scene_facts(opened.header)
+    check_order(opened, facts, findings)
+    figures = check_ledger(opened.entries, facts, findings)
+    if opened.entries:
+        figures |= _check_frames(opened, facts, findings)
+    if opened.kind == "segments" and (opened.path / PACKED).exists():
+        # The run has come to its end meanwhile, and has packed the frames.
+        return check_result(opened.path)
+    found = findings.found()
+    bad = [f.frame for f in found if f.severity != "note" and f.frame is not None]
+    first_bad = min(bad, default=None)
+    return ResultCheck(
+        path=opened.path,
+        kind=opened.kind,
+        status=(opened.record or {}).get("status", "unknown"),
+        findings=found,
+        first_bad_frame=first_bad,
+        limit="" if first_bad is None else _limit_at(opened, first_bad),
+        frames=len(opened.entries) - len(findings.frames_of("unreadable") & {e.number for e in opened.entries}),
+        frames_expected=frames_expected(opened, facts),
+        particles=opened.entries[0].count if opened.entries else 0,
+        figures=figures,
+    )
+
+
+def _check_frames(opened: OpenedResult, facts: SceneFacts, findings: FrameFindings) -> dict[str, float | None]:
+    """Read every frame once, and check it against itself, the one before it, and the ledger."""
+    state, motion = StateCheck(facts, findings), MotionCheck(facts, findings)
+    agreement = AgreementCheck(facts, findings)
+    momentum = MomentumCheck(facts, findings, opened.entries[0].row)
+    size = 0
+    before: tuple[int, int] | None = None
+    for entry in opened.entries:
+        number, row = entry.number, entry.row
+        try:
+            frame, ids = entry.read()
+        except InputError as error:
+            findings.add("error", "unreadable", number, str(error).rstrip("."), RUN_AGAIN)
+            motion.forget()
+            momentum.lost()
+            before = None
+            continue
+        size += sum(array.nbytes for array in arrays_of(frame, ids).values())
+        # What is not finite is told once; it must not make the rest complain, too.
+        with np.errstate(invalid="ignore", over="ignore"):
+            sound = state.check(number, frame, ids, entry.count)
+            J = state.volume_ratio(frame)
+            if J is not None:
+                state.check_volume(number, frame, J)
+            motion.check(number, frame, row, sound)
+            if sound is None:
+                steps = frame.step - before[1] if before is not None and before[0] + 1 == number else None
+                agreement.check(number, frame, row, J, steps)
+                momentum.check(number, frame, row)
+            else:
+                momentum.lost()
+        before = (number, frame.step)
+    return {
+        "displacement_ratio": motion.largest_ratio,
+        "deformation_max": motion.deformation,
+        "momentum_drift": momentum.drift,
+        "momentum_frames": momentum.frames,
+        "ledger_difference": agreement.largest,
+        "bytes": size,
+    }
+
+
+def _limit_at(opened: OpenedResult, number: int) -> str:
+    """Return the bound that was nearest at a frame: by the ledger up to it, or by the diagnosis of a run that broke."""
+    last = max((entry.number for entry in opened.entries), default=-1)
+    diagnosed = ((opened.record or {}).get("failure") or {}).get("limit")
+    if number > last and diagnosed:
+        return str(diagnosed)
+    up_to = [entry.row.limit for entry in opened.entries if entry.number <= max(number, 1) and entry.row.limit]
+    return up_to[-1] if up_to else ""
+
+
+def _plain(values: dict) -> dict:
+    """Replace what JSON has no number for by None."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()
+    }

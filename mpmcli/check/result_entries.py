@@ -1,0 +1,161 @@
+"""Opening a result that may be damaged: every frame that can be read, and a finding for what cannot."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpmcli.check.result_findings import FrameFindings
+from mpmcli.errors import InputError
+from mpmcli.output.frame import Frame
+from mpmcli.output.result import Result, open_result
+from mpmcli.output.run_record import read_record
+from mpmcli.output.series import SERIES, SERIES_HEADER
+from mpmcli.output.store import PACKED, SEGMENTS, sealed_segments
+from mpmcli.stability.ledger import LedgerRow
+
+HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+# What HDF5, numpy and the XML reader raise on a file whose content contradicts itself.
+DAMAGE = (InputError, OSError, RuntimeError, ValueError, KeyError, IndexError, TypeError, AttributeError)
+RUN_AGAIN = "Copy the file again from where it was made, or run the scene again."
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One frame of a result, not yet read.
+
+    Attributes:
+        number: of the frame, by the name of its file where it has one of its own.
+        said: number of the frame by its content.
+        time: s, as the file lists it.
+        row: of the ledger.
+        count: particles, as the file lists them.
+    """
+
+    number: int
+    said: int
+    time: float
+    row: LedgerRow
+    count: int
+    result: Result
+    k: int
+
+    def read(self) -> tuple[Frame, np.ndarray]:
+        """Read the frame and its ids.
+
+        Raises:
+            InputError: it cannot be read.
+        """
+        try:
+            frame, ids = self.result.numbered_frame(self.k)
+        except DAMAGE as error:
+            raise InputError(f"Frame {self.number} cannot be read ({_first_line(error).rstrip('.')}).") from error
+        lengths = {name: len(array) for name, array in arrays_of(frame, ids).items()}
+        shortest = min(lengths, key=lambda name: lengths[name])
+        if lengths[shortest] < max(lengths.values()):
+            raise InputError(
+                f"Frame {self.number} is cut off: {shortest} has {lengths[shortest]} of {max(lengths.values())} rows."
+            )
+        return frame, ids
+
+
+@dataclass(frozen=True)
+class OpenedResult:
+    """What can be read of a result.
+
+    Attributes:
+        kind: "packed", "segments", "series", or "none" where nothing can be read.
+        header: facts about the run, {} where nothing can be read.
+        record: content of run.json, None where there is none.
+        entries: the frames in the order of the files.
+    """
+
+    path: Path
+    kind: str
+    header: dict[str, Any]
+    record: dict[str, Any] | None
+    entries: list[Entry]
+
+
+def arrays_of(frame: Frame, ids: np.ndarray) -> dict[str, np.ndarray]:
+    """Return all arrays of a frame by name."""
+    standard = {name: getattr(frame, name) for name in ("position", "velocity", "body", "material")}
+    return {"id": ids, **standard, **frame.fields}
+
+
+def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
+    """Open a result as far as it goes.
+
+    Raises:
+        InputError: there is nothing at `path`, or nothing that this version of mpmcli wrote.
+    """
+    path = Path(path)
+    if path.name == SEGMENTS and path.is_dir():
+        path = path.parent
+    if path.is_dir() and not (path / PACKED).exists() and sealed_segments(path):
+        return _open_segments(path, findings)
+    try:
+        result = open_result(path)
+    except DAMAGE as error:
+        if not _is_damage(path, error):
+            raise
+        directory = path if path.is_dir() else path.parent
+        findings.add("error", "unreadable", 0, f"No frame can be read: {_first_line(error).rstrip('.')}", RUN_AGAIN)
+        return OpenedResult(path, "none", {}, read_record(directory), [])
+    listed = min(len(result.ledger), len(result.numbers), len(result.particle_counts))
+    if listed < result.frame_count:
+        what = f"The ledger has {listed} rows for {result.frame_count} frames"
+        findings.add("error", "ledger-missing", listed, what, RUN_AGAIN)
+    entries = [_entry(result, k, int(result.numbers[k])) for k in range(min(listed, result.frame_count))]
+    return OpenedResult(result.path, result.kind, result.header, result.record, entries)
+
+
+def _open_segments(directory: Path, findings: FrameFindings) -> OpenedResult:
+    """Open each sealed segment for itself, so that a damaged one does not hide the others."""
+    entries: list[Entry] = []
+    for segment in sealed_segments(directory):
+        number = int(segment.stem.split("_")[1])
+        try:
+            entries.append(_entry(open_result(segment), 0, number))
+        except DAMAGE as error:
+            what = f"The segment of frame {number} cannot be read ({_first_line(error).rstrip('.')})"
+            findings.add("error", "unreadable", number, what, RUN_AGAIN)
+    header = entries[0].result.header if entries else {}
+    return OpenedResult(directory, "segments", header, read_record(directory), entries)
+
+
+def _entry(result: Result, k: int, number: int) -> Entry:
+    return Entry(
+        number,
+        int(result.numbers[k]),
+        float(result.times[k]),
+        result.ledger[k],
+        int(result.particle_counts[k]),
+        result,
+        k,
+    )
+
+
+def _is_damage(path: Path, error: Exception) -> bool:
+    """Say whether mpmcli wrote what lies there, so that it is broken rather than something else."""
+    directory = path if path.is_dir() else path.parent
+    if not path.exists() or path.suffix == ".vtu":
+        return False
+    ours = read_record(directory) is not None
+    if path.is_dir():
+        packed = path / PACKED
+        if not packed.exists() and not (path / SERIES).exists():
+            return ours  # a run that wrote no frame
+        path = packed if packed.exists() else path / SERIES
+    # open_result names a cause where something could not be read, and none where it is of another kind or version.
+    if isinstance(error, InputError) and error.__cause__ is None:
+        return False
+    if ours or (path.parent / SERIES_HEADER).exists():
+        return True
+    with path.open("rb") as file:
+        return file.read(8) == HDF5_SIGNATURE
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,148 @@
+"""Checks the ledger of a result for itself: finite numbers, mass, energy, Courant number, volumes and steps."""
+
+from collections.abc import Sequence
+from dataclasses import fields
+
+import numpy as np
+
+from mpmcli.check.result_entries import Entry
+from mpmcli.check.result_findings import FrameFindings
+from mpmcli.check.result_scene import SceneFacts
+from mpmcli.check.result_state import BLOWN_UP, COHERENT_LAWS, CRUSHED, TOUCHED
+from mpmcli.stability.ledger import LedgerRow
+from mpmcli.stability.limits import COURANT
+
+# Energy that comes from nowhere, relative to what was turned over so far. The scenes in configs stay below 2e-4;
+# an impact at half the speed of sound gains 5e-2, one far above it more than 2e-1.
+ENERGY_SUSPECT, ENERGY_WRONG = 1e-2, 1e-1
+# Of all energy there is: what single precision may leave of it from step to step.
+ENERGY_ROUNDING = 1e-4
+# Masses are summed in double precision and never change.
+MASS_ERROR = 1e-9
+# Beyond a bound by less than this: the surprise of an impact, which time.safety is for.
+MARGIN = 1.1
+# Steps that shrink to less than this part of the first ones.
+COLLAPSE = 1e-2
+LOWER_SAFETY = "Lower time.safety, or refine the domain."
+
+
+def check_ledger(entries: Sequence[Entry], facts: SceneFacts, findings: FrameFindings) -> dict[str, float | None]:
+    """Check all rows.
+
+    Returns:
+        Figures by name: energy_growth, energy_lost, mass_change, courant_max, speed_max, volume_ratio_min,
+        volume_ratio_max, step_min, step_max, step_ratio; None where there is no number for it.
+    """
+    rows: list[tuple[int, LedgerRow]] = []
+    for entry in entries:
+        broken = _not_finite(entry.row)
+        if broken:
+            what = f"In frame {entry.number} {broken} of the ledger is not finite"
+            findings.add("error", "ledger-not-finite", entry.number, what, LOWER_SAFETY)
+        else:
+            rows.append((entry.number, entry.row))
+    if not rows:
+        return {}
+    figures: dict[str, float | None] = {}
+    figures["mass_change"] = _mass(rows, findings)
+    figures["energy_growth"], figures["energy_lost"] = _energy(rows, findings)
+    figures["courant_max"] = _courant(rows, findings)
+    figures["speed_max"] = max(row.speed_max for _, row in rows)
+    figures["volume_ratio_min"] = min(row.volume_ratio_min for _, row in rows)
+    figures["volume_ratio_max"] = max(row.volume_ratio_max for _, row in rows)
+    _volume(rows, facts, findings)
+    figures |= _steps(rows, findings)
+    return figures
+
+
+def _not_finite(row: LedgerRow) -> str:
+    for entry in fields(row):
+        value = getattr(row, entry.name)
+        if not isinstance(value, str) and not np.isfinite(value).all():
+            return entry.name
+    return ""
+
+
+def _mass(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> float:
+    # The median, so that one row that is off is the one that is named, the first row too.
+    usual = float(np.median([row.mass for _, row in rows]))
+    largest = 0.0
+    for number, row in rows:
+        change = abs(row.mass - usual) / usual if usual > 0 else float(row.mass != usual)
+        largest = max(largest, change)
+        if change > MASS_ERROR:
+            what = f"In frame {number} the mass is {row.mass:.8g} kg, where the run has {usual:.8g} kg"
+            findings.add("error", "mass", number, what, TOUCHED, value=change)
+    return largest
+
+
+def _energy(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> tuple[float, float]:
+    """Find growth of the total energy above its lowest value so far, and what is lost by the end.
+
+    Both are relative to the energy turned over: the largest kinetic energy so far and the ranges of potential and
+    elastic energy, since the zero of a potential is arbitrary.
+    """
+    kinetic = np.array([row.kinetic for _, row in rows])
+    potential, elastic = (np.array([getattr(row, name) for _, row in rows]) for name in ("potential", "elastic"))
+    total = kinetic + potential + elastic
+    turned = np.maximum.accumulate(kinetic) + _range_so_far(potential) + _range_so_far(elastic)
+    turned += ENERGY_ROUNDING * np.maximum.accumulate(kinetic + np.abs(potential) + np.abs(elastic))
+    turned = np.maximum(turned, np.finfo(np.float64).tiny)
+    growth = (total - np.minimum.accumulate(total)) / turned
+    for (number, _), value in zip(rows, growth.tolist(), strict=True):
+        if value > ENERGY_SUSPECT:
+            severity = "error" if value > ENERGY_WRONG else "warning"
+            what = f"By frame {number} the energy has grown by {value:.3g} of what was turned over, with no source"
+            findings.add(severity, "energy", number, what, LOWER_SAFETY, value=value)
+    return float(growth.max()), float((total[0] - total[-1]) / turned[-1])
+
+
+def _range_so_far(values: np.ndarray) -> np.ndarray:
+    return np.maximum.accumulate(values) - np.minimum.accumulate(values)
+
+
+def _courant(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> float:
+    for number, row in rows:
+        if row.courant_max > COURANT * MARGIN:
+            severity = "error" if row.courant_max > 1 else "warning"
+            what = f"Before frame {number} something moved {row.courant_max:.3g} cells in a step, {COURANT:g} is safe"
+            fix = 'Set time.step = "auto".' if row.limit == "forced" else LOWER_SAFETY
+            findings.add(severity, "courant", number, what, fix, value=row.courant_max)
+    return max(row.courant_max for _, row in rows)
+
+
+def _volume(rows: list[tuple[int, LedgerRow]], facts: SceneFacts, findings: FrameFindings) -> None:
+    coherent = bool(facts.laws) and all(law in COHERENT_LAWS for law in facts.laws)
+    for number, row in rows:
+        low, high = row.volume_ratio_min, row.volume_ratio_max
+        fix = "Make the material stiffer, the domain finer, or time.safety lower."
+        if not low > 0:
+            what = f"In frame {number} a particle has no volume left: the smallest J is {low:.4g}"
+            findings.add("error", "volume", number, what, fix, value=low, kind="ledger")
+        elif low < CRUSHED:
+            what = f"In frame {number} a particle is crushed: the smallest J is {low:.4g}"
+            findings.add("warning", "volume", number, what, fix, value=low, kind="ledger")
+        if high > BLOWN_UP and coherent:
+            what = f"In frame {number} a particle is blown up: the largest J is {high:.4g}"
+            findings.add("warning", "volume", number, what, fix, value=high, kind="ledger high")
+
+
+def _steps(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> dict[str, float | None]:
+    stepped = [(number, row) for number, row in rows if row.steps > 0]
+    if not stepped:
+        return {"step_min": None, "step_max": None, "step_ratio": None}
+    first = stepped[0][1].step_max
+    for number, row in stepped:
+        if row.step_min < COLLAPSE * first:
+            what = (
+                f"Before frame {number} the step fell to {row.step_min:.3g} s, where the run began with {first:.3g} s, "
+                f'by the bound "{row.limit}"'
+            )
+            fix = "Look for what became so fast, so stiff or so deformed there."
+            findings.add("warning", "step-collapse", number, what, fix, value=row.step_min / first)
+    smallest = min(row.step_min for _, row in stepped)
+    return {
+        "step_min": smallest,
+        "step_max": max(row.step_max for _, row in stepped),
+        "step_ratio": smallest / first if first > 0 else None,
+    }

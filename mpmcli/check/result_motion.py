@@ -1,0 +1,231 @@
+"""Checks what moves between two frames: no particle outruns the solver, and momentum is kept away from the walls."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.check.result_findings import FrameFindings
+from mpmcli.check.result_ledger import LOWER_SAFETY, MARGIN
+from mpmcli.check.result_scene import SceneFacts
+from mpmcli.check.result_state import TOUCHED, extent
+from mpmcli.output.frame import Frame
+from mpmcli.stability.ledger import LedgerRow
+from mpmcli.stability.limits import DEFORMATION
+
+# On a GPU the Courant number is an estimate between measurements, and what pushes may double the speed.
+GPU_FACTOR = 2.0
+# A particle may part from what its neighbours do by this much: cells, and part of the farthest any could move.
+# Largest seen over the scenes in configs: 1.2 cells where 67 were possible.
+OUTLIER_CELLS, OUTLIER_PART = 1.0, 0.2
+NEIGHBOURS = 3
+CANDIDATES = 8
+
+
+@dataclass(frozen=True)
+class _Moment:
+    number: int
+    frame: Frame
+
+
+class MotionCheck:
+    """Checks frames in their order.
+
+    Attributes:
+        largest_ratio: largest displacement between two frames over the farthest that the ledger allows.
+        deformation: largest deformation in a step, by the velocity gradients where they are stored, else None.
+    """
+
+    def __init__(self, facts: SceneFacts, findings: FrameFindings) -> None:
+        self._facts = facts
+        self._findings = findings
+        self._before: _Moment | None = None
+        self.largest_ratio = 0.0
+        self.deformation: float | None = None
+
+    def check(self, number: int, frame: Frame, row: LedgerRow, sound: np.ndarray | None) -> None:
+        """Compare a frame with the one before it, where that is known.
+
+        Args:
+            row: of the ledger, for the steps between the two.
+            sound: which particles are finite, (n,); None for all.
+        """
+        before, self._before = self._before, _Moment(number, frame)
+        if "affine" in frame.fields and sound is None and len(frame.position) > 0:
+            self._deformation(number, frame, row)
+        if before is None or before.number + 1 != number or len(before.frame.position) != len(frame.position):
+            return
+        if len(frame.position) == 0:
+            return
+        moved = frame.position - before.frame.position
+        squares = np.einsum("ij,ij->i", moved, moved)
+        squares = np.where(np.isfinite(squares), squares, 0.0) if sound is not None else squares
+        allowed = reach(self._facts, row, frame.position.dtype)
+        p = int(np.argmax(squares))
+        farthest = float(np.sqrt(float(squares[p])))
+        if farthest == 0.0:
+            self._repeated(number, frame, before.frame, row)
+        if allowed is None:
+            return
+        ratio = farthest / allowed if allowed > 0 else (np.inf if farthest > 0 else 0.0)
+        self.largest_ratio = max(self.largest_ratio, ratio)
+        if ratio > 1:
+            body = self._facts.body_name(int(frame.body[p]))
+            what = (
+                f'Up to frame {number} particle {p} of body "{body}" moved by {farthest:.4g} m since the one before, '
+                f"where {row.steps} steps at a Courant number of {row.courant_max:.3g} reach {allowed:.4g} m"
+            )
+            self._findings.add("error", "teleported", number, what, TOUCHED, value=ratio, body=body)
+        elif sound is None:
+            self._outlier(number, frame, before.frame, row.time - before.frame.time, allowed)
+
+    def forget(self) -> None:
+        """Compare nothing with the frames so far, as the next one could not be read."""
+        self._before = None
+
+    def _deformation(self, number: int, frame: Frame, row: LedgerRow) -> None:
+        """As the limit on the step has it: |tr C| dt where a law keeps J alone, else the largest row sum of |C| dt."""
+        n, d = frame.position.shape
+        C = frame.fields["affine"].reshape(n, d, d)
+        rate = np.abs(C).sum(2).max(1)
+        if "fluid" in self._facts.laws:
+            fluid = frame.material == self._facts.laws.index("fluid")
+            rate[fluid] = np.abs(np.trace(C, axis1=1, axis2=2))[fluid]
+        p = int(np.argmax(rate))
+        deformation = float(rate[p]) * row.step_max
+        self.deformation = max(self.deformation or 0.0, deformation)
+        if deformation > DEFORMATION * MARGIN:
+            severity = "error" if deformation > 1 else "warning"
+            body = self._facts.body_name(int(frame.body[p]))
+            what = (
+                f'In frame {number} particle {p} of body "{body}" deforms by {deformation:.3g} in a step, '
+                f"{DEFORMATION:g} is safe"
+            )
+            self._findings.add(severity, "deformation", number, what, LOWER_SAFETY, value=deformation, body=body)
+
+    def _repeated(self, number: int, frame: Frame, before: Frame, row: LedgerRow) -> None:
+        """A frame that repeats the one before it, though something moves, bit for bit."""
+        speed = float(np.abs(frame.velocity).max())
+        far = speed * (row.time - before.time) > 1e3 * self._facts.place_error(frame.position.dtype)
+        if far and np.array_equal(frame.velocity, before.velocity):
+            what = f"Frame {number} repeats frame {number - 1}, though something moves at {speed:.4g} m/s"
+            self._findings.add("error", "repeated-frame", number, what, TOUCHED, value=speed)
+
+    def _outlier(self, number: int, frame: Frame, before: Frame, time: float, allowed: float) -> None:
+        """A particle that moved otherwise than its neighbours did, and than its own velocities say.
+
+        With one change of velocity on the way x1 - x0 differs from t (v0 + v1)/2 by at most t |v1 - v0|/2. Bodies that
+        bounce to and fro between two frames differ by more, but all of their particles do.
+        """
+        h = self._facts.spacing
+        if h is None:
+            return
+        own = (frame.position - before.position) - 0.5 * time * (before.velocity + frame.velocity)
+        change = frame.velocity - before.velocity
+        threshold = OUTLIER_CELLS * h + OUTLIER_PART * allowed
+        excess = np.sqrt(np.einsum("ij,ij->i", own, own))
+        excess -= 0.5 * time * np.sqrt(np.einsum("ij,ij->i", change, change))
+        candidates = np.flatnonzero(excess > threshold)
+        for p in candidates[np.argsort(excess[candidates])[::-1][:CANDIDATES]].tolist():
+            near = np.flatnonzero((np.abs(before.position - before.position[p]) < h).all(1))
+            near = near[near != p]
+            if len(near) < NEIGHBOURS:
+                continue
+            # The median: another one astray next to it must not hide it.
+            apart = float(np.linalg.norm(own[p] - np.median(own[near], axis=0)))
+            apart -= 0.5 * time * float(np.linalg.norm(change[p] - np.median(change[near], axis=0)))
+            if apart > threshold:
+                body = self._facts.body_name(int(frame.body[p]))
+                what = (
+                    f'Up to frame {number} particle {p} of body "{body}" moved since the one before by '
+                    f"{apart / h:.3g} cells more than its velocities and its neighbours account for"
+                )
+                self._findings.add("warning", "displaced", number, what, TOUCHED, value=apart / h, body=body)
+                return
+
+
+def reach(facts: SceneFacts, row: LedgerRow, stored: np.dtype) -> float | None:
+    """Return how far a particle can have moved since the frame before, m: steps times Courant number times h.
+
+    Each step rounds the position, and so does the file, whose type of positions is given. None where the ledger or
+    the header does not tell.
+    """
+    if facts.spacing is None or not np.isfinite(row.courant_max):
+        return None
+    factor = GPU_FACTOR if facts.on_gpu else 1.0
+    rounding = row.steps * facts.step_error + 2 * facts.place_error(stored)
+    return factor * row.steps * row.courant_max * facts.spacing * (1 + 1e-3) + rounding
+
+
+class MomentumCheck:
+    """Holds the momentum of the ledger against P0 + M g t, as long as no wall can have acted on it.
+
+    The momentum along an axis is kept while no particle comes near a wall normal to it, or a wall that sticks. The
+    angular momentum is kept without gravity and far from all walls.
+
+    Attributes:
+        drift: largest difference, relative to sqrt(2 M E_kin), a bound on sum m |v|; None where it was never sure.
+        frames: number of frames in which it could be checked along one axis at least.
+    """
+
+    # A particle acts on nodes up to 1.5 cells away, and the first plane of nodes of a wall is the wall itself.
+    MARGIN = 2.0
+
+    def __init__(self, facts: SceneFacts, findings: FrameFindings, first: LedgerRow) -> None:
+        self._facts = facts
+        self._findings = findings
+        self._first = first
+        self._steps = 0
+        self._kinetic = 0.0
+        self._free = np.ones(facts.dimension, bool)
+        self._distance: np.ndarray | None = None
+        self.drift: float | None = None
+        self.frames = 0
+
+    def check(self, number: int, frame: Frame, row: LedgerRow) -> None:
+        """Check the row of a frame; every frame must come, in order."""
+        facts = self._facts
+        known = facts.origin is not None and facts.gravity is not None and facts.sticking is not None
+        if not known or not self._free.any() or len(frame.position) == 0:
+            return
+        self._kinetic = max(self._kinetic, row.kinetic)
+        self._steps += row.steps
+        allowed = reach(facts, row, frame.position.dtype)
+        if number > 0:
+            near = self.MARGIN * facts.spacing
+            gone = self._distance is None or allowed is None
+            touching = np.ones(facts.dimension, bool) if gone else ~(self._distance > near + allowed)
+            self._free &= ~touching
+            # A wall that sticks acts along itself, too.
+            if (touching & np.array(facts.sticking)).any():
+                self._free[:] = False
+        lowest, highest = extent(frame.position)
+        self._distance = np.minimum(lowest - facts.origin, facts.upper - highest)
+        if number > 0 and self._free.any():
+            self._compare(number, row)
+
+    def lost(self) -> None:
+        """Trust nothing from here on: a frame could not be read, or is not finite."""
+        self._free[:] = False
+
+    def _compare(self, number: int, row: LedgerRow) -> None:
+        facts, first = self._facts, self._first
+        scale = float(np.sqrt(2 * row.mass * self._kinetic))
+        expected = np.array(first.linear_momentum) + row.mass * facts.gravity * (row.time - first.time)
+        difference = np.abs(np.array(row.linear_momentum) - expected)[self._free].max()
+        angular = 0.0
+        if not facts.gravity.any() and self._free.all():
+            turned = np.abs(np.array(row.angular_momentum) - np.array(first.angular_momentum)).max()
+            angular = float(turned) / float(np.linalg.norm(facts.upper - facts.origin))
+        if scale == 0 or not np.isfinite(scale):
+            return
+        drift = float(max(difference, angular)) / scale
+        self.frames += 1
+        self.drift = max(self.drift or 0.0, drift)
+        # Rounding may go the same way in every step.
+        if drift > 1e-3 + self._steps * facts.epsilon:
+            what = (
+                f"By frame {number} momentum has drifted by {drift:.3g} of what moves, though no wall was near and "
+                "nothing but gravity acted"
+            )
+            fix = 'Run it with solver.precision = "f64" to see whether it is rounding.'
+            self._findings.add("warning", "momentum", number, what, fix, value=drift)

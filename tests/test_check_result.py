@@ -1,0 +1,351 @@
+"""A result is called stable when nothing is wrong with it, and whatever was broken on purpose is found and placed."""
+
+import json
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+from command import run_here
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from result_copies import FORMS, SCENE, StoredRun, real_run, stored_run
+
+from mpmcli.check.finding import Finding
+from mpmcli.check.result_check import ResultCheck, check_result
+from mpmcli.output import Frame
+from mpmcli.stability.ledger import LedgerRow
+
+K = 6  # the frame that is broken
+
+
+@pytest.fixture(scope="module")
+def run() -> StoredRun:
+    return real_run()
+
+
+@pytest.fixture
+def checked(run: StoredRun, tmp_path: Path) -> Callable[..., ResultCheck]:
+    """Return `checked(frames, rows, form)`: the check of a copy with these frames and rows."""
+
+    def check(frames: list[Frame] | None = None, rows: list[LedgerRow] | None = None, form: str = "packed"):
+        return check_result(run.write(tmp_path / "copy", form, frames, rows))
+
+    return check
+
+
+def the(check: ResultCheck, rule: str) -> Finding:
+    """Return the gravest finding of a rule."""
+    found = [finding for finding in check.findings if finding.rule == rule]
+    assert found, [finding.line for finding in check.findings]
+    return found[0]
+
+
+def rules(check: ResultCheck) -> set[str]:
+    return {finding.rule for finding in check.findings}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_an_unbroken_result_is_stable_in_every_form(run, checked, form):
+    check = checked(form=form)
+    assert check.findings == () and check.verdict == "stable" and check.passes(strict=True)
+    assert (check.kind, check.status) == (form, "finished")
+    assert (check.frames, check.frames_expected, check.first_bad_frame) == (11, 11, None)
+    figures = check.figures
+    assert figures["mass_change"] == 0
+    assert figures["courant_max"] == max(row.courant_max for row in run.rows)
+    # The fastest node is at least as fast as the fastest particle, and not by much.
+    assert 0.8 < figures["displacement_ratio"] <= 1
+    total = [row.energy for row in run.rows]
+    assert figures["energy_growth"] < 1e-3 and figures["energy_lost"] * total[0] > 0
+    # Nothing but gravity acts before the drop meets the floor; rounding is relative 6e-8 a step.
+    assert figures["momentum_frames"] >= 3 and figures["momentum_drift"] < 1e-5
+
+
+def test_the_real_result_is_stable_by_its_own_name_too(run):
+    for path in (run.directory, run.directory / "particles.vtkhdf"):
+        assert check_result(path).verdict == "stable"
+
+
+@pytest.mark.slow
+def test_double_precision_is_held_to_its_own_rounding(tmp_path):
+    check = check_result(stored_run(tmp_path, 'solver.precision="f64"').directory)
+    assert check.findings == ()
+    assert check.figures["momentum_drift"] < 1e-12
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("name", ["position", "velocity", "density", "affine"])
+def test_a_nan_is_found_and_named(run, checked, name, form):
+    check = checked(run.with_value(K, name, 17, np.nan), form=form)
+    finding = the(check, "not-finite")
+    assert check.verdict == "unstable" and check.first_bad_frame == K
+    assert finding.frame == K and finding.body == "drop" and finding.value == 1
+    assert f"In frame {K} {name} is not finite" in finding.what and 'number 17 of body "drop"' in finding.what
+    assert check.limit == run.rows[K].limit
+    # Where a particle is lost nothing else is made of it.
+    assert rules(check) == {"not-finite"}
+
+
+@settings(max_examples=10)
+@given(data=st.data())
+def test_a_nan_and_a_teleport_are_found_wherever_they_are(run, data):
+    k, p = data.draw(st.integers(1, 10)), data.draw(st.integers(0, run.particles - 1))
+    name = data.draw(st.sampled_from(["position", "velocity", *run.frames[0].fields]))
+    value = data.draw(st.sampled_from([np.nan, np.inf, -np.inf]))
+    angle = data.draw(st.floats(0, 2 * np.pi))
+    place = run.frames[k].position[p] + 0.2 * np.array([np.cos(angle), np.sin(angle)], np.float32)
+    with TemporaryDirectory() as directory:
+        lost = check_result(run.patched(Path(directory) / "lost", k, name, p, value))
+        gone = check_result(run.patched(Path(directory) / "gone", k, "position", p, place))
+    assert the(lost, "not-finite").frame == lost.first_bad_frame == k
+    # At most 2 m/s for 0.02 s, and so less than 0.04 m from one frame to the next.
+    assert the(gone, "teleported").frame == gone.first_bad_frame == k
+    assert f"particle {p} of" in the(gone, "teleported").what
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_teleported_particle_is_found(run, checked, form):
+    moved = run.frames[K].position[3] + np.array([0.3, 0.0], np.float32)
+    check = checked(run.with_value(K, "position", 3, moved), form=form)
+    finding = the(check, "teleported")
+    assert check.verdict == "unstable" and check.first_bad_frame == finding.frame == K
+    assert f"Up to frame {K} particle 3" in finding.what and "in 1 more frame" in finding.what
+    row = run.rows[K]
+    assert finding.value == pytest.approx(0.3 / (row.steps * row.courant_max / 16), rel=0.2)
+
+
+def test_a_small_teleport_upwards_does_not_agree_with_the_ledger(run, checked):
+    """Lifting one of N particles by dy changes the potential energy by m g dy, which is known to 1e-9."""
+    lifted = run.frames[K].position[3] + np.array([0.0, 1e-2], np.float32)
+    check = checked(run.with_value(K, "position", 3, lifted))
+    assert the(check, "ledger").frame == check.first_bad_frame == K
+    assert "potential" in the(check, "ledger").what
+
+
+def test_a_particle_that_parts_from_its_neighbours_is_suspect(run, checked):
+    """In frames that are far apart a jump sideways may be within reach, but no neighbour makes it."""
+    far = [replace(row, courant_max=2.5 * row.courant_max) for row in run.rows]
+    moved = run.frames[K].position[3] + np.array([0.15, 0.0], np.float32)
+    check = checked(run.with_value(K, "position", 3, moved), far)
+    assert rules(check) == {"displaced"} and check.verdict == "suspect"
+    assert the(check, "displaced").frame == check.first_bad_frame == K
+    assert check.passes() and not check.passes(strict=True)
+    assert checked(rows=far).verdict == "stable"
+
+
+@pytest.mark.parametrize("place", [[1.6, 0.5], [0.0, -0.01], [-0.6, 1.2]])
+def test_an_escaped_particle_is_found(run, checked, place):
+    check = checked(run.with_value(K, "position", 9, place))
+    finding = the(check, "escaped")
+    assert finding.frame == K and "number 9" in finding.what
+    beyond = max(np.max(np.array([-0.5, 0.0]) - place), np.max(np.array(place) - [1.5, 1.0]))
+    assert finding.value == pytest.approx(beyond, rel=1e-5)
+
+
+def test_the_rounding_of_a_particle_on_a_wall_is_no_escape(run, checked):
+    on_wall = run.with_value(K, "position", 9, [np.nextafter(np.float32(1.5), np.float32(2)), 0.5])
+    assert "escaped" not in rules(checked(on_wall))
+
+
+@pytest.mark.parametrize("count", [-1, 1])
+def test_particles_that_come_or_go_are_found(run, checked, count):
+    frame = run.frames[K]
+    n = run.particles
+    rows = np.arange(n + count) % n
+    fields = {name: array[rows] for name, array in frame.fields.items()}
+    arrays = {name: getattr(frame, name)[rows] for name in ("position", "velocity", "body", "material")}
+    frames = list(run.frames)
+    frames[K] = replace(frame, **arrays, fields=fields)
+    finding = the(checked(frames), "particle-count")
+    assert finding.frame == K and finding.value == count
+
+
+def test_two_particles_in_one_place_are_found(run, checked):
+    frames = run.with_value(K, "position", 3, run.frames[K].position[4])
+    velocity = run.frames[K].velocity.copy()
+    velocity[3] = velocity[4]
+    frames[K] = replace(frames[K], velocity=velocity)
+    finding = the(checked(frames), "duplicated-particles")
+    assert finding.frame == K and "particles 3 and 4" in finding.what
+
+
+@pytest.mark.parametrize("name", ["body", "material"])
+@pytest.mark.parametrize("value", [1, 5])
+def test_labels_that_change_are_found(run, checked, name, value):
+    label = value if value == 5 else 1 - int(getattr(run.frames[0], name)[3])
+    check = checked(run.with_value(K, name, 3, label))
+    assert the(check, "label").frame == check.first_bad_frame == K
+    assert f"the {name} of particle 3 is {label}" in the(check, "label").what
+    assert len([f for f in check.findings if f.rule == "label"]) == (2 if value == 5 else 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "rule"),
+    [("mass", 1.001, "mass"), ("density", 1.001, "density"), ("volume_ratio", 1.001, "density")],
+)
+def test_a_changed_field_is_found(run, checked, name, factor, rule):
+    value = np.float32(factor) * run.frames[K].fields[name][3]
+    check = checked(run.with_value(K, name, 3, value))
+    assert the(check, rule).frame == check.first_bad_frame == K
+
+
+@pytest.mark.parametrize("component", [0, 1])
+def test_a_velocity_changed_by_a_thousandth_does_not_agree_with_the_ledger(run, checked, component):
+    velocity = run.frames[K].velocity[3].copy()
+    velocity[component] += 1e-3
+    check = checked(run.with_value(K, "velocity", 3, velocity))
+    assert rules(check) == {"ledger"} and the(check, "ledger").frame == K
+    assert f"linear_momentum along {'xy'[component]}" in the(check, "ledger").what
+
+
+def test_masses_that_are_not_stored_follow_from_the_scene(run, tmp_path):
+    """Without the field mass the sums are taken with density times volume over number, and agree as well."""
+    frames = [replace(frame, fields={}) for frame in run.frames]
+    assert check_result(run.write(tmp_path / "whole", frames=frames)).findings == ()
+    velocity = frames[K].velocity.copy()
+    velocity[3, 0] += 1e-3
+    frames[K] = replace(frames[K], velocity=velocity)
+    assert the(check_result(run.write(tmp_path / "changed", frames=frames)), "ledger").frame == K
+
+
+def test_swapped_and_repeated_contents_are_found(run, checked):
+    swapped, repeated = list(run.frames), list(run.frames)
+    numbers = {name: getattr(run.frames[K], name) for name in ("index", "time", "step")}
+    after = {name: getattr(run.frames[K + 1], name) for name in ("index", "time", "step")}
+    swapped[K], swapped[K + 1] = replace(run.frames[K + 1], **numbers), replace(run.frames[K], **after)
+    repeated[K] = replace(run.frames[K - 1], **numbers)
+    for frames, rule in ((swapped, "ledger"), (repeated, "repeated-frame")):
+        check = checked(frames)
+        assert the(check, rule).frame == check.first_bad_frame == K and check.verdict == "unstable"
+
+
+@pytest.mark.parametrize("k", [0, K])
+@pytest.mark.parametrize("form", FORMS)
+def test_a_mass_that_changes_in_the_ledger_is_found(run, checked, k, form):
+    check = checked(rows=run.with_row(k, mass=run.rows[k].mass * (1 + 1e-5)), form=form)
+    assert the(check, "mass").frame == check.first_bad_frame == k
+    assert check.figures["mass_change"] == pytest.approx(1e-5, rel=1e-6)
+
+
+@pytest.mark.parametrize(("share", "severity"), [(5e-3, None), (0.05, "warning"), (0.5, "error")])
+def test_energy_from_nowhere_is_found(run, checked, share, severity):
+    """What was turned over is the largest kinetic energy and the ranges of the others."""
+    kinetic, potential, elastic = (
+        np.array([getattr(row, name) for row in run.rows[: K + 1]]) for name in ("kinetic", "potential", "elastic")
+    )
+    lowest = min(row.energy for row in run.rows[:K])
+    turned = kinetic.max() + np.ptp(potential) + np.ptp(elastic)
+    added = share * turned + lowest - run.rows[K].energy
+    check = checked(rows=run.with_row(K, elastic=elastic[-1] + added))
+    if severity is None:
+        assert check.verdict == "stable"
+        return
+    finding = the(check, "energy")
+    assert (finding.severity, finding.frame, check.first_bad_frame) == (severity, K, K)
+    # The range of the elastic energy grows, too; and rounding has its ten-thousandth.
+    grown = turned - np.ptp(elastic) + np.ptp([*elastic[:-1], elastic[-1] + added])
+    assert finding.value == pytest.approx(share * turned / grown, rel=1e-3)
+
+
+@pytest.mark.parametrize(("courant", "severity"), [(0.5, None), (0.6, "warning"), (1.2, "error")])
+def test_steps_that_are_too_long_are_found(run, checked, courant, severity):
+    check = checked(rows=run.with_row(K, courant_max=courant))
+    found = [(f.severity, f.frame) for f in check.findings if f.rule == "courant"]
+    assert found == ([] if severity is None else [(severity, K)])
+    assert check.figures["courant_max"] == courant
+
+
+@pytest.mark.parametrize(("deformation", "severity"), [(0.5, None), (0.7, "warning"), (1.5, "error")])
+def test_particles_that_deform_too_much_in_a_step_are_found(run, checked, deformation, severity):
+    """A fluid by |tr C| dt, whatever its shear; a solid by the largest row sum of |C| dt."""
+    rate = deformation / run.rows[K].step_max
+    fluid = checked(run.with_value(K, "affine", 3, [rate, 5 * rate, 5 * rate, 0.0]))
+    solid = checked(run.with_value(K, "affine", run.particles - 1, [0.25 * rate, 0.75 * rate, 0.0, 0.0]))
+    for check in (fluid, solid):
+        assert [(f.rule, f.severity, f.frame) for f in check.findings] == (
+            [("deformation", severity, K)] if severity else []
+        )
+        assert check.figures["deformation_max"] == pytest.approx(deformation, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "severity"),
+    [(0.11, 9.0, None), (0.05, 1.0, "warning"), (-0.1, 1.0, "error"), (0.9, 20.0, "warning")],
+)
+def test_volumes_out_of_bounds_are_found(run, tmp_path, low, high, severity):
+    frames = [replace(frame, fields={}) for frame in run.frames]
+    rows = run.with_row(K, volume_ratio_min=low, volume_ratio_max=high)
+    check = check_result(run.write(tmp_path / "copy", frames=frames, rows=rows))
+    assert [(f.rule, f.severity, f.frame) for f in check.findings] == ([("volume", severity, K)] if severity else [])
+
+
+def test_a_particle_without_volume_is_named(run, checked):
+    p = run.particles - 1
+    finding = the(checked(run.with_value(K, "volume_ratio", p, -0.2)), "volume")
+    assert (finding.severity, finding.frame, finding.body) == ("error", K, "ball") and f"particle {p}" in finding.what
+
+
+def test_a_collapsed_step_and_a_ledger_without_numbers_are_found(run, checked):
+    check = checked(rows=run.with_row(K, step_min=1e-3 * run.rows[1].step_min, limit="deformation"))
+    finding = the(check, "step-collapse")
+    assert (finding.severity, finding.frame, check.limit) == ("warning", K, "deformation")
+    check = checked(rows=run.with_row(K, kinetic=float("nan")))
+    assert the(check, "ledger-not-finite").frame == K and "kinetic" in the(check, "ledger-not-finite").what
+
+
+def test_momentum_that_drifts_without_a_wall_is_found(run, checked):
+    """Before anything is near the floor the momentum is P0 + M g t."""
+    k = 2
+    push = 1e-2 * np.sqrt(2 * run.rows[k].mass * run.rows[k].kinetic)
+    momentum = (run.rows[k].linear_momentum[0] + push, run.rows[k].linear_momentum[1])
+    check = checked(rows=run.with_row(k, linear_momentum=momentum))
+    assert the(check, "momentum").frame == k
+    assert check.figures["momentum_drift"] == pytest.approx(1e-2, rel=1e-2)
+
+
+def test_it_is_told_to_programs_and_to_people(run, checked):
+    check = checked(run.with_value(K, "velocity", 3, np.nan))
+    told = json.loads(json.dumps(check.as_dict(), allow_nan=False))
+    assert (told["ok"], told["verdict"], told["first_bad_frame"]) == (False, "unstable", K)
+    assert (told["frames"], told["frames_expected"], told["limit"]) == (11, 11, run.rows[K].limit)
+    assert told["findings"][0]["rule"] == "not-finite" and told["figures"]["mass_change"] == 0
+    first, *_, last = check.text().splitlines()
+    assert first.endswith(f': unstable, first bad frame {K}, nearest limit "{run.rows[K].limit}"')
+    assert last == f"error: {check.findings[0].what} {check.findings[0].fix}"
+    for finding in check.findings:
+        for sentence in (finding.what, finding.fix):
+            assert sentence[0].isupper() and sentence.endswith(".")
+
+
+def test_a_run_that_breaks_is_unstable_and_its_diagnosis_is_repeated(tmp_path):
+    """Thirty times the speed of sound crushes the ball on the wall: the run stops by itself."""
+    scene = tmp_path / "crash.toml"
+    scene.write_text(SCENE.replace("[0.3, 0.0]", "[300.0, 0.0]").replace("end = 0.2", "end = 0.02"), encoding="utf-8")
+    outcome = run_here("simulate", scene, "-o", tmp_path / "result", "--threads", 1, "--quiet")
+    assert outcome.status == 1
+    check = check_result(tmp_path / "result")
+    record = json.loads((tmp_path / "result" / "run.json").read_text(encoding="utf-8"))
+    assert (check.verdict, check.status) == ("unstable", "unstable")
+    assert record["failure"]["message"] in the(check, "unstable-run").what + "."
+    assert the(check, "unstable-run").frame == check.frames == record["frames_written"]
+
+
+def test_memory_is_that_of_a_few_frames(run, tmp_path):
+    n, count = 20_000, 40
+    tile = np.arange(n) % run.particles
+    first = run.frames[0]
+    base = {name: getattr(first, name)[tile] for name in ("position", "velocity", "body", "material")}
+    frames = [Frame(index=k, time=0.02 * k, step=k, **base, fields={}) for k in range(count)]
+    rows = [replace(run.rows[1], time=0.02 * k, steps=min(k, 1)) for k in range(count)]
+    path = run.write(tmp_path / "long", frames=frames, rows=rows)
+    size = sum(array.nbytes for array in base.values())
+    check_result(path)
+    tracemalloc.start()
+    check_result(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 12 * size < count * size / 3

@@ -1,0 +1,286 @@
+"""A result whose files are cut off, lost, mixed up or doubled: what can be read is checked, and the rest is named."""
+
+import json
+import shutil
+from pathlib import Path
+from xml.etree import ElementTree
+
+import h5py
+import numpy as np
+import pytest
+from result_copies import StoredRun, real_run
+from test_check_result import rules, the
+
+from mpmcli.check import result_check
+from mpmcli.check.result_check import check_result
+from mpmcli.errors import InputError
+from mpmcli.output.run_record import RECORD
+from mpmcli.output.series import SERIES, SERIES_HEADER, SERIES_LEDGER, series_frame_name
+from mpmcli.output.store import PACKED, SEGMENTS, segment_name
+
+K = 6
+
+
+@pytest.fixture(scope="module")
+def run() -> StoredRun:
+    return real_run()
+
+
+@pytest.fixture
+def packed(run: StoredRun, tmp_path: Path) -> Path:
+    return shutil.copytree(run.directory, tmp_path / "packed_copy")
+
+
+@pytest.fixture
+def segments(run: StoredRun, tmp_path: Path) -> Path:
+    return run.write(tmp_path / "segments_copy", "segments")
+
+
+@pytest.fixture
+def series(run: StoredRun, tmp_path: Path) -> Path:
+    return run.write(tmp_path / "series_copy", "series")
+
+
+def cut(path: Path, part: float) -> None:
+    """Cut a file off behind this part of it."""
+    content = path.read_bytes()
+    path.write_bytes(content[: int(part * len(content))])
+
+
+def entries_of(series: Path) -> tuple[ElementTree.ElementTree, ElementTree.Element, list[ElementTree.Element]]:
+    tree = ElementTree.parse(series / SERIES)
+    collection = tree.getroot().find("Collection")
+    return tree, collection, list(collection)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.001, 0.5, 0.999])
+def test_a_packed_file_that_is_cut_off(packed, part):
+    """HDF5 refuses a file that ends before its superblock says so: no frame of it can be read."""
+    cut(packed / PACKED, part)
+    for path in (packed, packed / PACKED):
+        check = check_result(path)
+        assert rules(check) == {"unreadable"} and check.verdict == "unstable"
+        assert (check.first_bad_frame, check.frames, check.frames_expected) == (0, 0, 11)
+        assert PACKED in check.findings[0].what
+    json.dumps(check.as_dict(), allow_nan=False)
+    assert check.text().endswith(check.findings[0].line)
+
+
+def test_a_packed_file_without_its_record_is_still_known(packed):
+    (packed / RECORD).unlink()
+    check = check_result(packed)
+    assert rules(check) == {"no-record"} and check.verdict == "stable" and check.status == "unknown"
+    cut(packed / PACKED, 0.5)
+    assert the(check_result(packed / PACKED), "unreadable").frame == 0
+
+
+@pytest.mark.parametrize("part", [0.0, 0.5, 0.99])
+def test_a_segment_that_is_cut_off(segments, part):
+    cut(segments / SEGMENTS / segment_name(K), part)
+    check = check_result(segments)
+    assert rules(check) == {"unreadable"} and check.verdict == "unstable"
+    assert (check.first_bad_frame, check.frames) == (K, 10)
+    assert f"frame {K} cannot be read" in check.findings[0].what
+
+
+@pytest.mark.parametrize("gone", [(0,), (K,), (10,), (2, 3, K)])
+def test_segments_that_are_missing(segments, gone):
+    for k in gone:
+        (segments / SEGMENTS / segment_name(k)).unlink()
+    check = check_result(segments)
+    finding = the(check, "missing-frames")
+    assert rules(check) == {"missing-frames"}
+    assert finding.frame == check.first_bad_frame == gone[0] and finding.value == len(gone)
+    assert check.frames == 11 - len(gone)
+
+
+def test_a_segment_under_two_names(segments):
+    shutil.copy(segments / SEGMENTS / segment_name(K - 1), segments / SEGMENTS / segment_name(K))
+    check = check_result(segments)
+    finding = the(check, "frame-number")
+    assert finding.frame == check.first_bad_frame == K and finding.value == K - 1
+    assert "frame-time" in rules(check)
+
+
+def test_all_segments_damaged(segments):
+    for segment in (segments / SEGMENTS).iterdir():
+        segment.write_bytes(b"")
+    check = check_result(segments)
+    assert check.frames == 0 and check.first_bad_frame == 0 and check.verdict == "unstable"
+
+
+@pytest.mark.parametrize(
+    ("swaps", "rule", "frame"),
+    [
+        ({3: 4, 4: 3}, "frame-order", 3),
+        ({4: 3}, "duplicated-frames", 3),
+        ({10: 12}, "extra-frames", 11),
+    ],
+)
+def test_numbers_of_packed_frames_that_are_wrong(packed, swaps, rule, frame):
+    with h5py.File(packed / PACKED, "r+") as file:
+        numbers = file["mpmcli/frame"]
+        numbers[:] = [swaps.get(k, k) for k in numbers[:].tolist()]
+    check = check_result(packed)
+    assert the(check, rule).frame == frame and check.verdict == "unstable"
+    # Frame 10 is missing where 12 takes its place.
+    assert check.first_bad_frame == min(frame, 10)
+
+
+@pytest.mark.parametrize("time", [0.1201, 0.0801, np.nan])
+def test_a_time_that_is_wrong(packed, time):
+    with h5py.File(packed / PACKED, "r+") as file:
+        file["VTKHDF/Steps/Values"][K] = time
+    check = check_result(packed)
+    assert the(check, "frame-time").frame == check.first_bad_frame == K
+
+
+def test_a_packed_array_that_has_lost_its_last_rows(run, packed):
+    with h5py.File(packed / PACKED, "r+") as file:
+        values = file["VTKHDF/PointData/velocity"][:-5]
+        del file["VTKHDF/PointData/velocity"]
+        file["VTKHDF/PointData/velocity"] = values
+    check = check_result(packed)
+    assert rules(check) == {"unreadable"} and (check.first_bad_frame, check.frames) == (10, 10)
+    assert f"velocity has {run.particles - 5} of {run.particles} rows" in check.findings[0].what
+
+
+def test_a_run_that_is_packed_while_it_is_checked(run, segments, monkeypatch):
+    real = result_check.check_order
+
+    def packed_meanwhile(*arguments: object) -> None:
+        shutil.copy(run.directory / PACKED, segments / PACKED)
+        shutil.rmtree(segments / SEGMENTS, ignore_errors=True)
+        real(*arguments)
+
+    monkeypatch.setattr(result_check, "check_order", packed_meanwhile)
+    check = check_result(segments)
+    assert (check.kind, check.verdict) == ("packed", "stable")
+
+
+def test_ids_that_change(packed, run):
+    with h5py.File(packed / PACKED, "r+") as file:
+        ids = file["VTKHDF/PointData/id"]
+        first = K * run.particles
+        ids[first + 3], ids[first + 4] = 4, 3
+    check = check_result(packed)
+    assert the(check, "label").frame == check.first_bad_frame == K
+    assert "the id of particle 3 is 4 instead of 3, and 1 more differ" in the(check, "label").what
+
+
+def test_a_damaged_chunk_of_a_compressed_file_is_one_frame_and_not_the_whole(run, packed):
+    """Each chunk holds whole frames; one whose bytes are overwritten does not decompress."""
+    path = packed / PACKED
+    with h5py.File(path, "r+") as file:
+        values = file["VTKHDF/PointData/density"][:]
+        del file["VTKHDF/PointData/density"]
+        file["VTKHDF/PointData"].create_dataset("density", data=values, chunks=(run.particles,), compression="gzip")
+        place = file["VTKHDF/PointData/density"].id.get_chunk_info(K)
+    with path.open("r+b") as file:
+        file.seek(place.byte_offset)
+        file.write(b"\xff" * place.size)
+    check = check_result(packed)
+    assert rules(check) == {"unreadable"} and (check.first_bad_frame, check.frames) == (K, 10)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.5, 0.99])
+def test_a_frame_of_a_series_that_is_cut_off(series, part):
+    cut(series / series_frame_name(K), part)
+    check = check_result(series / SERIES)
+    assert rules(check) == {"unreadable"} and (check.first_bad_frame, check.frames) == (K, 10)
+
+
+def test_a_frame_of_a_series_that_is_gone(series):
+    (series / series_frame_name(K)).unlink()
+    check = check_result(series)
+    assert rules(check) == {"unreadable"} and (check.first_bad_frame, check.frames) == (K, 10)
+
+
+def test_frames_of_a_series_that_changed_places(series):
+    """Each file is whole, and the ledger of its place belongs to another one."""
+    one, two = series / series_frame_name(K), series / series_frame_name(K + 1)
+    content = one.read_bytes()
+    one.write_bytes(two.read_bytes())
+    two.write_bytes(content)
+    check = check_result(series)
+    assert the(check, "ledger").frame == check.first_bad_frame == K and check.verdict == "unstable"
+
+
+@pytest.mark.parametrize("change", ["left out", "twice", "swapped"])
+def test_a_list_of_a_series_that_was_changed(series, change):
+    tree, collection, entries = entries_of(series)
+    if change == "left out":
+        collection.remove(entries[K])
+    elif change == "twice":
+        collection.insert(K, entries[K - 1])
+        collection.remove(entries[-1])
+    else:
+        collection[K], collection[K + 1] = entries[K + 1], entries[K]
+    tree.write(series / SERIES)
+    check = check_result(series)
+    assert the(check, "frame-time").frame == check.first_bad_frame == K and check.verdict == "unstable"
+
+
+@pytest.mark.parametrize("name", [SERIES, SERIES_HEADER, SERIES_LEDGER])
+def test_a_table_of_a_series_that_is_cut_off(series, name):
+    cut(series / name, 0.5)
+    check = check_result(series)
+    assert check.verdict == "unstable" and check.findings[0].rule in ("unreadable", "ledger-missing")
+    assert check.first_bad_frame is not None
+
+
+def test_a_row_of_the_ledger_that_is_gone(series):
+    lines = (series / SERIES_LEDGER).read_text(encoding="utf-8").splitlines(keepends=True)
+    (series / SERIES_LEDGER).write_text("".join(lines[:-1]), encoding="utf-8")
+    check = check_result(series)
+    assert the(check, "ledger-missing").frame == 10 and check.verdict == "unstable"
+
+
+@pytest.mark.parametrize(
+    ("status", "rule", "verdict"),
+    [
+        ("running", "running", "suspect"),
+        ("interrupted", "interrupted-run", "suspect"),
+        ("failed", "failed-run", "unstable"),
+        ("unstable", "unstable-run", "unstable"),
+        ("finished", "missing-frames", "unstable"),
+    ],
+)
+def test_a_run_that_did_not_come_to_its_end(segments, status, rule, verdict):
+    for k in range(K, 11):
+        (segments / SEGMENTS / segment_name(k)).unlink()
+    record = json.loads((segments / RECORD).read_text(encoding="utf-8"))
+    record |= {"status": status, "failure": {"message": "the disk was full.", "limit": "deformation"}}
+    (segments / RECORD).write_text(json.dumps(record), encoding="utf-8")
+    check = check_result(segments / SEGMENTS)
+    assert rules(check) == {rule} and check.verdict == verdict and check.status == status
+    assert (check.first_bad_frame, check.frames, check.frames_expected) == (K, K, 11)
+    assert check.limit == "deformation"
+    assert ("the disk was full." in check.findings[0].what) == (status in ("failed", "unstable"))
+
+
+def test_a_run_that_wrote_no_frame(run, tmp_path):
+    shutil.copy(run.directory / RECORD, tmp_path / RECORD)
+    check = check_result(tmp_path)
+    assert check.verdict == "unstable" and check.frames == 0 and check.first_bad_frame == 0
+
+
+def test_what_is_no_result_is_bad_input(run, packed, series, tmp_path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.vtkhdf").write_text("notes")
+    (tmp_path / "other.pvd").write_text("<VTKFile/>")
+    with h5py.File(tmp_path / "foreign.vtkhdf", "w") as file:
+        file["x"] = np.zeros(3)
+    for name in ("missing", "empty", "notes.vtkhdf", "other.pvd", "foreign.vtkhdf"):
+        with pytest.raises(InputError):
+            check_result(tmp_path / name)
+    with pytest.raises(InputError, match=r"one frame of a series"):
+        check_result(series / series_frame_name(0))
+    with h5py.File(packed / PACKED, "r+") as file:
+        file["mpmcli"].attrs["format"] = 99
+    with pytest.raises(InputError, match="newer version"):
+        check_result(packed)
+    facts = json.loads((series / SERIES_HEADER).read_text(encoding="utf-8"))
+    (series / SERIES_HEADER).write_text(json.dumps(facts | {"format": 99}), encoding="utf-8")
+    with pytest.raises(InputError, match="newer version"):
+        check_result(series)
