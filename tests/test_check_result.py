@@ -251,7 +251,7 @@ def test_energy_from_nowhere_is_found(run, checked, share, severity):
     assert finding.value == pytest.approx(share * turned / grown, rel=1e-3)
 
 
-@pytest.mark.parametrize(("courant", "severity"), [(0.5, None), (0.6, "warning"), (1.2, "error")])
+@pytest.mark.parametrize(("courant", "severity"), [(0.5, None), (0.6, "warning"), (1.9, "warning"), (2.2, "error")])
 def test_steps_that_are_too_long_are_found(run, checked, courant, severity):
     check = checked(rows=run.with_row(K, courant_max=courant))
     found = [(f.severity, f.frame) for f in check.findings if f.rule == "courant"]

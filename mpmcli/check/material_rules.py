@@ -10,8 +10,8 @@ from mpmcli.check.finding import Finding
 LOCKING = 0.49
 # Densities further apart make the light body follow the heavy one within a step (H4).
 DENSITY_RATIO = 100.0
-# Speed over wave speed: the density of a fluid varies by its square, and 0.1 is the most that "auto" allows. Elastic
-# impacts gain 5 to 7 % of energy at 0.5, and 24 to 36 % at 5, in the solver as measured.
+# Speed over wave speed: the density of a fluid varies by its square, and 0.1 is the most that "auto" allows. A block of
+# linear fluid that hits a wall at five times its speed of sound is crushed to nothing.
 FAST, SUPERSONIC = 1 / 3, 1.0
 # Weight of the column over Young's modulus: a third is the strain under which a body is no longer the shape that was
 # drawn.
@@ -38,11 +38,11 @@ def _impact(facts: SceneFacts, body: BodyFacts, *, flowing: bool) -> Iterator[Fi
         return
     ratio = speed / body.wave_speed
     if ratio > SUPERSONIC:
-        said = "faster than its waves: impacts are shocks, which the scheme does not resolve, and make energy"
+        said = "faster than its waves: impacts are shocks, smeared over some cells, and may crush it to nothing"
     elif body.law.deformation == "J":
         said = f"{ratio:.2g} of its speed of sound: its density varies by up to {100 * ratio**2:.0f} % in smooth flow"
     else:
-        said = f"{ratio:.2g} of its wave speed: impacts crush it, and make some per cent of energy"
+        said = f"{ratio:.2g} of its wave speed: impacts crush it by about as much"
     name, value = _stiffness(body)
     yield Finding(
         "warning",
