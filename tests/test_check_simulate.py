@@ -52,6 +52,11 @@ def test_force_takes_the_step_and_the_guard_ends_the_run(unstable: Path, tmp_pat
     assert 'time.step = "auto"' in result.record["failure"]["suggestion"]
     assert result.frame_count == summary["frames"]
     assert all(row.limit == "forced" and row.step_max == pytest.approx(5e-3) for row in result.ledger[1:])
+    checked = run_here("check", tmp_path / "result", "--json")
+    found = json.loads(checked.stdout)
+    assert checked.status == 1
+    assert (found["verdict"], found["ok"], found["frames"]) == ("unstable", False, summary["frames"])
+    assert found["limit"] == "forced"
 
 
 def test_warnings_are_told_in_one_line_each_and_recorded(tmp_path: Path) -> None:
@@ -62,3 +67,6 @@ def test_warnings_are_told_in_one_line_each_and_recorded(tmp_path: Path) -> None
     told = [line for line in outcome.stderr.splitlines() if line.startswith("warning: ")]
     assert len(told) == 1 and "step" in told[0]
     assert told[0] in open_result(tmp_path / "result").record["notes"]
+    checked = run_here("check", tmp_path / "result" / "particles.vtkhdf")
+    assert (checked.status, checked.stdout) == (0, "")
+    assert "stable" in checked.stderr

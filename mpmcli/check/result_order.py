@@ -91,8 +91,8 @@ def _status(opened: OpenedResult, expected: int | None, findings: FrameFindings)
     message = ((record.get("failure") or {}).get("message") or "").rstrip(".")
     said = f": {message}" if message else ""
     if status == "unstable":
-        what, fix = f"The run became unstable after {far}{said}", "Change what the sentence names and run it again."
-        findings.add("error", "unstable-run", count, what, fix)
+        fix = "Change what the sentence names and run it again."
+        findings.add("error", "unstable-run", count, f"After {far} {message or 'the run became unstable'}", fix)
     elif status == "failed":
         findings.add("error", "failed-run", count, f"The run failed after {far}{said}", "Run it again.")
     elif status == "interrupted":
