@@ -36,12 +36,14 @@ def soft_block() -> Scene:
 
 def fall(backend: Backend) -> dict:
     """Return the fall, the speed and the largest Courant number of the block."""
-    (first, _), (last, row) = Solver(soft_block(), backend).frames()
+    solver = Solver(soft_block(), backend)
+    (first, _), (last, row) = solver.frames()
     return {
         "fallen": float((first.position - last.position)[:, 1].mean()),
         "speeds": [float(v) for v in (last.velocity[:, 1].min(), last.velocity[:, 1].max())],
         "courant": float(row.courant_max),
         "step_max": float(row.step_max),
+        "last": solver._last_step,
     }
 
 

@@ -1,6 +1,6 @@
 """One MLS-MPM step in plain numpy, one particle and one node at a time, from the published formulas.
 
-It shares no code with the solver: Hu et al. (2018) for the scatter with A = m C - dt V0 (4/h^2) tau,
+It shares no code with the solver: Hu et al. (2018) for the scatter with A = m C - kick V0 (4/h^2) tau,
 Jiang et al. (2015) for the gather, and the fold of ghost nodes at a wall (verification: 1.4).
 """
 
@@ -59,7 +59,7 @@ def stencil_of(x: np.ndarray, h: float) -> list[tuple[tuple[int, ...], float, np
     return found
 
 
-def scatter(groups: Sequence[Particles], box: Box, dt: float) -> tuple[np.ndarray, np.ndarray]:
+def scatter(groups: Sequence[Particles], box: Box, kick: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the momentum (..., d) and the mass of every node, MARGIN ghost nodes beyond each wall included."""
     shape = tuple(n + 1 + 2 * MARGIN for n in box.cells)
     momentum = np.zeros((*shape, len(shape)))
@@ -67,7 +67,7 @@ def scatter(groups: Sequence[Particles], box: Box, dt: float) -> tuple[np.ndarra
     for group in groups:
         for p, x in enumerate(group.x):
             tau = group.stress(group.deformation[p], p)
-            A = group.mass[p] * group.C[p] - dt * group.volume[p] * 4 / box.spacing**2 * tau
+            A = group.mass[p] * group.C[p] - kick * group.volume[p] * 4 / box.spacing**2 * tau
             for node, w, lever in stencil_of(x, box.spacing):
                 at = tuple(i + MARGIN for i in node)
                 momentum[at] += w * (group.mass[p] * group.v[p] + A @ lever)
@@ -75,7 +75,7 @@ def scatter(groups: Sequence[Particles], box: Box, dt: float) -> tuple[np.ndarra
     return momentum, mass
 
 
-def update(momentum: np.ndarray, mass: np.ndarray, box: Box, dt: float) -> np.ndarray:
+def update(momentum: np.ndarray, mass: np.ndarray, box: Box, kick: float) -> np.ndarray:
     """Return the velocity of every node, with gravity and the walls.
 
     A node and its images in the faces that act on it share their momenta, the images' mirrored; on the
@@ -84,7 +84,7 @@ def update(momentum: np.ndarray, mass: np.ndarray, box: Box, dt: float) -> np.nd
     the images of that plane in the faces that never let go included.
     """
     d = len(box.cells)
-    g = dt * box.gravity
+    g = kick * box.gravity
     raw_momentum, raw_mass = momentum, mass
     velocity = np.zeros_like(momentum)
 
@@ -180,12 +180,6 @@ def gather(groups: Sequence[Particles], velocity: np.ndarray, box: Box, dt: floa
         x = np.clip(group.x + dt * v, 0, np.array(box.cells) * box.spacing)
         moved.append(replace(group, x=x, v=v, C=C, deformation=deformation))
     return moved
-
-
-def step(groups: Sequence[Particles], box: Box, dt: float) -> list[Particles]:
-    """Return the particles of every group after one step."""
-    momentum, mass = scatter(groups, box, dt)
-    return gather(groups, update(momentum, mass, box, dt), box, dt)
 
 
 def fluid_stress(bulk_modulus: np.ndarray, dimension: int) -> Callable[[np.ndarray, int], np.ndarray]:

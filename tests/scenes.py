@@ -98,7 +98,7 @@ def restart(solver: Solver, sample: BodyParticles, end: float) -> None:
         values.fill(variable.at_rest)
     group.id.from_numpy(np.arange(group.count, dtype=np.int32))
     solver.scene = solver.scene.model_copy(update={"time": solver.scene.time.model_copy(update={"end": end})})
-    solver.time, solver.step_count = 0.0, 0
+    solver.time, solver.step_count, solver._last_step = 0.0, 0, 0.0
     # What only a new Solver sets: no particle is lost.
     solver._kernels.lost.fill(NOT_LOST)
     solver.state_was_replaced()

@@ -81,8 +81,9 @@ class TestOurs:
         """The same physics: from the same block, before a wall is in reach, both give the same positions.
 
         Both take tau = E (J - 1), J by 1 + dt tr C and x by dt v, so in f64 only round-off differs:
-        20 steps of 1e-16, grown a little by the compression of randomly placed particles. And both fall:
-        after n symplectic Euler steps the mean is at y0 - V n dt - g dt^2 n (n + 1) / 2.
+        20 steps of 1e-16, grown a little by the compression of randomly placed particles. And both fall: after n
+        steps of the peer's symplectic Euler, which begins with a whole step of gravity where leapfrog begins with half
+        a step, the mean is at y0 - V n dt - g dt^2 n (n + 1) / 2. Ours is told that a step has gone before.
         """
         steps = 20
         for module, name in (("ours", "falling_block"), ("peers", "Peer")):
@@ -91,6 +92,8 @@ import numpy as np
 from mpmcli.bench.cases import BenchCase
 from mpmcli.bench.{module} import {name}
 side = {name}({case!r}, threads=1, precision="f64", arch="cpu")
+if "{module}" == "ours":
+    side._solver._last_step = {case.step}
 for _ in range({steps}):
     side.step()
 side.sync()

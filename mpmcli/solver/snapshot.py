@@ -133,8 +133,8 @@ def measure(
 ) -> dict[str, float | tuple[float, ...]]:
     """Sum what a run conserves; the affine velocity carries energy and angular momentum too (Jiang et al. 2017).
 
-    Symplectic Euler has its velocities half a step dt (s) before its positions. All energies are taken there, where
-    their sum is second order in the step; with the positions as they are it would swing by v dt/2 times the force.
+    Leapfrog has its velocities half a step dt (s) before its positions. All energies are taken there, where their sum
+    is second order in the step; with the positions as they are it would swing by v dt/2 times the force.
 
     Returns:
         The entries of a `LedgerRow` that belong to the state alone, by name, summed in float64.

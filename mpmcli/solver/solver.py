@@ -193,7 +193,10 @@ class Solver:
                 sort()
             self._kernels.find_box()
             self._drift = 0.0
-        fastest = self._kernels.step(dt)
+        # Velocities live in the middle of steps: they move on from that of the last one to that of this one, at the
+        # start by half a step. A kick longer than dt / safety^2 might be unstable: kick dt <= (dt / safety)^2.
+        kick = min(0.5 * (self._last_step + dt), dt / self.scene.time.safety**2)
+        fastest = self._kernels.step(dt, kick)
         self.time += dt
         self._last_step = dt
         self.step_count += 1
@@ -205,7 +208,7 @@ class Solver:
             self._speed = float(fastest)
         else:
             # Not read back: what is known of it is gravity.
-            self._speed += dt * self._pull
+            self._speed += kick * self._pull
         self.courant = dt * self._speed / self.spacing
         # Whatever else pushes on a GPU is allowed to double the speed; `advance` flags what went further.
         unseen = 2 * self.courant + UNSEEN if fastest is None else 0.0

@@ -23,15 +23,16 @@ class StepKernels:
     """Compiled steps.
 
     Attributes:
-        step: (dt) -> largest speed of a node, m/s, which no particle exceeds. On a GPU it is not read
-            back, and None.
+        step: (dt, kick) -> largest speed of a node, m/s, which no particle exceeds. Positions move on by dt, s,
+            velocities by kick, s: from the middle of the last step to the middle of this one (leapfrog). On a GPU the
+            speed is not read back, and None.
         find_box: set the grid's box in use from the sorted tiles.
         lost: per group, the first particle (in solver order) that left the domain, inverted or became
             non-finite, or NOT_LOST.
         any_lost: () -> whether there is one.
     """
 
-    step: Callable[[float], float | None]
+    step: Callable[[float, float], float | None]
     find_box: Callable[[], None]
     lost: ti.Field
     any_lost: Callable[[], bool]
@@ -109,10 +110,10 @@ def build_step(
             ti.atomic_min(lost[g], p)
 
     @ti.func
-    def spread_one(g: ti.template(), group: ti.template(), p: int, dt: float, atomic: ti.template()):
+    def spread_one(g: ti.template(), group: ti.template(), p: int, kick: float, atomic: ti.template()):
         """Scatter one particle, unless it is crushed or inverted: its stress would spread NaN over the grid."""
         if volume_ratio(group, group.stored(p)) > SMALLEST_J:
-            scatter(group, grid, p, dt, atomic)
+            scatter(group, grid, p, kick, atomic)
         else:
             ti.atomic_min(lost[g], p)
 
@@ -135,14 +136,14 @@ def build_step(
         return speed_squared
 
     @ti.func
-    def gravity_of(dt: float):
+    def gravity_of(kick: float):
         result = ti.Vector.zero(float, d)
         for a in ti.static(range(d)):
-            result[a] = dt * ti.static(gravity[a])
+            result[a] = kick * ti.static(gravity[a])
         return result
 
     @ti.kernel
-    def spread(half: int, dt: float):
+    def spread(half: int, kick: float):
         """Scatter two colours, after clearing the grid for the first two.
 
         Four colours written out in one kernel would double the compile time of 3D scenes.
@@ -164,20 +165,20 @@ def build_step(
                         for r in range(order.work[colour, t], order.work[colour, t + 1]):
                             first = order.pencil_start(colour, r)
                             for p in range(order.start[first], order.start[first + order.pencil]):
-                                spread_one(g, group, p, dt, False)
+                                spread_one(g, group, p, kick, False)
 
     @ti.kernel
-    def collect(dt: float) -> float:
+    def collect(dt: float, kick: float) -> float:
         """Update the grid, gather, and return the largest speed of a node, or -1 where a particle was lost."""
         fastest[None] = 0.0
         if ti.static(len(walls.separating) > 0):
             for q in range(walls.plane_nodes(grid)):
-                walls.find_contact(grid, q, gravity_of(dt))
+                walls.find_contact(grid, q, gravity_of(kick))
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
                 t = q // CHUNK
                 rows = grid.row_count()
-                gravity_step = gravity_of(dt)
+                gravity_step = gravity_of(kick)
                 speed_squared = 0.0
                 for row in range(share_start(rows, t, threads), share_start(rows, t + 1, threads)):
                     node = grid.row_start(row)
@@ -195,24 +196,24 @@ def build_step(
                 result = -1.0
         return result
 
-    def step_cpu(dt: float) -> float:
+    def step_cpu(dt: float, kick: float) -> float:
         for half in range(orders[0].colours // 2):
-            spread(half, dt)
-        return collect(dt)
+            spread(half, kick)
+        return collect(dt, kick)
 
     @ti.kernel
-    def step_gpu(dt: float):
+    def step_gpu(dt: float, kick: float):
         for q in range(grid.box_nodes()):
             grid.nodes[grid.first_node(grid.box_node(q))] = ti.Vector.zero(float, grid.width)
         for g, group, _order in ti.static(pairs):
             for p in range(group.count):
-                spread_one(g, group, p, dt, True)
+                spread_one(g, group, p, kick, True)
         if ti.static(len(walls.separating) > 0):
             for q in range(walls.plane_nodes(grid)):
-                walls.find_contact(grid, q, gravity_of(dt))
+                walls.find_contact(grid, q, gravity_of(kick))
         for q in range(grid.box_nodes()):
             node = grid.box_node(q)
-            update_node(node, grid.first_node(node), gravity_of(dt))
+            update_node(node, grid.first_node(node), gravity_of(kick))
         for g, group, _order in ti.static(pairs):
             for p in range(group.count):
                 advance(g, group, p, dt)

@@ -13,7 +13,7 @@ from mpmcli.solver.particles import MASS, VOLUME
 
 
 @ti.func
-def scatter(group: ti.template(), grid: ti.template(), p: int, dt: float, atomic: ti.template()):
+def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float, atomic: ti.template()):
     """Add the mass and the momentum of particle p, stress included, to the nodes around it.
 
     A law with plastic flow returns the particle's state to what it can bear first.
@@ -26,7 +26,7 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, dt: float, atomic
     row = group.row(p)
     mass = row[MASS]
     v, C = group.motion(p)
-    stress, _, deformation, inner = group.law.respond(group.stored(p), group.inner(p), C, dt, group.constants(p))
+    stress, _, deformation, inner = group.law.respond(group.stored(p), group.inner(p), C, kick, group.constants(p))
     if ti.static(group.law.projects):
         group.store(p, deformation, inner)
     base, distance = stencil(group.x[p], 1 / h)
@@ -35,7 +35,7 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, dt: float, atomic
     # Momentum and mass that the middle node would take, and their change per cell along each axis.
     middle = ti.Vector.zero(float, grid.width)
     change = ti.Matrix.zero(float, d, grid.width)
-    stress_scale = dt * row[VOLUME] * (4 / h)
+    stress_scale = kick * row[VOLUME] * (4 / h)
     for c in ti.static(range(d)):
         middle[c] = mass * v[c]
         for a in ti.static(range(d)):

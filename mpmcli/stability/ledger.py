@@ -23,6 +23,8 @@ class LedgerRow:
         linear_momentum: sum m v, kg m/s, one number per axis.
         angular_momentum: sum m x cross v + m h^2/4 axl(C) about the origin of the domain,
             kg m^2/s, one number in 2D and three in 3D.
+
+    Velocities are those of the middle of the last step before `time`.
     """
 
     time: float

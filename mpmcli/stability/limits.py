@@ -1,6 +1,6 @@
 """Closed-form bounds on the time step, one function per bound (verification: 10.1).
 
-For MLS-MPM with APIC, quadratic B-splines and symplectic Euler. The wave bound is exact for an isolated
+For MLS-MPM with APIC, quadratic B-splines and leapfrog. The wave bound is exact for an isolated
 particle, which is the least stable configuration: particles that share nodes allow 1.0 to 1.4 times more.
 """
 
