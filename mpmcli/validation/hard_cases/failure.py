@@ -1,0 +1,94 @@
+"""States that are not finite, set on purpose: how soon the run stops, and whom it names."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError
+from mpmcli.solver.particles import ParticleGroup
+from mpmcli.validation.hard_cases.case import HardCase, Outcome
+from mpmcli.validation.hard_cases.setting import block, scene, start
+
+H = 0.1
+PARTICLE = 7
+
+
+def poison_deformation(group: ParticleGroup, place: int) -> None:
+    """Set J of one particle to NaN."""
+    values = group.deformation_to_numpy()
+    values[place] = np.nan
+    group.set_deformation(values)
+
+
+def poison_velocity(group: ParticleGroup, place: int) -> None:
+    """Set the velocity of one particle to NaN."""
+    v, C = group.motion_to_numpy()
+    v[place] = np.nan
+    group.set_motion(v, C)
+
+
+def poison_affine(group: ParticleGroup, place: int) -> None:
+    """Set the affine velocity of one particle to infinity."""
+    v, C = group.motion_to_numpy()
+    C[place] = np.inf
+    group.set_motion(v, C)
+
+
+POISONS: dict[str, Callable[[ParticleGroup, int], None]] = {
+    "J": poison_deformation,
+    "v": poison_velocity,
+    "C": poison_affine,
+}
+
+
+def stop_after(poison: Callable[[ParticleGroup, int], None]) -> tuple[Diagnosis | None, int]:
+    """Return the diagnosis of a run of two bodies that is poisoned after 20 steps, and the step then."""
+    water = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e4}
+    bodies = [
+        block("drop", water, [0.2] * 2, [0.6] * 2, velocity=[0.1, 0.1]),
+        block("second drop", {**water, "density": 700.0}, [1.0] * 2, [1.4] * 2, velocity=[-0.1, 0.1]),
+    ]
+    solver = start(scene(bodies, [16, 16], H))
+    for _ in range(20):
+        solver.step(1e-3)
+    group = solver.groups[0]
+    # The particles of the first body are those with the smallest ids.
+    first = 64
+    poison(group, int(np.flatnonzero(group.id.to_numpy() == first + PARTICLE)[0]))
+    began = solver.step_count
+    try:
+        for _ in range(20):
+            solver.step(1e-3)
+    except UnstableRunError as error:
+        return error.diagnosis, began
+    return None, began
+
+
+def named() -> Outcome:
+    """H23: NaN in J and v and infinity in C of one particle of the second of two bodies."""
+    right, said = True, []
+    for name, poison in POISONS.items():
+        found, began = stop_after(poison)
+        if found is None:
+            right = False
+            said.append(f"{name}: the run goes on")
+            continue
+        # What a velocity does reaches its neighbours within the same step.
+        exact = found.particle == 64 + PARTICLE
+        steps = found.step - began
+        right = right and steps <= 1 and found.body == "second drop" and (exact or name != "J")
+        who = "the particle" if exact else "a neighbour"
+        said.append(f'{name}: {who} of "{found.body}" {found.cause}, {steps} step later')
+    return Outcome(right, "stops within one step, with the name" if right else "not as asked", "; ".join(said) + ".")
+
+
+CASES = [
+    HardCase(
+        "H23",
+        "a NaN appears",
+        "J or v of a particle of the second of two bodies is set to NaN, or its C to infinity",
+        "stops within one step, with step, particle and body",
+        True,
+        named,
+    ),
+]

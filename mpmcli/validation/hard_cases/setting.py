@@ -1,0 +1,120 @@
+"""Set-ups that the hard cases share: scenes in few words, runs of them, and what is read from a solver."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.materials.registry import parameter_models
+from mpmcli.output.frame import Frame
+from mpmcli.scene import BodyParticles, Scene, parse_scene
+from mpmcli.solver.backend import start_backend, stop_backend
+from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.solver import Solver
+from mpmcli.stability.ledger import LedgerRow
+
+GRAVITY = 9.81
+
+
+def block(name: str, material: dict, low: Sequence[float], high: Sequence[float], **more: object) -> dict:
+    """Return the table of a body that is a box."""
+    box = {"min": [float(x) for x in low], "max": [float(x) for x in high]}
+    return {"name": name, "material": material, "shape": {"box": box}, **more}
+
+
+def scene(
+    bodies: Sequence[dict],
+    cells: Sequence[int],
+    spacing: float,
+    *,
+    end: float = 1.0,
+    frames: int = 1,
+    gravity: float = 0.0,
+    walls: object = "separate",
+    precision: str = "f32",
+    origin: float = 0.0,
+    fields: Sequence[str] = ("velocity", "volume_ratio", "affine"),
+) -> Scene:
+    """Return a scene on so many cells, with gravity (m/s^2) downwards and the lower corner at `origin` on each axis."""
+    d = len(cells)
+    return parse_scene(
+        {
+            "domain": {
+                "size": [n * spacing for n in cells],
+                "spacing": spacing,
+                "walls": walls,
+                "gravity": [0.0] * (d - 1) + [-gravity],
+                "origin": [origin] * d,
+            },
+            "time": {"end": float(end), "frames": frames},
+            "output": {"fields": list(fields)},
+            "solver": {"precision": precision},
+            "bodies": list(bodies),
+        },
+        laws=parameter_models(),
+    ).scene
+
+
+def start(asked: Scene, particles: list[BodyParticles] | None = None) -> Solver:
+    """Return a solver on a backend of its own, one thread of the CPU; earlier solvers die."""
+    stop_backend()
+    return Solver(asked, start_backend("cpu", 1, asked.solver.precision), particles)
+
+
+def look(solver: Solver) -> tuple[Frame, LedgerRow]:
+    """Return the state of a solver at this moment."""
+    return solver.frame(0, [])
+
+
+def sound(frame: Frame, row: LedgerRow) -> bool:
+    """Return whether every number of a frame is finite."""
+    arrays = [frame.position, frame.velocity, *frame.fields.values()]
+    return all(np.isfinite(values).all() for values in arrays) and bool(np.isfinite(row.energy))
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run to its end, or to the error that stopped it: all frames, their ledger rows, and whether all are finite."""
+
+    frames: list[Frame]
+    rows: list[LedgerRow]
+    sound: bool
+    stopped: UnstableRunError | None
+
+    @property
+    def energy(self) -> np.ndarray:
+        """Total energy of each frame, J."""
+        return np.array([row.energy for row in self.rows])
+
+    @property
+    def ratios(self) -> tuple[float, float]:
+        """Smallest and largest volume ratio of the run."""
+        return min(row.volume_ratio_min for row in self.rows), max(row.volume_ratio_max for row in self.rows)
+
+    @property
+    def last(self) -> Frame:
+        """The last frame."""
+        return self.frames[-1]
+
+
+def run(solver: Solver) -> Run:
+    """Run a solver to its end."""
+    frames, rows, fine, stopped = [], [], True, None
+    try:
+        for frame, row in solver.frames():
+            frames.append(frame)
+            rows.append(row)
+            fine = fine and sound(frame, row)
+    except UnstableRunError as error:
+        stopped = error
+    return Run(frames, rows, fine, stopped)
+
+
+def growth(energy: np.ndarray) -> float:
+    """Return the largest rise of an energy above what it was at any time before."""
+    return float((energy - np.minimum.accumulate(energy)).max())
+
+
+def nearest(position: np.ndarray) -> np.ndarray:
+    """Return the distance from each particle to its nearest neighbour, (n,); for some thousands of particles."""
+    return np.array([np.sort(((position - x) ** 2).sum(1))[1] for x in position]) ** 0.5
