@@ -9,6 +9,7 @@ import numpy as np
 import taichi as ti
 
 from mpmcli.boundaries.walls import Walls
+from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
 from mpmcli.output.frame import Frame
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
@@ -69,6 +70,9 @@ class Solver:
         Args:
             particles: one entry per body, in place of the scene's own sampling.
             force: take time.step as it is, above the stable step too.
+
+        Raises:
+            InputError: a particle is not in the domain.
         """
         self.scene = scene
         self.backend = backend
@@ -91,6 +95,8 @@ class Solver:
         self._names = tuple(body.name for body in scene.bodies)
 
         particles = particles or sample_bodies(scene)
+        for sample in particles:
+            _require_inside(sample, self._origin, np.array(scene.domain.upper))
         self.particle_count = sum(len(b.position) for b in particles)
         first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
         self.laws = tuple(sorted({body.material.law for body in scene.bodies}))
@@ -379,3 +385,15 @@ class Solver:
         )
         self.frame_seconds += time.perf_counter() - began
         return frame, row
+
+
+def _require_inside(sample: BodyParticles, lower: np.ndarray, upper: np.ndarray) -> None:
+    """Refuse particles beyond the domain, or nowhere: the sort would count them in a tile that does not exist."""
+    inside = ((sample.position >= lower) & (sample.position <= upper)).all(axis=1)
+    if not inside.all():
+        p = int(np.argmin(inside))
+        place, low, high = (", ".join(f"{x:.6g}" for x in point) for point in (sample.position[p], lower, upper))
+        raise InputError(
+            f'particle {p} of body "{sample.name}" lies at ({place}) m, outside the domain from ({low}) to ({high}) m; '
+            "every particle must begin inside it."
+        )
