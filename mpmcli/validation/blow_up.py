@@ -1,0 +1,217 @@
+"""Measures the step at which a scene blows up, and sets it against the bound that the solver predicts."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import BodyParticles, Scene, parse_scene
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.solver import Solver
+from mpmcli.solver.step import NOT_LOST
+from mpmcli.stability.limits import Limit
+from mpmcli.validation.blow_up_scenes import SPACING, BlowUpScene
+
+# Size of the perturbation, in cells per predicted step: growth is seen long before anything is nonlinear.
+AMPLITUDE = 1e-7
+# By how much the energy of a perturbation must grow, and by how much that of a deformed start.
+GROWTH, STORED_GROWTH = 1e6, 100.0
+# Steps between two readings at most; the first ones are as close as the growth of a strong instability needs.
+MOST_UNREAD = 100
+# Steps of one trial, and the relative width at which a bisection stops.
+TRIAL_STEPS, WIDTH = 3000, 0.004
+# Ratios at which a bisection gives up looking for stability below and for a blow-up above.
+LEAST_RATIO, MOST_RATIO = 0.2, 4.0
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run of a fixed step did.
+
+    Attributes:
+        steps: taken.
+        blew_up: whether the energy grew beyond all bounds, or the solver stopped.
+        largest: kinetic energy about the mean motion, the largest over what the start holds, kinetic or stored.
+        late: the largest in the last tenth of the run over the largest in the fifth tenth.
+    """
+
+    steps: int
+    blew_up: bool
+    largest: float
+    late: float
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One row of the study.
+
+    Attributes:
+        scene: what was run; particles: how many.
+        predicted: the solver's own bound, safety 1, s; limit: its name.
+        ratio: step of the blow-up over the predicted one, inf where none was found up to MOST_RATIO.
+        below: the run at 0.98 of the predicted step; above: the one at 1.02.
+    """
+
+    scene: BlowUpScene
+    particles: int
+    predicted: float
+    limit: str
+    ratio: float
+    below: Run
+    above: Run
+
+
+class Trial:
+    """A scene that can be run again and again with steps of any size: its kernels stay compiled."""
+
+    def __init__(self, scene: BlowUpScene, backend: Backend) -> None:
+        self.scene = scene
+        self.dimension = d = scene.position.shape[1]
+        self.count = n = len(scene.position)
+        density = scene.material["density"]
+        body = BodyParticles(
+            "body",
+            scene.position,
+            np.tile(scene.velocity, (n, 1)),
+            np.zeros((n, d, d)),
+            scene.volume,
+            density * scene.volume,
+        )
+        self.solver = Solver(_scene_of(scene), backend, [body])
+        self.predicted = math.inf
+        self._start(0.0)
+        # What `check` prints: of speeds and of the deformation per step nothing is asked here.
+        self.limit: Limit = min(limit for limit in self.solver.limits() if limit.name in ("wave", "viscosity"))
+        self.predicted = self.limit.value
+
+    def _start(self, amplitude: float) -> None:
+        """Put every particle where it began, with a seeded perturbation of v and of C."""
+        n, d, scene = self.count, self.dimension, self.scene
+        group = self.solver.groups[0]
+        random = np.random.default_rng(0)
+        noise = amplitude * SPACING / self.predicted
+        group.x.from_numpy(scene.position.astype(group.real))
+        group.set_motion(
+            scene.velocity + noise * random.standard_normal((n, d)), noise / SPACING * random.standard_normal((n, d, d))
+        )
+        F = np.diag(scene.stretches)
+        group.set_deformation(np.full(n, np.linalg.det(F)) if group.law.deformation == "J" else np.tile(F, (n, 1, 1)))
+        for variable, values in zip(group.law.internal, group.internal, strict=True):
+            values.fill(scene.internal.get(variable.name, variable.at_rest))
+        group.id.from_numpy(np.arange(n, dtype=np.int32))
+        # What only a new Solver sets: no particle is lost. Its kernels would be compiled once more.
+        self.solver._kernels.lost.fill(NOT_LOST)
+        self.solver.state_was_replaced()
+
+    def kinetic_energy(self) -> float:
+        """Return sum |v - mean v|^2 + h^2/4 |C|^2, m^2/s^2: twice the energy per particle's mass."""
+        v, C = self.solver.groups[0].motion_to_numpy()
+        v = v - v.mean(axis=0)
+        return float((v * v).sum() + SPACING**2 / 4 * (C * C).sum())
+
+    def _stored_energy(self) -> float:
+        """Return what a deformed start holds beside the perturbation, in the units of `kinetic_energy`."""
+        if (self.scene.stretches == 1).all():
+            return 0.0
+        row = self.solver.frame(0, [])[1]
+        return 2 * row.elastic / (self.scene.material["density"] * self.scene.volume)
+
+    def run(self, dt: float, steps: int) -> Run:
+        """Run at a fixed step dt, s, until it blows up or `steps` are taken."""
+        self._start(AMPLITUDE)
+        first = self.kinetic_energy()
+        stored = self._stored_energy()
+        deformed = stored > first
+        held = stored if deformed else first
+        bound = held * (STORED_GROWTH if deformed else GROWTH)
+        taken, largest = 0, first / held
+        fifth, last = 0.0, 0.0
+        try:
+            while taken < steps:
+                # A fraction of the steps taken: a growth per step that shows at all multiplies by little in between.
+                gap = max(1, min(taken // 8, MOST_UNREAD, steps - taken))
+                for _ in range(gap):
+                    self.solver.step(dt)
+                taken += gap
+                energy = self.kinetic_energy()
+                largest = max(largest, energy / held)
+                if not energy < bound:
+                    return Run(taken, True, largest, math.inf)
+                if 0.4 * steps < taken <= 0.5 * steps:
+                    fifth = max(fifth, energy)
+                elif taken > 0.9 * steps:
+                    last = max(last, energy)
+                self._shift_back()
+        except UnstableRunError:
+            return Run(taken, True, math.inf, math.inf)
+        # What has decayed to round-off may double.
+        floor = 1e-9 * held
+        return Run(taken, False, largest, max(last, floor) / max(fifth, floor))
+
+    def _shift_back(self) -> None:
+        """Move a travelling body back by whole cells, so that it never leaves the domain."""
+        if not self.scene.velocity.any():
+            return
+        group = self.solver.groups[0]
+        x = group.x.to_numpy()
+        cells = np.round((x - self.scene.position.mean(axis=0)).mean(axis=0) / SPACING)
+        if cells.any():
+            group.x.from_numpy(x - cells * SPACING)
+            self.solver.state_was_replaced()
+
+    def blow_up_ratio(self, steps: int = TRIAL_STEPS) -> float:
+        """Bisect the step between stable and unstable over so many steps; return it over the predicted one.
+
+        The search goes out from the predicted step by tenths, so that the boundary nearest to it is found.
+        Returns 0 or inf where everything down to LEAST_RATIO or up to MOST_RATIO is unstable or stable.
+        """
+
+        def unstable(ratio: float) -> bool:
+            return self.run(ratio * self.predicted, steps).blew_up
+
+        low = high = 1.0
+        if unstable(1.0):
+            while unstable(low):
+                low, high = low / 1.1, low
+                if low < LEAST_RATIO:
+                    return 0.0
+        else:
+            while not unstable(high):
+                low, high = high, high * 1.1
+                if high > MOST_RATIO:
+                    return math.inf
+        while high - low > WIDTH * low:
+            middle = (low + high) / 2
+            low, high = (low, middle) if unstable(middle) else (middle, high)
+        return (low + high) / 2
+
+
+def _scene_of(scene: BlowUpScene) -> Scene:
+    """Return the scene: one body whose particles are given, in a box with slip walls, without gravity."""
+    d = scene.position.shape[1]
+    box = {"min": [0.0] * d, "max": [SPACING] * d}
+    return parse_scene(
+        {
+            "domain": {"size": [n * SPACING for n in scene.cells], "spacing": SPACING, "walls": "slip"},
+            "time": {"end": 1.0, "frames": 1},
+            "solver": {"precision": "f64"},
+            "bodies": [{"name": "body", "material": scene.material, "shape": {"box": box}}],
+        },
+        laws=parameter_models(),
+    ).scene
+
+
+def measure_scene(scene: BlowUpScene, backend: Backend, long_steps: int) -> Measured:
+    """Bisect one scene, and run it at 0.98 of its predicted step for `long_steps` and at 1.02 for TRIAL_STEPS."""
+    trial = Trial(scene, backend)
+    return Measured(
+        scene,
+        trial.count,
+        trial.predicted,
+        trial.limit.name,
+        trial.blow_up_ratio(),
+        trial.run(0.98 * trial.predicted, long_steps),
+        trial.run(1.02 * trial.predicted, TRIAL_STEPS),
+    )
