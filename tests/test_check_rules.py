@@ -222,7 +222,9 @@ def test_a_full_disk_and_too_little_memory(monkeypatch: pytest.MonkeyPatch) -> N
     checked = check()
     need = checked.forecast.file_bytes
     for free, fires in ((2 * need - 1, True), (2 * need, False)):
-        monkeypatch.setattr(shutil, "disk_usage", lambda _path, free=free: SimpleNamespace(free=free))
+        monkeypatch.setattr(
+            shutil, "disk_usage", lambda _path, free=free, need=need: SimpleNamespace(free=free, total=10 * need)
+        )
         assert [one.severity for one in found("disk")] == ["warning"] * fires
     total = checked.plan.device_bytes + checked.plan.host_bytes
     for available, fires in ((1.24 * total, True), (1.26 * total, False)):

@@ -121,7 +121,7 @@ def test_a_backend_that_is_not_there_is_refused(refused, monkeypatch):
     ("arguments", "sentence"),
     [
         (["simulat"], 'there is no command "simulat"; did you mean "simulate"? See mpmcli --help.'),
-        (["paint"], 'there is no command "paint"; the commands are simulate, info, materials, schema, bench, '),
+        (["paint"], 'there is no command "paint"; the commands are simulate, check, info, materials, schema, bench, '),
         (["--verbose"], "no such option '--verbose'"),
         (["simulate"], "missing argument 'SCENE'. See mpmcli simulate --help."),
         (["simulate", "a.toml", "b.toml"], "got unexpected extra argument (b.toml). See mpmcli simulate --help."),
@@ -154,7 +154,7 @@ def test_too_many_particles_are_refused_before_any_is_made(refused, monkeypatch)
 
     monkeypatch.setattr("mpmcli.solver.run.Solver", unreachable)
     said = refused("simulate", "scene.toml", scene=HUGE)
-    assert said.startswith("the scene needs 1e+12 particles and 1e+12 grid nodes, 2")
+    assert said.startswith("scene.toml: The scene needs 1e+12 particles and 1e+12 grid nodes, 2")
     assert " TB of memory, and " in said and said.endswith("fewer particles_per_cell needs less.")
 
 

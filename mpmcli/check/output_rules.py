@@ -8,6 +8,7 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import Forecast
 from mpmcli.errors import InputError
+from mpmcli.plain_text import size_text
 from mpmcli.solver.plan import Plan, require_room
 
 # More frames than this are as many files while the run goes on, and hours of writing.
@@ -38,13 +39,14 @@ def output_findings(facts: SceneFacts, plan: Plan, forecast: Forecast, directory
         )
     # Where results would go need not exist yet.
     place = next(place for place in (directory.absolute(), *directory.absolute().parents) if place.exists())
-    free = shutil.disk_usage(place).free
-    if COPIES * forecast.file_bytes > free:
+    disk = shutil.disk_usage(place)
+    # File systems that are no disk, such as that of processes, have no size.
+    if COPIES * forecast.file_bytes > disk.free and disk.total > 0:
         yield Finding(
             "warning",
             "disk",
-            f"The result takes {forecast.file_bytes / 1e9:.3g} GB, twice that while it is packed, and the disk has "
-            f"{free / 1e9:.3g} GB left.",
+            f"The result takes {size_text(forecast.file_bytes)}, twice that while it is packed, and the disk has "
+            f"{size_text(disk.free)} left.",
             "Store fewer frames or output.fields, or write to another disk with -o.",
             forecast.file_bytes,
         )

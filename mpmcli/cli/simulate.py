@@ -77,7 +77,9 @@ def command(
     findings = check_scene(loaded, threads=threads, directory=directory).findings
     if not (force or passes(findings)):
         errors = [f"{loaded.source}: {f.what} {f.fix}" for f in findings if f.severity == "error"]
-        raise InputError("\n".join([*errors, "--force runs it all the same."]))
+        # Nothing makes room that is not there.
+        hint = [] if any(finding.rule == "memory" for finding in findings) else ["--force runs it all the same."]
+        raise InputError("\n".join(errors + hint))
     grave = tuple(finding.line for finding in findings if finding.severity != "note")
     loaded = replace(loaded, notes=(*loaded.notes, *grave))
     settings = RunSettings(
