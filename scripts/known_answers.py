@@ -234,6 +234,23 @@ def material(result: Result) -> dict:
     return tomllib.loads(result.header["scene"])["bodies"][0]["material"]
 
 
+def stirred_tank_2d(result: Result) -> str:
+    """Compare the centre of mass with linear theory for a tank that is shaken by A sin(w t) at its lowest frequency.
+
+    By linear potential theory the first mode, eta = q cos(pi x / L), begins at rest and obeys
+    q'' + w^2 q = -(4 L w^2 / (g pi^2)) A sin(w t), and the centre of mass lies -(2 L / (pi^2 d)) q off the middle.
+    """
+    length, depth, gravity, shaking, w = 1.0, 0.4, 9.81, 0.3, 5.12
+    off = np.array([frame.position[:, 0].mean(dtype=np.float64) for frame in result.frames([])]) - length / 2
+    t = result.times
+    swing = (np.sin(w * t) - w * t * np.cos(w * t)) / (2 * w**2)
+    theory = (2 * length / (np.pi**2 * depth)) * (4 * length * w**2 * shaking / (gravity * np.pi**2)) * swing
+    return (
+        f"swings {off @ theory / (theory @ theory):.2f} times as far as linear theory, "
+        f"correlation {np.corrcoef(off, theory)[0, 1]:.3f}"
+    )
+
+
 def percent(error: float) -> str:
     """Write a relative error; what rounds to zero has no minus sign."""
     return f"{round(100 * error, 2) + 0.0:+.2f} %"
@@ -257,4 +274,5 @@ KNOWN_ANSWERS = {
     "clay_drop_2d": clay_drop_2d,
     "metal_impact_2d": metal_impact_2d,
     "mixed_2d": falling,
+    "stirred_tank_2d": stirred_tank_2d,
 }

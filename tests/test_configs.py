@@ -34,6 +34,7 @@ def test_these_are_the_scenes():
         "sand_column_3d",
         "snowball_wall_2d",
         "snowball_wall_3d",
+        "stirred_tank_2d",
     ]
 
 

@@ -7,14 +7,18 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import ROOT
 
+from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.output.ledger_table import COLUMNS
+from mpmcli.scene import parse_scene, scene_to_toml
+from mpmcli.scene.functions import FUNCTIONS
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
@@ -52,7 +56,7 @@ def checkout(tmp_path_factory) -> Path:
             shutil.copytree(source, directory / name, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(source, directory / name)
-    (scene,) = blocks("toml")
+    scene = blocks("toml")[0]
     (directory / "drop.toml").write_text(scene, encoding="utf-8")
     programs = directory / ".venv" / "bin"
     programs.mkdir(parents=True)
@@ -131,13 +135,33 @@ def test_the_ledger_of_the_readme_is_complete():
 def test_the_keys_of_the_readme_are_those_of_a_scene():
     """Each row of the table of keys names keys of its table, and all of them."""
     from mpmcli.scene.domain import Domain
-    from mpmcli.scene.schema import Body, Output, SolverSettings, Time
+    from mpmcli.scene.schema import Body, Force, Output, SolverSettings, Time
 
-    models = {"[domain]": Domain, "[time]": Time, "[[bodies]]": Body, "[output]": Output, "[solver]": SolverSettings}
+    models = {
+        "[domain]": Domain,
+        "[time]": Time,
+        "[[bodies]]": Body,
+        "[[forces]]": Force,
+        "[output]": Output,
+        "[solver]": SolverSettings,
+    }
     for table, model in models.items():
         row = next(line for line in README.splitlines() if line.startswith(f"| `{table}` |"))
         missing = set(model.model_fields) - set(re.findall(r"`(\w+)`", row))
         assert not missing, f"{table}: {missing}"
+
+
+def test_the_expressions_of_the_readme_belong_to_its_scene():
+    """Put into the first scene, the fragment makes another that loads, and says what it said."""
+    scene, fragment = (tomllib.loads(block) for block in blocks("toml"))
+    scene["domain"] |= fragment["domain"]
+    scene["bodies"][0] |= fragment["bodies"][0]
+    loaded = parse_scene({**scene, "forces": fragment["forces"]}, laws=parameter_models()).scene
+    text = scene_to_toml(loaded)
+    for line in ('gravity = ["sin(2 * t)", -9.81]', 'acceleration = ["-40 * (x - X)", "5 if t < 0.1 else 0"]'):
+        assert line in text.splitlines()
+    told = README[README.index("### Forces and initial") : README.index("## Materials")]
+    assert set(FUNCTIONS) <= set(re.findall(r"\w+", told))
 
 
 def script(name: str):

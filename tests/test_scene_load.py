@@ -316,7 +316,7 @@ REPLACED = [
         "[time]",
         '[output]\nfields = [\n  "mass",\n  "plastic_strain"]\n[time]',
         '9: output.fields[1]: no body of this 2D scene stores "plastic_strain"; it can store velocity, density, '
-        "pressure, volume_ratio, deformation_gradient, affine, stress and mass",
+        "pressure, volume_ratio, deformation_gradient, affine, stress, mass and initial_position",
     ),
     ("[time]", "[output]\ncompress = 1\n[time]", "7: output.compress: must be true or false; found 1"),
     (

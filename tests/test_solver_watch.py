@@ -53,15 +53,6 @@ def test_a_lost_particle_ends_the_run_soon(outcome: dict) -> None:
     assert "particle 10" in lost["sentence"]
 
 
-def true_limit(solver: Solver) -> float:
-    """Return the bound on the next step by the state as it is, which the solver measured some steps ago."""
-    known = solver._extremes
-    solver._extremes = [measure.state() for measure in solver._measure]
-    limit = min(min(solver._limits_of(g)).value for g in range(len(solver.groups)))
-    solver._extremes = known
-    return limit
-
-
 @pytest.mark.parametrize("law", ["snow", "neo_hookean", "fixed_corotated", "viscoplastic"])
 def test_no_step_exceeds_the_limit_of_its_moment(law: str, backend_of: Callable, record_property: Callable) -> None:
     """A block hits a wall at a fifth of its wave speed: no step is longer than the state then allows.
@@ -81,11 +72,11 @@ def test_no_step_exceeds_the_limit_of_its_moment(law: str, backend_of: Callable,
         }
     body = block("block", material, [0.65, 0.05], [0.95, 0.25], velocity=[wave_speed / 5, 0.0])
     solver = Solver(scene([32, 16], 1 / 32, [body], end=1.0), backend_of("f32", 1))
-    largest, at_start = 0.0, true_limit(solver)
+    largest, at_start = 0.0, min(solver._watch.limits_now()).value
     smallest = at_start
     while solver.time < 0.06:
         dt, _ = solver.stable_step()
-        limit = true_limit(solver)
+        limit = min(solver._watch.limits_now()).value
         largest, smallest = max(largest, dt / limit), min(smallest, limit)
         solver.step(dt)
     record_property("step over limit", largest)

@@ -82,7 +82,8 @@ class SceneFacts:
     @cached_property
     def bodies(self) -> tuple[BodyFacts, ...]:
         """Facts of each body."""
-        down = np.array(self.scene.domain.gravity)
+        # Of a gravity that depends on time, that of the start.
+        down = np.nan_to_num(self.scene.domain.gravity_at(0.0))
         g = float(np.linalg.norm(down))
         found = []
         for body, arrival in zip(self.scene.bodies, arrivals(self.scene), strict=True):

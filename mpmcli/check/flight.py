@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.scene import Scene
+from mpmcli.scene import Scene, scene_bounds
+from mpmcli.scene.initial import moves_unevenly
 
 # Cells between two things that meet through the grid already.
 CONTACT = 1.0
@@ -27,8 +28,11 @@ class Arrival:
 def arrivals(scene: Scene) -> list[Arrival]:
     """Return the arrival of each body, of its bounding box, from its velocity, gravity, walls and the other bodies.
 
-    Bodies fall alike, so that two of them approach each other steadily. How they rotate and deform is left out.
+    Bodies fall alike, so that two of them approach each other steadily. How they rotate and deform is left out. Where
+    forces act, or gravity or a velocity is an expression, nothing is known of the flight: all bodies count as arrived.
     """
+    if scene.forces or not scene.domain.steady or any(moves_unevenly(body) for body in scene.bodies):
+        return [Arrival(0.0, scene_bounds(scene).speed)] * len(scene.bodies)
     reach = CONTACT * scene.domain.spacing
     gravity = np.array(scene.domain.gravity)
     walls = np.array(scene.domain.origin), np.array(scene.domain.upper)

@@ -135,6 +135,8 @@ def layout_of(scene: Scene) -> FrameLayout:
     }
     tensors = {"stress": (9,), "affine": (d * d,), "deformation_gradient": (d * d,)}
     shapes |= {name: (real, tensors.get(name, ())) for name in scene.output.fields if name != "velocity"}
+    if "initial_position" in shapes:
+        shapes["initial_position"] = shapes[POSITION]
     return FrameLayout(d, {name: ArrayLayout(name, kind, shape, d) for name, (kind, shape) in shapes.items()})
 
 

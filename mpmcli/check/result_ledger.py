@@ -48,7 +48,7 @@ def check_ledger(entries: Sequence[Entry], facts: SceneFacts, findings: FrameFin
         return {}
     figures: dict[str, float | None] = {}
     figures["mass_change"] = _mass(rows, findings)
-    figures["energy_growth"], figures["energy_lost"] = _energy(rows, findings)
+    figures["energy_growth"], figures["energy_lost"] = _energy(rows, facts, findings)
     figures["courant_max"] = _courant(rows, findings)
     figures["speed_max"] = max(row.speed_max for _, row in rows)
     figures["volume_ratio_min"] = min(row.volume_ratio_min for _, row in rows)
@@ -79,12 +79,18 @@ def _mass(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> float:
     return largest
 
 
-def _energy(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> tuple[float, float]:
+def _energy(
+    rows: list[tuple[int, LedgerRow]], facts: SceneFacts, findings: FrameFindings
+) -> tuple[float | None, float | None]:
     """Find growth of the total energy above its lowest value so far, and what is lost by the end.
 
     Both are relative to the energy turned over: the largest kinetic energy so far and the ranges of potential and
-    elastic energy, since the zero of a potential is arbitrary.
+    elastic energy, since the zero of a potential is arbitrary. Nothing is known of either where the scene is driven.
     """
+    if facts.driven:
+        what = "Forces or a gravity of time do work, so that neither energy nor momentum can be held against a balance"
+        findings.add("note", "driven", None, what, "Nothing needs to be done.")
+        return None, None
     kinetic = np.array([row.kinetic for _, row in rows])
     potential, elastic = (np.array([getattr(row, name) for _, row in rows]) for name in ("potential", "elastic"))
     total = kinetic + potential + elastic

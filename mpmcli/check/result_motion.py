@@ -187,7 +187,7 @@ class MomentumCheck:
         """Check the row of a frame; every frame must come, in order."""
         facts = self._facts
         known = facts.origin is not None and facts.gravity is not None and facts.sticking is not None
-        if not known or not self._free.any() or len(frame.position) == 0:
+        if not known or facts.driven or not self._free.any() or len(frame.position) == 0:
             return
         self._kinetic = max(self._kinetic, row.kinetic)
         self._steps += row.steps

@@ -19,7 +19,8 @@ class SceneFacts:
         dimension: d, 2 or 3.
         spacing: h, m.
         origin, upper: corners of the domain, (d,), m.
-        gravity: (d,), m/s^2.
+        gravity: (d,), m/s^2; None where it depends on time.
+        driven: whether forces act, or gravity depends on time: energy and momentum have a source then.
         sticking: per axis, whether a face normal to it sticks.
         bodies, laws: names, in the order of the labels in the frames.
         densities: at rest, of each body, kg/m^3.
@@ -34,6 +35,7 @@ class SceneFacts:
     origin: np.ndarray | None
     upper: np.ndarray | None
     gravity: np.ndarray | None
+    driven: bool
     sticking: tuple[bool, ...] | None
     bodies: tuple[str, ...]
     laws: tuple[str, ...]
@@ -84,6 +86,8 @@ def scene_facts(header: dict[str, Any]) -> SceneFacts:
     volumes = [_volume(body.get("shape", {}), d) for body in bodies]
     densities = [body.get("material", {}).get("density") for body in bodies]
     known = None not in volumes and None not in densities
+    gravity = domain.get("gravity")
+    timed = isinstance(gravity, list) and any(isinstance(entry, str) for entry in gravity)
     time = scene.get("time", {})
     precision = header.get("precision", "f32")
     return SceneFacts(
@@ -91,7 +95,8 @@ def scene_facts(header: dict[str, Any]) -> SceneFacts:
         spacing=header.get("spacing", domain.get("spacing")),
         origin=origin if size is not None else None,
         upper=None if origin is None or size is None else origin + size,
-        gravity=_vector(domain.get("gravity"), d),
+        gravity=None if timed else _vector(gravity, d),
+        driven=timed or bool(scene.get("forces")),
         sticking=_sticking(domain.get("walls"), d),
         bodies=tuple(header.get("bodies", ())),
         laws=tuple(header.get("materials", ())),

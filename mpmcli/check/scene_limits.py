@@ -9,6 +9,8 @@ import numpy as np
 from mpmcli.materials.law import Law, StateBound
 from mpmcli.materials.registry import laws
 from mpmcli.scene import Body, Scene, SceneBounds, highest_speed
+from mpmcli.scene.bounds import body_points
+from mpmcli.scene.initial import initial_motion, moves_unevenly
 from mpmcli.stability.limits import FIX, WHY, deformation_limit, mode_limit, speed_limit
 
 # In an impact a cell stops on one side while matter comes in on the other from two nodes: two speeds per cell.
@@ -158,11 +160,12 @@ def _motion_limits(scene: Scene, bounds: SceneBounds) -> Iterator[SceneLimit]:
 
 def _initial_gradient(body: Body, dimension: int) -> float:
     """Return the rate of deformation at the start as the solver measures it: |tr C|, or the largest row sum of |C|."""
-    if body.velocity_gradient is None:
+    if body.velocity_gradient is None and not moves_unevenly(body):
         return 0.0
-    C = np.array(body.velocity_gradient)
+    _, C = initial_motion(body, body_points(body) if moves_unevenly(body) else np.zeros((1, dimension)))
     keeps_J = law_of(body, dimension).deformation == "J"
-    return float(abs(np.trace(C)) if keeps_J else np.abs(C).sum(axis=1).max())
+    rates = np.abs(np.trace(C, axis1=1, axis2=2)) if keeps_J else np.abs(C).sum(axis=2).max(axis=1)
+    return float(np.max(rates, initial=0.0, where=np.isfinite(rates)))
 
 
 def _parameter(body: Body, names: tuple[str, ...], otherwise: str) -> str:

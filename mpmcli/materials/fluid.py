@@ -16,6 +16,8 @@ QUIET_SPEED = 1.0
 # The pressure of a nonlinear equation of state grows no further below this J: the largest power stays a number of
 # 32 bits. Far beyond what weak compressibility means, but a crushed particle must not turn into infinities.
 CRUSHED = 0.05
+# Of Newton's method; some six do, from any load.
+MOST_ITERATIONS = 100
 
 
 class WeaklyCompressibleParameters(MaterialParameters):
@@ -43,6 +45,8 @@ class WeaklyCompressibleParameters(MaterialParameters):
 
 class FluidParameters(WeaklyCompressibleParameters):
     """Parameters of the weakly compressible fluid."""
+
+    hydrostatic = True
 
     law: Literal["fluid"] = "fluid"
     exponent: Annotated[
@@ -76,6 +80,19 @@ class FluidParameters(WeaklyCompressibleParameters):
             return self, []
         modulus, note = soft_bulk_modulus(self.density, self.compressibility, bounds)
         return self.model_copy(update={"bulk_modulus": modulus}), [note]
+
+    def volume_ratio_under(self, load: np.ndarray) -> np.ndarray:
+        """Solve K/g (J^(1-g) - J) = load by Newton's method, from J = 1; nan where J is below CRUSHED."""
+        g, strain = self.exponent, np.asarray(load, dtype=np.float64) / self.bulk_modulus
+        if g == 1:
+            return np.where(strain < 1, 1 - strain, np.nan)
+        J = np.ones_like(strain)
+        for _ in range(MOST_ITERATIONS):
+            step = ((J ** (1 - g) - J) / g - strain) / (((g - 1) * J**-g + 1) / g)
+            J = np.clip(J + step, J / 2, 2 * J)
+            if np.all(np.abs(step) <= 1e-15 * J):
+                break
+        return np.where(J > CRUSHED, J, np.nan)
 
 
 def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBounds) -> tuple[float, str]:

@@ -70,6 +70,13 @@ class Law(ABC):
     sensitivity: float = 1.0
     hardening: float = 0.0
 
+    def __init_subclass__(cls, **options: object) -> None:
+        """Tell the parameters, which a scene checks before there is a law, what a particle stores."""
+        super().__init_subclass__(**options)
+        parameters = getattr(cls, "parameters", None)
+        if isinstance(parameters, type) and issubclass(parameters, MaterialParameters):
+            parameters.stores = getattr(cls, "deformation", parameters.stores)
+
     def __init__(self, members: Sequence[MaterialParameters], dimension: int) -> None:
         self.members = tuple(members)
         self.dimension = dimension

@@ -1,4 +1,6 @@
-"""Checks that need the whole scene: bodies inside the domain, apart and not empty; fields that are stored."""
+"""Checks that need the whole scene: bodies inside the domain, apart, not empty and well started; forces on bodies that
+exist; fields that are stored.
+"""
 
 import math
 from collections.abc import Iterator
@@ -6,11 +8,12 @@ from typing import get_args
 
 import numpy as np
 
+from mpmcli.scene.initial import has_expressions, initial_faults
 from mpmcli.scene.problem import Problem
 from mpmcli.scene.quantity import AXES
-from mpmcli.scene.sampling import holds_particles, lattice_points, lattice_spacing, no_particles
+from mpmcli.scene.sampling import holds_particles, lattice_points, lattice_spacing, no_particles, particle_places
 from mpmcli.scene.schema import Body, ParticleField, Scene
-from mpmcli.scene.sentences import listed
+from mpmcli.scene.sentences import listed, nearest
 from mpmcli.scene.shapes import Box
 
 # Lengths below this fraction of the grid spacing are round-off.
@@ -25,8 +28,10 @@ def problems_in(scene: Scene) -> list[Problem]:
     """Return everything that is wrong with a scene whose tables are valid, one by one."""
     outside = list(_outside(scene))
     # A body that is much too large is told so, not filled.
-    empty = [] if outside else _empty(scene)
-    return [*_repeated_names(scene), *outside, *_overlaps(scene), *empty, *_unstored(scene)]
+    empty = [] if outside else list(_empty(scene))
+    unstarted = [] if outside or empty else list(_initial(scene))
+    where = [*_repeated_names(scene), *outside, *_overlaps(scene), *empty]
+    return [*where, *unstarted, *_pushed(scene), *_unstored(scene)]
 
 
 def _repeated_names(scene: Scene) -> Iterator[Problem]:
@@ -101,6 +106,53 @@ def _empty(scene: Scene) -> Iterator[Problem]:
             continue  # its lattice is fitted to it, and has a point at least
         if lattice_points(body, h) <= _MOST_SEARCHED and not holds_particles(body, i, h):
             yield Problem(("bodies", i, "shape"), no_particles(body, h))
+
+
+def _initial(scene: Scene) -> Iterator[Problem]:
+    """Find deformations that do not fit their law, and what is not finite where a particle starts."""
+    h = scene.domain.spacing
+    for i, body in enumerate(scene.bodies):
+        misfits = [*_deformation_kind(body, scene.dimension), *_hydrostatic(body, scene)]
+        yield from (Problem(("bodies", i, key), said) for key, said in misfits)
+        starts_unevenly = has_expressions(body) or body.initial_pressure is not None
+        if not misfits and starts_unevenly and lattice_points(body, h) <= _MOST_SEARCHED:
+            for key, said in initial_faults(body, particle_places(body, i, h), scene.domain):
+                yield Problem(("bodies", i, *key), said)
+
+
+def _deformation_kind(body: Body, dimension: int) -> Iterator[tuple[str, str]]:
+    law, keeps_J = body.material.law, body.material.stores == "J"
+    if body.deformation is None or isinstance(body.deformation, tuple) != keeps_J:
+        return
+    if keeps_J:
+        yield "deformation", f"must be J, one number or expression, as the law {law} stores no more; found a matrix"
+    else:
+        rest = [[int(i == j) for j in range(dimension)] for i in range(dimension)]
+        yield "deformation", f"must be F, {dimension} rows such as {rest}, as the law {law} stores it; found one value"
+
+
+def _hydrostatic(body: Body, scene: Scene) -> Iterator[tuple[str, str]]:
+    if body.initial_pressure is None:
+        return
+    key = "initial_pressure"
+    if not body.material.hydrostatic:
+        yield key, f"is for fluids: the law {body.material.law} has no pressure that the depth alone sets"
+    elif body.deformation is not None:
+        yield key, "sets the deformation, which is given as well; leave one of them out"
+    elif not scene.domain.steady:
+        yield key, "needs gravity that stays the same; domain.gravity depends on t"
+    elif not any(scene.domain.gravity):
+        yield key, "needs gravity: give domain.gravity, or leave it out"
+
+
+def _pushed(scene: Scene) -> Iterator[Problem]:
+    """Find forces on bodies that do not exist."""
+    names = [body.name for body in scene.bodies]
+    for k, force in enumerate(scene.forces):
+        if force.body is not None and force.body not in names:
+            guess = nearest(force.body, names)
+            hint = f'did you mean "{guess}"?' if guess else f"the bodies are {listed(names, 'and')}"
+            yield Problem(("forces", k, "body"), f'no body has the name "{force.body}"; {hint}')
 
 
 def _unstored(scene: Scene) -> Iterator[Problem]:

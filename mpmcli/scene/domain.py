@@ -2,8 +2,10 @@
 
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
+from mpmcli.scene.entry import TimeVector, value_of, varies
 from mpmcli.scene.quantity import (
     AXES,
     NUMBER_WORDS,
@@ -91,7 +93,13 @@ class Domain(Table):
             json_schema_extra={"minItems": 2, "maxItems": 3},
         ),
     ] = None  # type: ignore[assignment]
-    gravity: Annotated[Vector, Field(validate_default=True, description="Gravity, m/s^2. Default: none.")] = None  # type: ignore[assignment]
+    gravity: Annotated[
+        TimeVector,
+        Field(
+            validate_default=True,
+            description="Gravity, m/s^2; numbers, or expressions of the time t (s). Default: none.",
+        ),
+    ] = None  # type: ignore[assignment]
     walls: Annotated[
         Walls,
         BeforeValidator(_one_word_for_all),
@@ -131,6 +139,15 @@ class Domain(Table):
     def upper(self) -> tuple[float, ...]:
         """Coordinates of the upper corner, m."""
         return tuple(o + s for o, s in zip(self.origin, self.size, strict=True))
+
+    @property
+    def steady(self) -> bool:
+        """Whether gravity is the same at all times."""
+        return not varies(*self.gravity)
+
+    def gravity_at(self, time: float) -> np.ndarray:
+        """Return gravity at a time (s), (d,), m/s^2."""
+        return np.array([float(value_of(entry, t=time)) for entry in self.gravity])
 
 
 def _cells_of(size: tuple[float, ...], spacing: float) -> tuple[int, ...]:

@@ -23,6 +23,7 @@ def scene_to_toml(scene: Scene) -> str:
     for body in bodies:
         material = body.pop("material")
         blocks += [_table("[[bodies]]", body), _table("[bodies.material]", material)]
+    blocks += [_table("[[forces]]", force) for force in data.pop("forces")]
     blocks += [_table(f"[{name}]", table) for name, table in data.items()]
     return "\n\n".join(blocks) + "\n"
 

@@ -1,8 +1,9 @@
 """What a scene says of a material: the base class of every law's parameters."""
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, NamedTuple, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from mpmcli.scene.quantity import Positive
@@ -53,6 +54,8 @@ class MaterialParameters(BaseModel):
 
     Attributes:
         internal: what a particle stores beside its deformation.
+        stores: what it stores of its deformation, "J" or "F", as the law says that these parameters belong to.
+        hydrostatic: whether it is a fluid whose J follows from the pressure, by `volume_ratio_under`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
@@ -61,6 +64,8 @@ class MaterialParameters(BaseModel):
     density: Annotated[Positive, Field(description="Density at rest, kg/m^3.")]
 
     internal: ClassVar[tuple[Internal, ...]] = ()
+    stores: ClassVar[Literal["J", "F"]] = "F"
+    hydrostatic: ClassVar[bool] = False
 
     @classmethod
     def internal_in(cls, dimension: int) -> tuple[Internal, ...]:
@@ -70,3 +75,7 @@ class MaterialParameters(BaseModel):
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
         """Return these parameters with every "auto" replaced, and a sentence for each choice."""
         return self, []
+
+    def volume_ratio_under(self, load: np.ndarray) -> np.ndarray:
+        """Return the J, (n,), at which the material at rest has J p = `load`, (n,), Pa; nan where none does."""
+        raise NotImplementedError

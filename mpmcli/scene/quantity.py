@@ -1,6 +1,6 @@
 """The kinds of values that a scene is made of: numbers, counts, and vectors as long as the scene has axes."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
 from pydantic_core import PydanticCustomError
@@ -85,7 +85,12 @@ Flag = Annotated[bool, Field(strict=True)]
 
 _ONE_PER_AXIS = Field(json_schema_extra={"minItems": 2, "maxItems": 3})
 
-# One number per axis; None, which TOML cannot write, stands for the default: zeros.
-Vector = Annotated[tuple[Number, ...], BeforeValidator(_zeros), AfterValidator(_as_long_as_the_scene), _ONE_PER_AXIS]
-# One row per axis, each a vector.
-Matrix = Annotated[tuple[Vector, ...], AfterValidator(_as_long_as_the_scene), _ONE_PER_AXIS]
+
+def list_of_axes(kind: Any, *, zeros: bool = False) -> Any:
+    """Return the type of a list with one value per axis; None, which TOML cannot write, may stand for zeros."""
+    default = [BeforeValidator(_zeros)] if zeros else []
+    return Annotated[tuple[kind, ...], *default, AfterValidator(_as_long_as_the_scene), _ONE_PER_AXIS]
+
+
+# One number per axis; None stands for the default: zeros.
+Vector = list_of_axes(Number, zeros=True)

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpmcli.errors import InputError
+from mpmcli.scene.domain import Domain
+from mpmcli.scene.initial import initial_deformation, initial_faults, initial_motion
+from mpmcli.scene.problem import path_text
 from mpmcli.scene.schema import Body, Scene
 from mpmcli.scene.shapes import Box
 
@@ -22,9 +25,11 @@ class BodyParticles:
         name: name of the body.
         position: (n, d) float64, m, in the coordinates of the scene.
         velocity: (n, d) float64, m/s.
-        affine: (n, d, d) float64, initial velocity gradient, 1/s; a read-only view of one matrix.
+        affine: (n, d, d) float64, initial velocity gradient, 1/s; one read-only matrix where all have the same.
         volume: of each particle, m^3 (m^2 in 2D): that of the shape divided by n.
         mass: of each particle, kg (kg per metre of depth in 2D).
+        deformation: J, (n,), or F, (n, d, d), at the start; None where there is none.
+        initial: (n, d), the X of expressions, m, where that is not the position.
     """
 
     name: str
@@ -33,6 +38,8 @@ class BodyParticles:
     affine: np.ndarray
     volume: float
     mass: float
+    deformation: np.ndarray | None = None
+    initial: np.ndarray | None = None
 
     @property
     def count(self) -> int:
@@ -46,9 +53,9 @@ def sample_bodies(scene: Scene) -> list[BodyParticles]:
     Memory is proportional to `estimate_particles`, which callers check first.
 
     Raises:
-        InputError: a body is too thin for its lattice and gets no particle.
+        InputError: a body is too thin for its lattice and gets no particle, or what it starts with is not finite there.
     """
-    return [_sample(body, index, scene.domain.spacing) for index, body in enumerate(scene.bodies)]
+    return [_sample(body, index, scene.domain) for index, body in enumerate(scene.bodies)]
 
 
 def estimate_particles(scene: Scene) -> int:
@@ -88,25 +95,31 @@ def _lattice_counts(body: Body, h: float) -> list[int]:
     return [max(1, math.ceil(r - 1e-9)) for r in ratios]
 
 
-def _sample(body: Body, index: int, h: float) -> BodyParticles:
+def particle_places(body: Body, index: int, h: float) -> np.ndarray:
+    """Return where the particles of a body start, (n, d), m, from its index in the scene and the grid spacing h."""
     form = body.shape.form
-    position = np.concatenate([points[form.contains(points)] for points in _lattice(body, index, h)])
+    return np.concatenate([points[form.contains(points)] for points in _lattice(body, index, h)])
+
+
+def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
+    form = body.shape.form
+    position = particle_places(body, index, domain.spacing)
     if not len(position):
-        raise InputError(no_particles(body, h))
-    velocity = np.broadcast_to(np.array(body.velocity), position.shape)
-    dimension = position.shape[1]
-    affine = np.zeros((dimension, dimension))
-    if body.velocity_gradient is not None:
-        affine = np.array(body.velocity_gradient)
-        velocity = velocity + (position - np.mean(form.bounds(), axis=0)) @ affine.T
+        raise InputError(no_particles(body, domain.spacing))
+    # A body too large to be looked at when the scene was loaded.
+    faults = [f"{path_text(('bodies', index, *key))}: {said}" for key, said in initial_faults(body, position, domain)]
+    if faults:
+        raise InputError("\n".join(faults))
+    velocity, affine = initial_motion(body, position)
     volume = form.volume / len(position)
     return BodyParticles(
         name=body.name,
         position=position,
-        velocity=np.ascontiguousarray(velocity),
-        affine=np.broadcast_to(affine, (len(position), dimension, dimension)),
+        velocity=velocity,
+        affine=affine,
         volume=volume,
         mass=body.material.density * volume,
+        deformation=initial_deformation(body, position, domain),
     )
 
 

@@ -6,9 +6,12 @@ from typing import Annotated, Any, Literal, Union, get_args
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, create_model
 
 from mpmcli.scene.domain import Domain
+from mpmcli.scene.entry import PlaceVector, StartDeformation, StartMatrix, StartVector
 from mpmcli.scene.material import MaterialParameters
-from mpmcli.scene.quantity import Flag, Integer, Matrix, Positive, Table, Vector, flaw, scene_dimension
+from mpmcli.scene.quantity import Flag, Integer, Positive, Table, flaw, scene_dimension
 from mpmcli.scene.shapes import OneShape
+
+NAME = r"^[^\W\d_][\w -]*$"
 
 ParticleField = Literal[
     "velocity",
@@ -19,6 +22,7 @@ ParticleField = Literal[
     "affine",
     "stress",
     "mass",
+    "initial_position",
 ]
 
 
@@ -73,22 +77,40 @@ def _whole_lattice(count: int, info: ValidationInfo) -> int:
 class Body(Table):
     """One body: a shape filled with particles of one material."""
 
-    name: Annotated[
-        str, Field(pattern=r"^[^\W\d_][\w -]*$", description="Name of the body, used in messages and --set.")
-    ]
+    name: Annotated[str, Field(pattern=NAME, description="Name of the body, used in messages and --set.")]
     material: Annotated[
         MaterialParameters,
         Field(description="A preset in quotes, or a table: a law or a preset, with parameters and knobs."),
     ]
     shape: Annotated[OneShape, Field(description="Exactly one of box, ball, cylinder (3D), polygon (2D).")]
     velocity: Annotated[
-        Vector, Field(validate_default=True, description="Initial velocity, m/s. Default: at rest.")
+        StartVector,
+        Field(
+            validate_default=True,
+            description="Initial velocity, m/s; numbers, or expressions of the place X, Y, Z (m), whose gradient is "
+            "the initial affine velocity C. Default: at rest.",
+        ),
     ] = None  # type: ignore[assignment]
     velocity_gradient: Annotated[
-        Matrix | None,
+        StartMatrix | None,
         Field(
-            description="Initial velocity gradient L, 1/s, one row per axis: v = velocity + L (x - c), "
-            "c the centre of the bounding box of the shape. Default: none."
+            description="Velocity gradient, 1/s, one row per axis. Numbers L add L (x - c) to the velocity, c the "
+            "centre of the bounding box of the shape, and L to C. With an expression of X, Y, Z in it, it is C alone, "
+            "in place of the gradient of the velocity. Default: none."
+        ),
+    ] = None
+    deformation: Annotated[
+        StartDeformation | None,
+        Field(
+            description="Initial deformation, numbers or expressions of X, Y, Z: the volume ratio J of a law that "
+            "stores it, else F, one row per axis (its elastic part where the law has plastic flow). Default: none."
+        ),
+    ] = None
+    initial_pressure: Annotated[
+        Literal["hydrostatic"] | None,
+        Field(
+            description='"hydrostatic": a fluid starts with the J at which it carries its own weight, density g times '
+            "the depth below the top of its bounding box. Default: none."
         ),
     ] = None
     sampling: Annotated[
@@ -111,6 +133,20 @@ class Body(Table):
     ] = 0
 
 
+class Force(Table):
+    """An acceleration that acts on one body, or on all of them."""
+
+    name: Annotated[str | None, Field(pattern=NAME, description="Name of the force, for --set.")] = None
+    body: Annotated[str | None, Field(description="Name of the body that it acts on. Default: all of them.")] = None
+    acceleration: Annotated[
+        PlaceVector,
+        Field(
+            description="m/s^2, one entry per axis: numbers, or expressions of the time t (s), the position x, y, z "
+            "and the initial position X, Y, Z of a particle (m)."
+        ),
+    ]
+
+
 def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:
     repeated = sorted({name for name in fields if fields.count(name) > 1})
     if repeated:
@@ -126,7 +162,8 @@ class Output(Table):
         AfterValidator(_no_repeats),
         Field(
             description="Fields of each stored frame: velocity (m/s), density (kg/m^3), pressure (Pa), "
-            "volume_ratio J, deformation_gradient F, affine C (1/s), stress (Cauchy, Pa), mass (kg)."
+            "volume_ratio J, deformation_gradient F, affine C (1/s), stress (Cauchy, Pa), mass (kg), "
+            "initial_position (m)."
         ),
     ] = ("velocity", "density", "pressure")
     compress: Annotated[
@@ -152,6 +189,9 @@ class Scene(Table):
     domain: Annotated[Domain, Field(description="The box that the scene lives in, and its grid.")]
     time: Annotated[Time, Field(description="How long, how many frames, which steps.")]
     bodies: Annotated[tuple[Body, ...], Field(min_length=1, description="The bodies, at least one.")]
+    forces: Annotated[
+        tuple[Force, ...], Field(description="Accelerations beside gravity; what acts on a particle adds up.")
+    ] = ()
     output: Annotated[Output, Field(description="What is stored.")] = Output()
     solver: Annotated[SolverSettings, Field(description="How it is computed.")] = SolverSettings()
 

@@ -101,8 +101,8 @@ def build_extremes(group: ParticleGroup, backend: Backend) -> Measurement:
             own[STRETCH_SQUARED] = ti.max(own[STRETCH_SQUARED], J * J)
             own[GRADIENT] = ti.max(own[GRADIENT], ti.abs(C.trace()))
 
-    measure_state = _build_maxima(group.count, ENTRIES, widen, backend)
-    measure_internal = _build_maxima(group.count, 2 * len(group.internal), widen_internal, backend)
+    measure_state = build_maxima(group.count, ENTRIES, widen, backend)
+    measure_internal = build_maxima(group.count, 2 * len(group.internal), widen_internal, backend)
 
     def internal() -> dict[str, tuple[float, float]]:
         if not group.internal:
@@ -118,7 +118,7 @@ def build_extremes(group: ParticleGroup, backend: Backend) -> Measurement:
     return Measurement(state, internal)
 
 
-def _build_maxima(count: int, size: int, widen: Callable, backend: Backend) -> Callable[[], list[float]]:
+def build_maxima(count: int, size: int, widen: Callable, backend: Backend) -> Callable[[], list[float]]:
     """Compile-ready reduction over particles: `widen` (own, p) raises the maxima `own` to those of particle p."""
     if size == 0:
         return list

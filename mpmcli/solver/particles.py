@@ -29,6 +29,8 @@ class ParticleGroup:
         id: (n) int, row of the particle in every frame.
         body: (n) int, place in `bodies`; None where the group has one body.
         real: numpy's type of the real fields.
+        initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force.
+        force: what acts on the particles of groups that are `pushed`.
         table: per body a row of particle mass, particle volume and the constants of the law.
     """
 
@@ -41,6 +43,8 @@ class ParticleGroup:
         origin: np.ndarray,
         width: int,
         layout: ti.Layout,
+        *,
+        keeps_initial: bool = False,
     ) -> None:
         self.law = law
         self.bodies = tuple(bodies)
@@ -57,6 +61,10 @@ class ParticleGroup:
         self.id = ti.field(int, shape=n)
         self.several = len(self.bodies) > 1
         self.body = ti.field(int, shape=n) if self.several else None
+        self.keeps_initial = keeps_initial
+        self.initial = ti.Vector.field(d, float, shape=n, layout=layout) if keeps_initial else None
+        self.pushed = False
+        self.force = None
         rows = [(b.mass, b.volume, *law.constants(p)) for b, p in zip(particles, law.members, strict=True)]
         self.table = ti.Vector.field(len(rows[0]), float, shape=len(rows))
 
@@ -64,7 +72,15 @@ class ParticleGroup:
         self.table.from_numpy(np.array(rows, dtype=host))
         self.x.from_numpy(np.concatenate([b.position - origin for b in particles]).astype(host))
         self.set_motion(np.concatenate([b.velocity for b in particles]), np.concatenate([b.affine for b in particles]))
-        self.set_deformation(np.ones(n) if law.deformation == "J" else np.tile(np.eye(d), (n, 1, 1)))
+        if self.initial is not None:
+            initial = [b.position if b.initial is None else b.initial for b in particles]
+            self.initial.from_numpy((np.concatenate(initial) - origin).astype(host))
+        rest = np.ones(1) if law.deformation == "J" else np.eye(d)[None]
+        self.set_deformation(
+            np.concatenate(
+                [np.repeat(rest, len(b.position), 0) if b.deformation is None else b.deformation for b in particles]
+            )
+        )
         for variable, values in zip(law.internal, self.internal, strict=True):
             values.fill(variable.at_rest)
         ids = [first + np.arange(len(b.position)) for b, first in zip(particles, first_ids, strict=True)]
@@ -76,12 +92,17 @@ class ParticleGroup:
     @property
     def state(self) -> tuple[ti.Field, ...]:
         """Every real field that the sort must move."""
-        return (self.x, self.v, self.gradient, self.deformation, *self.internal)
+        initial = () if self.initial is None else (self.initial,)
+        return (self.x, self.v, self.gradient, self.deformation, *self.internal, *initial)
 
     @property
     def labels(self) -> tuple[ti.Field, ...]:
         """Every integer field that the sort must move."""
         return (self.id,) if self.body is None else (self.id, self.body)
+
+    def push_by(self, force: object) -> None:
+        """Let a force act on the particles, see `forces.GroupForce`."""
+        self.pushed, self.force = True, force
 
     def set_motion(self, velocity: np.ndarray, C: np.ndarray) -> None:
         """Set the velocity, (n, d), and the affine velocity C, (n, d, d), of all particles."""

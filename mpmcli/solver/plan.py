@@ -13,6 +13,7 @@ from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
 from mpmcli.solver.backend import Backend
+from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import TILE, Grid, node_width
 from mpmcli.solver.ordering import TileOrder
 
@@ -89,7 +90,9 @@ class Plan:
         }
 
 
-def fields_of(law: type[Law], dimension: int, backend: Backend, *, several_bodies: bool) -> dict[str, int]:
+def fields_of(
+    law: type[Law], dimension: int, backend: Backend, *, several_bodies: bool, keeps_initial: bool = False
+) -> dict[str, int]:
     """Return the bytes of each field of one particle of a law, by name."""
     real = 8 if backend.precision == "f64" else 4
     width = node_width(dimension, on_cpu=True) if backend.on_cpu else dimension
@@ -100,19 +103,26 @@ def fields_of(law: type[Law], dimension: int, backend: Backend, *, several_bodie
     else:
         fields["volume_ratio"] = real
     fields |= {variable.name: real for variable in law.parameters.internal_in(dimension)}
+    fields |= {"initial_position": dimension * real} if keeps_initial else {}
     return fields | {"id": 4} | ({"body": 4} if several_bodies else {})
 
 
 def passes_of(names: Sequence[str], scene: Scene) -> tuple[str, ...]:
     """Return the loops of one step: the particles of each law, and the grid."""
     separate = any("separate" in pair for pair in scene.domain.walls.faces(scene.dimension))
+    pushed = {name for name in names if forces_on(scene, members_of(scene, name))}
     return (
         "clear grid",
-        *(f"scatter {name}" for name in names),
+        *(f"scatter {name}" + (" with forces" if name in pushed else "") for name in names),
         *(("find contact",) if separate else ()),
         "update grid",
         *(f"gather {name}" for name in names),
     )
+
+
+def members_of(scene: Scene, law: str) -> list[int]:
+    """Return the indices of the bodies that follow a law."""
+    return [i for i, body in enumerate(scene.bodies) if body.material.law == law]
 
 
 def make_plan(scene: Scene, backend: Backend) -> Plan:
@@ -126,7 +136,17 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     for body in scene.bodies:
         counts[body.material.law] += estimate_body(body, scene.domain.spacing)
     groups = tuple(
-        LawPlan(name, counts[name], fields_of(laws()[name], dimension, backend, several_bodies=bodies[name] > 1))
+        LawPlan(
+            name,
+            counts[name],
+            fields_of(
+                laws()[name],
+                dimension,
+                backend,
+                several_bodies=bodies[name] > 1,
+                keeps_initial=needs_initial(scene, members_of(scene, name)),
+            ),
+        )
         for name in sorted(bodies)
     )
     # The widest field is a matrix; sources and keys are integers.

@@ -96,11 +96,17 @@ def build_frame(
     fields: Sequence[str],
     origin: np.ndarray,
     position_type: type,
+    initial: np.ndarray | None,
     index: int,
     time: float,
     step: int,
 ) -> Frame:
-    """Put the groups together, each particle in the row of its id; `position_type` is numpy's of the positions."""
+    """Put the groups together, each particle in the row of its id.
+
+    Args:
+        position_type: numpy's of the positions.
+        initial: (n, d) positions at the start, m, where the field initial_position is among the fields.
+    """
     ids = np.concatenate([s.id for s in snapshots])
 
     def ordered(parts: Sequence[np.ndarray]) -> np.ndarray:
@@ -108,6 +114,11 @@ def build_frame(
         result = np.empty_like(joined)
         result[ids] = joined
         return result
+
+    def of_field(name: str) -> np.ndarray:
+        if name == "initial_position":
+            return initial.astype(position_type)
+        return ordered([_field(name, s, o, at_rest).astype(real) for s, o in zip(snapshots, seen, strict=True)])
 
     # What particles of other laws show of an internal variable.
     at_rest = {variable.name: variable.at_rest for s in snapshots for variable in s.group.law.internal}
@@ -120,11 +131,7 @@ def build_frame(
         velocity=ordered([s.v for s in snapshots]),
         body=ordered([s.body for s in snapshots]),
         material=ordered([np.full(len(s.id), m, np.int32) for m, s in enumerate(snapshots)]),
-        fields={
-            name: ordered([_field(name, s, o, at_rest).astype(real) for s, o in zip(snapshots, seen, strict=True)])
-            for name in fields
-            if name != "velocity"
-        },
+        fields={name: of_field(name) for name in fields if name != "velocity"},
     )
 
 

@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 import taichi as ti
@@ -15,28 +14,19 @@ from mpmcli.output.frame import Frame
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError, cause_of, diagnose, first_unsound, rate_of_change
-from mpmcli.solver.extremes import build_extremes
+from mpmcli.solver.drive import Drive
+from mpmcli.solver.forces import needs_initial
 from mpmcli.solver.grid import DRIFT, PAD, TILE, Grid, node_width
 from mpmcli.solver.observe import build_observation
 from mpmcli.solver.ordering import SortBuffers, TileOrder, build_sort
 from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.plan import members_of
 from mpmcli.solver.snapshot import STRESSES, Snapshot, build_frame, measure, read_group
-from mpmcli.solver.step import NOT_LOST, SMALLEST_J, build_step
+from mpmcli.solver.step import NOT_LOST, build_step
+from mpmcli.solver.watch import Watch
 from mpmcli.stability.ledger import LedgerRow
-from mpmcli.stability.limits import Limit, deformation_limit, mode_limit, speed_limit
+from mpmcli.stability.limits import Limit, force_limit, speed_limit
 
-# The state is measured, and the limits with it, once in so many steps at least. It is earlier where a stiffness may
-# have grown since by more than this share of what time.safety leaves.
-MOST_UNWATCHED_STEPS = 32
-UNWATCHED_SHARE = 0.75
-# On a GPU the measurement is also what sees that a particle was lost.
-MOST_BLIND_STEPS = 16
-# Cells per step below which a sudden stop, which turns speed into a velocity gradient of up to two speeds a cell,
-# stays clear of the bound on the deformation in a step.
-SLOW = 0.1
-# A bound by stiffness falls at once and rises by this factor a step at most: a step that follows the oscillation of a
-# lone particle up and down drives it until it bursts. At 1.01 one of fourteen trials did, at 1.001 none.
-EASING = 1.001
 # Largest rounding of a stored position, in cells.
 POSITION_ERROR = 1e-3
 # Cells that a particle of a GPU run may move in a step beyond what was expected.
@@ -55,9 +45,8 @@ class Solver:
         laws: names of the laws, in the order of `Frame.material`.
         first_step_seconds: wall time of the first step, which compiles the kernels; 0 before it.
         courant: largest displacement in the last step, cells: that of the fastest node, which no particle
-            exceeds; on a GPU an estimate from the last measurement and gravity.
+            exceeds; on a GPU an estimate from the last measurement, gravity and forces.
         frame_seconds: wall time spent so far on building frames and ledger rows.
-        watch_seconds: wall time spent so far on measuring the state for the limits.
     """
 
     def __init__(
@@ -84,11 +73,8 @@ class Solver:
         self.step_count = 0
         self.first_step_seconds = 0.0
         self.frame_seconds = 0.0
-        self.watch_seconds = 0.0
         self.courant = 0.0
         self.spacing = scene.domain.spacing
-        self._gravity = np.array(scene.domain.gravity)
-        self._pull = float(np.linalg.norm(self._gravity))
         self._origin = np.array(scene.domain.origin)
         # Far from zero single precision cannot tell neighbours apart, though the solver, which counts from the
         # origin of the domain, can.
@@ -107,7 +93,7 @@ class Solver:
         layout = ti.Layout.AOS if backend.on_cpu else ti.Layout.SOA
         self.groups = []
         for name in self.laws:
-            members = [i for i, body in enumerate(scene.bodies) if body.material.law == name]
+            members = members_of(scene, name)
             materials = [scene.bodies[i].material for i in members]
             self.groups.append(
                 ParticleGroup(
@@ -118,8 +104,13 @@ class Solver:
                     self._origin,
                     width if backend.on_cpu else scene.dimension,
                     layout,
+                    keeps_initial=needs_initial(scene, members),
                 )
             )
+        self._initial = None
+        if "initial_position" in scene.output.fields:
+            self._initial = np.concatenate([b.position if b.initial is None else b.initial for b in particles])
+        self._drive = Drive(scene, self.groups, backend)
         self.grid = Grid(scene.dimension, self.spacing, scene.domain.cells, width)
         walls = Walls(scene.domain.walls.faces(scene.dimension), PAD, self.grid.cells, self.grid.shape)
         buffers = SortBuffers(self.groups)
@@ -132,61 +123,32 @@ class Solver:
             walls,
             self.groups,
             orders,
-            self._gravity.tolist(),
+            self._drive.gravity,
             on_cpu=backend.on_cpu,
             drift=math.ceil(self._drift_allowed),
         )
-        self._measure = [build_extremes(group, backend) for group in self.groups]
         self._observe = [build_observation(group) for group in self.groups]
         self._last_step = 0.0
         self._drift = math.inf
-        self._extremes = [measure.state() for measure in self._measure]
-        # Per group, since its last measurement: steps, and growth of the logarithm of its stiffness: by deformation,
-        # and by hardening, which is measured by itself.
-        self._unwatched = [0] * len(self.groups)
-        self._change = [0.0] * len(self.groups)
-        self._hardened = [0.0] * len(self.groups)
-        self._most_unwatched = MOST_UNWATCHED_STEPS if backend.on_cpu else MOST_BLIND_STEPS
-        # A step of safety times the limit is stable until the stiffness has grown to safety^-2 of what it was.
-        self._growth_allowed = -2 * UNWATCHED_SHARE * math.log(scene.time.safety)
-        self._use_speeds()
-        self._slow_limits = [self._limits_of(g) for g in range(len(self.groups))]
-        self._eased = math.inf
-        self._take_limits()
+        self._watch = Watch(scene, self.groups, backend)
+        self._speed = self._watch.speed
+        self._drive.measure(0.0, 0.0)
+        # Once more, with the step that says how far ahead the next measurement is.
+        self._drive.measure(0.0, self._watch.longest * self.stable_step()[0])
         self._first_stable_step = self.stable_step()[0]
-
-    def _use_speeds(self) -> None:
-        self._speed = max(extremes.speed for extremes in self._extremes)
 
     def limits(self) -> list[Limit]:
         """Return every bound on the next step: of the speed as it is, of the rest as last measured."""
-        return [self._speed_limit(), *(limit for limits in self._slow_limits for limit in limits)]
+        return [*self._fast_limits(), *self._watch.limits()]
 
-    def _speed_limit(self) -> Limit:
-        return Limit(speed_limit(self.spacing, self._speed, self._pull), "speed", "")
-
-    def _limits_of(self, g: int) -> list[Limit]:
-        """Return the bounds that the g-th group sets, as last measured."""
-        group, extremes = self.groups[g], self._extremes[g]
-        bounds = [Limit(deformation_limit(extremes.gradient), "deformation", "")]
-        for place, parameters in zip(group.bodies, group.law.members, strict=True):
-            for mode in group.law.modes(parameters, extremes.bound):
-                value, cause = mode_limit(self.spacing, parameters.density, mode.stiffness, mode.viscosity)
-                bounds.append(Limit(value, cause, self._names[place]))
-        return bounds
+    def _fast_limits(self) -> list[Limit]:
+        speed = Limit(speed_limit(self.spacing, self._speed, self._drive.pull(self.time)), "speed", "")
+        return [speed, Limit(force_limit(self._drive.slope), "force", "")] if self._drive.pushes else [speed]
 
     @property
     def nearest_limit(self) -> Limit:
         """The smallest bound on the next step."""
-        stiffness = self._stiffness_limit
-        eased = stiffness._replace(value=min(stiffness.value, self._eased))
-        return min(eased, self._deformation_limit, self._speed_limit())
-
-    def _take_limits(self) -> None:
-        """Keep the smallest of the bounds that were measured, those of stiffness apart from those of deformation."""
-        limits = [limit for limits in self._slow_limits for limit in limits]
-        self._deformation_limit = min(limit for limit in limits if limit.name == "deformation")
-        self._stiffness_limit = min(limit for limit in limits if limit.name != "deformation")
+        return min(self._watch.nearest, *self._fast_limits())
 
     def stable_step(self) -> tuple[float, Limit]:
         """Return the step to take, safety included, and the bound that sets it."""
@@ -214,6 +176,8 @@ class Solver:
         # Velocities live in the middle of steps: they move on from that of the last one to that of this one, at the
         # start by half a step. A kick longer than dt / safety^2 might be unstable: kick dt <= (dt / safety)^2.
         kick = min(0.5 * (self._last_step + dt), dt / self.scene.time.safety**2)
+        pull = self._drive.pull(self.time)
+        self._drive.begin_step(self.time)
         fastest = self._kernels.step(dt, kick)
         self.time += dt
         self._last_step = dt
@@ -225,31 +189,13 @@ class Solver:
                 self._stop(dt)
             self._speed = float(fastest)
         else:
-            # Not read back: what is known of it is gravity.
-            self._speed += kick * self._pull
-        self._eased = min(EASING * self._eased, self._stiffness_limit.value)
+            # Not read back: what is known of it is what pulls from outside.
+            self._speed += kick * pull
         self.courant = dt * self._speed / self.spacing
         # Whatever else pushes on a GPU is allowed to double the speed; `advance` flags what went further.
         unseen = 2 * self.courant + UNSEEN if fastest is None else 0.0
         self._drift += max(self.courant, unseen)
-        due = []
-        for g, (group, extremes) in enumerate(zip(self.groups, self._extremes, strict=True)):
-            self._unwatched[g] += 1
-            # What moves through a fifth of a cell may meet something that deforms it by about as much. Where stiffness
-            # does not grow with it, only the deformation itself bounds the step, and slow steps deform little.
-            strain = max(dt * extremes.gradient, 0.5 * self.courant)
-            self._change[g] += strain * (
-                group.law.sensitivity if self.courant < SLOW else max(group.law.sensitivity, 1.0)
-            )
-            # The internal variables alone do not know yet of the last step's strain.
-            pending = strain * group.law.hardening
-            self._hardened[g] += pending
-            hardened = self._hardened[g] >= self._growth_allowed
-            grown = self._change[g] >= self._growth_allowed or (hardened and 2 * pending > self._growth_allowed)
-            if grown or self._unwatched[g] >= self._most_unwatched:
-                due.append(g)
-            elif hardened:
-                self._watch_hardening(g, pending)
+        due = self._watch.after_step(dt, self.courant)
         blind = unseen > 0 and self._drift + unseen >= self._drift_allowed
         if blind:
             self.watch(dt)
@@ -266,34 +212,21 @@ class Solver:
         Raises:
             UnstableRunError: a particle is lost.
         """
-        began = time.perf_counter()
         # On the CPU every step says so itself.
         if not self.backend.on_cpu and self._kernels.any_lost():
             self._stop(dt)
-        for g in range(len(self.groups)) if due is None else due:
-            self._extremes[g] = self._measure[g].state()
-            self._unwatched[g] = 0
-            self._change[g] = self._hardened[g] = 0.0
-            if not self._extremes[g].bound.volume_ratio_min > SMALLEST_J:
-                # Crushed or inverted by the last step: the next one would have refused to scatter it.
-                self._stop(dt)
-            self._slow_limits[g] = self._limits_of(g)
+        if not self._watch.measure(due):
+            # Crushed or inverted by the last step: the next one would have refused to scatter it.
+            self._stop(dt)
+        self._drive.measure(self.time, self._watch.longest * dt)
         # Otherwise the fastest node of the last step bounds the speeds of all.
-        if max(self._unwatched) == 0:
-            self._use_speeds()
-        self._take_limits()
-        self.watch_seconds += time.perf_counter() - began
+        if self._watch.fresh:
+            self._speed = self._watch.speed
 
-    def _watch_hardening(self, g: int, pending: float) -> None:
-        """Measure the internal variables of a group alone; `pending` is what they do not know of yet."""
-        began = time.perf_counter()
-        extremes = self._extremes[g]
-        bound = replace(extremes.bound, internal=self._measure[g].internal())
-        self._extremes[g] = replace(extremes, bound=bound)
-        self._hardened[g] = pending
-        self._slow_limits[g] = self._limits_of(g)
-        self._take_limits()
-        self.watch_seconds += time.perf_counter() - began
+    @property
+    def watch_seconds(self) -> float:
+        """Wall time spent so far on measuring the state for the limits."""
+        return self._watch.seconds
 
     def state_was_replaced(self) -> None:
         """Sort and measure particles whose state was set from outside, as tests and benchmarks do."""
@@ -381,11 +314,12 @@ class Solver:
             self.scene.output.fields,
             self._origin,
             self._position_type,
+            self._initial,
             index,
             self.time,
             self.step_count,
         )
-        sums = measure(snapshots, seen, self._gravity, self.spacing, self._last_step)
+        sums = measure(snapshots, seen, self._drive.gravity_at(self.time), self.spacing, self._last_step)
         smallest = min(taken, default=(0.0, 0.0, ""))
         row = LedgerRow(
             time=self.time,

@@ -7,6 +7,7 @@ import taichi as ti
 
 from mpmcli.boundaries.walls import REACH, Walls
 from mpmcli.solver.extremes import volume_ratio
+from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import TILE, Grid
 from mpmcli.solver.kernel import stencil
 from mpmcli.solver.ordering import CHUNK, TileOrder, share_start
@@ -43,7 +44,7 @@ def build_step(
     walls: Walls,
     groups: Sequence[ParticleGroup],
     orders: Sequence[TileOrder],
-    gravity: Sequence[float],
+    gravity: Gravity,
     *,
     on_cpu: bool,
     drift: int,
@@ -51,7 +52,7 @@ def build_step(
     """Build the kernels for these groups and nothing else.
 
     Args:
-        gravity: m/s^2 per axis.
+        gravity: what it adds to velocities.
         on_cpu: scatter by coloured pencils without atomics, and read the largest speed back.
         drift: cells that a particle may move away from the tile that it was sorted into.
     """
@@ -135,13 +136,6 @@ def build_step(
                 speed_squared += grid.nodes[index][a] ** 2
         return speed_squared
 
-    @ti.func
-    def gravity_of(kick: float):
-        result = ti.Vector.zero(float, d)
-        for a in ti.static(range(d)):
-            result[a] = kick * ti.static(gravity[a])
-        return result
-
     @ti.kernel
     def spread(half: int, kick: float):
         """Scatter two colours, after clearing the grid for the first two.
@@ -173,12 +167,12 @@ def build_step(
         fastest[None] = 0.0
         if ti.static(len(walls.separating) > 0):
             for q in range(walls.plane_nodes(grid)):
-                walls.find_contact(grid, q, gravity_of(kick))
+                walls.find_contact(grid, q, gravity.in_step(kick))
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
                 t = q // CHUNK
                 rows = grid.row_count()
-                gravity_step = gravity_of(kick)
+                gravity_step = gravity.in_step(kick)
                 speed_squared = 0.0
                 for row in range(share_start(rows, t, threads), share_start(rows, t + 1, threads)):
                     node = grid.row_start(row)
@@ -210,10 +204,10 @@ def build_step(
                 spread_one(g, group, p, kick, True)
         if ti.static(len(walls.separating) > 0):
             for q in range(walls.plane_nodes(grid)):
-                walls.find_contact(grid, q, gravity_of(kick))
+                walls.find_contact(grid, q, gravity.in_step(kick))
         for q in range(grid.box_nodes()):
             node = grid.box_node(q)
-            update_node(node, grid.first_node(node), gravity_of(kick))
+            update_node(node, grid.first_node(node), gravity.in_step(kick))
         for g, group, _order in ti.static(pairs):
             for p in range(group.count):
                 advance(g, group, p, dt)

@@ -16,7 +16,8 @@ from mpmcli.solver.particles import MASS, VOLUME
 def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float, atomic: ti.template()):
     """Add the mass and the momentum of particle p, stress included, to the nodes around it.
 
-    A law with plastic flow returns the particle's state to what it can bear first.
+    A law with plastic flow returns the particle's state to what it can bear first. Forces change what is
+    scattered: v by kick a, and C by kick da/dx.
 
     Node i receives w_i (m v + A (x_i - x_p)) with A = m C - dt V0 (4/h^2) tau (Hu et al. 2018, eq. 18
     with the quadratic D = h^2/4), and w_i m. Without `atomic` the caller owns those nodes.
@@ -29,6 +30,10 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float, atom
     stress, _, deformation, inner = group.law.respond(group.stored(p), group.inner(p), C, kick, group.constants(p))
     if ti.static(group.law.projects):
         group.store(p, deformation, inner)
+    if ti.static(group.pushed):
+        push, slope = group.force.acceleration(group, p, group.force.spreads)
+        v += kick * push
+        C += kick * slope
     base, distance = stencil(group.x[p], 1 / h)
     w = weights(distance)
 

@@ -17,6 +17,7 @@ WHY = {
     "viscosity": "momentum must not diffuse across more than a quarter of a cell's square in a step",
     "speed": "a particle must not move more than half a cell in a step",
     "deformation": "a particle must not be compressed by more than half in a step",
+    "force": "a force must not change by itself within a step, as the particle that it pushes moves on",
     "maximum": "time.step in the scene sets it",
     "forced": "time.step in the scene sets it, above what is stable, as --force allows",
 }
@@ -25,6 +26,7 @@ FIX = {
     "viscosity": "a thinner fluid or a coarser grid allows a larger step",
     "speed": "a coarser grid or a slower scene allows a larger step",
     "deformation": "a coarser grid or a stiffer material deforms less in a step",
+    "force": "a force that changes less from place to place allows a larger step",
     "maximum": 'a larger time.step, or "auto", allows a larger step',
     "forced": 'time.step = "auto" takes the largest stable step',
 }
@@ -35,7 +37,7 @@ class Limit(NamedTuple):
 
     Attributes:
         value: the largest step that it allows, s.
-        name: "wave", "viscosity", "speed", "deformation", "maximum" or "forced".
+        name: "wave", "viscosity", "speed", "deformation", "force", "maximum" or "forced".
         body: name of the body that sets it, "" where no single one does.
     """
 
@@ -97,3 +99,11 @@ def speed_limit(spacing: float, speed: float, gravity: float) -> float:
 def deformation_limit(gradient: float) -> float:
     """Return the step in which the largest velocity gradient (1/s) deforms by DEFORMATION, s."""
     return DEFORMATION / gradient if gradient > 0 else math.inf
+
+
+def force_limit(slope: float) -> float:
+    """Return the step at which a force with the largest slope |da/dx| (1/s^2) stays smooth, s: dt^2 |da/dx| <= 1.
+
+    Symplectic Euler is stable up to 4 in a force that pulls back, a = -k x.
+    """
+    return 1 / math.sqrt(slope) if slope > 0 else math.inf

@@ -1,0 +1,76 @@
+"""How hard a scene is driven from outside, for the bounds on the step: by gravity and forces, now and soon."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from mpmcli.scene import Scene
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.expression_kernels import Clock
+from mpmcli.solver.forces import Gravity, GroupForce, build_push, forces_on
+from mpmcli.solver.particles import ParticleGroup
+
+# Forces are measured with the state, for the steps up to the next measurement: at so many instants of that time where
+# they depend on time, and with a margin for what the particles meet on their way.
+INSTANTS = 5
+MARGIN = 1.5
+
+
+class Drive:
+    """Gravity and forces of a scene, and how strong they are.
+
+    Attributes:
+        gravity: for the kernels.
+        slope: largest row sum of |da/dx| of the forces, 1/s^2, as last measured, margin included.
+    """
+
+    def __init__(self, scene: Scene, groups: Sequence[ParticleGroup], backend: Backend) -> None:
+        """Give each group its forces, before kernels are built."""
+        self._domain = scene.domain
+        clock = Clock()
+        self.gravity = Gravity(scene, clock)
+        self._constant = scene.domain.gravity_at(0.0)
+        self._steady_pull = float(np.linalg.norm(self._constant))
+        pushed = [group for group in groups if forces_on(scene, group.bodies)]
+        for group in pushed:
+            group.push_by(GroupForce(scene, group, clock))
+        self._timed = bool(clock.trees)
+        self._set_time = clock.allocate()
+        self._measures = [build_push(group, backend) for group in pushed]
+        self._push = 0.0
+        self.slope = 0.0
+
+    @property
+    def pushes(self) -> bool:
+        """Whether there are forces beside gravity."""
+        return bool(self._measures)
+
+    def begin_step(self, time: float) -> None:
+        """Let gravity and forces be those of a time, s."""
+        if self._timed:
+            self._set_time(time)
+
+    def gravity_at(self, time: float) -> np.ndarray:
+        """Return gravity, (d,), m/s^2."""
+        return self._constant if self._domain.steady else self._domain.gravity_at(time)
+
+    def pull(self, time: float) -> float:
+        """Return a bound on the acceleration of the step from a time (s) on: gravity as it is, forces as measured."""
+        if self._domain.steady:
+            return self._steady_pull + self._push
+        return float(np.linalg.norm(self.gravity_at(time))) + self._push
+
+    def measure(self, time: float, ahead: float) -> None:
+        """Measure the forces where the particles are, from a time on up to the next measurement, `ahead` s later."""
+        if not self._measures:
+            return
+        times = np.linspace(time, time + ahead, INSTANTS) if self._timed and ahead > 0 else [time]
+        found = []
+        for instant in times:
+            self.begin_step(float(instant))
+            found += [measure() for measure in self._measures]
+        self._push, self.slope = (
+            MARGIN * max((value for value in values if math.isfinite(value)), default=0.0)
+            for values in zip(*found, strict=True)
+        )
