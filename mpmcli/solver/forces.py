@@ -1,6 +1,7 @@
 """What acts on matter from outside: gravity, which may depend on time, and forces that are expressions.
 
-Symplectic Euler takes both at the start of a step: gravity and forces at t_n, x_n give v_(n+1), which moves to x_(n+1).
+Leapfrog takes both at the start of a step: at t_n and x_n they move the velocity on from the middle of the last step to
+that of this one, which moves to x_(n+1).
 Gravity acts on the nodes; a force acts on its particles, before their momentum is scattered.
 """
 
@@ -56,14 +57,14 @@ class Gravity:
         self.places = () if self.steady else tuple(clock.place_of(tree_of(entry)) for entry in scene.domain.gravity)
 
     @ti.func
-    def in_step(self, dt: float):
-        """Return what gravity adds to a velocity in a step."""
+    def in_step(self, kick: float):
+        """Return what gravity adds to a velocity in `kick` seconds."""
         result = ti.Vector.zero(float, self.dimension)
         for a in ti.static(range(self.dimension)):
             if ti.static(self.steady):
-                result[a] = dt * ti.static(self.constant[a])
+                result[a] = kick * ti.static(self.constant[a])
             else:
-                result[a] = dt * self.clock.values[None][ti.static(self.places[a])]
+                result[a] = kick * self.clock.values[None][ti.static(self.places[a])]
         return result
 
 
