@@ -104,6 +104,6 @@ def deformation_limit(gradient: float) -> float:
 def force_limit(slope: float) -> float:
     """Return the step at which a force with the largest slope |da/dx| (1/s^2) stays smooth, s: dt^2 |da/dx| <= 1.
 
-    Symplectic Euler is stable up to 4 in a force that pulls back, a = -k x.
+    Leapfrog is stable up to 4 in a force that pulls back, a = -k x.
     """
     return 1 / math.sqrt(slope) if slope > 0 else math.inf
