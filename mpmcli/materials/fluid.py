@@ -16,6 +16,11 @@ QUIET_SPEED = 1.0
 # The pressure of a nonlinear equation of state grows no further below this J: the largest power stays a number of
 # 32 bits. Far beyond what weak compressibility means, but a crushed particle must not turn into infinities.
 CRUSHED = 0.05
+# In bulk the pressure itself stiffens the flow, as moving particles carry it with them: waves of pressure see the
+# tangent modulus and the pressure together, K at any J for p = K (1/J - 1). At J = 0.5 and 0.3, where this is more than
+# a lone particle's tangent, one particle per cell at random places blows up at 0.956 and 0.969 of h/c,
+# c = sqrt(K / density): the factor covers that (`scripts/stable_step_study`).
+CARRIED = 1.2
 # Of Newton's method; some six do, from any load.
 MOST_ITERATIONS = 100
 
@@ -148,12 +153,13 @@ class Fluid(Law):
         """d K ((g - 1) J^(1-g) + J) / g for volume, where viscosity adds (2 - 2d/3) mu + d zeta; 2 mu for shear.
 
         -J p changes by that K-term times tr(C) dt, and tr(C) by d entries. It is convex in J, and so
-        largest at an end of its range.
+        largest at an end of its range. Far compressed fluid in bulk is stiffer: K J^(1-g), see CARRIED.
         """
         d, g, K = self.dimension, parameters.exponent, parameters.bulk_modulus
         largest = min(bound.volume_ratio_max, 1.0) if parameters.tension_cutoff else bound.volume_ratio_max
         ends = (max(min(bound.volume_ratio_min, largest), CRUSHED), max(largest, CRUSHED))
         stiffness = max(d * K * ((g - 1) * J ** (1 - g) + J) / g for J in ends)
+        stiffness = max(stiffness, CARRIED * K * ends[0] ** (1 - g))
         volumetric = (2 - 2 * d / 3) * parameters.viscosity + d * parameters.bulk_viscosity
         modes = [Mode(stiffness, volumetric)]
         return modes + [Mode(0.0, 2 * parameters.viscosity)] * (parameters.viscosity > 0)

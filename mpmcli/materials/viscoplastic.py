@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 import taichi as ti
 from pydantic import Field
 
-from mpmcli.materials.fluid import WeaklyCompressibleParameters, soft_bulk_modulus, volume_energy
+from mpmcli.materials.fluid import CARRIED, WeaklyCompressibleParameters, soft_bulk_modulus, volume_energy
 from mpmcli.materials.law import Law, Mode, StateBound
 from mpmcli.materials.polar import rounding
 from mpmcli.scene.knobs import Knob
@@ -110,13 +110,13 @@ class Viscoplastic(Law):
 
         The two do not couple: C = c I leaves the isochoric b alone, and the rest of C changes dev b only, by
         G (b_i + b_j) at most for a pair of shear entries and by diag(2 G b_i) without its trace for the normal ones.
-        Relaxation shrinks what results, for any step.
+        Relaxation shrinks what results, for any step. Far compressed matter in bulk is stiffer: K, see `fluid.CARRIED`.
         """
         largest = min(bound.volume_ratio_max, 1.0) if parameters.tension_cutoff else bound.volume_ratio_max
         smallest = max(bound.volume_ratio_min, CRUSHED)
         isochoric = bound.stretch_squared_max * smallest ** (-2 / self.dimension)
         isochoric = min(max(isochoric, 1.0), self.dimension * FLAT)
-        bulk = self.dimension * parameters.bulk_modulus * max(largest, 0.0)
+        bulk = max(self.dimension * largest, CARRIED) * parameters.bulk_modulus
         return [Mode(bulk), Mode(2 * parameters.shear_modulus * isochoric)]
 
     @ti.func

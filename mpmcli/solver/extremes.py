@@ -1,6 +1,6 @@
 """Measures how far the particles of each law have gone: what the limits of the next steps depend on."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import taichi as ti
@@ -24,8 +24,7 @@ class Extremes:
 
     Attributes:
         speed: largest speed, m/s.
-        gradient: bound on the rate of deformation, 1/s: |tr C| where J is stored, else the largest row sum of
-            |C + C^T| / 2.
+        gradient: bound on the rate of deformation, 1/s (see `deformation_rate`).
         bound: range of J, of stretches and of the internal variables.
     """
 
@@ -60,6 +59,18 @@ def row_sum(matrix: ti.template()):
     return largest
 
 
+@ti.func
+def deformation_rate(group: ti.template(), C: ti.template()):
+    """Return a bound on how fast C changes what a particle stores: |tr C| for J, else the row sum of |C + C^T| / 2.
+
+    A rotation deforms nothing: |(I + dt C) a| >= (1 - dt |D|) |a|, D the symmetric part of C.
+    """
+    rate = ti.abs(C.trace())
+    if ti.static(group.law.deformation == "F"):
+        rate = 0.5 * row_sum(C + C.transpose())
+    return rate
+
+
 @dataclass(frozen=True)
 class Measurement:
     """Compiled measurements of a group.
@@ -74,48 +85,63 @@ class Measurement:
     internal: Callable[[], dict[str, tuple[float, float]]]
 
 
+def entries(group: ParticleGroup) -> int:
+    """Return how many maxima `widen` raises."""
+    return ENTRIES + 2 * len(group.internal)
+
+
+@ti.func
+def widen(group: ti.template(), own: ti.template(), p: int):
+    """Raise maxima to those of particle p."""
+    v, C = group.motion(p)
+    deformation = group.stored(p)
+    J = volume_ratio(group, deformation)
+    own[SPEED_SQUARED] = ti.max(own[SPEED_SQUARED], v.norm_sqr())
+    own[GRADIENT] = ti.max(own[GRADIENT], deformation_rate(group, C))
+    own[J_MAX] = ti.max(own[J_MAX], J)
+    own[MINUS_J_MIN] = ti.max(own[MINUS_J_MIN], -J)
+    if ti.static(group.law.deformation == "F"):
+        # The largest eigenvalue of b = F F^T, exact at rest in any rotation.
+        own[STRETCH_SQUARED] = ti.max(own[STRETCH_SQUARED], row_sum(deformation @ deformation.transpose()))
+    else:
+        own[STRETCH_SQUARED] = ti.max(own[STRETCH_SQUARED], J * J)
+    widen_internal(group, own, p, ENTRIES)
+
+
+@ti.func
+def widen_internal(group: ti.template(), own: ti.template(), p: int, first: ti.template()):
+    """Raise the maxima of the internal variables, which begin at `first`, to those of particle p."""
+    for i in ti.static(range(len(group.internal))):
+        value = group.internal[i][p]
+        own[first + 2 * i] = ti.max(own[first + 2 * i], value)
+        own[first + 2 * i + 1] = ti.max(own[first + 2 * i + 1], -value)
+
+
+def extremes_of(group: ParticleGroup, maxima: Sequence[float]) -> Extremes:
+    """Return the extremes that the maxima of all particles, as `widen` raises them, stand for."""
+    internal = _ranges(group, maxima[ENTRIES:])
+    bound = StateBound(-maxima[MINUS_J_MIN], maxima[J_MAX], maxima[STRETCH_SQUARED], internal)
+    return Extremes(maxima[SPEED_SQUARED] ** 0.5, maxima[GRADIENT], bound)
+
+
+def _ranges(group: ParticleGroup, maxima: Sequence[float]) -> dict[str, tuple[float, float]]:
+    return {v.name: (-maxima[2 * i + 1], maxima[2 * i]) for i, v in enumerate(group.law.internal)}
+
+
 def build_extremes(group: ParticleGroup, backend: Backend) -> Measurement:
     """Compile-ready measurements of a group."""
 
     @ti.func
-    def widen_internal(own: ti.template(), p: int):
-        for i in ti.static(range(len(group.internal))):
-            value = group.internal[i][p]
-            own[2 * i] = ti.max(own[2 * i], value)
-            own[2 * i + 1] = ti.max(own[2 * i + 1], -value)
+    def widen_all(own: ti.template(), p: int):
+        widen(group, own, p)
 
     @ti.func
-    def widen(own: ti.template(), p: int):
-        v, C = group.motion(p)
-        deformation = group.stored(p)
-        J = volume_ratio(group, deformation)
-        own[SPEED_SQUARED] = ti.max(own[SPEED_SQUARED], v.norm_sqr())
-        own[J_MAX] = ti.max(own[J_MAX], J)
-        own[MINUS_J_MIN] = ti.max(own[MINUS_J_MIN], -J)
-        if ti.static(group.law.deformation == "F"):
-            # The largest eigenvalue of b = F F^T, exact at rest in any rotation.
-            own[STRETCH_SQUARED] = ti.max(own[STRETCH_SQUARED], row_sum(deformation @ deformation.transpose()))
-            # A rotation deforms nothing: |(I + dt C) a| >= (1 - dt |D|) |a|, D the symmetric part of C.
-            own[GRADIENT] = ti.max(own[GRADIENT], 0.5 * row_sum(C + C.transpose()))
-        else:
-            own[STRETCH_SQUARED] = ti.max(own[STRETCH_SQUARED], J * J)
-            own[GRADIENT] = ti.max(own[GRADIENT], ti.abs(C.trace()))
+    def widen_inner(own: ti.template(), p: int):
+        widen_internal(group, own, p, 0)
 
-    measure_state = build_maxima(group.count, ENTRIES, widen, backend)
-    measure_internal = build_maxima(group.count, 2 * len(group.internal), widen_internal, backend)
-
-    def internal() -> dict[str, tuple[float, float]]:
-        if not group.internal:
-            return {}
-        values = measure_internal()
-        return {v.name: (-values[2 * i + 1], values[2 * i]) for i, v in enumerate(group.law.internal)}
-
-    def state() -> Extremes:
-        values = measure_state()
-        bound = StateBound(-values[MINUS_J_MIN], values[J_MAX], values[STRETCH_SQUARED], internal())
-        return Extremes(values[SPEED_SQUARED] ** 0.5, values[GRADIENT], bound)
-
-    return Measurement(state, internal)
+    state = build_maxima(group.count, entries(group), widen_all, backend)
+    internal = build_maxima(group.count, 2 * len(group.internal), widen_inner, backend)
+    return Measurement(lambda: extremes_of(group, state()), lambda: _ranges(group, internal()))
 
 
 def build_maxima(count: int, size: int, widen: Callable, backend: Backend) -> Callable[[], list[float]]:

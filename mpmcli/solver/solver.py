@@ -178,24 +178,24 @@ class Solver:
         kick = min(0.5 * (self._last_step + dt), dt / self.scene.time.safety**2)
         pull = self._drive.pull(self.time)
         self._drive.begin_step(self.time)
-        fastest = self._kernels.step(dt, kick)
+        pace = self._kernels.step(dt, kick)
         self.time += dt
         self._last_step = dt
         self.step_count += 1
         if self.step_count == 1:
             self.first_step_seconds = time.perf_counter() - began
-        if fastest is not None:
-            if not fastest >= 0:
+        if pace is not None:
+            if not pace.speed >= 0:
                 self._stop(dt)
-            self._speed = float(fastest)
+            self._speed = pace.speed
         else:
             # Not read back: what is known of it is what pulls from outside.
             self._speed += kick * pull
         self.courant = dt * self._speed / self.spacing
         # Whatever else pushes on a GPU is allowed to double the speed; `advance` flags what went further.
-        unseen = 2 * self.courant + UNSEEN if fastest is None else 0.0
+        unseen = 2 * self.courant + UNSEEN if pace is None else 0.0
         self._drift += max(self.courant, unseen)
-        due = self._watch.after_step(dt, self.courant)
+        due = self._watch.after_step(dt, self.courant, pace)
         blind = unseen > 0 and self._drift + unseen >= self._drift_allowed
         if blind:
             self.watch(dt)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from mpmcli.boundaries.walls import REACH, Walls
-from mpmcli.solver.extremes import volume_ratio
+from mpmcli.solver.extremes import NOTHING, Extremes, deformation_rate, entries, extremes_of, volume_ratio, widen
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import TILE, Grid
 from mpmcli.solver.kernel import stencil
@@ -20,20 +20,34 @@ SMALLEST_J = 1e-6
 
 
 @dataclass(frozen=True)
+class Pace:
+    """How fast the state changed in a step.
+
+    Attributes:
+        speed: largest speed of a node, m/s, which no particle exceeds; -1 where a particle was lost.
+        gradients: of each group, the largest rate of deformation, 1/s (see `deformation_rate`).
+        extremes: of each group that hardens, the extremes of its state; None of the others, which change less.
+    """
+
+    speed: float
+    gradients: list[float]
+    extremes: list[Extremes | None]
+
+
+@dataclass(frozen=True)
 class StepKernels:
     """Compiled steps.
 
     Attributes:
-        step: (dt, kick) -> largest speed of a node, m/s, which no particle exceeds. Positions move on by dt, s,
-            velocities by kick, s: from the middle of the last step to the middle of this one (leapfrog). On a GPU the
-            speed is not read back, and None.
+        step: (dt, kick) -> how fast the state changed. Positions move on by dt, s, velocities by kick, s: from the
+            middle of the last step to the middle of this one (leapfrog). On a GPU nothing is read back, and None.
         find_box: set the grid's box in use from the sorted tiles.
         lost: per group, the first particle (in solver order) that left the domain, inverted or became
             non-finite, or NOT_LOST.
         any_lost: () -> whether there is one.
     """
 
-    step: Callable[[float, float], float | None]
+    step: Callable[[float, float], Pace | None]
     find_box: Callable[[], None]
     lost: ti.Field
     any_lost: Callable[[], bool]
@@ -61,6 +75,16 @@ def build_step(
     threads = orders[0].threads
     pairs = tuple(zip(range(len(groups)), groups, orders, strict=True))
     fastest = ti.field(float, shape=())
+    # What is read back of each group: its rate of deformation, and all extremes where it hardens. A field each, as only
+    # a field without axes is reduced without an atomic operation per particle.
+    sharpest = tuple(ti.field(float, shape=()) for _ in groups)
+    hardens = tuple(group.law.hardening > 0 for group in groups)
+    farthest = tuple(
+        tuple(ti.field(float, shape=()) for _ in range(entries(group) * hardened))
+        for group, hardened in zip(groups, hardens, strict=True)
+    )
+    read_back = (*sharpest, *(field for fields in farthest for field in fields))
+    found = ti.types.vector(1 + len(read_back), float)
     lost = ti.field(int, shape=len(groups))
     tile_low = ti.field(int, shape=d)
     tile_high = ti.field(int, shape=d)
@@ -68,7 +92,7 @@ def build_step(
 
     @ti.func
     def advance(g: ti.template(), group: ti.template(), p: int, dt: float):
-        """Gather and move one particle: x += dt v, J *= 1 + dt tr C or F <- (I + dt C) F."""
+        """Gather and move one particle, x += dt v and J *= 1 + dt tr C or F <- (I + dt C) F; return its rate."""
         x = group.x[p]
         v, gradient = gather(x, grid)
         C = ti.Matrix.zero(float, d, d)
@@ -109,6 +133,7 @@ def build_step(
             group.x[p][c] = ti.select(sound, inside[c], x[c])
         if not sound:
             ti.atomic_min(lost[g], p)
+        return deformation_rate(group, C)
 
     @ti.func
     def spread_one(g: ti.template(), group: ti.template(), p: int, kick: float, atomic: ti.template()):
@@ -162,9 +187,11 @@ def build_step(
                                 spread_one(g, group, p, kick, False)
 
     @ti.kernel
-    def collect(dt: float, kick: float) -> float:
-        """Update the grid, gather, and return the largest speed of a node, or -1 where a particle was lost."""
+    def collect(dt: float, kick: float) -> found:
+        """Update the grid, gather, and return the numbers of a `Pace`."""
         fastest[None] = 0.0
+        for k in ti.static(range(len(read_back))):
+            read_back[k][None] = NOTHING
         if ti.static(len(walls.separating) > 0):
             for q in range(walls.plane_nodes(grid)):
                 walls.find_contact(grid, q, gravity.in_step(kick))
@@ -183,17 +210,31 @@ def build_step(
                 ti.atomic_max(fastest[None], speed_squared)
         for g, group, _order in ti.static(pairs):
             for p in range(group.count):
-                advance(g, group, p, dt)
-        result = ti.sqrt(fastest[None])
+                ti.atomic_max(sharpest[g][None], advance(g, group, p, dt))
+                if ti.static(hardens[g]):
+                    own = ti.Vector([NOTHING] * ti.static(entries(group)))
+                    widen(group, own, p)
+                    for k in ti.static(range(len(farthest[g]))):
+                        ti.atomic_max(farthest[g][k][None], own[k])
+        result = found(0.0)
+        result[0] = ti.sqrt(fastest[None])
+        for k in ti.static(range(len(read_back))):
+            result[1 + k] = read_back[k][None]
         for g in ti.static(range(len(groups))):
             if lost[g] != NOT_LOST:
-                result = -1.0
+                result[0] = -1.0
         return result
 
-    def step_cpu(dt: float, kick: float) -> float:
+    def step_cpu(dt: float, kick: float) -> Pace:
         for half in range(orders[0].colours // 2):
             spread(half, kick)
-        return collect(dt, kick)
+        speed, *values = collect(dt, kick).to_list()
+        extremes, first = [], len(groups)
+        for group, fields in zip(groups, farthest, strict=True):
+            own = values[first : first + len(fields)]
+            extremes.append(extremes_of(group, own) if own else None)
+            first += len(fields)
+        return Pace(speed, values[: len(groups)], extremes)
 
     @ti.kernel
     def step_gpu(dt: float, kick: float):

@@ -7,21 +7,21 @@ from dataclasses import replace
 
 from mpmcli.scene import Scene
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.extremes import build_extremes
+from mpmcli.solver.extremes import Extremes, build_extremes
 from mpmcli.solver.particles import ParticleGroup
-from mpmcli.solver.step import SMALLEST_J
+from mpmcli.solver.step import SMALLEST_J, Pace
 from mpmcli.stability.limits import Limit, deformation_limit, mode_limit
 
 # The state is measured, and the limits with it, once in so many steps at least. It is earlier where a stiffness may
 # have grown since by more than this share of what time.safety leaves.
-MOST_UNWATCHED_STEPS = 32
+MOST_UNWATCHED_STEPS = 64
 UNWATCHED_SHARE = 0.75
 # On a GPU the measurement is also what sees that a particle was lost.
 MOST_BLIND_STEPS = 16
 # Cells per step below which a sudden stop, which turns speed into a velocity gradient of up to two speeds a cell,
 # stays clear of the bound on the deformation in a step.
 SLOW = 0.1
-# A bound by stiffness falls at once and rises by this factor a step at most: a step that follows the oscillation of a
+# A bound falls at once and rises by this factor a step at most: a step that follows the oscillation of a
 # lone particle up and down drives it until it bursts. At 1.01 one of fourteen trials did, at 1.001 none.
 EASING = 1.001
 
@@ -41,8 +41,9 @@ class Watch:
         self._spacing = scene.domain.spacing
         self._measure = [build_extremes(group, backend) for group in groups]
         self._extremes = [measure.state() for measure in self._measure]
-        # Per group, since its last measurement: steps, and growth of the logarithm of its stiffness: by deformation,
-        # and by hardening, which is measured by itself.
+        # Per group: its rate of deformation after the last step as far as known, and since its last measurement steps
+        # and growth of the logarithm of its stiffness: by deformation, and by hardening, which is measured by itself.
+        self._gradients = [extremes.gradient for extremes in self._extremes]
         self._unwatched = [0] * len(groups)
         self._change = [0.0] * len(groups)
         self._hardened = [0.0] * len(groups)
@@ -50,7 +51,7 @@ class Watch:
         # A step of safety times the limit is stable until the stiffness has grown to safety^-2 of what it was.
         self._growth_allowed = -2 * UNWATCHED_SHARE * math.log(scene.time.safety)
         self.seconds = 0.0
-        self._limits = [self._limits_of(g) for g in range(len(groups))]
+        self._limits = [self._limits_of(g, extremes) for g, extremes in enumerate(self._extremes)]
         self._eased = math.inf
         self._take_limits()
 
@@ -66,44 +67,62 @@ class Watch:
 
     def limits(self) -> list[Limit]:
         """Return every bound as last measured."""
-        return [limit for limits in self._limits for limit in limits]
+        return [limit for limits in self._limits for limit in limits] + [self._deformation_limit]
 
     def limits_now(self) -> list[Limit]:
         """Return every bound by the state as it is, without keeping it."""
-        known = self._extremes
-        self._extremes = [measure.state() for measure in self._measure]
-        limits = [limit for g in range(len(self._groups)) for limit in self._limits_of(g)]
-        self._extremes = known
-        return limits
+        states = [measure.state() for measure in self._measure]
+        limits = [limit for g, extremes in enumerate(states) for limit in self._limits_of(g, extremes)]
+        return [*limits, _deformation_limit(extremes.gradient for extremes in states)]
 
     @property
     def nearest(self) -> Limit:
         """The smallest bound on the next step."""
-        stiffness = self._stiffness_limit
-        return min(stiffness._replace(value=min(stiffness.value, self._eased)), self._deformation_limit)
+        limit = min(self._stiffness_limit, self._deformation_limit)
+        return limit._replace(value=min(limit.value, self._eased))
 
-    def after_step(self, dt: float, courant: float) -> list[int]:
-        """Count a step of dt (s) in which something moved by so many cells; return the groups to measure now.
+    def after_step(self, dt: float, courant: float, pace: Pace | None) -> list[int]:
+        """Count a step and return the groups to measure now.
 
-        What only hardened is measured at once.
+        What the step itself read back is taken in at once.
+
+        Args:
+            dt: the step, s.
+            courant: cells that the fastest particle moved.
+            pace: what changed in it, None where that was not read back.
         """
-        self._eased = min(EASING * self._eased, self._stiffness_limit.value)
+        began = time.perf_counter()
+        self._eased = min(EASING * self._eased, self._stiffness_limit.value, self._deformation_limit.value)
+        if pace is not None:
+            self._gradients[:] = pace.gradients
+            self._deformation_limit = _deformation_limit(self._gradients)
         due = []
-        for g, (group, extremes) in enumerate(zip(self._groups, self._extremes, strict=True)):
+        for g, group in enumerate(self._groups):
             self._unwatched[g] += 1
-            # What moves through a fifth of a cell may meet something that deforms it by about as much. Where stiffness
-            # does not grow with it, only the deformation itself bounds the step, and slow steps deform little.
-            strain = max(dt * extremes.gradient, 0.5 * courant)
-            self._change[g] += strain * (group.law.sensitivity if courant < SLOW else max(group.law.sensitivity, 1.0))
+            strain = dt * self._gradients[g]
+            sensitivity = group.law.sensitivity
+            if pace is None:
+                # What moves through a fifth of a cell may meet something that deforms it by about as much. Where
+                # stiffness does not grow with it, only the deformation itself bounds the step, and slow steps deform
+                # little.
+                strain = max(strain, 0.5 * courant)
+                sensitivity = max(sensitivity, 1.0) if courant >= SLOW else sensitivity
+            self._change[g] += strain * sensitivity
             # The internal variables alone do not know yet of the last step's strain.
             pending = strain * group.law.hardening
             self._hardened[g] += pending
-            hardened = self._hardened[g] >= self._growth_allowed
-            grown = self._change[g] >= self._growth_allowed or (hardened and 2 * pending > self._growth_allowed)
-            if grown or self._unwatched[g] >= self.longest:
+            grown = self._change[g] >= self._growth_allowed
+            if self._unwatched[g] >= self.longest:
                 due.append(g)
-            elif hardened:
-                self._measure_hardening(g, pending)
+            elif grown or self._hardened[g] >= self._growth_allowed:
+                known = None if pace is None else pace.extremes[g]
+                if known is not None and _sound(known):
+                    self._take(g, known)
+                elif pace is None and not grown and 2 * pending <= self._growth_allowed:
+                    self._measure_hardening(g, pending)
+                else:
+                    due.append(g)
+        self.seconds += time.perf_counter() - began
         return due
 
     def measure(self, due: Iterable[int] | None = None) -> bool:
@@ -111,31 +130,34 @@ class Watch:
         began = time.perf_counter()
         sound = True
         for g in range(len(self._groups)) if due is None else due:
-            self._extremes[g] = self._measure[g].state()
-            self._unwatched[g] = 0
-            self._change[g] = self._hardened[g] = 0.0
-            sound = sound and self._extremes[g].bound.volume_ratio_min > SMALLEST_J
+            extremes = self._measure[g].state()
+            sound = sound and _sound(extremes)
             if sound:
-                self._limits[g] = self._limits_of(g)
-        self._take_limits()
+                self._take(g, extremes)
+                self._unwatched[g] = 0
         self.seconds += time.perf_counter() - began
         return sound
 
+    def _take(self, g: int, extremes: Extremes) -> None:
+        """Keep the extremes of a group as they are now, and the bounds that follow from them."""
+        self._extremes[g] = extremes
+        self._gradients[g] = extremes.gradient
+        self._change[g] = self._hardened[g] = 0.0
+        self._limits[g] = self._limits_of(g, extremes)
+        self._take_limits()
+
     def _measure_hardening(self, g: int, pending: float) -> None:
         """Measure the internal variables of a group alone; `pending` is what they do not know of yet."""
-        began = time.perf_counter()
         extremes = self._extremes[g]
-        bound = replace(extremes.bound, internal=self._measure[g].internal())
-        self._extremes[g] = replace(extremes, bound=bound)
+        self._extremes[g] = replace(extremes, bound=replace(extremes.bound, internal=self._measure[g].internal()))
         self._hardened[g] = pending
-        self._limits[g] = self._limits_of(g)
+        self._limits[g] = self._limits_of(g, self._extremes[g])
         self._take_limits()
-        self.seconds += time.perf_counter() - began
 
-    def _limits_of(self, g: int) -> list[Limit]:
-        """Return the bounds that the g-th group sets, as last measured."""
-        group, extremes = self._groups[g], self._extremes[g]
-        bounds = [Limit(deformation_limit(extremes.gradient), "deformation", "")]
+    def _limits_of(self, g: int, extremes: Extremes) -> list[Limit]:
+        """Return the bounds that the stiffness of the g-th group sets within such extremes."""
+        group = self._groups[g]
+        bounds = []
         for place, parameters in zip(group.bodies, group.law.members, strict=True):
             for mode in group.law.modes(parameters, extremes.bound):
                 value, cause = mode_limit(self._spacing, parameters.density, mode.stiffness, mode.viscosity)
@@ -144,6 +166,14 @@ class Watch:
 
     def _take_limits(self) -> None:
         """Keep the smallest of the bounds that were measured, those of stiffness apart from those of deformation."""
-        limits = self.limits()
-        self._deformation_limit = min(limit for limit in limits if limit.name == "deformation")
-        self._stiffness_limit = min(limit for limit in limits if limit.name != "deformation")
+        self._stiffness_limit = min(limit for limits in self._limits for limit in limits)
+        self._deformation_limit = _deformation_limit(self._gradients)
+
+
+def _sound(extremes: Extremes) -> bool:
+    """Return whether no particle is crushed, inverted or NaN."""
+    return extremes.bound.volume_ratio_min > SMALLEST_J
+
+
+def _deformation_limit(gradients: Iterable[float]) -> Limit:
+    return Limit(deformation_limit(max(gradients)), "deformation", "")

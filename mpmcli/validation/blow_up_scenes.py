@@ -209,13 +209,9 @@ def study_scenes() -> list[BlowUpScene]:
         confined("fluid held at J 0.8, 4 per cell", liquid(), (math.sqrt(0.8),) * 2, 2, jittered=True),
         confined("fluid with cut-off held at J 0.8", liquid(tension_cutoff=True), (math.sqrt(0.8),) * 2, 2),
         confined("fluid held at J 1.2, 4 per cell", liquid(), (math.sqrt(1.2),) * 2, 2, jittered=True),
-    ]
-
-
-def compressed_scenes() -> list[BlowUpScene]:
-    """Return boxes of fluid held at J far below 1, with one particle in a cell and with four."""
-    return [
-        confined(f"fluid held at J {J}, {per_axis**2} per cell", liquid(), (math.sqrt(J),) * 2, per_axis, jittered=True)
-        for J in (0.5, 0.3)
-        for per_axis in (1, 2)
+        confined("fluid held at J 0.5, 1 per cell", liquid(), (math.sqrt(0.5),) * 2, 1, jittered=True),
+        confined("fluid held at J 0.3, 1 per cell", liquid(), (math.sqrt(0.3),) * 2, 1, jittered=True),
+        confined("fluid held at J 0.3, 4 per cell", liquid(), (math.sqrt(0.3),) * 2, 2, jittered=True),
+        confined("fluid held at J 0.4, 1 per cell", liquid(), (0.4 ** (1 / 3),) * 3, 1, side=5, jittered=True),
+        confined("viscoplastic held at J 0.5, 1 per cell", mud, (math.sqrt(0.5),) * 2, 1, jittered=True),
     ]
