@@ -121,7 +121,10 @@ def test_a_backend_that_is_not_there_is_refused(refused, monkeypatch):
     ("arguments", "sentence"),
     [
         (["simulat"], 'there is no command "simulat"; did you mean "simulate"? See mpmcli --help.'),
-        (["paint"], 'there is no command "paint"; the commands are simulate, check, info, materials, schema, bench, '),
+        (
+            ["paint"],
+            'there is no command "paint"; the commands are simulate, check, info, materials, schema, validate, bench, ',
+        ),
         (["--verbose"], "no such option '--verbose'"),
         (["simulate"], "missing argument 'SCENE'. See mpmcli simulate --help."),
         (["simulate", "a.toml", "b.toml"], "got unexpected extra argument (b.toml). See mpmcli simulate --help."),

@@ -18,6 +18,7 @@ COMMANDS = {
     "info": "Say what a result or a scene holds.",
     "materials": "List laws, presets, their parameters and knobs.",
     "schema": "Print the JSON Schema of scenes, for editors.",
+    "validate": "Measure speed against error on problems with known answers.",
     "bench": "Compare speed with the MPM examples that Taichi ships.",
     "completion": "Print the script that completes commands in a shell.",
 }

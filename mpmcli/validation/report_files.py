@@ -1,0 +1,51 @@
+"""Writes a report: report.json, report.md with its figures, and report.html, which holds them itself."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from mpmcli.errors import RunError
+from mpmcli.output.durable import sealed, write_text
+from mpmcli.validation.figure_settings import draw_settings
+from mpmcli.validation.figures import draw_case
+from mpmcli.validation.journal import FIGURES
+from mpmcli.validation.page_html import to_html
+from mpmcli.validation.page_markdown import to_markdown
+from mpmcli.validation.report import Report
+from mpmcli.validation.report_page import SETTINGS_FIGURE, TITLE, figure_name, report_page
+
+
+def write_report(report: Report, directory: Path) -> None:
+    """Write the report into a directory that exists, each file in one durable step.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    pictures = {figure_name(entry): draw_case(entry) for entry in report.case_reports}
+    if len(report.compared) > 1:
+        pictures[SETTINGS_FIGURE] = draw_settings(report.compared)
+    blocks = report_page(report)
+    texts = {
+        "report.json": json.dumps(plain(report.as_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n",
+        "report.md": to_markdown(blocks, FIGURES),
+        "report.html": to_html(TITLE, blocks, pictures),
+    }
+    try:
+        (directory / FIGURES).mkdir(exist_ok=True)
+        for name, content in pictures.items():
+            with sealed(directory / FIGURES / name) as temporary:
+                temporary.write_bytes(content)
+        for name, text in texts.items():
+            write_text(directory / name, text)
+    except OSError as error:
+        raise RunError(f"The report could not be written to {directory} ({error.strerror or error}).") from error
+
+
+def plain(value: Any) -> Any:
+    """Replace what is not finite by null, as JSON has no infinity."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,131 @@
+"""Whether a case came out as it should: bounds, orders, and single against double precision."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from mpmcli.validation.case import Case, Measure
+from mpmcli.validation.convergence import observed_order
+from mpmcli.validation.matrix import Run, label_of
+from mpmcli.validation.run_result import RunResult
+from mpmcli.validation.setting import Setting
+
+# Single precision may have so much more error, where the error is above what rounding makes of it.
+SINGLE_RATIO = 1.2
+SINGLE_FLOOR = 1e-4
+
+SINGLE = replace(Setting(), precision="f32")
+
+Results = Mapping[Run, RunResult]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that must hold.
+
+    Attributes:
+        subject: of what, such as "period error".
+        setting: of whose runs; n: at which resolution, None where it is about several.
+        figure: what was found, bound: what is right, as text; None where there is no figure.
+        passed: whether it holds; sentence: why, or why not.
+    """
+
+    subject: str
+    setting: Setting
+    n: int | None
+    figure: float | None
+    bound: str
+    passed: bool
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """All checks of a case, and what failed."""
+
+    checks: tuple[Check, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether everything holds."""
+        return all(check.passed for check in self.checks)
+
+    @property
+    def word(self) -> str:
+        """It in a word."""
+        return "pass" if self.passed else "fail"
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """What does not hold, in sentences."""
+        return tuple(check.sentence for check in self.checks if not check.passed)
+
+
+def judge(case: Case, results: Results) -> Verdict:
+    """Judge the runs of a case: those of the default setting by its bounds, f32 by those of f64.
+
+    Other settings are there to be compared, and have no bounds.
+    """
+    default = default_results(case, results)
+    checks = [check for n, result in default.items() for check in _bound_checks(case, n, result)]
+    checks += [check for measure in case.measures if (check := _order_check(measure, default)) is not None]
+    for run, result in results.items():
+        if run.case == case.name and run.setting == SINGLE:
+            checks += _single_checks(case, run, default.get(run.n), result)
+    return Verdict(tuple(checks))
+
+
+def default_results(case: Case, results: Results) -> dict[int, RunResult]:
+    """Return the runs of a case with the default setting by their resolution, from coarse to fine."""
+    found = {run.n: result for run, result in results.items() if run.case == case.name and run.setting == Setting()}
+    return dict(sorted(found.items()))
+
+
+def verdict_of_run(verdict: Verdict, run: Run) -> str | None:
+    """Return "pass" or "fail" of one run; None of a run that nothing is asked of."""
+    mine = [check for check in verdict.checks if check.n == run.n and check.setting == run.setting]
+    return None if not mine else "pass" if all(check.passed for check in mine) else "fail"
+
+
+def _bound_checks(case: Case, n: int, result: RunResult) -> list[Check]:
+    if not result.finished:
+        sentence = f"At n = {n} the run with the default setting {_ending(result)}"
+        return [Check("run", Setting(), n, None, "finishes", False, sentence)]
+    checks = []
+    for measure in case.measures:
+        value, bound = result.values[measure.name], measure.bound(n)
+        passed = abs(value) <= bound
+        unit = f" {measure.unit}" if measure.unit else ""
+        where = f"At n = {n} the {measure.name} is {value:.3g}{unit}"
+        sentence = f"{where}, {'within' if passed else 'beyond'} its bound of {bound:.3g}{unit}."
+        checks.append(Check(measure.name, Setting(), n, value, f"{bound:.3g}", passed, sentence))
+    return checks
+
+
+def _order_check(measure: Measure, default: dict[int, RunResult]) -> Check | None:
+    finest = [(n, abs(result.values[measure.name])) for n, result in default.items() if result.finished][-2:]
+    order = observed_order(*finest) if len(finest) == 2 else None
+    if measure.order is None or order is None:
+        return None
+    passed = order >= measure.order
+    between = f"Between n = {finest[0][0]} and {finest[1][0]} the {measure.name} falls at order {order:.2f}"
+    sentence = f"{between}, {'as' if passed else 'but'} at least {measure.order:g} is asked for."
+    return Check(f"order of {measure.name}", Setting(), None, order, f"at least {measure.order:g}", passed, sentence)
+
+
+def _single_checks(case: Case, run: Run, double: RunResult | None, single: RunResult) -> list[Check]:
+    name = case.measures[0].name
+    if double is None or not double.finished or double.error(name) <= SINGLE_FLOOR:
+        return []
+    bound, subject = f"{SINGLE_RATIO:g}", f"f32 / f64, {name}"
+    if not single.finished:
+        sentence = f"At n = {run.n} the run in {label_of(run.setting)} {_ending(single)}"
+        return [Check(subject, run.setting, run.n, None, bound, False, sentence)]
+    ratio = single.error(name) / double.error(name)
+    passed = ratio <= SINGLE_RATIO
+    sentence = f"At n = {run.n} the {name} in f32 is {ratio:.3g} times that in f64; up to {bound} is right."
+    return [Check(subject, run.setting, run.n, ratio, bound, passed, sentence)]
+
+
+def _ending(result: RunResult) -> str:
+    word = "became unstable" if result.status == "unstable" else "failed"
+    return f"{word}: {result.message}"

@@ -1,0 +1,153 @@
+"""`mpmcli validate` as people and pipelines call it."""
+
+import json
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from command import Outcome, run_here, started
+
+from mpmcli.output import open_result
+from mpmcli.validation.registry import all_cases
+
+BAR = "bar_fixed_free"
+PATIENCE = 120  # s
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the bar one resolution: two runs at the level coarse."""
+    monkeypatch.setattr(type(all_cases()[BAR]), "levels", {"coarse": (13,)})
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["bar_fixed_fre"], 'there is no case "bar_fixed_fre"; did you mean "bar_fixed_free"?'),
+        (["zzz"], 'there is no case "zzz"; there are '),
+        ([BAR, "--resume"], "name its directory with -o"),
+        ([BAR, "--resume", "--overwrite", "-o", "x"], "give one of them"),
+        ([BAR, "--resolution", "9"], "--resolution is for --write-scene"),
+        (["--write-scene"], "prints the scene of one case; name it"),
+        ([BAR, "--levels", "finest"], "'finest' is not one of 'coarse', 'default', 'fine'"),
+        ([BAR, "--workers", "0"], "0 is not in the range x>=1"),
+        ([BAR, "-o", "."], "exists and is not empty: --resume keeps"),
+    ],
+)
+def test_bad_usage_is_told_before_anything_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.txt").write_text("mine")
+    outcome = run_here("validate", *words)
+    assert (outcome.status, outcome.stdout) == (2, "")
+    (line,) = outcome.stderr.splitlines()
+    assert line.startswith("error: ") and said in line
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_the_list_names_every_case() -> None:
+    outcome = run_here("validate", "--list")
+    assert outcome.status == 0 and outcome.stdout == ""
+    assert [line.split()[0] for line in outcome.stderr.splitlines()[2:]] == list(all_cases())
+    facts = json.loads(run_here("validate", "bar", "--list", "--json").stdout)
+    assert [entry["case"] for entry in facts] == ["bar_fixed_fixed", BAR]
+    assert facts[1]["resolutions"] == [13, 26, 52] and facts[1]["resolution"] == "cells along the bar"
+
+
+def test_the_scene_of_a_case_runs_as_it_is(tmp_path: Path) -> None:
+    outcome = run_here("validate", "bar", "--write-scene", "--resolution", "7")
+    assert outcome.status == 0
+    assert outcome.stderr == "this is the scene of bar_fixed_fixed; others are those of bar_fixed_free\n"
+    (tmp_path / "bar.toml").write_text(outcome.stdout, encoding="utf-8")
+    ran = run_here("simulate", tmp_path / "bar.toml", "-o", tmp_path / "result", "--quiet", "--set", "time.frames=2")
+    assert (ran.status, ran.stderr) == (0, "")
+    result = open_result(tmp_path / "result")
+    assert result.times[-1] == 25.0 and result.header["precision"] == "f64"
+    assert result.particle_counts[0] == 7 * 5 * 4
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    """A report of the bar at one resolution, and what its command said."""
+    directory = tmp_path_factory.mktemp("validate") / "report"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(all_cases()[BAR]), "levels", {"coarse": (13,)})
+        return directory, run_here("validate", BAR, "--levels", "coarse", "-o", directory, "--workers", "2", "--json")
+
+
+def test_json_has_error_order_speed_and_verdict_of_each_run(ran: tuple[Path, Outcome]) -> None:
+    directory, outcome = ran
+    assert outcome.status == 0
+    facts = json.loads(outcome.stdout)
+    assert facts == json.loads((directory / "report.json").read_text(encoding="utf-8"))
+    runs = facts["cases"][0]["runs"]
+    assert [(run["setting"], run["n"], run["verdict"]) for run in runs] == [
+        ("default", 13, "pass"),
+        ("f32", 13, "pass"),
+    ]
+    for run in runs:
+        assert 0 < run["error"] == abs(run["values"]["period error"]) < 2e-3 and run["order"] is None
+        assert run["particle_steps"] == run["particles"] * run["steps"] and run["particles"] == 260
+        assert run["seconds"] > 0 and run["compile_seconds"] > 0 and run["particle_steps_per_s"] > 0
+        assert (run["arch"], run["threads"], run["status"]) == ("cpu", 1, "finished")
+    assert [run["precision"] for run in runs] == ["f64", "f32"]
+    environment = facts["environment"]
+    assert environment["threads"] == 1 and environment["workers"] == 2 and environment["processor"]
+
+
+def test_people_see_each_run_and_a_table(ran: tuple[Path, Outcome]) -> None:
+    directory, outcome = ran
+    lines = outcome.stderr.splitlines()
+    assert lines[0] == "1 case, 2 runs, 2 at a time, one thread each"
+    assert [line.split()[0] for line in lines[1:3]] == ["1/2", "2/2"]
+    assert all("bar_fixed_free, n = 13" in line and "period error 0.001" in line for line in lines[1:3])
+    assert "1 of 1 cases pass" in lines[-2] and lines[-1] == f"report: {directory / 'report.html'}"
+
+
+def test_what_is_done_is_not_done_again(ran: tuple[Path, Outcome], short: None) -> None:
+    """A run that is damaged, or of another program, is; nothing without --resume or --overwrite."""
+    directory, outcome = ran
+    (damaged, kept) = sorted((directory / "runs").iterdir())
+    before = kept.read_bytes()
+    damaged.write_text("{", encoding="utf-8")
+    again = run_here("validate", BAR, "--levels", "coarse", "-o", directory, "--resume", "--json")
+    assert again.status == 0 and kept.read_bytes() == before
+    assert "1 of 2 runs are done already, by the same program" in again.stderr.splitlines()
+    errors = [[run["error"] for run in json.loads(text)["cases"][0]["runs"]] for text in (outcome.stdout, again.stdout)]
+    assert errors[0] == errors[1]
+    refused = run_here("validate", BAR, "--levels", "coarse", "-o", directory)
+    assert refused.status == 2 and "--resume keeps the runs" in refused.stderr
+
+
+def test_a_case_out_of_tolerance_is_exit_code_1(
+    ran: tuple[Path, Outcome], short: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The bounds of the same runs are made too tight."""
+    directory, _ = ran
+    case = all_cases()[BAR]
+    tight = [type(measure)(measure.name, measure.unit, measure.text, lambda n: 1e-9) for measure in case.measures]
+    monkeypatch.setattr(case, "measures", tuple(tight))
+    outcome = run_here("validate", BAR, "--levels", "coarse", "-o", directory, "--resume", "--quiet", "--json")
+    assert outcome.status == 1 and outcome.stderr == ""
+    (facts,) = json.loads(outcome.stdout)["cases"]
+    assert facts["verdict"] == "fail" and "beyond its bound of 1e-09" in facts["reasons"][0]
+
+
+def test_an_interrupt_keeps_what_is_done_and_ends_the_rest(tmp_path: Path) -> None:
+    runs = tmp_path / "report" / "runs"
+    words = ["validate", "bar", "--levels", "coarse", "-o", "report", "--workers", "1"]
+    with started(tmp_path, *words) as process:
+        waited_until = time.monotonic() + PATIENCE
+        while not list(runs.glob("*.json")):
+            assert process.poll() is None, process.communicate()
+            assert time.monotonic() < waited_until, "no run ended"
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        stdout, stderr = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130 and stdout == "" and "Traceback" not in stderr
+    assert stderr.splitlines()[-1] == "interrupted; the runs that are done are kept: --resume -o report goes on"
+    assert [path.name for path in (tmp_path / "report").iterdir()] == ["runs"]
+    for path in runs.iterdir():
+        assert json.loads(path.read_text(encoding="utf-8"))["result"]["status"] == "finished"

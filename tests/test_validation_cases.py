@@ -1,0 +1,95 @@
+"""Every validation case at its coarse level, with the default setting: bounds, orders, and the committed figures."""
+
+import json
+import tomllib
+from collections.abc import Callable
+from functools import cache
+
+import pytest
+from conftest import ROOT
+
+from mpmcli.check.finding import passes
+from mpmcli.check.scene_check import check_scene
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import parse_scene, scene_to_toml
+from mpmcli.validation.carry_out import carry_out, scene_of
+from mpmcli.validation.convergence import ROUND_OFF
+from mpmcli.validation.matrix import KNOBS, Run
+from mpmcli.validation.registry import all_cases
+from mpmcli.validation.run_result import RunResult
+from mpmcli.validation.setting import Setting
+from mpmcli.validation.verdict import judge
+
+CASES = all_cases()
+COARSE = {name: sorted(case.levels["coarse"]) for name, case in CASES.items()}
+RUNS = [pytest.param(name, n, id=f"{name}-{n}") for name, resolutions in COARSE.items() for n in resolutions]
+# Written by scripts/validation_report, perhaps on another machine, whose sines and roots differ in the last digit.
+COMMITTED = ROOT / "docs" / "validation" / "coarse.json"
+TOLERANCE = 0.2
+
+
+@pytest.fixture(scope="module")
+def run_of(backend_of: Callable) -> Callable[[str, int], RunResult]:
+    """Return `run(case, n)`: what came of it; each is computed once."""
+
+    @cache
+    def run(name: str, n: int) -> RunResult:
+        return carry_out(CASES[name], n, Setting(), backend_of("f64"))
+
+    return run
+
+
+@pytest.mark.parametrize(("name", "n"), RUNS)
+def test_a_case_is_within_its_bounds(run_of: Callable, record_property: Callable, name: str, n: int) -> None:
+    result = run_of(name, n)
+    for measure, value in result.values.items():
+        record_property(measure, value)
+    assert judge(CASES[name], {Run(name, n, Setting()): result}).reasons == ()
+
+
+@pytest.mark.parametrize("name", [name for name, resolutions in COARSE.items() if len(resolutions) > 1])
+def test_a_case_converges_as_it_should(run_of: Callable, record_property: Callable, name: str) -> None:
+    found = {Run(name, n, Setting()): run_of(name, n) for n in COARSE[name][-2:]}
+    orders = [check for check in judge(CASES[name], found).checks if check.subject.startswith("order")]
+    for check in orders:
+        record_property(check.subject, check.figure)
+        assert check.passed, check.sentence
+
+
+@pytest.mark.skipif(not COMMITTED.exists(), reason="scripts/validation_report has not written it yet")
+@pytest.mark.parametrize(("name", "n"), RUNS)
+def test_a_case_gives_the_committed_figures(run_of: Callable, name: str, n: int) -> None:
+    values = run_of(name, n).values
+    committed = json.loads(COMMITTED.read_text(encoding="utf-8")).get(name, {}).get(str(n))
+    assert committed is not None, f"{COMMITTED.name} has no {name} at {n}: run scripts/validation_report"
+    assert set(committed) == set(values)
+    for measure, value in values.items():
+        assert value == pytest.approx(committed[measure], rel=TOLERANCE, abs=ROUND_OFF), measure
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_scene_of_a_case_is_a_public_one(name: str) -> None:
+    """Written as TOML, as --write-scene does, it is the same scene again, and one that `simulate` accepts."""
+    case = CASES[name]
+    n = COARSE[name][0]
+    loaded = parse_scene(case.tables(n, Setting()), laws=parameter_models())
+    again = parse_scene(tomllib.loads(scene_to_toml(loaded.scene)), laws=parameter_models())
+    assert again.scene == loaded.scene
+    findings = check_scene(loaded).findings
+    assert passes(findings), [finding.what for finding in findings if finding.severity == "error"]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_setting_makes_a_scene(name: str) -> None:
+    """Every knob of the case is a key that scenes know, and all resolutions have a bound for each measure."""
+    case = CASES[name]
+    assert set(case.varies) <= set(KNOBS) and set(case.levels) == {"coarse", "default", "fine"}
+    for level in case.levels.values():
+        for n in level:
+            assert all(measure.bound(n) >= 0 for measure in case.measures)
+    for knob in set(case.varies):
+        for value in KNOBS[knob]:
+            scene = scene_of(case, COARSE[name][0], Setting(**{knob: value}))
+            assert scene.solver.precision == (value if knob == "precision" else "f64")
+            if knob == "safety":
+                assert scene.time.safety == value
