@@ -1,0 +1,67 @@
+"""What the cases of fluids are measured against: the drop's motion, waves in a tank, and the loss of the transfers."""
+
+import mpm_reference as reference
+import numpy as np
+import pytest
+
+from mpmcli.validation.drop_motion import half_axis
+from mpmcli.validation.standing_wave import standing_wave_frequency
+from mpmcli.validation.transfer_loss import apic_factor
+
+
+@pytest.mark.parametrize(("time", "a"), [(0.2, 0.82082616), (0.76, 0.51426647), (2.0, 0.27181408)])
+def test_half_axis_is_the_published_one(time: float, a: float) -> None:
+    """The table of verification 6.3, and the same motion in other units of time."""
+    assert half_axis(time) == pytest.approx(a, abs=1e-8)
+    assert half_axis(time / 50, 50.0) == pytest.approx(a, abs=1e-8)
+
+
+def test_half_axis_solves_its_other_equation() -> None:
+    """dA/dt = A^2 (a^4 - 1)/(a^4 + 1) with A = -(da/dt)/a: Monaghan's pair of equations, by central differences."""
+    step = 1e-3
+    a = np.array([half_axis(0.6 + k * step) for k in range(-2, 3)])
+    A = -(a[2:] - a[:-2]) / (2 * step) / a[1:-1]
+    expected = A[1] ** 2 * (a[2] ** 4 - 1) / (a[2] ** 4 + 1)
+    assert (A[2] - A[0]) / (2 * step) == pytest.approx(expected, rel=1e-5)
+
+
+def test_waves_swing_as_the_limits_say() -> None:
+    """The tank of verification 6.2; -(k a)^2/8 in deep water; no change by amplitude where k d = 1.058."""
+    assert standing_wave_frequency(9.81, np.pi, 0.5) == pytest.approx(5.316553, abs=5e-7)
+    deep = standing_wave_frequency(9.81, 1.0, 40.0, 0.1) / standing_wave_frequency(9.81, 1.0, 40.0)
+    assert deep == pytest.approx(1 - 0.1**2 / 8, abs=1e-12)
+    middle = standing_wave_frequency(9.81, 1.0, 1.058, 0.1) / standing_wave_frequency(9.81, 1.0, 1.058)
+    assert middle == pytest.approx(1, abs=2e-6)
+
+
+def test_apic_loses_as_the_leading_terms_say() -> None:
+    """0.024 (kh)^4 per step along an axis and 0.110 (kh)^4 along the diagonal, two particles per axis."""
+    lattice = np.array([-0.25, 0.25])
+    assert (1 - apic_factor([0.05], lattice)) / 0.05**4 == pytest.approx(0.0242, rel=2e-3)
+    assert (1 - apic_factor([0.05, 0.05], lattice)) / 0.05**4 == pytest.approx(0.1108, rel=2e-3)
+    assert apic_factor([0.0, 0.0]) == pytest.approx(1, abs=1e-15)
+    many = (np.arange(400) + 0.5) / 400 - 0.5
+    assert apic_factor([0.7, 0.3]) == pytest.approx(apic_factor([0.7, 0.3], many), abs=1e-5)
+
+
+def test_apic_loses_as_the_reference_does() -> None:
+    """A Taylor-Green wave in a slip box, to the grid and back on a lattice that stays where it is, in plain numpy."""
+    n, h = 8, 1 / 8
+    k = np.pi
+    places = (np.arange(2 * n) + 0.5) * h / 2
+    x = np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1).reshape(-1, 2)
+    X, Y = k * x.T
+    wave = np.stack([np.sin(X) * np.cos(Y), -np.cos(X) * np.sin(Y)], axis=1)
+    ones = np.ones(len(x))
+    particles = reference.Particles(
+        x, wave, np.zeros((len(x), 2, 2)), ones, ones, ones, reference.fluid_stress(0 * ones, 2)
+    )
+    box = reference.Box((n, n), h, np.zeros(2), [("slip", "slip")] * 2)
+    kept = []
+    for _ in range(4):
+        velocity = reference.update(*reference.scatter([particles], box, 0.0), box, 0.0)
+        particles = reference.gather([particles], velocity, box, 0.0)[0]
+        kept.append((particles.v * wave).sum())
+    factor = apic_factor([k * h, k * h], np.array([-0.25, 0.25]))
+    # The first step begins without the affine part; from then on the wave is multiplied.
+    assert np.array(kept[1:]) / kept[:-1] == pytest.approx(factor, rel=1e-12)
