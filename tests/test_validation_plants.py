@@ -1,0 +1,315 @@
+"""Errors planted on purpose, each of which a validation case must catch at its coarse level."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from mpmcli.validation.registry import all_cases
+
+ROOT = Path(__file__).resolve().parent.parent
+FEWEST = 10
+# Runs the coarse level of one case and prints what is off. The last line is for this test.
+WORKER = """
+import json, math, sys
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import parse_scene
+from mpmcli.solver.backend import start_backend, stop_backend
+from mpmcli.solver.solver import Solver
+from mpmcli.validation.registry import all_cases
+from mpmcli.validation.setting import Setting
+
+case, setting = all_cases()[sys.argv[1]], Setting()
+found = {}
+for n in case.levels["coarse"]:
+    scene = parse_scene(case.tables(n, setting), laws=parameter_models()).scene
+    solver = Solver(scene, start_backend("cpu", 1, setting.precision))
+    found[n] = case.measure(n, scene, solver.frames())
+    stop_backend()
+off = [
+    f"{m.name} {found[n][m.name]:.4g} at {n}, bound {m.bound(n):.4g}"
+    for n in found for m in case.measures if not abs(found[n][m.name]) <= m.bound(n)
+]
+*_, coarse, fine = [None, *found]
+for m in case.measures:
+    if m.order is not None and coarse is not None:
+        order = math.log(abs(found[coarse][m.name] / found[fine][m.name])) / math.log(fine / coarse)
+        if not order >= m.order:
+            off.append(f"order of {m.name} {order:.3g}, bound {m.order:.3g}")
+print(json.dumps(off))
+"""
+
+
+@dataclass(frozen=True)
+class Plant:
+    """An error: in one source file one text in place of another, `count` times; and the cases that should see it."""
+
+    name: str
+    file: str
+    right: str
+    wrong: str
+    cases: tuple[str, ...]
+    count: int = 1
+
+    def __str__(self) -> str:
+        return self.name
+
+
+PLANTS = (
+    Plant(
+        "stress with the wrong sign",
+        "solver/transfer.py",
+        "(mass * h) * C[c, a] - stress_scale * stress[c, a]",
+        "(mass * h) * C[c, a] + stress_scale * stress[c, a]",
+        ("bar_fixed_fixed",),
+    ),
+    Plant(
+        "stress without 4/h^2",
+        "solver/transfer.py",
+        "stress_scale = kick * row[VOLUME] * (4 / h)",
+        "stress_scale = kick * row[VOLUME] * h",
+        ("bar_fixed_fixed",),
+    ),
+    Plant(
+        "stress with the cubic kernel's 3/h^2",
+        "solver/transfer.py",
+        "stress_scale = kick * row[VOLUME] * (4 / h)",
+        "stress_scale = kick * row[VOLUME] * (3 / h)",
+        ("bar_fixed_fixed",),
+    ),
+    Plant(
+        "gradient with 3/h^2",
+        "solver/transfer.py",
+        "* ti.static(4 / grid.spacing)",
+        "* ti.static(3 / grid.spacing)",
+        ("bar_fixed_fixed",),
+    ),
+    Plant(
+        "middle weight of the kernel",
+        "solver/kernel.py",
+        "0.75 - (distance - 1.0) ** 2",
+        "0.7 - (distance - 1.0) ** 2",
+        ("bar_fixed_fixed",),
+    ),
+    Plant(
+        "gradient transposed",
+        "solver/step.py",
+        "C[c, a] = gradient[a, c]",
+        "C[c, a] = gradient[c, a]",
+        ("conservation", "cantilever"),
+    ),
+    Plant(
+        "affine velocity transposed",
+        "solver/transfer.py",
+        "(mass * h) * C[c, a] -",
+        "(mass * h) * C[a, c] -",
+        ("conservation", "taylor_green"),
+    ),
+    Plant(
+        "affine velocity halved",
+        "solver/transfer.py",
+        "(mass * h) * C[c, a] -",
+        "(0.5 * mass * h) * C[c, a] -",
+        ("dam_break",),
+    ),
+    Plant(
+        "walls that zero their nodes",
+        "boundaries/walls.py",
+        "result[c] = -result[c]",
+        "result[c] = 0.0",
+        ("bar_fixed_fixed",),
+        count=2,
+    ),
+    Plant(
+        "mirror images that are not mirrored",
+        "boundaries/walls.py",
+        "result[c] = -result[c]",
+        "result[c] = result[c]",
+        ("bar_fixed_fixed",),
+        count=2,
+    ),
+    Plant(
+        "gravity upwards",
+        "solver/forces.py",
+        "result[a] = kick * ti.static(self.constant[a])",
+        "result[a] = -kick * ti.static(self.constant[a])",
+        ("dam_break",),
+    ),
+    Plant(
+        "half of gravity",
+        "solver/forces.py",
+        "kick * ti.static(self.constant[a])",
+        "0.5 * kick * ti.static(self.constant[a])",
+        ("dam_break",),
+    ),
+    Plant(
+        "deformation by half a step",
+        "solver/step.py",
+        "rate = dt * C[i, k]",
+        "rate = 0.5 * dt * C[i, k]",
+        ("bar_fixed_fixed",),
+    ),
+    Plant(
+        "motion by half a step",
+        "solver/step.py",
+        "moved = x[c] + dt * v[c]",
+        "moved = x[c] + 0.5 * dt * v[c]",
+        ("dam_break",),
+    ),
+    Plant(
+        "J without the whole trace",
+        "solver/step.py",
+        "1.0 + dt * C.trace()",
+        "1.0 + dt * C[0, 0]",
+        ("dam_break",),
+    ),
+    Plant(
+        "a first kick of a whole step",
+        "solver/solver.py",
+        "kick = min(0.5 * (self._last_step + dt),",
+        "kick = min(dt,",
+        ("column_dynamic",),
+    ),
+    Plant(
+        "pressure halved",
+        "materials/fluid.py",
+        "spherical = constants[0] * (J - 1.0)",
+        "spherical = 0.5 * constants[0] * (J - 1.0)",
+        ("hydrostatic",),
+    ),
+    Plant(
+        "viscosity halved",
+        "materials/fluid.py",
+        "tau += constants[2] * (C + C.transpose())",
+        "tau += 0.5 * constants[2] * (C + C.transpose())",
+        ("taylor_green",),
+    ),
+    Plant(
+        "lambda of the neo-Hookean solid doubled",
+        "materials/neo_hookean.py",
+        "constants[1] * ti.log(deformation.determinant())",
+        "2.0 * constants[1] * ti.log(deformation.determinant())",
+        ("mms_2d_neo_hookean",),
+    ),
+    Plant(
+        "lambda of the corotated solid with J squared",
+        "materials/fixed_corotated.py",
+        "pressure_part = constants[1] * (J - 1.0) * J",
+        "pressure_part = constants[1] * (J - 1.0) * J * J",
+        ("mms_2d_corotated",),
+    ),
+    Plant(
+        "mu of the corotated solid halved",
+        "materials/fixed_corotated.py",
+        "tau = constants[0] * (stretched + stretched.transpose())",
+        "tau = constants[0] * stretched",
+        ("mms_2d_corotated",),
+    ),
+    Plant(
+        "friction angle in degrees",
+        "materials/sand.py",
+        "phi = math.radians(parameters.friction_angle)",
+        "phi = parameters.friction_angle",
+        ("sand_shear",),
+    ),
+    Plant(
+        "friction angle of triaxial compression",
+        "materials/sand.py",
+        "math.sqrt(2) * math.sin(phi)",
+        "math.sqrt(2 / 3) * 4 * math.sin(phi) / (3 - math.sin(phi))",
+        ("sand_shear",),
+    ),
+    Plant(
+        "sand that slides without friction on itself",
+        "materials/sand.py",
+        "deviator *= strength / shear",
+        "deviator *= 0.5 * strength / shear",
+        ("sand_shear",),
+    ),
+    Plant(
+        "snow that softens as it packs",
+        "materials/snow.py",
+        "hardness = ti.exp(constants[4] * (1.0 - variables[0]))",
+        "hardness = ti.exp(constants[4] * (variables[0] - 1.0))",
+        ("snow_oedometer",),
+    ),
+    Plant(
+        "snow that forgets what it lost",
+        "materials/snow.py",
+        "lost *= before / s[i]",
+        "lost *= 1.0",
+        ("snow_oedometer",),
+    ),
+)
+
+
+def judge(package: Path, case: str) -> str:
+    """Run the coarse level of a case with the package below a directory; return what is off, "" where all is right."""
+    done = subprocess.run(
+        [sys.executable, "-c", WORKER, case],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        cwd=package,
+        env={**os.environ, "PYTHONPATH": str(package)},
+    )
+    if done.returncode != 0:
+        return f"the run fails: {done.stderr.strip().splitlines()[-1]}"
+    return "; ".join(json.loads(done.stdout.splitlines()[-1]))
+
+
+def planted(plant: Plant, directory: Path) -> Path:
+    """Copy the package to a directory, and plant an error in the copy."""
+    shutil.copytree(ROOT / "mpmcli", directory / "mpmcli", ignore=shutil.ignore_patterns("__pycache__"))
+    file = directory / "mpmcli" / plant.file
+    file.write_text(file.read_text(encoding="utf-8").replace(plant.right, plant.wrong), encoding="utf-8")
+    return directory
+
+
+def cases_of(plant: Plant) -> list[str]:
+    """Return the cases that should see an error, of those that there are."""
+    return [name for name in plant.cases if name in all_cases()]
+
+
+@pytest.fixture(scope="module")
+def unplanted() -> Callable[[str], str]:
+    """Return `judge` of this package as it is, once for each case."""
+    return cache(lambda case: judge(ROOT, case))
+
+
+@pytest.mark.parametrize("plant", PLANTS, ids=str)
+def test_a_plant_finds_its_place(plant: Plant) -> None:
+    """Where the source has changed, nothing would be planted, and nothing caught."""
+    text = (ROOT / "mpmcli" / plant.file).read_text(encoding="utf-8")
+    assert text.count(plant.right) == plant.count
+    assert plant.wrong != plant.right
+
+
+def test_there_are_enough_plants_that_cases_can_see() -> None:
+    assert sum(bool(cases_of(plant)) for plant in PLANTS) >= FEWEST
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("plant", PLANTS, ids=str)
+def test_a_planted_error_is_caught(
+    plant: Plant, tmp_path: Path, unplanted: Callable[[str], str], record_property: Callable
+) -> None:
+    """The first of its cases, which passes as the package is, fails with the error in it, or another one does."""
+    names = cases_of(plant)
+    if not names:
+        pytest.skip(f"none of {', '.join(plant.cases)} is there")
+    package = planted(plant, tmp_path)
+    for name in names:
+        assert unplanted(name) == "", name
+        said = judge(package, name)
+        record_property(name, said)
+        if said:
+            return
+    pytest.fail(f"{plant.name}: not caught by {', '.join(names)}")
