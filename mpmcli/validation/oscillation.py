@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 STEPS = 50
+LARGEST_EXPONENT = 200.0
 # Frequencies that a fit may start from, over the guess.
 STARTS = np.linspace(0.5, 2.0, 61)
 
@@ -50,8 +51,8 @@ def fit_oscillation(times: np.ndarray, signal: np.ndarray, frequency: float) -> 
         slopes = np.stack([times * (b * cosine - a * sine), -times * model], axis=1)
         change, *_ = np.linalg.lstsq(np.hstack([basis, slopes]), signal - basis @ [a, b, offset], rcond=None)
         w, decay = w + change[3], decay + change[4]
-        # Further off than any oscillation that could have been meant.
-        if not (0.1 * frequency < w < 10 * frequency and abs(decay) < 10 * frequency):
+        # Further off than any oscillation that could have been meant, or an exponential that overflows.
+        if not (0.1 * frequency < w < 10 * frequency and abs(decay) < LARGEST_EXPONENT / np.ptp(times)):
             return NOT_FOUND
         if (abs(change[3]) <= 1e-14 * abs(w) and abs(change[4]) <= 1e-14 * abs(w)) or scale == 0:
             break
