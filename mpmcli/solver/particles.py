@@ -24,7 +24,8 @@ class ParticleGroup:
         x: position relative to the origin of the domain, (n) Vector(d), m.
         v: velocity, (n) Vector, m/s, as wide as a node of the grid; the first d entries count.
         gradient: of the velocity, (n) matrix of d rows as wide, 1/s: row a holds dv/dx_a, the transpose of C.
-        deformation: J, (n), or F, (n) matrix of d rows as wide as a node, as the law says.
+        departure: what the deformation is beyond rest: J - 1, (n), or F - I, (n) matrix of d rows as wide as a node, as
+            the law says. A step adds strains of 1e-6 and less: to 1 they would be rounded off in single precision.
         internal: the law's internal variables, (n) each.
         id: (n) int, row of the particle in every frame.
         body: (n) int, place in `bodies`; None where the group has one body.
@@ -54,9 +55,9 @@ class ParticleGroup:
         self.v = ti.Vector.field(width, float, shape=n, layout=layout)
         self.gradient = ti.Matrix.field(d, width, float, shape=n, layout=layout)
         if law.deformation == "F":
-            self.deformation = ti.Matrix.field(d, width, float, shape=n, layout=layout)
+            self.departure = ti.Matrix.field(d, width, float, shape=n, layout=layout)
         else:
-            self.deformation = ti.field(float, shape=n)
+            self.departure = ti.field(float, shape=n)
         self.internal = tuple(ti.field(float, shape=n) for _ in law.internal)
         self.id = ti.field(int, shape=n)
         self.several = len(self.bodies) > 1
@@ -93,7 +94,7 @@ class ParticleGroup:
     def state(self) -> tuple[ti.Field, ...]:
         """Every real field that the sort must move."""
         initial = () if self.initial is None else (self.initial,)
-        return (self.x, self.v, self.gradient, self.deformation, *self.internal, *initial)
+        return (self.x, self.v, self.gradient, self.departure, *self.internal, *initial)
 
     @property
     def labels(self) -> tuple[ti.Field, ...]:
@@ -123,27 +124,30 @@ class ParticleGroup:
     def set_deformation(self, deformation: np.ndarray) -> None:
         """Set J, (n,), or F, (n, d, d), of all particles, in the solver's order."""
         if deformation.ndim == 3:
-            padded = np.zeros((self.count, self.dimension, self.deformation.m), self.real)
-            padded[:, :, : self.dimension] = deformation
-            deformation = padded
-        self.deformation.from_numpy(deformation.astype(self.real))
+            departure = np.zeros((self.count, self.dimension, self.departure.m), self.real)
+            departure[:, :, : self.dimension] = deformation - np.eye(self.dimension)
+        else:
+            departure = (deformation - 1).astype(self.real)
+        self.departure.from_numpy(departure)
 
     def deformation_to_numpy(self) -> np.ndarray:
         """Return J, (n,), or F, (n, d, d), in the solver's order."""
-        values = self.deformation.to_numpy()
-        return values if values.ndim == 1 else np.ascontiguousarray(values[:, :, : self.dimension])
+        values = self.departure.to_numpy()
+        if values.ndim == 1:
+            return 1 + values
+        return np.eye(self.dimension, dtype=self.real) + values[:, :, : self.dimension]
 
     @ti.func
     def stored(self, p: int):
         """Return J, or F as a d x d matrix, of particle p."""
         if ti.static(self.law.deformation == "F"):
-            F = ti.Matrix.zero(float, self.dimension, self.dimension)
+            F = ti.Matrix.identity(float, self.dimension)
             for i in ti.static(range(self.dimension)):
                 for j in ti.static(range(self.dimension)):
-                    F[i, j] = self.deformation[p][i, j]
+                    F[i, j] += self.departure[p][i, j]
             return F
         else:
-            return self.deformation[p]
+            return 1.0 + self.departure[p]
 
     @ti.func
     def inner(self, p: int):
@@ -156,12 +160,14 @@ class ParticleGroup:
     @ti.func
     def store(self, p: int, deformation: ti.template(), inner: ti.template()):
         """Replace what particle p stores of its deformation, and its internal variables."""
+        # By the change: what a law left alone keeps every digit.
+        change = deformation - self.stored(p)
         if ti.static(self.law.deformation == "F"):
             for i in ti.static(range(self.dimension)):
                 for j in ti.static(range(self.dimension)):
-                    self.deformation[p][i, j] = deformation[i, j]
+                    self.departure[p][i, j] += change[i, j]
         else:
-            self.deformation[p] = deformation
+            self.departure[p] += change
         for i in ti.static(range(len(self.internal))):
             self.internal[i][p] = inner[i]
 

@@ -111,16 +111,19 @@ def build_step(
             for c in ti.static(range(group.v.n)):
                 group.gradient[p][a, c] = gradient[a, c]
         if ti.static(group.law.deformation == "F"):
-            old = group.deformation[p]
-            F = old
+            # F - I grows by dt C + dt C (F - I).
+            old = group.departure[p]
+            new = old
             for i in ti.static(range(d)):
                 for k in ti.static(range(d)):
                     rate = dt * C[i, k]
+                    new[i, k] += rate
                     for j in ti.static(range(old.m)):
-                        F[i, j] += rate * old[k, j]
-            group.deformation[p] = F
+                        new[i, j] += rate * old[k, j]
+            group.departure[p] = new
         else:
-            group.deformation[p] *= 1.0 + dt * C.trace()
+            rate = dt * C.trace()
+            group.departure[p] += rate + rate * group.departure[p]
         # Written so that a NaN is not sound; then the position stays, and no later step writes outside the grid.
         sound = beyond <= 0.5 * h
         if ti.static(not on_cpu):
