@@ -60,6 +60,13 @@ class Bar(Case):
                 # Where the loss itself, which falls as n^-3 in a period, is above what a finite amplitude does to it.
                 bound=(lambda n: 1.3 * END_LOSS / n if n <= 26 else math.inf) if free else (lambda n: 0.1),
             ),
+            Measure(
+                "amplitude error",
+                "",
+                "Amplitude of the displacement at the start over v0/w, less 1.",
+                bound=lambda n: 0.3 * (b * LENGTH / n) ** 2,
+                expected=2.0,
+            ),
             Measure("energy loss", "", "Energy that the mode loses in a period.", expected=3.0),
         )
         self.note = (
@@ -109,8 +116,9 @@ class Bar(Case):
         times, signal, steps = [], [], 0
         for frame, row in frames:
             X = frame.fields["initial_position"][:, 0].astype(np.float64)
+            shape = np.sin(self.b * X)
             times.append(frame.time)
-            signal.append(float((frame.position[:, 0] - X) @ np.sin(self.b * X)))
+            signal.append(float((frame.position[:, 0] - X) @ shape / (shape @ shape)))
             steps += row.steps
         found = fit_oscillation(np.array(times), np.array(signal), self.frequency)
         error = self.frequency / found.frequency - 1
@@ -122,6 +130,7 @@ class Bar(Case):
             "period error": error,
             "period error against theory": error / theory.period_error - 1,
             "dissipation against theory": -math.expm1(-2 * found.decay * dt) / loss - 1,
+            "amplitude error": found.amplitude * self.frequency / SPEED - 1,
             "energy loss": -math.expm1(-2 * found.decay * 2 * math.pi / found.frequency),
         }
 
