@@ -30,6 +30,8 @@ class Measure:
         bound: (n) -> the largest |value| that is right at resolution n, with the default setting in double precision.
         order: the smallest order that |value| must fall at between the two finest resolutions, None where it need not.
         expected: the order that theory gives, for the report; None where there is none.
+        order_to: the finest resolution that takes part in the order, None for all: beyond it another error rules, as
+            the note of the case says.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Measure:
     bound: Callable[[int], float] = unbounded
     order: float | None = None
     expected: float | None = None
+    order_to: int | None = None
 
 
 class Case(ABC):

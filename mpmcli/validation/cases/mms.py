@@ -42,7 +42,9 @@ class ManufacturedWave(Case):
                 "",
                 "RMS error of the displacement of all particles over a period, in amplitudes.",
                 bound=lambda n: _second_order(n, *error),
+                order=1.9,
                 expected=2.0,
+                order_to=16,
             ),
             Measure(
                 "largest displacement error",
