@@ -41,8 +41,8 @@ class TaylorGreen(Case):
             "decay error",
             "",
             "Rate at which kinetic energy decays until t = 1 s, over that of viscosity, 4 nu k^2, less 1.",
-            bound=lambda n: 1.05 * excess(n) + 0.016,
-            order=1.5,
+            bound=lambda n: 1.05 * excess(n) + 0.014,
+            order=0.9,
             expected=3.0,
         ),
         Measure(
@@ -64,7 +64,8 @@ class TaylorGreen(Case):
         "the factor of the transfers in full. Particles start at random places in their cells. From a lattice the "
         "decay is right to 1 % until t = 0.3 s, too, but the flow stretches it by exp(pi t) at the corners, and from "
         "t = ln(3)/pi = 0.35 s on, with rows more than 1.5 h apart there, it is torn into sheets: until t = 1 s the "
-        "rate is then 39 % too high at 32 cells and 58 % at 64 (11 % and 21 % with three particles per axis)."
+        "rate is then 7 % too high at 32 cells and 12 % at 64; with the cut-off of tension, which books every gap as "
+        "a loss of volume, 39 % and 58 %. From random places the cut-off costs less than 1 %."
     )
 
     def tables(self, n: int, setting: Setting) -> dict[str, Any]:
@@ -83,6 +84,8 @@ class TaylorGreen(Case):
                         "density": 1.0,
                         "bulk_modulus": modulus,
                         "viscosity": VISCOSITY,
+                        # The flow takes none; the noise of the particles' pressures must not be cut on one side.
+                        "tension_cutoff": False,
                     },
                     "shape": {"box": {"min": [0.0, 0.0], "max": [1.0, 1.0]}},
                     "velocity": ["sin(pi * X) * cos(pi * Y)", "-cos(pi * X) * sin(pi * Y)"],
