@@ -42,6 +42,10 @@ class Measure:
     expected: float | None = None
     order_to: int | None = None
 
+    def has_order_at(self, n: int) -> bool:
+        """Return whether resolution n takes part in the order."""
+        return self.order_to is None or n <= self.order_to
+
 
 class Case(ABC):
     """One problem with a known answer.

@@ -90,8 +90,10 @@ class CaseReport:
 
     @property
     def order(self) -> float | None:
-        """Observed order between the two finest runs of the default setting, None where there is none."""
-        orders = [row.order for row in self.rows if row.run.setting == Setting() and row.error is not None]
+        """Observed order between the two finest runs of the default setting that have one, None where there is none."""
+        counts = self.case.measures[0].has_order_at
+        rows = [row for row in self.rows if row.run.setting == Setting() and counts(row.run.n)]
+        orders = [row.order for row in rows if row.error is not None]
         return orders[-1] if orders else None
 
     def as_dict(self) -> dict[str, Any]:

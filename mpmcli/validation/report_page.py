@@ -41,7 +41,8 @@ def report_page(report: Report) -> list[Block]:
         Paragraph(_outcome(report)),
         _summary(report),
         Paragraph(
-            "Error, n and order are of the default setting, the order between its two finest resolutions. "
+            "Error, n and order are of the default setting, the order between its two finest resolutions (of those "
+            "before a floor, where a case says that it has one). "
             "The cheapest setting is the one that reaches an error of 1 % in the least seconds, interpolated between "
             "resolutions; ≤ where the coarsest run reaches it already. The default one is named where no other saves a "
             "tenth of its time. The default setting is "

@@ -102,7 +102,8 @@ def _bound_checks(case: Case, n: int, result: RunResult) -> list[Check]:
 
 
 def _order_check(measure: Measure, default: dict[int, RunResult]) -> Check | None:
-    finest = [(n, abs(result.values[measure.name])) for n, result in default.items() if result.finished][-2:]
+    finished = {n: result for n, result in default.items() if result.finished and measure.has_order_at(n)}
+    finest = [(n, abs(result.values[measure.name])) for n, result in finished.items()][-2:]
     order = observed_order(*finest) if len(finest) == 2 else None
     if measure.order is None or order is None:
         return None
