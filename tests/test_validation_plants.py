@@ -282,7 +282,10 @@ def judge(package: Path, case: str) -> str:
         env={**os.environ, "PYTHONPATH": str(package)},
     )
     if done.returncode != 0:
-        return f"the run fails: {done.stderr.strip().splitlines()[-1]}"
+        last = done.stderr.strip().splitlines()[-1]
+        # Any other failure would be a plant that does not even compile.
+        assert "UnstableRunError" in last, done.stderr
+        return f"the run fails: {last}"
     return "; ".join(json.loads(done.stdout.splitlines()[-1]))
 
 
