@@ -164,7 +164,7 @@ def update(momentum: np.ndarray, mass: np.ndarray, box: Box, kick: float) -> np.
 
 
 def gather(groups: Sequence[Particles], velocity: np.ndarray, box: Box, dt: float) -> list[Particles]:
-    """Return the particles after the step: v, C, x + dt v, and J (1 + dt tr C) or (I + dt C) F."""
+    """Return the particles after the step: v, C, x + dt v, and J det(I + dt C) or (I + dt C) F."""
     moved = []
     for group in groups:
         v, C = np.zeros_like(group.v), np.zeros_like(group.C)
@@ -174,7 +174,7 @@ def gather(groups: Sequence[Particles], velocity: np.ndarray, box: Box, dt: floa
                 v[p] += w * v_i
                 C[p] += 4 / box.spacing**2 * w * np.outer(v_i, lever)
         if group.deformation.ndim == 1:
-            deformation = group.deformation * (1 + dt * np.trace(C, axis1=1, axis2=2))
+            deformation = group.deformation * np.linalg.det(np.eye(C.shape[1]) + dt * C)
         else:
             deformation = group.deformation + dt * C @ group.deformation
         x = np.clip(group.x + dt * v, 0, np.array(box.cells) * box.spacing)

@@ -80,8 +80,8 @@ class TestOurs:
     def test_both_move_alike(self, case: BenchCase, run_python: Callable, tmp_path: Path) -> None:
         """The same physics: from the same block, before a wall is in reach, both give the same positions.
 
-        Both take tau = E (J - 1), J by 1 + dt tr C and x by dt v, so in f64 only round-off differs:
-        20 steps of 1e-16, grown a little by the compression of randomly placed particles. And both fall: after n
+        Both take tau = E (J - 1) and x by dt v, so in f64 hardly more than round-off differs: J grows by
+        det(I + dt C) here and by 1 + dt tr C there, (dt C)^2 apart where little deforms. And both fall: after n
         steps of the peer's symplectic Euler, which begins with a whole step of gravity where leapfrog begins with half
         a step, the mean is at y0 - V n dt - g dt^2 n (n + 1) / 2. Ours is told that a step has gone before.
         """

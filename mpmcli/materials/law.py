@@ -44,7 +44,7 @@ class Law(ABC):
     """One constitutive law for the particles of some bodies.
 
     A particle stores J or F (of a law with plastic flow: the elastic part) and the law's internal variables.
-    A step deforms it, J <- J (1 + dt tr C) or F <- (I + dt C) F; the next one begins with `respond`, which
+    A step deforms it, J <- J det(I + dt C) or F <- (I + dt C) F; the next one begins with `respond`, which
     returns the stress, and the state after plastic flow where there is any.
 
     Instances are handed to kernels as templates and compare by identity, so that two laws never share a

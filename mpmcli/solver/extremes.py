@@ -60,12 +60,31 @@ def row_sum(matrix: ti.template()):
 
 
 @ti.func
-def deformation_rate(group: ti.template(), C: ti.template()):
-    """Return a bound on how fast C changes what a particle stores: |tr C| for J, else the row sum of |C + C^T| / 2.
+def second_invariant(C: ti.template()):
+    """Return the sum of the principal minors of order two: ((tr C)^2 - tr C^2) / 2."""
+    result = C[0, 0] * C[1, 1] - C[0, 1] * C[1, 0]
+    if ti.static(C.n == 3):
+        result += C[1, 1] * C[2, 2] - C[1, 2] * C[2, 1] + C[2, 2] * C[0, 0] - C[2, 0] * C[0, 2]
+    return result
 
-    A rotation deforms nothing: |(I + dt C) a| >= (1 - dt |D|) |a|, D the symmetric part of C.
+
+@ti.func
+def volume_growth(C: ti.template(), dt: float):
+    """Return det(I + dt C) - 1, by which J grows in a step."""
+    growth = dt * (C.trace() + dt * second_invariant(C))
+    if ti.static(C.n == 3):
+        growth += dt * dt * dt * C.determinant()
+    return growth
+
+
+@ti.func
+def deformation_rate(group: ti.template(), C: ti.template()):
+    """Return a bound on how fast C changes what a particle stores: the row sum of |C + C^T| / 2 for F.
+
+    A rotation deforms nothing: |(I + dt C) a| >= (1 - dt |D|) |a|, D the symmetric part of C. For J it is
+    |tr C| + sqrt(-m) with m < 0 the second invariant of C: det(I + dt C) = 1 + dt tr C + dt^2 m + ...
     """
-    rate = ti.abs(C.trace())
+    rate = ti.abs(C.trace()) + ti.sqrt(ti.max(-second_invariant(C), 0.0))
     if ti.static(group.law.deformation == "F"):
         rate = 0.5 * row_sum(C + C.transpose())
     return rate

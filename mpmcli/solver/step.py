@@ -6,7 +6,16 @@ from dataclasses import dataclass
 import taichi as ti
 
 from mpmcli.boundaries.walls import REACH, Walls
-from mpmcli.solver.extremes import NOTHING, Extremes, deformation_rate, entries, extremes_of, volume_ratio, widen
+from mpmcli.solver.extremes import (
+    NOTHING,
+    Extremes,
+    deformation_rate,
+    entries,
+    extremes_of,
+    volume_growth,
+    volume_ratio,
+    widen,
+)
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import TILE, Grid
 from mpmcli.solver.kernel import stencil
@@ -92,7 +101,7 @@ def build_step(
 
     @ti.func
     def advance(g: ti.template(), group: ti.template(), p: int, dt: float):
-        """Gather and move one particle, x += dt v and J *= 1 + dt tr C or F <- (I + dt C) F; return its rate."""
+        """Gather and move one particle, x += dt v and F <- (I + dt C) F or J *= det(I + dt C); return its rate."""
         x = group.x[p]
         v, gradient = gather(x, grid)
         C = ti.Matrix.zero(float, d, d)
@@ -122,8 +131,8 @@ def build_step(
                         new[i, j] += rate * old[k, j]
             group.departure[p] = new
         else:
-            rate = dt * C.trace()
-            group.departure[p] += rate + rate * group.departure[p]
+            growth = volume_growth(C, dt)
+            group.departure[p] += growth + growth * group.departure[p]
         # Written so that a NaN is not sound; then the position stays, and no later step writes outside the grid.
         sound = beyond <= 0.5 * h
         if ti.static(not on_cpu):

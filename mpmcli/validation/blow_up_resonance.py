@@ -27,16 +27,16 @@ def measured_blow_ups(volume_ratio: float, backend: Backend, ratios: Sequence[fl
 def recursion_blow_ups(volume_ratio: float, ratios: Sequence[float] = RATIOS, steps: int = STEPS) -> np.ndarray:
     """Say the same from the recursion that a lone particle of p = K (1/J - 1) obeys.
 
-    With w = dt tr C and r the step over the bound at rest, w' = w - 4 r^2 (J - 1) and J' = J (1 + w'). It keeps the
-    area dw dJ / J, and so small oscillations stay small up to r = 1; but a period of three steps, at
+    With w = dt tr C / 2 and r the step over the bound at rest, w' = w - 2 r^2 (J - 1) and J' = J (1 + w')^2. It keeps
+    the area dw dJ / J, and so small oscillations stay small up to r = 1; but a period of three steps, at
     r = sqrt(3)/2 = 0.866, and one of four, at sqrt(1/2) = 0.707, throw out those of finite size (resonances of the
     leapfrog method: Mandziuk and Schlick 1995; Skeel, Zhang and Schlick 1997).
     """
     r = np.asarray(ratios, float)
     J, w, lost = np.full_like(r, volume_ratio), np.zeros_like(r), np.zeros(len(r), bool)
     for _ in range(steps):
-        w = w - 4 * r * r * (J - 1)
-        J = J * (1 + w)
+        w = w - 2 * r * r * (J - 1)
+        J = J * (1 + w) ** 2
         lost |= ~((J > SMALLEST) & (J < LARGEST))
         J[lost], w[lost] = 1.0, 0.0
     return lost
