@@ -1,7 +1,8 @@
 """One MLS-MPM step in plain numpy, one particle and one node at a time, from the published formulas.
 
-It shares no code with the solver: Hu et al. (2018) for the scatter with A = m C - kick V0 (4/h^2) tau,
-Jiang et al. (2015) for the gather, and the fold of ghost nodes at a wall (verification: 1.4).
+It shares no code with the solver: Hu et al. (2018) for the scatter with A = m C - kick V0 tau / D, D = h^2/4 or h^2/3,
+Jiang et al. (2015) for the gather, Fei et al. (2021) for AFLIP, and the fold of ghost nodes at a wall (verification:
+1.4).
 """
 
 from collections.abc import Callable, Sequence
@@ -32,15 +33,24 @@ class Particles:
 
 @dataclass(frozen=True)
 class Box:
-    """The domain: cells per axis, spacing, gravity, and the words of the (lower, upper) faces per axis."""
+    """The domain: cells per axis, spacing, gravity, the words of the (lower, upper) faces per axis, and the knobs."""
 
     cells: tuple[int, ...]
     spacing: float
     gravity: np.ndarray
     faces: Sequence[tuple[str, str]]
+    kernel: str = "quadratic"
+    transfer: str = "apic"
+    flip: float = 0.0
+    walls: str = "folded"
+
+    @property
+    def inverse_moment(self) -> float:
+        """1 / D, 1/m^2."""
+        return {"quadratic": 4, "cubic": 3}[self.kernel] / self.spacing**2
 
 
-def spline(u: float) -> float:
+def quadratic(u: float) -> float:
     """Quadratic B-spline: 3/4 - u^2 within half a cell, (3/2 - |u|)^2 / 2 within one and a half."""
     u = abs(u)
     if u <= 0.5:
@@ -48,13 +58,27 @@ def spline(u: float) -> float:
     return 0.5 * (1.5 - u) ** 2 if u <= 1.5 else 0.0
 
 
-def stencil_of(x: np.ndarray, h: float) -> list[tuple[tuple[int, ...], float, np.ndarray]]:
-    """Return (node, weight, x_i - x) of the 3^d nodes around a point; node 0 lies on the lower wall."""
-    nearest = np.floor(x / h + 0.5).astype(int)
+def cubic(u: float) -> float:
+    """Cubic B-spline: 2/3 - u^2 + |u|^3 / 2 within a cell, (2 - |u|)^3 / 6 within two."""
+    u = abs(u)
+    if u <= 1:
+        return 2 / 3 - u * u + u**3 / 2
+    return (2 - u) ** 3 / 6 if u <= 2 else 0.0
+
+
+def stencil_of(x: np.ndarray, box: Box) -> list[tuple[tuple[int, ...], float, np.ndarray]]:
+    """Return (node, weight, x_i - x) of the nodes around a point that feel it; node 0 lies on the lower wall."""
+    h = box.spacing
+    spline = {"quadratic": quadratic, "cubic": cubic}[box.kernel]
+    axes = []
+    for along in x / h:
+        nearest = int(np.floor(along + 0.5))
+        near = [(i, spline(along - i)) for i in range(nearest - 2, nearest + 3)]
+        axes.append([(i, w) for i, w in near if w > 0])
     found = []
-    for offset in product((-1, 0, 1), repeat=len(x)):
-        node = nearest + offset
-        weight = float(np.prod([spline(u) for u in x / h - node]))
+    for entries in product(*axes):
+        node = np.array([i for i, _ in entries])
+        weight = float(np.prod([w for _, w in entries]))
         found.append((tuple(int(i) for i in node), weight, node * h - x))
     return found
 
@@ -67,8 +91,10 @@ def scatter(groups: Sequence[Particles], box: Box, kick: float) -> tuple[np.ndar
     for group in groups:
         for p, x in enumerate(group.x):
             tau = group.stress(group.deformation[p], p)
-            A = group.mass[p] * group.C[p] - kick * group.volume[p] * 4 / box.spacing**2 * tau
-            for node, w, lever in stencil_of(x, box.spacing):
+            A = -kick * group.volume[p] * box.inverse_moment * tau
+            if box.transfer != "pic":
+                A = A + group.mass[p] * group.C[p]
+            for node, w, lever in stencil_of(x, box):
                 at = tuple(i + MARGIN for i in node)
                 momentum[at] += w * (group.mass[p] * group.v[p] + A @ lever)
                 mass[at] += w * group.mass[p]
@@ -76,17 +102,27 @@ def scatter(groups: Sequence[Particles], box: Box, kick: float) -> tuple[np.ndar
 
 
 def update(momentum: np.ndarray, mass: np.ndarray, box: Box, kick: float) -> np.ndarray:
-    """Return the velocity of every node, with gravity and the walls.
+    """Return the velocity of every node, with gravity and the walls."""
+    return update_both(momentum, np.zeros_like(momentum), mass, box, kick)[0]
 
+
+def update_both(
+    momentum: np.ndarray, before: np.ndarray, mass: np.ndarray, box: Box, kick: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the velocity of every node, with gravity and the walls, and that of the momentum from before the stress.
+
+    The latter knows nothing of gravity, and of walls what mirror images do to it.
     A node and its images in the faces that act on it share their momenta, the images' mirrored; on the
     plane of an acting face there is no normal velocity, and none at all where it sticks; the images get
     the velocity back, mirrored. A separating face acts where the material on its plane moves towards it,
     the images of that plane in the faces that never let go included.
     """
+    if box.walls == "zeroed":
+        return update_zeroed(momentum, before, mass, box, kick)
     d = len(box.cells)
     g = kick * box.gravity
     raw_momentum, raw_mass = momentum, mass
-    velocity = np.zeros_like(momentum)
+    velocity, velocity_before = np.zeros_like(momentum), np.zeros_like(momentum)
 
     def acting(node: tuple[int, ...]) -> list[tuple[int, int, int]]:
         """Return (axis, side, depth) of the faces that act on a node."""
@@ -148,10 +184,10 @@ def update(momentum: np.ndarray, mass: np.ndarray, box: Box, kick: float) -> np.
         weight = sum(raw_mass[at] for at, _ in images)
         if weight <= 0:
             continue
-        v = total / weight
+        v, u = total / weight, sum(flip * before[at] for at, flip in images) / weight
         for axis, side, depth in faces:
             if depth == 0:
-                v = np.where(sign(axis, side) < 0, 0.0, v)
+                v, u = (np.where(sign(axis, side) < 0, 0.0, w) for w in (v, u))
         for a, n in enumerate(box.cells):
             held = {axis for axis, _, _ in faces}
             if a not in held and node[a] <= 0:
@@ -159,26 +195,53 @@ def update(momentum: np.ndarray, mass: np.ndarray, box: Box, kick: float) -> np.
             if a not in held and node[a] >= n:
                 v[a] = min(v[a], 0.0)
         for at, flip in images:
-            velocity[at] = flip * v
-    return velocity
+            velocity[at], velocity_before[at] = flip * v, flip * u
+    return velocity, velocity_before
 
 
-def gather(groups: Sequence[Particles], velocity: np.ndarray, box: Box, dt: float) -> list[Particles]:
-    """Return the particles after the step: v, C, x + dt v, and J det(I + dt C) or (I + dt C) F."""
+def update_zeroed(
+    momentum: np.ndarray, before: np.ndarray, mass: np.ndarray, box: Box, kick: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same where walls set the velocity of nodes on and behind them to zero, whatever that is before."""
+    weight = np.where(mass > 0, mass, 1.0)[..., None]
+    velocity = np.where(mass[..., None] > 0, momentum / weight + kick * box.gravity, 0.0)
+    for a, n in enumerate(box.cells):
+        place = np.arange(-MARGIN, n + 1 + MARGIN)
+        for side, beyond in ((0, place <= 0), (1, place >= n)):
+            nodes = np.moveaxis(velocity, a, 0)
+            word, out = box.faces[a][side], 2 * side - 1
+            if word == "stick":
+                nodes[beyond] = 0.0
+            else:
+                normal = nodes[beyond][..., a]
+                nodes[beyond, ..., a] = 0.0 if word == "slip" else np.where(out * normal > 0, 0.0, normal)
+    return velocity, before / weight
+
+
+def gather(
+    groups: Sequence[Particles], velocity: np.ndarray, box: Box, dt: float, before: np.ndarray | None = None
+) -> list[Particles]:
+    """Return the particles after the step: v, C, x + dt v, and J det(I + dt C) or (I + dt C) F.
+
+    With the velocity from before the stress the particles keep the share `flip` of what the nodes do not see of them.
+    """
     moved = []
     for group in groups:
-        v, C = np.zeros_like(group.v), np.zeros_like(group.C)
+        v, C, unseen = np.zeros_like(group.v), np.zeros_like(group.C), np.zeros_like(group.v)
         for p, x in enumerate(group.x):
-            for node, w, lever in stencil_of(x, box.spacing):
-                v_i = velocity[tuple(i + MARGIN for i in node)]
+            unseen[p] = group.v[p] if before is not None else 0.0
+            for node, w, lever in stencil_of(x, box):
+                at = tuple(i + MARGIN for i in node)
+                v_i = velocity[at]
                 v[p] += w * v_i
-                C[p] += 4 / box.spacing**2 * w * np.outer(v_i, lever)
+                C[p] += box.inverse_moment * w * np.outer(v_i, lever)
+                unseen[p] -= 0.0 if before is None else w * before[at]
         if group.deformation.ndim == 1:
             deformation = group.deformation * np.linalg.det(np.eye(C.shape[1]) + dt * C)
         else:
             deformation = group.deformation + dt * C @ group.deformation
         x = np.clip(group.x + dt * v, 0, np.array(box.cells) * box.spacing)
-        moved.append(replace(group, x=x, v=v, C=C, deformation=deformation))
+        moved.append(replace(group, x=x, v=v + box.flip * unseen, C=C, deformation=deformation))
     return moved
 
 

@@ -146,6 +146,9 @@ compress = false
 
 [solver]
 precision = "f32"
+kernel = "quadratic"
+transfer = "apic"
+walls = "folded"
 """
     )
 

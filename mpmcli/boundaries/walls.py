@@ -144,6 +144,23 @@ class Walls:
         return total
 
     @ti.func
+    def folded_before(
+        self,
+        grid: ti.template(),
+        node: ti.template(),
+        mirror: ti.template(),
+        acts: ti.template(),
+        depth: ti.template(),
+        upper: ti.template(),
+    ):
+        """Return the momentum from before stress and forces of a node with those of its images behind the walls."""
+        total = ti.Vector.zero(float, grid.width)
+        for images in range(ti.static(2**self.dimension)):
+            if self.mirrored(images, acts, depth):
+                total += self.flip(grid.before[self.image(grid, node, mirror, images)], images, upper)
+        return total
+
+    @ti.func
     def pulled(self, value: ti.template(), gravity_step: ti.template()):
         """Return the momentum and mass of a node after a step of gravity."""
         result = value
@@ -199,6 +216,15 @@ class Walls:
                 for images in range(ti.static(2**d)):
                     if self.mirrored(images, acts, depth):
                         grid.nodes[self.image(grid, node, mirror, images)] = self.flip(velocity, images, upper)
+                if ti.static(grid.scheme.keeps_before):
+                    # As the mirror images have it, so that a wall that acts changes nothing but what stress does.
+                    before = self.folded_before(grid, node, mirror, acts, depth, upper) / total[d]
+                    for a in ti.static(range(d)):
+                        if acts[a] == 1 and depth[a] == 0:
+                            before = self.stop(before, a, upper[a])
+                    for images in range(ti.static(2**d)):
+                        if self.mirrored(images, acts, depth):
+                            grid.before[self.image(grid, node, mirror, images)] = self.flip(before, images, upper)
         return owned
 
     @ti.func

@@ -9,8 +9,10 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.check.probe import Probe
 from mpmcli.output.layout import POSITION, ArrayLayout, FrameLayout
 from mpmcli.scene import Scene, scene_to_toml
+from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.plan import Plan
 from mpmcli.solver.solver import POSITION_ERROR
+from mpmcli.stability.scheme import loss_per_step
 
 # Bytes of a packed file beside its particles, measured on files of 51 to 151 frames in 2D and 3D: the headers of
 # its data sets, and per frame the tables of steps and ledger without momenta.
@@ -26,8 +28,8 @@ FRAME_SECONDS = 0.015
 DISK_BYTES_PER_SECOND = 4e8
 # A frame is written once as a segment, read, written into the packed file, and compared: four passes.
 DISK_PASSES = 4
-# Energy of a wave of wave number k that a step loses is this times (k h)^4 (verification: finding 2).
-DISSIPATION = 0.024
+# Knobs of a scene that chooses none.
+USUAL = SolverSettings()
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,10 @@ def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
         file_bytes=file_bytes,
         vtk_bytes=series_bytes(scene, plan.particles),
         dissipation=wave_loss(
-            min(body.thickness for body in facts.bodies), scene.domain.spacing, facts.taken(facts.step_at_start)
+            min(body.thickness for body in facts.bodies),
+            scene.domain.spacing,
+            facts.taken(facts.step_at_start),
+            scene.solver,
         ),
     )
 
@@ -113,12 +118,12 @@ def expected_steps(facts: SceneFacts) -> int:
     return round(whole * before + mixed + max(0, frames - whole - 1) * after)
 
 
-def wave_loss(thickness: float, spacing: float, step: float) -> float:
+def wave_loss(thickness: float, spacing: float, step: float, settings: SolverSettings = USUAL) -> float:
     """Return the share of its energy that the longest wave across a body loses, 1/s, at a step (s).
 
-    0.024 (k h)^4 per step with k = pi / thickness: APIC damps per step, not per second (verification: finding 2).
+    With k = pi / thickness; the transfers damp per step, not per second (verification: finding 2).
     """
-    return DISSIPATION * (math.pi * spacing / thickness) ** 4 / step
+    return loss_per_step(settings, math.pi * spacing / thickness) / step
 
 
 def layout_of(scene: Scene) -> FrameLayout:

@@ -11,7 +11,9 @@ from mpmcli.materials.registry import laws
 from mpmcli.scene import Body, Scene, SceneBounds, highest_speed
 from mpmcli.scene.bounds import body_points
 from mpmcli.scene.initial import initial_motion, moves_unevenly
+from mpmcli.scene.schema import SolverSettings
 from mpmcli.stability.limits import FIX, WHY, deformation_limit, mode_limit, speed_limit
+from mpmcli.stability.scheme import step_inertia
 
 # In an impact a cell stops on one side while matter comes in on the other from two nodes: two speeds per cell.
 IMPACT_GRADIENT = 2.0
@@ -73,16 +75,18 @@ def scene_limits(scene: Scene, bounds: SceneBounds) -> list[SceneLimit]:
     for body in scene.bodies:
         law = law_of(body, scene.dimension)
         for state, bound in (("rest", StateBound()), ("stiffest", law.stiffest(body.material, bounds))):
-            found += _material_limits(body, law, state, bound, scene.domain.spacing)
+            found += _material_limits(body, law, state, bound, scene)
     return [*found, *_motion_limits(scene, bounds)]
 
 
-def _material_limits(body: Body, law: Law, state: str, bound: StateBound, spacing: float) -> Iterator[SceneLimit]:
+def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene: Scene) -> Iterator[SceneLimit]:
     """Yield the tightest bound of each name that the modes of one body set in one state."""
-    material = body.material
+    material, spacing = body.material, scene.domain.spacing
+    inertia = step_inertia(scene.solver)
+    scheme = _scheme_text(scene.solver, inertia)
     smallest: dict[str, tuple[float, float, float]] = {}
     for mode in law.modes(material, bound):
-        value, name = mode_limit(spacing, material.density, mode.stiffness, mode.viscosity)
+        value, name = mode_limit(spacing, material.density, mode.stiffness, mode.viscosity, inertia)
         entry = (value, mode.stiffness, mode.viscosity)
         smallest[name] = min(smallest.get(name, entry), entry)
     for name, (value, stiffness, viscosity) in smallest.items():
@@ -104,10 +108,21 @@ def _material_limits(body: Body, law: Law, state: str, bound: StateBound, spacin
             body.name,
             state,
             "at rest" if state == "rest" else _state_text(bound),
-            f'In body "{body.name}" {WHY[name]}: {numbers}.',
+            f'In body "{body.name}" {WHY[name]}: {numbers}{scheme[name]}.',
             f"{cure[:1].upper()}{cure[1:]} allow{'' if name == 'viscosity' else 's'} about twice the step.",
             bound,
         )
+
+
+def _scheme_text(settings: SolverSettings, inertia: float) -> dict[str, str]:
+    """Return by which factor knobs other than usual change the bounds of waves and of viscosity, in words."""
+    if inertia == 1:
+        return {"wave": "", "viscosity": ""}
+    chosen = f'; transfer = "{settings.transfer}" with kernel = "{settings.kernel}" is stable at'
+    return {
+        "wave": f"{chosen} {math.sqrt(inertia):.3g} times that step",
+        "viscosity": f"{chosen} {inertia:.3g} times that step",
+    }
 
 
 def _motion_limits(scene: Scene, bounds: SceneBounds) -> Iterator[SceneLimit]:

@@ -12,8 +12,8 @@ from mpmcli.scene.quantity import AXES
 # Cells across a body below which its motion within itself is lost: with three, one particle row has neighbours on
 # both sides that do not feel the surface (the stencil is three nodes wide; hard case H12).
 FEWEST_CELLS = 3.0
-# Cells that the kernels of two particles reach over together: closer ones always share a node.
-REACH = 2.0
+# Cells that the kernels of two particles reach over together, by kernel: closer ones always share a node.
+REACH = {"quadratic": 2.0, "cubic": 3.0}
 # Cells below which a gap is contact on purpose: round-off, and bodies set on each other by hand.
 TOUCHING = 0.1
 # Cells from a wall within which a body feels it: the stencil reaches 1.5 nodes, its matter half of that.
@@ -52,9 +52,10 @@ def _thin(facts: SceneFacts) -> Iterator[Finding]:
 def _gaps(facts: SceneFacts) -> Iterator[Finding]:
     h = facts.scene.domain.spacing
     bodies = facts.scene.bodies
-    for i, j, distance in close_pairs(facts.scene, REACH * h):
+    reach = REACH[facts.scene.solver.kernel]
+    for i, j, distance in close_pairs(facts.scene, reach * h):
         cells = distance / h
-        if cells <= TOUCHING or cells >= REACH:
+        if cells <= TOUCHING or cells >= reach:
             continue
         first, second = bodies[i], bodies[j]
         # Bodies that come to rest on each other end there anyway; those that pass are dragged along.
@@ -63,8 +64,8 @@ def _gaps(facts: SceneFacts) -> Iterator[Finding]:
             "warning" if passing else "note",
             "gap",
             f'Bodies "{first.name}" and "{second.name}" are {cells:.2g} cells apart and act on each other already, as '
-            f"the grid joins what is closer than {REACH:g} cells.",
-            f"Set them {REACH * h:.3g} m apart, or make the spacing {distance / REACH:.3g} m, to keep them apart.",
+            f"the grid joins what is closer than {reach:g} cells.",
+            f"Set them {reach * h:.3g} m apart, or make the spacing {distance / reach:.3g} m, to keep them apart.",
             cells,
             first.name,
         )

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import wave_loss
+from mpmcli.stability.scheme import step_inertia
 
 # A step this much smaller than the stable one costs four times the time and loses four times the energy (H19).
 SMALL_STEP = 0.25
@@ -72,7 +73,7 @@ def _asked(facts: SceneFacts, step: float) -> Iterator[Finding]:
             "small-step",
             f"A time.step of {step:.4g} s is {facts.step / step:.3g} times smaller than the stable step, "
             f"{facts.step:.4g} s: the run takes as many times longer and "
-            "loses as many times the energy, as APIC damps per step.",
+            f"loses as many times the energy, as {facts.scene.solver.transfer.upper()} damps per step.",
             f'Set time.step to {facts.step:.4g} s, or to "auto".',
             step / facts.step,
         )
@@ -83,7 +84,7 @@ def _courant(facts: SceneFacts, step: float) -> str:
     rest = facts.binding_at_start
     if rest.name != "wave":
         return ""
-    limit = 1 / math.sqrt(facts.scene.dimension)
+    limit = math.sqrt(step_inertia(facts.scene.solver) / facts.scene.dimension)
     return f" (Courant number c dt / h = {limit * step / rest.value:.3f}, the limit is {limit:.3f})"
 
 
@@ -91,8 +92,10 @@ def _dissipation(facts: SceneFacts) -> Iterator[Finding]:
     """Only of bodies that would keep their energy: plastic flow and viscosity take more than the scheme does."""
     step = facts.taken(facts.step_at_start)
     h, end = facts.scene.domain.spacing, facts.scene.time.end
+    # Of (k h)^4 or, with PIC, (k h)^2, in twice as many steps.
+    part = "a half" if facts.scene.solver.transfer == "pic" else "an eighth"
     for body in facts.bodies:
-        rate = wave_loss(body.thickness, h, step)
+        rate = wave_loss(body.thickness, h, step, facts.scene.solver)
         lost = -math.expm1(-rate * end)
         if lost < NOTED_LOSS or body.own_loss > rate:
             continue
@@ -102,7 +105,7 @@ def _dissipation(facts: SceneFacts) -> Iterator[Finding]:
             f"At a step of {step:.3g} s the transfers take {100 * -math.expm1(-rate):.2g} % of the energy of a wave "
             f'across body "{body.name}", {body.thickness / h:.3g} cells thick, in a second, and '
             f"{100 * lost:.2g} % in the run.",
-            f"The largest stable step, {facts.step_at_start:.3g} s, loses least; half the spacing loses an eighth.",
+            f"The largest stable step, {facts.step_at_start:.3g} s, loses least; half the spacing loses {part}.",
             rate,
             body.name,
         )

@@ -3,17 +3,28 @@
 import math
 from collections.abc import Sequence
 from itertools import product
+from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 
+if TYPE_CHECKING:
+    from mpmcli.solver.scheme import Scheme
+
 # Nodes beyond each wall: ghost nodes that the wall folds, and the reach of the kernel.
 PAD = 3
-# Edge of a tile, cells: same-coloured tiles write disjoint nodes as long as no particle has drifted
-# more than one cell out of the tile that it was sorted into (4 + 4 cells apart, 3 + 1 + 1 nodes reach). A little less
-# leaves room for the rounding of positions.
-TILE = 4
+# Cells that a particle may drift out of the tile that it was sorted into. A little less than one leaves room for the
+# rounding of positions.
 DRIFT = 0.98
+
+
+def tile_edge(stencil: int) -> int:
+    """Return the edge of a tile, cells, for a spline that reaches so many nodes per axis.
+
+    Same-coloured tiles write disjoint nodes as long as no particle has drifted more than one cell: two edges of t cells
+    apart, they write t + 1 + 1 nodes and the rest of the last stencil, which leaves t > stencil.
+    """
+    return stencil + 1
 
 
 def node_width(dimension: int, *, on_cpu: bool) -> int:
@@ -31,40 +42,55 @@ class Grid:
         dimension: 2 or 3.
         spacing: h, m.
         cells: cells of the domain per axis.
-        shape: nodes per axis, margins included, a multiple of TILE.
+        scheme: how particles and nodes speak to each other.
+        tile: edge of a tile, cells.
+        shape: nodes per axis, margins included, a multiple of `tile`.
         tiles: tiles per axis.
         strides: of the linear node index, per axis.
         lines: of a stencil's lines of nodes along the last axis: (offsets along the other axes, linear offset).
         width: numbers per node, at least d + 1.
         nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update.
+        before: Vector(width) field: momentum, later velocity, without stress and forces of this step; None in schemes
+            that do not keep it.
         box: (2, d) ints: first node in use and number of nodes in use, per axis.
     """
 
-    def __init__(self, dimension: int, spacing: float, cells: tuple[int, ...], width: int) -> None:
+    def __init__(self, dimension: int, spacing: float, cells: tuple[int, ...], width: int, scheme: "Scheme") -> None:
         self.dimension = dimension
         self.width = width
         self.spacing = spacing
         self.cells = tuple(cells)
-        self.tiles = self.tile_counts(cells)
-        self.shape = tuple(TILE * n for n in self.tiles)
+        self.scheme = scheme
+        stencil = scheme.spline.nodes
+        self.tile = tile_edge(stencil)
+        self.tiles = self.tile_counts(cells, stencil)
+        self.shape = tuple(self.tile * n for n in self.tiles)
         self.strides = tuple(int(np.prod(self.shape[a + 1 :])) for a in range(dimension))
         self.lines = tuple(
             (o, sum(n * stride for n, stride in zip(o, self.strides, strict=False)))
-            for o in product(range(3), repeat=dimension - 1)
+            for o in product(range(stencil), repeat=dimension - 1)
         )
         self.node_count = int(np.prod(self.shape))
         self.nodes = ti.Vector.field(width, float, shape=self.node_count)
+        self.before = ti.Vector.field(width, float, shape=self.node_count) if scheme.keeps_before else None
         self.box = ti.field(int, shape=(2, dimension))
 
     @staticmethod
-    def tile_counts(cells: Sequence[int]) -> tuple[int, ...]:
-        """Return the tiles per axis of a grid over so many cells."""
-        return tuple(-(-(n + 1 + 2 * PAD) // TILE) for n in cells)
+    def tile_counts(cells: Sequence[int], stencil: int) -> tuple[int, ...]:
+        """Return the tiles per axis of a grid over so many cells, for a spline that reaches so many nodes per axis."""
+        return tuple(-(-(n + 1 + 2 * PAD) // tile_edge(stencil)) for n in cells)
 
     @staticmethod
-    def nodes_needed(cells: Sequence[int]) -> int:
+    def nodes_needed(cells: Sequence[int], stencil: int) -> int:
         """Return the number of nodes of such a grid."""
-        return math.prod(TILE * n for n in Grid.tile_counts(cells))
+        return math.prod(tile_edge(stencil) * n for n in Grid.tile_counts(cells, stencil))
+
+    @ti.func
+    def clear(self, node: int):
+        """Forget what a node holds."""
+        self.nodes[node] = ti.Vector.zero(float, self.width)
+        if ti.static(self.scheme.keeps_before):
+            self.before[node] = ti.Vector.zero(float, self.width)
 
     @ti.func
     def first_node(self, base: ti.template()):

@@ -1,26 +1,65 @@
-"""The quadratic B-spline that carries everything between particles and nodes."""
+"""The B-splines that carry everything between particles and nodes."""
 
 import taichi as ti
 
 from mpmcli.solver.grid import PAD
+from mpmcli.stability.scheme import INVERSE_MOMENT
 
 
-@ti.func
-def stencil(x: ti.template(), inverse_spacing: float):
-    """Return the first node of the stencil of a point and the distance to it in cells, per axis.
+@ti.data_oriented
+class QuadraticSpline:
+    """The quadratic B-spline, which reaches the three nodes nearest to a point.
 
-    The quadratic B-spline reaches the three nodes nearest to the point, so the distance is in [0.5, 1.5).
+    Attributes:
+        nodes: of a stencil, per axis.
+        inverse_moment: h^2 / D.
     """
-    scaled = x * inverse_spacing + PAD
-    base = ti.cast(scaled - 0.5, int)
-    return base, scaled - ti.cast(base, float)
+
+    nodes = 3
+    inverse_moment = INVERSE_MOMENT["quadratic"]
+
+    @ti.func
+    def stencil(self, x: ti.template(), inverse_spacing: float):
+        """Return the first node of the stencil of a point and the distance to it in cells, per axis: in [0.5, 1.5)."""
+        scaled = x * inverse_spacing + PAD
+        base = ti.cast(scaled - 0.5, int)
+        return base, scaled - ti.cast(base, float)
+
+    @ti.func
+    def weights(self, distance: ti.template()):
+        """Return the weights of the three nodes, each a vector over the axes (Steffen et al. 2008, eq. 24)."""
+        return (
+            0.5 * (1.5 - distance) ** 2,
+            0.75 - (distance - 1.0) ** 2,
+            0.5 * (distance - 0.5) ** 2,
+        )
 
 
-@ti.func
-def weights(distance: ti.template()):
-    """Return the weights of the three nodes, each a vector over the axes (Steffen et al. 2008, eq. 24)."""
-    return (
-        0.5 * (1.5 - distance) ** 2,
-        0.75 - (distance - 1.0) ** 2,
-        0.5 * (distance - 0.5) ** 2,
-    )
+@ti.data_oriented
+class CubicSpline:
+    """The cubic B-spline, which reaches the two nodes on either side of a point; see QuadraticSpline."""
+
+    nodes = 4
+    inverse_moment = INVERSE_MOMENT["cubic"]
+
+    @ti.func
+    def stencil(self, x: ti.template(), inverse_spacing: float):
+        """Return the first node of the stencil of a point and the distance to it in cells, per axis: in [1, 2)."""
+        scaled = x * inverse_spacing + PAD
+        base = ti.cast(scaled - 1.0, int)
+        return base, scaled - ti.cast(base, float)
+
+    @ti.func
+    def weights(self, distance: ti.template()):
+        """Return the weights of the four nodes, each a vector over the axes (Steffen et al. 2008, eq. 25)."""
+        up = distance - 1.0
+        down = 2.0 - distance
+        return (
+            down**3 / 6.0,
+            2.0 / 3.0 - up**2 + 0.5 * up**3,
+            2.0 / 3.0 - down**2 + 0.5 * down**3,
+            up**3 / 6.0,
+        )
+
+
+SPLINES = {"quadratic": QuadraticSpline(), "cubic": CubicSpline()}

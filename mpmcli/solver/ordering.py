@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 import taichi as ti
 
 from mpmcli.solver.grid import Grid
-from mpmcli.solver.kernel import stencil
 from mpmcli.solver.particles import ParticleGroup
 
 # Taichi gives a CPU thread at least this many iterations of a parallel loop.
@@ -75,20 +74,20 @@ class TileOrder:
         self.work = ti.field(int, shape=(self.colours, threads + 1))
 
     @staticmethod
-    def bytes_needed(cells: Sequence[int], threads: int) -> int:
+    def bytes_needed(cells: Sequence[int], stencil: int, threads: int) -> int:
         """Return the bytes that the tables of one group take."""
         tiles = 1
-        for n in Grid.tile_counts(cells):
+        for n in Grid.tile_counts(cells, stencil):
             tiles *= n
         return 4 * tiles * (threads + 1)
 
     @ti.func
     def tile_of(self, p: int):
         """Return the linear index of the tile that holds the stencil's first node of particle p."""
-        base, _ = stencil(self.group.x[p], ti.static(1 / self.grid.spacing))
+        base, _ = self.grid.scheme.spline.stencil(self.group.x[p], ti.static(1 / self.grid.spacing))
         tile = 0
         for a in ti.static(range(self.grid.dimension)):
-            tile = tile * ti.static(self.grid.tiles[a]) + (base[a] >> 2)
+            tile = tile * ti.static(self.grid.tiles[a]) + ti.raw_div(base[a], ti.static(self.grid.tile))
         return tile
 
     @ti.func

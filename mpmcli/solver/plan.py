@@ -14,8 +14,9 @@ from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.forces import forces_on, needs_initial
-from mpmcli.solver.grid import TILE, Grid, node_width
+from mpmcli.solver.grid import Grid, node_width, tile_edge
 from mpmcli.solver.ordering import TileOrder
+from mpmcli.solver.scheme import scheme_of
 
 # Taichi addresses fields with 32-bit integers, and a particle has at most 3 x 4 numbers in one field.
 LARGEST_INDEX = 2**31 - 1
@@ -109,7 +110,7 @@ def fields_of(
 
 def passes_of(names: Sequence[str], scene: Scene) -> tuple[str, ...]:
     """Return the loops of one step: the particles of each law, and the grid."""
-    separate = any("separate" in pair for pair in scene.domain.walls.faces(scene.dimension))
+    separate = bool(_separating_axes(scene))
     pushed = {name for name in names if forces_on(scene, members_of(scene, name))}
     return (
         "clear grid",
@@ -151,24 +152,30 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     )
     # The widest field is a matrix; sources and keys are integers.
     widest = max(size for group in groups for size in group.fields.values())
-    nodes = Grid.nodes_needed(cells)
-    tables = len(groups) * TileOrder.bytes_needed(cells, backend.threads) + _contact_bytes(scene, nodes)
+    scheme = scheme_of(scene.solver)
+    stencil = scheme.spline.nodes
+    nodes = Grid.nodes_needed(cells, stencil)
+    node_bytes = real * width * (2 if scheme.keeps_before else 1)
+    tables = len(groups) * TileOrder.bytes_needed(cells, stencil, backend.threads) + _contact_bytes(scene, nodes)
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
     host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)
     passes = passes_of(sorted(bodies), scene)
-    return Plan(groups, nodes, widest + 8, real * width, nodes * real * width + tables, host_bytes, passes)
+    return Plan(groups, nodes, widest + 8, node_bytes, nodes * node_bytes + tables, host_bytes, passes)
+
+
+def _separating_axes(scene: Scene) -> list[int]:
+    """Return the axis of every face that lets go and has to find out when; one whose nodes are set to zero has not."""
+    if scene.solver.walls == "zeroed":
+        return []
+    faces = scene.domain.walls.faces(scene.dimension)
+    return [axis for axis, pair in enumerate(faces) for wall in pair if wall == "separate"]
 
 
 def _contact_bytes(scene: Scene, nodes: int) -> int:
     """Return the bytes of the contact of separating walls: an integer per face and node of the largest such plane."""
-    planes = [
-        nodes // (TILE * tiles)
-        for tiles, pair in zip(
-            Grid.tile_counts(scene.domain.cells), scene.domain.walls.faces(scene.dimension), strict=True
-        )
-        for wall in pair
-        if wall == "separate"
-    ]
+    stencil = scheme_of(scene.solver).spline.nodes
+    tiles = Grid.tile_counts(scene.domain.cells, stencil)
+    planes = [nodes // (tile_edge(stencil) * tiles[axis]) for axis in _separating_axes(scene)]
     return 4 * len(planes) * max(planes, default=0)
 
 

@@ -136,12 +136,20 @@ def build_frame(
 
 
 def measure(
-    snapshots: Sequence[Snapshot], seen: Sequence[Observation], gravity: np.ndarray, spacing: float, dt: float
+    snapshots: Sequence[Snapshot],
+    seen: Sequence[Observation],
+    gravity: np.ndarray,
+    spacing: float,
+    dt: float,
+    moment: float = 0.25,
 ) -> dict[str, float | tuple[float, ...]]:
     """Sum what a run conserves; the affine velocity carries energy and angular momentum too (Jiang et al. 2017).
 
     Leapfrog has its velocities half a step dt (s) before its positions. All energies are taken there, where their sum
     is second order in the step; with the positions as they are it would swing by v dt/2 times the force.
+
+    Args:
+        moment: D / h^2, see `stability.scheme.affine_moment`.
 
     Returns:
         The entries of a `LedgerRow` that belong to the state alone, by name, summed in float64.
@@ -150,7 +158,7 @@ def measure(
     mass = kinetic = elastic = potential = 0.0
     linear = np.zeros(d)
     angular = np.zeros(1 if d == 2 else 3)
-    inertia = 0.25 * spacing**2
+    inertia = moment * spacing**2
     for s, o in zip(snapshots, seen, strict=True):
         m, V0 = s.per_body(MASS), s.per_body(VOLUME)
         x, v, C = (a.astype(np.float64) for a in (s.x, s.v, s.C))

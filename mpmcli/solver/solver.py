@@ -8,6 +8,7 @@ import numpy as np
 import taichi as ti
 
 from mpmcli.boundaries.walls import Walls
+from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
 from mpmcli.output.frame import Frame
@@ -16,16 +17,18 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError, cause_of, diagnose, first_unsound, rate_of_change
 from mpmcli.solver.drive import Drive
 from mpmcli.solver.forces import needs_initial
-from mpmcli.solver.grid import DRIFT, PAD, TILE, Grid, node_width
+from mpmcli.solver.grid import DRIFT, PAD, Grid, node_width
 from mpmcli.solver.observe import build_observation
 from mpmcli.solver.ordering import SortBuffers, TileOrder, build_sort
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.plan import members_of
+from mpmcli.solver.scheme import scheme_of
 from mpmcli.solver.snapshot import STRESSES, Snapshot, build_frame, measure, read_group
 from mpmcli.solver.step import NOT_LOST, build_step
 from mpmcli.solver.watch import Watch
 from mpmcli.stability.ledger import LedgerRow
 from mpmcli.stability.limits import Limit, force_limit, speed_limit
+from mpmcli.stability.scheme import affine_moment
 
 # Largest rounding of a stored position, in cells.
 POSITION_ERROR = 1e-3
@@ -111,13 +114,14 @@ class Solver:
         if "initial_position" in scene.output.fields:
             self._initial = np.concatenate([b.position if b.initial is None else b.initial for b in particles])
         self._drive = Drive(scene, self.groups, backend)
-        self.grid = Grid(scene.dimension, self.spacing, scene.domain.cells, width)
-        walls = Walls(scene.domain.walls.faces(scene.dimension), PAD, self.grid.cells, self.grid.shape)
+        self.grid = Grid(scene.dimension, self.spacing, scene.domain.cells, width, scheme_of(scene.solver))
+        kind = ZeroedWalls if scene.solver.walls == "zeroed" else Walls
+        walls = kind(scene.domain.walls.faces(scene.dimension), PAD, self.grid.cells, self.grid.shape)
         buffers = SortBuffers(self.groups)
         orders = [TileOrder(g, self.grid, buffers, backend.threads, backend.on_cpu) for g in self.groups]
         self._sorts = [build_sort(order) for order in orders]
         # Without atomics a particle may drift only as far as its tile's colour allows.
-        self._drift_allowed = DRIFT if backend.on_cpu else float(TILE)
+        self._drift_allowed = DRIFT if backend.on_cpu else float(self.grid.tile)
         self._kernels = build_step(
             self.grid,
             walls,
@@ -319,7 +323,8 @@ class Solver:
             self.time,
             self.step_count,
         )
-        sums = measure(snapshots, seen, self._drive.gravity_at(self.time), self.spacing, self._last_step)
+        gravity, moment = self._drive.gravity_at(self.time), affine_moment(self.scene.solver)
+        sums = measure(snapshots, seen, gravity, self.spacing, self._last_step, moment)
         smallest = min(taken, default=(0.0, 0.0, ""))
         row = LedgerRow(
             time=self.time,

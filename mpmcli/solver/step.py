@@ -16,9 +16,9 @@ from mpmcli.solver.extremes import (
     volume_ratio,
     widen,
 )
+from mpmcli.solver.flip import settle_before, unseen_velocity
 from mpmcli.solver.forces import Gravity
-from mpmcli.solver.grid import TILE, Grid
-from mpmcli.solver.kernel import stencil
+from mpmcli.solver.grid import Grid
 from mpmcli.solver.ordering import CHUNK, TileOrder, share_start
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.transfer import gather, scatter
@@ -98,12 +98,17 @@ def build_step(
     tile_low = ti.field(int, shape=d)
     tile_high = ti.field(int, shape=d)
     extent = tuple(n * h for n in grid.cells)
+    # Colours written out in one kernel: four would double the compile time of 3D scenes, two that of what scatters
+    # more than is usual.
+    together = 2 if grid.scheme.plain else 1
+    # Nodes from the first to the last of a stencil.
+    reach = grid.scheme.spline.nodes - 1
 
     @ti.func
     def advance(g: ti.template(), group: ti.template(), p: int, dt: float):
         """Gather and move one particle, x += dt v and F <- (I + dt C) F or J *= det(I + dt C); return its rate."""
         x = group.x[p]
-        v, gradient = gather(x, grid)
+        v, gradient = gather(x, grid, grid.nodes)
         C = ti.Matrix.zero(float, d, d)
         inside = x
         beyond = 0.0
@@ -114,6 +119,10 @@ def build_step(
             inside[c] = ti.select(moved > 0.0, moved, 0.0)
             inside[c] = ti.select(inside[c] < extent[c], inside[c], extent[c])
             beyond += ti.abs(moved - inside[c])
+        if ti.static(grid.scheme.keeps_before):
+            kept = unseen_velocity(group, p, x, grid)
+            for c in ti.static(range(d)):
+                v[c] += kept[c]
         for c in ti.static(range(group.v.n)):
             group.v[p][c] = v[c]
         for a in ti.static(range(d)):
@@ -137,10 +146,10 @@ def build_step(
         sound = beyond <= 0.5 * h
         if ti.static(not on_cpu):
             # Speeds are not read back at every step there: a stencil may have outrun the nodes in use.
-            base, _ = stencil(inside, 1 / h)
+            base, _ = grid.scheme.spline.stencil(inside, 1 / h)
             for a in ti.static(range(d)):
                 low = grid.box[0, a]
-                sound = sound and base[a] >= low and base[a] + 2 < low + grid.box[1, a]
+                sound = sound and base[a] >= low and base[a] + reach < low + grid.box[1, a]
         for c in ti.static(range(d)):
             group.x[p][c] = ti.select(sound, inside[c], x[c])
         if not sound:
@@ -167,6 +176,8 @@ def build_step(
                 for a in ti.static(range(d)):
                     value[a] = value[a] / value[d] + gravity_step[a]
                 grid.nodes[index] = value
+                if ti.static(grid.scheme.keeps_before):
+                    settle_before(grid, index)
         speed_squared = 0.0
         if owned and grid.nodes[index][d] > 0:
             for a in ti.static(range(d)):
@@ -174,25 +185,22 @@ def build_step(
         return speed_squared
 
     @ti.kernel
-    def spread(half: int, kick: float):
-        """Scatter two colours, after clearing the grid for the first two.
-
-        Four colours written out in one kernel would double the compile time of 3D scenes.
-        """
+    def spread(part: int, kick: float):
+        """Scatter some colours, after clearing the grid for the first ones."""
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
                 t = q // CHUNK
-                rows = grid.row_count() if half == 0 else 0
+                rows = grid.row_count() if part == 0 else 0
                 for row in range(share_start(rows, t, threads), share_start(rows, t + 1, threads)):
                     first = grid.first_node(grid.row_start(row))
                     for k in range(grid.box[1, d - 1]):
-                        grid.nodes[first + k] = ti.Vector.zero(float, grid.width)
+                        grid.clear(first + k)
         for g, group, order in ti.static(pairs):
-            for parity in ti.static(range(2)):
+            for parity in ti.static(range(together)):
                 for q in range(CHUNK * threads):
                     if q % CHUNK == 0:
                         t = q // CHUNK
-                        colour = parity + 2 * half
+                        colour = parity + together * part
                         for r in range(order.work[colour, t], order.work[colour, t + 1]):
                             first = order.pencil_start(colour, r)
                             for p in range(order.start[first], order.start[first + order.pencil]):
@@ -238,8 +246,8 @@ def build_step(
         return result
 
     def step_cpu(dt: float, kick: float) -> Pace:
-        for half in range(orders[0].colours // 2):
-            spread(half, kick)
+        for part in range(orders[0].colours // together):
+            spread(part, kick)
         speed, *values = collect(dt, kick).to_list()
         extremes, first = [], len(groups)
         for group, fields in zip(groups, farthest, strict=True):
@@ -251,7 +259,7 @@ def build_step(
     @ti.kernel
     def step_gpu(dt: float, kick: float):
         for q in range(grid.box_nodes()):
-            grid.nodes[grid.first_node(grid.box_node(q))] = ti.Vector.zero(float, grid.width)
+            grid.clear(grid.first_node(grid.box_node(q)))
         for g, group, _order in ti.static(pairs):
             for p in range(group.count):
                 spread_one(g, group, p, kick, True)
@@ -285,9 +293,9 @@ def build_step(
                         ti.atomic_max(tile_high[a], rest % ti.static(grid.tiles[a]))
                         rest = rest // ti.static(grid.tiles[a])
         for a in ti.static(range(d)):
-            # A stencil starts up to `drift` cells outside its tile and reaches two nodes further up.
-            first = TILE * tile_low[a] - drift
-            last = TILE * tile_high[a] + TILE - 1 + drift + 2
+            # A stencil starts up to `drift` cells outside its tile and reaches so many nodes further up.
+            first = grid.tile * tile_low[a] - drift
+            last = grid.tile * tile_high[a] + grid.tile - 1 + drift + reach
             # A box that comes near a wall holds the images beyond it too: they are read and written.
             if first <= walls.first + REACH:
                 first = walls.first - REACH

@@ -11,6 +11,7 @@ from mpmcli.solver.extremes import Extremes, build_extremes
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.step import SMALLEST_J, Pace
 from mpmcli.stability.limits import Limit, deformation_limit, mode_limit
+from mpmcli.stability.scheme import step_inertia
 
 # The state is measured, and the limits with it, once in so many steps at least. It is earlier where a stiffness may
 # have grown since by more than this share of what time.safety leaves.
@@ -39,6 +40,7 @@ class Watch:
         self._groups = groups
         self._names = tuple(body.name for body in scene.bodies)
         self._spacing = scene.domain.spacing
+        self._inertia = step_inertia(scene.solver)
         self._measure = [build_extremes(group, backend) for group in groups]
         self._extremes = [measure.state() for measure in self._measure]
         # Per group: its rate of deformation after the last step as far as known, and since its last measurement steps
@@ -160,7 +162,9 @@ class Watch:
         bounds = []
         for place, parameters in zip(group.bodies, group.law.members, strict=True):
             for mode in group.law.modes(parameters, extremes.bound):
-                value, cause = mode_limit(self._spacing, parameters.density, mode.stiffness, mode.viscosity)
+                value, cause = mode_limit(
+                    self._spacing, parameters.density, mode.stiffness, mode.viscosity, self._inertia
+                )
                 bounds.append(Limit(value, cause, self._names[place]))
         return bounds
 

@@ -1,7 +1,8 @@
 """Closed-form bounds on the time step, one function per bound (verification: 10.1).
 
-For MLS-MPM with APIC, quadratic B-splines and leapfrog. The wave bound is exact for an isolated
-particle, which is the least stable configuration: particles that share nodes allow 1.0 to 1.4 times more.
+For MLS-MPM and leapfrog. The wave bound is exact for an isolated particle, which is the least stable
+configuration: particles that share nodes allow 1.0 to 1.4 times more with APIC and quadratic B-splines. With the other
+knobs of [solver] that is so too: `scheme.step_inertia` has their factor.
 """
 
 import math
@@ -56,7 +57,9 @@ class Limit(NamedTuple):
         return FIX[self.name]
 
 
-def mode_limit(spacing: float, density: float, stiffness: float, viscosity: float = 0.0) -> tuple[float, str]:
+def mode_limit(
+    spacing: float, density: float, stiffness: float, viscosity: float = 0.0, inertia: float = 1.0
+) -> tuple[float, str]:
     """Return the step that one mode of an isolated particle allows, s, and which of the two binds.
 
     With a = 4 dt / (h^2 density) its velocity gradient obeys C' = C - a tau, where tau = stiffness e + viscosity C,
@@ -67,11 +70,12 @@ def mode_limit(spacing: float, density: float, stiffness: float, viscosity: floa
         spacing: h, m.
         density: kg/m^3, at rest.
         stiffness, viscosity: Pa and Pa s, see `Mode`.
+        inertia: factor of density h^2 by the scheme, see `scheme.step_inertia`.
 
     Returns:
         The step, and "wave" or "viscosity", whichever term is the larger one at that step.
     """
-    inertia = density * spacing**2
+    inertia = inertia * density * spacing**2
     # The root in the form that neither cancels nor overflows.
     root = viscosity + math.sqrt(viscosity**2 + stiffness * inertia)
     if root == 0:

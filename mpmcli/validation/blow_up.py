@@ -1,6 +1,7 @@
 """Measures the step at which a scene blows up, and sets it against the bound that the solver predicts."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.solver import Solver
 from mpmcli.solver.step import NOT_LOST
 from mpmcli.stability.limits import Limit
+from mpmcli.stability.scheme import INVERSE_MOMENT
 from mpmcli.validation.blow_up_scenes import SPACING, BlowUpScene
 
 # Size of the perturbation, in cells per predicted step: growth is seen long before anything is nonlinear.
@@ -66,7 +68,8 @@ class Measured:
 class Trial:
     """A scene that can be run again and again with steps of any size: its kernels stay compiled."""
 
-    def __init__(self, scene: BlowUpScene, backend: Backend) -> None:
+    def __init__(self, scene: BlowUpScene, backend: Backend, knobs: Mapping[str, object] | None = None) -> None:
+        """Build the scene, with these knobs of its [solver] table in place of the usual ones."""
         self.scene = scene
         self.dimension = d = scene.position.shape[1]
         self.count = n = len(scene.position)
@@ -79,7 +82,8 @@ class Trial:
             scene.volume,
             density * scene.volume,
         )
-        self.solver = Solver(_scene_of(scene), backend, [body])
+        self.solver = Solver(_scene_of(scene, knobs or {}), backend, [body])
+        self._moment = 1 / INVERSE_MOMENT[self.solver.scene.solver.kernel]
         self.predicted = math.inf
         self._start(0.0)
         # What `check` prints: of speeds and of the deformation per step nothing is asked here.
@@ -106,10 +110,10 @@ class Trial:
         self.solver.state_was_replaced()
 
     def kinetic_energy(self) -> float:
-        """Return sum |v - mean v|^2 + h^2/4 |C|^2, m^2/s^2: twice the energy per particle's mass."""
+        """Return sum |v - mean v|^2 + D |C|^2, m^2/s^2: twice the energy per particle's mass; D = h^2/4 is usual."""
         v, C = self.solver.groups[0].motion_to_numpy()
         v = v - v.mean(axis=0)
-        return float((v * v).sum() + SPACING**2 / 4 * (C * C).sum())
+        return float((v * v).sum() + self._moment * SPACING**2 * (C * C).sum())
 
     def _stored_energy(self) -> float:
         """Return what a deformed start holds beside the perturbation, in the units of `kinetic_energy`."""
@@ -188,7 +192,7 @@ class Trial:
         return (low + high) / 2
 
 
-def _scene_of(scene: BlowUpScene) -> Scene:
+def _scene_of(scene: BlowUpScene, knobs: Mapping[str, object]) -> Scene:
     """Return the scene: one body whose particles are given, in a box with slip walls, without gravity."""
     d = scene.position.shape[1]
     box = {"min": [0.0] * d, "max": [SPACING] * d}
@@ -196,7 +200,7 @@ def _scene_of(scene: BlowUpScene) -> Scene:
         {
             "domain": {"size": [n * SPACING for n in scene.cells], "spacing": SPACING, "walls": "slip"},
             "time": {"end": 1.0, "frames": 1},
-            "solver": {"precision": "f64"},
+            "solver": {"precision": "f64", **knobs},
             "bodies": [{"name": "body", "material": scene.material, "shape": {"box": box}}],
         },
         laws=parameter_models(),

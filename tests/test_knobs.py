@@ -1,0 +1,171 @@
+"""The knobs of [solver]: how a scene says them, what they cost in memory, and what a run with them conserves."""
+
+import tomllib
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from solver_state import bodies_of, scene_of
+from test_solver_conservation import free_scene
+
+from mpmcli.check.scene_limits import scene_limits
+from mpmcli.errors import InputError
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import Scene, SolverSettings, parse_scene, scene_bounds, scene_to_toml
+from mpmcli.scene.schema import USUAL_FLIP
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.plan import make_plan
+from mpmcli.solver.snapshot import read_group
+from mpmcli.solver.solver import Solver
+from mpmcli.stability.scheme import step_inertia
+
+H = 0.1
+
+
+def small_scene(**knobs: object) -> Scene:
+    """Return a block of jelly on the floor of a box."""
+    return scene_of(
+        domain={"size": [11 * H, 9 * H], "spacing": H, "gravity": [0.0, -9.81]},
+        time={"end": 1.0, "frames": 1},
+        solver=knobs,
+        bodies=[
+            {
+                "name": "block",
+                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5},
+                "shape": {"box": {"min": [3 * H, 0.0], "max": [7 * H, 4 * H]}},
+            }
+        ],
+    )
+
+
+def test_a_scene_that_chooses_nothing_has_nothing_of_it(backend_of: Callable) -> None:
+    """No share of FLIP in the settings, and on the grid no momentum from before and no wider stencil."""
+    assert small_scene().solver == SolverSettings(
+        precision="f32", kernel="quadratic", transfer="apic", flip=None, walls="folded"
+    )
+    solver = Solver(small_scene(), backend_of("f32", 1))
+    assert solver.grid.before is None and solver.grid.tile == 4
+    assert len(solver.grid.lines) == 3 and solver.grid.nodes.n == 4
+
+
+def test_flip_belongs_to_aflip() -> None:
+    """It has a default there, which the effective scene says; elsewhere it is one sentence."""
+    scene = small_scene(transfer="aflip")
+    assert scene.solver.flip == USUAL_FLIP
+    assert f"flip = {USUAL_FLIP:g}" in scene_to_toml(scene)
+    assert "flip" not in scene_to_toml(small_scene())
+    assert small_scene(transfer="aflip", flip=0.0).solver.flip == 0.0
+    with pytest.raises(InputError, match=r'solver\.flip.*transfer = "aflip".*leave it out') as error:
+        small_scene(flip=0.9)
+    assert len(str(error.value).splitlines()) == 1
+    with pytest.raises(InputError, match=r"solver\.flip"):
+        small_scene(transfer="aflip", flip=1.5)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "right"),
+    [("kernel", "linear", "cubic"), ("transfer", "flip", "aflip"), ("walls", "open", "folded")],
+)
+def test_other_words_are_refused(key: str, value: str, right: str) -> None:
+    with pytest.raises(InputError, match=rf"solver\.{key}.*{right}"):
+        small_scene(**{key: value})
+
+
+def test_the_effective_scene_says_every_knob() -> None:
+    scene = small_scene(kernel="cubic", transfer="aflip", flip=0.5, walls="zeroed")
+    again = parse_scene(tomllib.loads(scene_to_toml(scene)), laws=parameter_models()).scene
+    assert again.solver == scene.solver
+
+
+@pytest.mark.parametrize(
+    "knobs",
+    [{}, {"kernel": "cubic"}, {"transfer": "aflip"}, {"transfer": "pic", "walls": "zeroed"}],
+    ids=lambda knobs: "-".join(knobs.values()) or "usual",
+)
+def test_the_plan_follows_the_knobs(backend_of: Callable, knobs: dict) -> None:
+    """Nodes, their bytes and the passes, counted from the solver's own fields."""
+    scene, backend = small_scene(**knobs), backend_of("f32", 2)
+    plan, solver = make_plan(scene, backend), Solver(scene, backend)
+    fields = [field for field in (solver.grid.nodes, solver.grid.before) if field is not None]
+    assert plan.nodes == solver.grid.node_count
+    assert plan.bytes_per_node == sum(4 * field.n for field in fields)
+    assert ("find contact" in plan.passes) == (knobs.get("walls") != "zeroed")
+
+
+@pytest.mark.parametrize("knobs", [{"kernel": "cubic"}, {"transfer": "pic"}, {"transfer": "pic", "kernel": "cubic"}])
+def test_check_and_solver_take_the_same_step(backend_of: Callable, knobs: dict) -> None:
+    """The bound at rest goes with the root of the inertia that the scheme has, in the report and in the run."""
+    usual, scene = small_scene(), small_scene(**knobs)
+    factor = np.sqrt(step_inertia(scene.solver))
+    told = [
+        next(limit for limit in scene_limits(s, scene_bounds(s)) if limit.name == "wave" and limit.state == "rest")
+        for s in (usual, scene)
+    ]
+    assert told[1].value == pytest.approx(factor * told[0].value, rel=1e-12)
+    assert f"{factor:.3g} times that step" in told[1].why
+    taken = [limit for limit in Solver(scene, backend_of("f32", 1)).limits() if limit.name == "wave"]
+    assert taken[0].value == pytest.approx(told[1].value, rel=1e-4)
+
+
+def momenta_lost(scene: Scene, backend: Backend, step: float, steps: int) -> tuple[float, float]:
+    """Return by how much linear and angular momentum change, as the ledger sums them, over sum m |v| and m |x| |v|."""
+    solver = Solver(scene, backend)
+    states = bodies_of(solver).values()
+    linear = sum(s.mass @ np.linalg.norm(s.v, axis=1) for s in states)
+    angular = sum(s.mass @ (np.linalg.norm(s.x, axis=1) * np.linalg.norm(s.v, axis=1)) for s in states)
+    first = solver.frame(0, [])[1]
+    for _ in range(steps):
+        solver.step(step)
+    last = solver.frame(0, [])[1]
+    pushed = np.subtract(last.linear_momentum, first.linear_momentum)
+    turned = np.subtract(last.angular_momentum, first.angular_momentum)
+    return float(np.abs(pushed).max() / linear), float(np.abs(turned).max() / angular)
+
+
+def spinning(**knobs: object) -> Scene:
+    """Return two small bodies that spin, one of jelly and one of fluid."""
+    return free_scene(2, "f64").model_copy(update={"solver": SolverSettings(precision="f64", **knobs)})
+
+
+def test_cubic_splines_keep_both_momenta(backend_of: Callable) -> None:
+    """To round-off, with C's own angular momentum m h^2/3 axl(C); with the h^2/4 of quadratic ones it is not kept."""
+    linear, angular = momenta_lost(spinning(kernel="cubic"), backend_of("f64", 2), 0.01, 300)
+    assert linear < 1e-13 and angular < 1e-13
+
+
+def test_aflip_keeps_momentum_and_angular_momentum_to_first_order(backend_of: Callable) -> None:
+    """Linear momentum to round-off. Angular momentum is lost as positions follow the nodes: dt sum m v_nodes x v_own.
+
+    Over the same time it falls with the step.
+    """
+    backend = backend_of("f64", 2)
+    linear, long_steps = momenta_lost(spinning(transfer="aflip"), backend, 0.012, 100)
+    _, short_steps = momenta_lost(spinning(transfer="aflip"), backend, 0.003, 400)
+    assert linear < 1e-13
+    assert long_steps < 5e-3
+    assert short_steps < 0.4 * long_steps
+
+
+def test_pull_reaches_the_own_velocities_of_aflip(backend_of: Callable) -> None:
+    """Gravity and a force of the particles alike: a free block falls by (g + a) t, and every particle of it."""
+    body = small_scene().bodies[0]
+    scene = scene_of(
+        domain={"size": [2.0, 2.0], "spacing": H, "gravity": [0.0, -1.0]},
+        time={"end": 0.1, "frames": 1},
+        solver={"transfer": "aflip", "flip": 1.0, "precision": "f64"},
+        forces=[{"acceleration": [2.0, 0.0]}],
+        bodies=[
+            {
+                "name": "block",
+                "material": body.material.model_dump(),
+                "shape": {"box": {"min": [0.8, 0.8], "max": [1.2, 1.2]}},
+            }
+        ],
+    )
+    solver = Solver(scene, backend_of("f64", 1))
+    # Velocities live half a step behind.
+    dt, steps = 1e-3, 50
+    for _ in range(steps):
+        solver.step(dt)
+    v = read_group(solver.groups[0]).v
+    assert v == pytest.approx(np.tile([2.0, -1.0], (len(v), 1)) * dt * (steps - 0.5), rel=1e-9)

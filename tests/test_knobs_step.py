@@ -1,0 +1,122 @@
+"""Every knob of [solver] against plain numpy: the same scene of two laws and all kinds of wall as test_solver_paths."""
+
+from collections.abc import Callable
+
+import mpm_reference as reference
+import numpy as np
+import path_run
+import pytest
+from path_reference import Arrays, check_nodes, reference_groups
+
+from mpmcli.errors import InputError
+from mpmcli.scene import Scene
+from mpmcli.scene.schema import SolverSettings
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.grid import PAD
+from mpmcli.solver.solver import Solver
+
+# As in test_solver_paths.
+TOLERANCE = {"f32": 1e-6, "f64": 1e-12}
+CUBIC = {"kernel": "cubic"}
+PIC = {"transfer": "pic"}
+AFLIP = {"transfer": "aflip", "flip": 0.9}
+ZEROED = {"walls": "zeroed"}
+
+
+def slowly(*parameters: object) -> object:
+    return pytest.param(*parameters, marks=pytest.mark.slow)
+
+
+def name_of(choice: object) -> str:
+    return "-".join(map(str, choice.values())) if isinstance(choice, dict) else f"{choice}D"
+
+
+def scene_of(dimension: int, precision: str, knobs: dict) -> Scene:
+    """Return the scene of `path_run` with other knobs; in 3D of its jelly alone, which compiles in half the time."""
+    scene = path_run.scene_of(dimension, precision)
+    bodies = scene.bodies if dimension == 2 else scene.bodies[:1]
+    return scene.model_copy(update={"solver": SolverSettings(precision=precision, **knobs), "bodies": bodies})
+
+
+def prepare(scene: Scene, backend: Backend) -> Solver:
+    """Return a solver of the scene with the random state of `path_run`."""
+    solver = Solver(scene, backend, path_run.stirred(scene))
+    path_run.deform(solver)
+    return solver
+
+
+def check_steps(scene: Scene, arrays: Arrays, tolerance: float) -> None:
+    """Compare the nodes and the particles of every recorded step with the reference."""
+    knobs = {name: getattr(scene.solver, name) for name in ("kernel", "transfer", "walls")}
+    box = reference.Box(
+        scene.domain.cells,
+        scene.domain.spacing,
+        np.array(scene.domain.gravity),
+        scene.domain.walls.faces(scene.dimension),
+        flip=scene.solver.flip or 0.0,
+        **knobs,
+    )
+    laws = sorted({body.material.law for body in scene.bodies})
+    inside = tuple(slice(PAD - reference.MARGIN, PAD + n + 1 + reference.MARGIN) for n in box.cells)
+    for k in range(path_run.RECORDED):
+        groups = reference_groups(scene, arrays, k)
+        kick = path_run.STEP * (0.5 if k == 0 else 1.0)
+        momentum, mass = reference.scatter(groups, box, kick)
+        # What the particles bring without a kick is what nodes hold before it.
+        before, _ = reference.scatter(groups, box, 0.0)
+        velocity, velocity_before = reference.update_both(momentum, before, mass, box, kick)
+        expected = reference.gather(groups, velocity, box, path_run.STEP, velocity_before if box.flip else None)
+        fastest = np.abs(velocity).max()
+        for law, group in zip(laws, expected, strict=True):
+            scales = {"x": group.x.max(), "v": fastest, "C": 4 / box.spacing * fastest, "deformation": 1.0}
+            for name, scale in scales.items():
+                error = np.abs(arrays[f"{k + 1}_{law}_{name}"] - getattr(group, name)).max() / scale
+                assert error < tolerance, f"step {k}, {law} {name}: {error:.2e}"
+        check_nodes(arrays[f"{k}_nodes"][inside], momentum, mass, velocity, kick * box.gravity, tolerance)
+
+
+@pytest.mark.parametrize(
+    ("dimension", "knobs"),
+    [
+        (2, AFLIP | CUBIC),
+        (2, PIC | ZEROED),
+        (3, CUBIC),
+        slowly(2, AFLIP),
+        slowly(2, AFLIP | CUBIC | ZEROED),
+        slowly(3, AFLIP | CUBIC),
+        slowly(3, PIC | ZEROED),
+    ],
+    ids=name_of,
+)
+def test_steps_match_plain_numpy(backend_of: Callable, dimension: int, knobs: dict) -> None:
+    """Six steps on two threads in double precision, each from the device's own state, to round-off."""
+    scene = scene_of(dimension, "f64", knobs)
+    check_steps(scene, path_run.record_steps(prepare(scene, backend_of("f64", 2))), TOLERANCE["f64"])
+
+
+@pytest.mark.parametrize(
+    ("dimension", "knobs"), [(2, AFLIP | CUBIC | ZEROED), slowly(2, PIC), slowly(3, CUBIC)], ids=name_of
+)
+def test_steps_of_a_gpu_match_plain_numpy(backend_of: Callable, dimension: int, knobs: dict) -> None:
+    try:
+        backend = backend_of("f32", 1, "vulkan")
+    except InputError as error:
+        pytest.skip(str(error))
+    scene = scene_of(dimension, "f32", knobs)
+    check_steps(scene, path_run.record_steps(prepare(scene, backend)), TOLERANCE["f32"])
+
+
+@pytest.mark.parametrize(("dimension", "knobs"), [(2, AFLIP | CUBIC), slowly(3, AFLIP | CUBIC)], ids=name_of)
+def test_bitwise_equal_for_any_number_of_threads(backend_of: Callable, dimension: int, knobs: dict) -> None:
+    """State after 150 steps and many sorts: the tiles of a wider stencil are as disjoint when their colours run."""
+    states = []
+    for threads in (1, 2):
+        solver = prepare(scene_of(dimension, "f32", knobs), backend_of("f32", threads))
+        orders = set()
+        for _ in range(150):
+            solver.step(0.75 * path_run.STEP)
+            orders.add(path_run.order_of(solver))
+        assert len(orders) > 5
+        states.append(path_run.state(solver))
+    for name, value in states[0].items():
+        assert np.array_equal(value, states[1][name]), name
