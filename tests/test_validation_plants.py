@@ -44,22 +44,22 @@ PLANTS = (
     Plant(
         "stress without 4/h^2",
         "solver/transfer.py",
-        "stress_scale = kick * row[VOLUME] * (4 / h)",
+        "stress_scale = kick * row[VOLUME] * ti.static(grid.scheme.spline.inverse_moment / h)",
         "stress_scale = kick * row[VOLUME] * h",
         ("bar_fixed_fixed",),
     ),
     Plant(
         "stress with the cubic kernel's 3/h^2",
         "solver/transfer.py",
-        "stress_scale = kick * row[VOLUME] * (4 / h)",
+        "stress_scale = kick * row[VOLUME] * ti.static(grid.scheme.spline.inverse_moment / h)",
         "stress_scale = kick * row[VOLUME] * (3 / h)",
         ("bar_fixed_fixed",),
     ),
     Plant(
         "gradient with 3/h^2",
         "solver/transfer.py",
-        "* ti.static(4 / grid.spacing)",
-        "* ti.static(3 / grid.spacing)",
+        "scale = ti.static(grid.scheme.spline.inverse_moment / grid.spacing)",
+        "scale = ti.static(3 / grid.spacing)",
         ("bar_fixed_fixed",),
     ),
     Plant(
