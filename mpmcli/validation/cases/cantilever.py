@@ -134,6 +134,7 @@ class LargeBend(Cantilever):
     source = "Bisshopp and Drucker 1945 (elastica); Reissner 1972 (with shear and stretch)"
     load = 1.0
     finer = 4
+    varies = ("precision", "kernel", "transfer")
     levels: dict[Level, tuple[int, ...]] = {"coarse": (2, 4), "default": (2, 4, 8), "fine": (2, 4, 8, 12)}  # noqa: RUF012
     measures = (Measure("tip error", "", TIP, bound=lambda n: 0.015 if n >= 8 else 0.02), THIN)
     note = (

@@ -134,6 +134,8 @@ class ColumnSettlement(WeightedColumn):
     """The soft column: strains of 4 %, at which each law settles by a length of its own."""
 
     youngs_modulus = SOFT
+    # What the knobs do shows in the firm column.
+    varies = ("precision",)
     levels = {"coarse": (32,), "default": (16, 32, 64), "fine": (16, 32, 64, 128)}  # noqa: RUF012
     measures = (
         Measure("settlement error", "", SETTLEMENT, bound=lambda n: 1.3 * 0.021 / n, expected=1.0),

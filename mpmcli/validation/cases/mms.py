@@ -34,6 +34,8 @@ class ManufacturedWave(Case):
     ) -> None:
         """`error` and `stress` are their bounds, at n = 16 and at most resolutions: of the grid, and of quadrature."""
         self.name, self.title, self.source, self.wave = name, title, source, wave
+        # What the knobs do shows with the other law.
+        self.varies = ("precision",) if wave.law == "fixed_corotated" else Case.varies
         self.levels = levels
         self.note = f"{note} {NOTE}"
         self.measures = (

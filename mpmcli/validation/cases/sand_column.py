@@ -38,6 +38,8 @@ class SandColumn(Case):
         """`runout` and `height` are bands of (L - L0) / L0 and of H / L0; `resolutions`, those of the three levels."""
         self.aspect, self.runout, self.height, self.note = aspect, runout, height, note
         self.name = f"sand_column_{aspect}"
+        # What the knobs do shows in one of them.
+        self.varies = Case.varies if aspect == 2 else ("precision",)
         self.title = f"Column of sand, height over width {aspect}"
         coarse, usual, fine = resolutions
         self.levels = {"coarse": (coarse,), "default": (coarse, usual), "fine": (coarse, usual, fine)}
