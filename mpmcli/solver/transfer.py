@@ -151,10 +151,11 @@ def gather(x: ti.template(), grid: ti.template(), field: ti.template()):
         mid = field[node + 1] * (w[1][d - 1] * line_weight)
         high = field[node + 2] * (w[2][d - 1] * line_weight)
         total = (low + high) + mid
-        far = ti.Vector.zero(float, grid.width)
         if ti.static(grid.scheme.spline.nodes == 4):
             far = field[node + 3] * (w[3][d - 1] * line_weight)
             total += far
+            for c in ti.static(range(grid.width)):
+                moment[d - 1, c] += 2.0 * far[c]
         velocity += total
         for c in ti.static(range(grid.width)):
             for a in ti.static(range(d - 1)):
@@ -165,8 +166,6 @@ def gather(x: ti.template(), grid: ti.template(), field: ti.template()):
                 if ti.static(o[a] == 3):
                     moment[a, c] += 2.0 * total[c]
             moment[d - 1, c] += high[c] - low[c]
-            if ti.static(grid.scheme.spline.nodes == 4):
-                moment[d - 1, c] += 2.0 * far[c]
     scale = ti.static(grid.scheme.spline.inverse_moment / grid.spacing)
     for a in ti.static(range(d)):
         for c in ti.static(range(grid.width)):
