@@ -9,6 +9,7 @@ import tomllib
 import numpy as np
 
 from mpmcli.output.result import Result
+from mpmcli.validation.drop_motion import half_axis
 from mpmcli.validation.martin_moyce import N_SQUARED, mean_error, measured
 
 # How much later than assumed the column may have been free to move, in T: the gate takes its time.
@@ -50,22 +51,6 @@ def elliptical_drop_2d(result: Result) -> str:
         f"half axes {percent(axes[0] / a - 1)} and {percent(axes[1] * a - 1)}, "
         f"RMS {rms:.1e} R, at A0 t = {result.times[k]:.2f}"
     )
-
-
-def half_axis(time: float, steps: int = 1000) -> float:
-    """Return the half axis a(t) of the drop, R = A0 = 1: da/dt = -a sqrt(2 / (a^2 + a^-2)), by Runge-Kutta 4."""
-
-    def rate(a: float) -> float:
-        return -a * math.sqrt(2 / (a**2 + a**-2))
-
-    a, dt = 1.0, time / steps
-    for _ in range(steps):
-        k1 = rate(a)
-        k2 = rate(a + dt / 2 * k1)
-        k3 = rate(a + dt / 2 * k2)
-        k4 = rate(a + dt * k3)
-        a += dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    return a
 
 
 def falling(result: Result) -> str:

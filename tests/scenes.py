@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from solver_state import scene_of
@@ -52,21 +51,6 @@ def tilted(degrees: float) -> list[float]:
     return [GRAVITY * math.sin(theta), -GRAVITY * math.cos(theta)]
 
 
-def moved(sample: BodyParticles, position: np.ndarray) -> BodyParticles:
-    """Return the particles at other places, (n, d)."""
-    return replace(sample, position=position)
-
-
-def column_start(Y: np.ndarray, weight: float, modulus: float, top: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the particles of a resting column lie and their J, both (n,), for p = K (1/J - 1).
-
-    In one dimension the stress carries the weight of what was above at the start, p = weight (top - Y), with
-    weight = density g; y is the integral of J = 1 / (1 + p / K) from 0 to Y.
-    """
-    a = weight / modulus
-    return np.log((1 + a * top) / (1 + a * (top - Y))) / a, 1 / (1 + a * (top - Y))
-
-
 def row_means(values: np.ndarray, rows: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Return the mean of the chosen values in each row of particles; rows (n,) are their heights at the start."""
     keys = np.round(rows, 9)
@@ -76,13 +60,6 @@ def row_means(values: np.ndarray, rows: np.ndarray, chosen: np.ndarray) -> np.nd
 def stresses(fields: dict[str, np.ndarray]) -> np.ndarray:
     """Return the Cauchy stress of a frame as matrices, (n, 3, 3), Pa."""
     return fields["stress"].reshape(-1, 3, 3)
-
-
-def period_of(times: np.ndarray, signal: np.ndarray) -> float:
-    """Return the period of a signal about 0: twice the mean distance of its zeros."""
-    i = np.flatnonzero(np.sign(signal[1:]) != np.sign(signal[:-1]))
-    zeros = times[i] - signal[i] * (times[i + 1] - times[i]) / (signal[i + 1] - signal[i])
-    return 2 * float(np.polyfit(np.arange(len(zeros)), zeros, 1)[0])
 
 
 def restart(solver: Solver, sample: BodyParticles, end: float) -> None:
