@@ -31,8 +31,6 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float, atom
     stress, _, deformation, inner = group.law.respond(group.stored(p), group.inner(p), C, kick, group.constants(p))
     if ti.static(group.law.projects):
         group.store(p, deformation, inner)
-    if ti.static(grid.scheme.keeps_before):
-        scatter_before(group.x[p], mass, v, C, grid, atomic)
     if ti.static(group.pushed):
         push, slope = group.force.acceleration(group, p, ti.static(group.force.spreads and affine))
         v += kick * push
@@ -54,6 +52,10 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float, atom
             middle[c] -= change[a, c] * (distance[a] - 1.0)
     middle[d] = mass
     spread(grid.nodes, grid, grid.first_node(base), w, middle, change, atomic)
+    if ti.static(grid.scheme.keeps_before):
+        # Last, and with a copy: before it, Taichi 1.7.4 loses what a force with branches adds to v and C.
+        own_v, own_C = group.motion(p)
+        scatter_before(group.x[p], mass, own_v, own_C, grid, atomic)
 
 
 @ti.func
