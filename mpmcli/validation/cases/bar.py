@@ -38,6 +38,8 @@ class Bar(Case):
         self.frequency = self.b * WAVE_SPEED
         b = self.b
         free = room > 0
+        # What the other knobs do shows in the bar between two walls.
+        self.varies = ("precision", "walls") if free else Case.varies
         self.measures = (
             Measure(
                 "period error",

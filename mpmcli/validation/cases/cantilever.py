@@ -112,6 +112,7 @@ class SmallBend(Cantilever):
     """The tip sinks by 0.03 m, a quarter of the finest cells: particles keep their places in their cells."""
 
     name = "cantilever_small"
+    varies = ("precision", "kernel", "transfer")
     title = "Cantilever that hardly bends"
     source = "Timoshenko's beam"
     load = 0.02

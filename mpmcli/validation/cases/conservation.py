@@ -66,6 +66,7 @@ class Conservation(Case):
 
     def __init__(self, name: str, title: str, dimension: int, levels: dict[Level, tuple[int, ...]]) -> None:
         self.name, self.title, self.dimension, self.levels = name, title, dimension, levels
+        self.varies = ("precision", "kernel", "transfer")
         # Some thousand steps.
         self.end = 20.0 if dimension == 2 else 10.0
 

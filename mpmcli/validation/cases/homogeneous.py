@@ -70,6 +70,7 @@ class Homogeneous(Case):
     """v = L (X - c) in four free blocks."""
 
     name = "homogeneous"
+    varies = ("precision", "kernel", "transfer")
     title = "Free blocks in homogeneous motion"
     group = "invariants"
     source = "Closed forms: F = I + t L, and the laws at that F"

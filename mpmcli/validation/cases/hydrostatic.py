@@ -115,6 +115,7 @@ class HydrostaticDrop(Case):
     """Gravity switched on at t = 0: the base feels a triangle between 0 and 2 density g H, of period 4 H/c."""
 
     name = "hydrostatic_drop"
+    varies = ("precision", "transfer", "walls")
     title = "Column of water let go"
     group = "fluids"
     source = "d'Alembert's solution of the linear column, verification 4.2 and 6.1 a"

@@ -28,6 +28,7 @@ class SandShear(Case):
     """
 
     name = "sand_shear"
+    varies = ("precision",)
     title = "Sand sheared at constant volume"
     group = "plastic"
     source = "Mohr-Coulomb in plane strain, (s1 - s2) / (s1 + s2) = sin(phi); for Klar's alpha see Klar et al. 2016"
