@@ -19,6 +19,7 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError
 from mpmcli.validation import fingerprint, study
 from mpmcli.validation.carry_out import carry_out
+from mpmcli.validation.case import Measure
 from mpmcli.validation.fingerprint import case_files, code_digest, run_key
 from mpmcli.validation.journal import Journal
 from mpmcli.validation.matrix import Run, runs_of
@@ -198,10 +199,11 @@ class Still:
 
 
 class Broken(type(BAR)):
-    """The bar, measured wrongly."""
+    """The bar with two measures, measured wrongly."""
 
     def __init__(self, found: Callable[[], dict]) -> None:
         super().__init__("broken", "Broken", 1, 4)
+        self.measures = tuple(Measure(name, "", "Some number.") for name in ("period error", "energy loss"))
         self.found = found
 
     def measure(self, n: int, scene: object, frames: Iterable) -> dict[str, float]:

@@ -22,7 +22,20 @@ from mpmcli.validation.verdict import judge
 
 CASES = all_cases()
 COARSE = {name: sorted(case.levels["coarse"]) for name, case in CASES.items()}
-RUNS = [pytest.param(name, n, id=f"{name}-{n}") for name, resolutions in COARSE.items() for n in resolutions]
+# Of a kind one case is run always, and the others with -m slow.
+SLOW = {
+    "bar_fixed_free", "cantilever", "column_corotated", "column_hencky", "column_neo_hookean", "conservation_3d",
+    "mms_3d", "sand_column_1", "sand_column_5",
+}  # fmt: skip
+
+
+def marked(name: str, *parameters: int) -> object:
+    """Return the parameters of a test of a case."""
+    mark = [pytest.mark.slow] if name in SLOW else []
+    return pytest.param(name, *parameters, id="-".join(map(str, (name, *parameters))), marks=mark)
+
+
+RUNS = [marked(name, n) for name, resolutions in COARSE.items() for n in resolutions]
 # Written by scripts/validation_report, perhaps on another machine, whose sines and roots differ in the last digit.
 COMMITTED = ROOT / "docs" / "validation" / "coarse.json"
 TOLERANCE = 0.2
@@ -47,7 +60,7 @@ def test_a_case_is_within_its_bounds(run_of: Callable, record_property: Callable
     assert judge(CASES[name], {Run(name, n, Setting()): result}).reasons == ()
 
 
-@pytest.mark.parametrize("name", [name for name, resolutions in COARSE.items() if len(resolutions) > 1])
+@pytest.mark.parametrize("name", [marked(name) for name, resolutions in COARSE.items() if len(resolutions) > 1])
 def test_a_case_converges_as_it_should(run_of: Callable, record_property: Callable, name: str) -> None:
     found = {Run(name, n, Setting()): run_of(name, n) for n in COARSE[name][-2:]}
     orders = [check for check in judge(CASES[name], found).checks if check.subject.startswith("order")]
