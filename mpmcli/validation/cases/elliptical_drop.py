@@ -19,6 +19,7 @@ class EllipticalDrop(Case):
     """x = diag(a(t), 1/a(t)) X under v = A0 (-X, Y) at t = 0 and p = density A0^2/2 (1 - r^2)."""
 
     name = "elliptical_drop"
+    varies = ("precision", "kernel", "transfer", "per_axis", "safety")
     title = "Elliptical drop"
     group = "fluids"
     source = "Monaghan 1994 (JCP 110:399); a(t) from its energy, verification 6.3"

@@ -39,7 +39,7 @@ class SandColumn(Case):
         self.aspect, self.runout, self.height, self.note = aspect, runout, height, note
         self.name = f"sand_column_{aspect}"
         # What the knobs do shows in one of them.
-        self.varies = Case.varies if aspect == 2 else ("precision",)
+        self.varies = ("precision", "kernel", "transfer", "walls") if aspect == 2 else ("precision",)
         self.title = f"Column of sand, height over width {aspect}"
         coarse, usual, fine = resolutions
         self.levels = {"coarse": (coarse,), "default": (coarse, usual), "fine": (coarse, usual, fine)}

@@ -25,6 +25,7 @@ class Sloshing(Case):
     """From flat, with v = a w (-sin kX cosh kY, cos kX sinh kY)/sinh kd: the centre of mass swings at w."""
 
     name = "sloshing"
+    varies = ("precision", "kernel", "transfer", "walls", "safety")
     title = "Sloshing in a tank"
     group = "fluids"
     source = "w^2 = g k tanh(k d); its change by amplitude: Tadjbakhsh and Keller 1960 (JFM 8:442); verification 6.2"

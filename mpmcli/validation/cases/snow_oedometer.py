@@ -31,6 +31,7 @@ class SnowOedometer(Case):
     """A shaft of snow between slip walls, in which gravity grows slowly: every height is at another compression."""
 
     name = "snow_oedometer"
+    varies = ("precision", "kernel", "transfer")
     title = "Snow pressed together in a shaft"
     group = "plastic"
     source = "Stomakhin et al. 2013 (ACM TOG 32:102), in confined compression"

@@ -24,6 +24,7 @@ class SpinningDisc(Case):
     """
 
     name = "spinning_disc"
+    varies = ("precision", "kernel", "transfer", "per_axis")
     title = "Spinning elastic disc"
     group = "invariants"
     source = "Timoshenko and Goodier 1970 (rotating disc); Jiang et al. 2017 (conservation)"

@@ -31,7 +31,7 @@ class TwoDisks(Case):
     source = "Sulsky, Chen and Schreyer 1994 (CMAME 118:179); what must be conserved is derived"
     resolution = "cells per unit of length"
     levels = {"coarse": (20, 40), "default": (20, 40, 80), "fine": (20, 40, 80, 160)}  # noqa: RUF012
-    varies = ("precision", "kernel", "transfer", "per_axis", "safety")
+    varies = ("precision", "kernel", "transfer", "per_axis")
     measures = (
         Measure(
             "early contact",
