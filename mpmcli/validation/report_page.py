@@ -105,7 +105,7 @@ def _outcome(report: Report) -> str:
     passed = sum(entry.verdict.passed for entry in entries)
     runs = list(report.results.values())
     ended = sum(not result.finished for result in runs)
-    failed = f"; {ended} did not finish, and are crosses in the figures" if ended else ""
+    failed = f"; {ended} did not finish: {'a cross' if ended == 1 else 'crosses'} in the figures" if ended else ""
     return f"**{passed} of {len(entries)} cases pass.** {len(runs)} runs{failed}."
 
 

@@ -49,9 +49,9 @@ def stiff_cube() -> Outcome:
     return Outcome(
         fine and off[10] < 0.05,
         f"stress noise of f32 {100 * off[1]:.2g} % of rho g L after one crossing, {100 * off[10]:.2g} % after ten",
-        f"{steps} steps of {bound:.2g} s in a crossing. The rounding of F, added up at random, predicts "
-        f"{100 * noise_of_rounding(young, steps) / scale:.2g} % and "
-        f"{100 * noise_of_rounding(young, 10 * steps) / scale:.2g} %: it grows with the root of the number of steps.",
+        f"{steps} steps of {bound:.2g} s in a crossing. F - I is stored, and F rounded once, when the stress is taken: "
+        f"that predicts {100 * noise_of_rounding(young, 1) / scale:.2g} % at any time. Stored as F it would be rounded "
+        f"in every step, and {100 * noise_of_rounding(young, 10 * steps) / scale:.2g} % off after ten crossings.",
     )
 
 
