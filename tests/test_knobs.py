@@ -171,7 +171,7 @@ def test_pull_reaches_the_own_velocities_of_aflip(backend_of: Callable) -> None:
     assert v == pytest.approx(np.tile([2.0, -1.0], (len(v), 1)) * dt * (steps - 0.5), rel=1e-9)
 
 
-@pytest.mark.parametrize("kernel", ["quadratic", "cubic"])
+@pytest.mark.parametrize("kernel", ["quadratic", pytest.param("cubic", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("transfer", ["pic", "aflip"])
 @pytest.mark.parametrize("acceleration", ["-1 if X > 0.5 else 0", "-y"])
 def test_a_force_of_any_kind_pulls_with_every_scheme(

@@ -24,8 +24,9 @@ CASES = all_cases()
 COARSE = {name: sorted(case.levels["coarse"]) for name, case in CASES.items()}
 # Of a kind one case is run always, and the others with -m slow.
 SLOW = {
-    "bar_fixed_free", "cantilever", "column_corotated", "column_hencky", "column_neo_hookean", "conservation_3d",
-    "mms_3d", "sand_column_1", "sand_column_5",
+    "bar_fixed_free", "cantilever", "cantilever_small", "column_corotated", "column_hencky", "column_neo_hookean",
+    "conservation", "conservation_3d", "mms_2d_corotated", "mms_3d", "sand_column_1", "sand_column_2", "sand_column_5",
+    "sloshing", "spinning_disc",
 }  # fmt: skip
 
 
