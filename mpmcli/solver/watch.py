@@ -14,11 +14,11 @@ from mpmcli.stability.limits import Limit, deformation_limit, mode_limit
 from mpmcli.stability.scheme import step_inertia
 
 # The state is measured, and the limits with it, once in so many steps at least. It is earlier where a stiffness may
-# have grown since by more than this share of what time.safety leaves.
-MOST_UNWATCHED_STEPS = 64
-UNWATCHED_SHARE = 0.75
-# On a GPU the measurement is also what sees that a particle was lost.
-MOST_BLIND_STEPS = 16
+# have grown since by more than this share of what time.safety leaves: nearly all, as every step tells how fast it
+# deformed.
+MOST_UNWATCHED_STEPS, UNWATCHED_SHARE = 64, 0.95
+# The same on a GPU, where that is a guess, and where the measurement is also what sees that a particle was lost.
+MOST_BLIND_STEPS, BLIND_SHARE = 16, 0.75
 # Cells per step below which a sudden stop, which turns speed into a velocity gradient of up to two speeds a cell,
 # stays clear of the bound on the deformation in a step.
 SLOW = 0.1
@@ -50,8 +50,9 @@ class Watch:
         self._change = [0.0] * len(groups)
         self._hardened = [0.0] * len(groups)
         self.longest = MOST_UNWATCHED_STEPS if backend.on_cpu else MOST_BLIND_STEPS
+        share = UNWATCHED_SHARE if backend.on_cpu else BLIND_SHARE
         # A step of safety times the limit is stable until the stiffness has grown to safety^-2 of what it was.
-        self._growth_allowed = -2 * UNWATCHED_SHARE * math.log(scene.time.safety)
+        self._growth_allowed = -2 * share * math.log(scene.time.safety)
         self.seconds = 0.0
         self._limits = [self._limits_of(g, extremes) for g, extremes in enumerate(self._extremes)]
         self._eased = math.inf
