@@ -24,6 +24,8 @@ LEVELS = {
     "dataset": 5,
     "check": 5,
     "validation": 5,
+    "doctor": 5,
+    "plot": 5,
     "render": 5,
     "bench": 5,
     "solver": 4,
@@ -38,8 +40,8 @@ LEVELS = {
 }
 TAICHI_ROOMS = {"solver", "materials", "boundaries"}
 # These know frames and files, never the device state.
-WITHOUT_SOLVER = {"render", "output", "dataset"}
-HEAVY = {"taichi", "numpy", "h5py", "pydantic", "vtk", "vtkmodules", "pyvista", "meshio", "matplotlib"}
+WITHOUT_SOLVER = {"render", "plot", "output", "dataset"}
+HEAVY = {"taichi", "numpy", "h5py", "pydantic", "vtk", "vtkmodules", "pyvista", "meshio", "matplotlib", "PIL"}
 LINES_MAX = 400
 
 
