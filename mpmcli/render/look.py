@@ -1,0 +1,78 @@
+"""What a material looks like: colours that are told apart, and how light meets it."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from mpmcli.scene.presets import PRESETS
+
+# How light meets it: clear and thin, clear and thick, lit from within, white crumbs, loose grains, bare metal, dull.
+Finish = Literal["water", "syrup", "translucent", "crumbly", "grains", "metal", "matte"]
+
+
+@dataclass(frozen=True)
+class Look:
+    """The look of one material.
+
+    Attributes:
+        name: of the preset that it is nearest to, or of its law.
+        color: "#rrggbb" of the lit surface.
+        ink: "#rrggbb" of dots and legends: told apart from every other, on a light ground and on a dark one.
+        finish: how light meets it.
+        liquid: whether it flows as one body, so that dots hide what it is.
+    """
+
+    name: str
+    color: str
+    ink: str
+    finish: Finish
+    liquid: bool = False
+
+
+LOOKS = {
+    "water": Look("water", "#3b8fd4", "#2f7fd0", "water", liquid=True),
+    "honey": Look("honey", "#e8960c", "#e88a00", "syrup", liquid=True),
+    "lava": Look("lava", "#c8321a", "#d62f1f", "syrup", liquid=True),
+    "mud": Look("mud", "#74543a", "#8a5a33", "matte", liquid=True),
+    "jelly": Look("jelly", "#58b84c", "#3fa34d", "translucent"),
+    "rubber": Look("rubber", "#5a4a8a", "#7a5fc0", "matte"),
+    "snow": Look("snow", "#f2f6fb", "#8fb8dc", "crumbly"),
+    "sand": Look("sand", "#d9b56d", "#c9a040", "grains"),
+    "clay": Look("clay", "#b8694a", "#c4704e", "matte"),
+    "metal": Look("metal", "#a4acb6", "#8a95a3", "metal"),
+}
+# Laws without a preset, in the order in which they come.
+OTHERS = ("#0f9d8a", "#c2569b", "#7d8a2e", "#4e6fb8", "#b0563c")
+# Laws that share their parameters: what they look like hangs on these.
+ELASTIC = ("fixed_corotated", "hencky", "neo_hookean")
+# Two values of a parameter this far apart, as a ratio, differ as much as it can matter.
+FAR = 1e6
+
+
+def look_of(law: str, parameters: dict[str, Any], others: int = 0) -> Look:
+    """Return the look of a law with these parameters: that of the preset of its kind that they are nearest to.
+
+    Args:
+        parameters: those of the effective scene.
+        others: how many laws without a preset came before.
+    """
+    kind = ELASTIC if law in ELASTIC else (law,)
+    known = {name: preset for name, preset in PRESETS.items() if preset.law in kind and name in LOOKS}
+    if not known:
+        color = OTHERS[others % len(OTHERS)]
+        return Look(law, color, color, "matte")
+    nearest = min(known, key=lambda name: _distance(known[name].parameters, parameters))
+    return LOOKS[nearest]
+
+
+def _distance(preset: dict[str, Any], parameters: dict[str, Any]) -> float:
+    """Return how far apart two sets of parameters are: the sum of the squared logarithms of their ratios."""
+    total = 0.0
+    for name, wanted in preset.items():
+        given = parameters.get(name)
+        if any(isinstance(value, bool) or not isinstance(value, int | float) for value in (wanted, given)):
+            continue
+        if wanted <= 0.0:
+            continue
+        total += min(abs(math.log(max(given, wanted / FAR) / wanted)), math.log(FAR)) ** 2
+    return total

@@ -1,0 +1,42 @@
+"""Light and dark: the colours of everything that is not particles."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+ThemeName = Literal["light", "dark"]
+
+
+@dataclass(frozen=True)
+class Theme:
+    """Colours, "#rrggbb".
+
+    Attributes:
+        ground: of the canvas, and behind the particles in 2D.
+        sky, horizon: of the room behind a 3D scene, above and below.
+        floor: what shadows fall on.
+        text: titles and numbers; faint: what is there to be found, not to be seen.
+        wall: lines of the domain.
+        missing: values that are not numbers.
+    """
+
+    name: ThemeName
+    ground: str
+    sky: str
+    horizon: str
+    floor: str
+    text: str
+    faint: str
+    wall: str
+    missing: str = "#ff00c8"
+
+
+THEMES: dict[str, Theme] = {
+    "light": Theme("light", "#ffffff", "#dfe8f2", "#ffffff", "#eceff3", "#1c2330", "#6b7482", "#3f4856"),
+    "dark": Theme("dark", "#11141a", "#0d1016", "#232a36", "#1b2029", "#e8ebf1", "#8b94a4", "#aeb7c6"),
+}
+
+
+def rgb(color: str) -> tuple[float, float, float]:
+    """Return "#rrggbb" as three numbers from 0 to 1."""
+    red, green, blue = (int(color[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
+    return red, green, blue

@@ -1,0 +1,179 @@
+"""Where the camera stands, and which pixel a point of the scene falls on."""
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mpmcli.errors import InputError
+from mpmcli.render.subject import Subject
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+CAMERAS = ("iso", "front", "side", "top")
+# Full vertical angle of a perspective view, degrees: a long lens, which distorts little.
+ANGLE = 24.0
+# Share of the picture that stays free around the domain, on each side.
+MARGIN = 0.04
+# Of "iso": degrees that the camera stands to the right of the front, and above the ground.
+AZIMUTH, ELEVATION = 32.0, 24.0
+# Rounds in which the middle of the projected domain is brought to the middle of the picture.
+CENTRING_ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera and the size of what it takes.
+
+    Attributes:
+        size: pixels, (width, height).
+        position, focus, up: of the camera, (3,), m; `up` is a direction.
+        height: length at the focus that the full height of the picture shows, m.
+        parallel: lengths look alike at every distance, so that a scale bar has a meaning.
+        near, far: distances from the camera between which the domain lies, m.
+    """
+
+    size: tuple[int, int]
+    position: tuple[float, ...]
+    focus: tuple[float, ...]
+    up: tuple[float, ...]
+    height: float
+    parallel: bool
+    near: float
+    far: float
+
+    @property
+    def distance(self) -> float:
+        """Distance of the camera from its focus, m."""
+        return float(np.linalg.norm(np.subtract(self.position, self.focus)))
+
+    @property
+    def pixels_per_metre(self) -> float:
+        """Pixels to the metre, at the focus where the view is in perspective."""
+        return self.size[1] / self.height
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Directions (3, 3) of the camera as rows: to the right, up, and towards the viewer."""
+        return _axes(np.subtract(self.position, self.focus), np.array(self.up))
+
+    def pixels(self, points: np.ndarray) -> np.ndarray:
+        """Return (n, 3) for points (n, 3), m: pixels from the left and from the top, and the distance, m."""
+        right, up, back = ((points - np.array(self.position)) @ self.axes.T).T
+        depth = -back
+        scale = self.pixels_per_metre * (1.0 if self.parallel else self.distance / depth)
+        width, height = self.size
+        return np.stack([0.5 * width + right * scale, 0.5 * height - up * scale, depth], axis=1)
+
+    def place(self, plotter: "pv.Plotter") -> None:
+        """Put the camera of a plotter here."""
+        camera = plotter.camera
+        camera.position, camera.focal_point, camera.up = self.position, self.focus, self.up
+        camera.parallel_projection = self.parallel
+        camera.parallel_scale = 0.5 * self.height
+        camera.view_angle = math.degrees(2 * math.atan2(0.5 * self.height, self.distance))
+        camera.clipping_range = (self.near, self.far)
+
+
+def view_of(subject: Subject, camera: str, size: tuple[int, int]) -> View:
+    """Frame the domain of a run.
+
+    Args:
+        camera: one of `CAMERAS`, or six numbers with commas between: where it stands and what it looks at, m. A 2D
+            scene is looked at in its plane, whatever is asked for but six numbers.
+        size: pixels, (width, height).
+
+    Raises:
+        InputError: `camera` is none of these.
+    """
+    if camera not in CAMERAS:
+        return _free_view(subject, camera, size)
+    up = np.array(subject.up)
+    right = np.eye(3)[int(np.argmin(np.abs(up)))]
+    front = np.cross(right, up)
+    if subject.dimension == 2 or camera == "front":
+        return _framed(subject, front, up, size, parallel=True)
+    if camera == "side":
+        return _framed(subject, right, up, size, parallel=True)
+    if camera == "top":
+        return _framed(subject, up, -front, size, parallel=True)
+    turn, rise = math.radians(AZIMUTH), math.radians(ELEVATION)
+    level = math.cos(turn) * front + math.sin(turn) * right
+    return _framed(subject, math.cos(rise) * level + math.sin(rise) * up, up, size, parallel=False)
+
+
+def _axes(back: np.ndarray, up: np.ndarray) -> np.ndarray:
+    back = back / np.linalg.norm(back)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(back, right), back])
+
+
+def _corners(subject: Subject) -> np.ndarray:
+    low, high = np.array(subject.lower), np.array(subject.upper)
+    picks = np.array([[i >> axis & 1 for axis in range(3)] for i in range(8)])
+    return np.where(picks == 1, high, low)
+
+
+def _framed(subject: Subject, back: np.ndarray, up: np.ndarray, size: tuple[int, int], *, parallel: bool) -> View:
+    """Return the nearest view from a direction in which the whole domain is seen, its projection in the middle."""
+    corners, axes = _corners(subject), _axes(back, up)
+    focus = corners.mean(axis=0)
+    room = 1.0 - 2.0 * MARGIN
+    aspect = size[0] / size[1]
+    tangent = math.tan(math.radians(0.5 * ANGLE))
+    distance = 0.0
+    for _ in range(CENTRING_ROUNDS):
+        right, rise, towards = (axes @ (corners - focus).T) / room
+        if parallel:
+            height = 2 * max(np.abs(rise).max(), np.abs(right).max() / aspect)
+            distance = height / (2 * tangent)
+            break
+        towards = towards * room
+        distance = float((towards + np.maximum(np.abs(rise), np.abs(right) / aspect) / tangent).max())
+        # The middle of the outline moves to the middle of the picture, and the camera with it.
+        outline = np.stack([right, rise]) / (distance - towards)
+        shift = 0.5 * (outline.min(axis=1) + outline.max(axis=1)) * distance * room
+        focus = focus + shift @ axes[:2]
+    position = focus + distance * axes[2]
+    return _view(subject, size, position, focus, up, 2 * tangent * distance, parallel)
+
+
+def _free_view(subject: Subject, camera: str, size: tuple[int, int]) -> View:
+    try:
+        numbers = np.array([float(word) for word in camera.split(",")])
+    except ValueError:
+        numbers = np.empty(0)
+    what = f'--camera "{camera}" is not a camera: give {", ".join(CAMERAS)}, or six numbers x,y,z,x,y,z in metres'
+    if len(numbers) != 6 or not np.isfinite(numbers).all():
+        raise InputError(f"{what}, where it stands and what it looks at.")
+    position, focus = numbers[:3], numbers[3:]
+    back, up = position - focus, np.array(subject.up)
+    if np.linalg.norm(back) <= 1e-9 * max(np.abs(numbers).max(), 1e-300):
+        raise InputError(f"{what}: this one looks at where it stands.")
+    if np.linalg.norm(np.cross(back, up)) <= 1e-6 * np.linalg.norm(back):
+        # Straight up or down: any other direction will do for the upper edge.
+        up = np.eye(3)[(int(np.argmax(np.abs(up))) + 1) % 3]
+    height = 2 * math.tan(math.radians(0.5 * ANGLE)) * float(np.linalg.norm(back))
+    return _view(subject, size, position, focus, up, height, parallel=False)
+
+
+def _view(
+    subject: Subject,
+    size: tuple[int, int],
+    position: np.ndarray,
+    focus: np.ndarray,
+    up: np.ndarray,
+    height: float,
+    parallel: bool,
+) -> View:
+    axes = _axes(position - focus, up)
+    depths = (position - _corners(subject)) @ axes[2]
+    # Room for shadows and for what has left the domain.
+    spare = 0.1 * float(np.ptp(_corners(subject), axis=0).max())
+    near, far = float(depths.min()) - spare, float(depths.max()) + spare
+    near = max(near, 1e-3 * float(np.linalg.norm(position - focus)))
+    plain = [tuple(float(number) for number in vector) for vector in (position, focus, up)]
+    return View(size, *plain, height, parallel, near, max(far, 1.1 * near))
