@@ -369,12 +369,27 @@ def test_what_is_no_result_is_named(tmp_path):
         open_result(tmp_path / "good")
 
 
-def test_frames_packed_under_a_reader_are_named(tmp_path):
-    store = fill(tmp_path, [make_frame(0, 20, 3)], finish=False)
+def test_frames_packed_under_a_reader_are_read_on(tmp_path):
+    frames = [make_frame(k, 20, 3) for k in range(3)]
+    store = fill(tmp_path, frames, finish=False)
     result = open_result(tmp_path)
     store.finish()
-    with pytest.raises(InputError, match="open it again"):
-        result.frame(0)
+    assert result.kind == "segments" and not (tmp_path / "segments").exists()
+    for k, frame in enumerate(frames):
+        np.testing.assert_array_equal(result.frame(k).position, frame.position)
+
+
+def test_a_run_that_ends_while_it_is_opened_is_opened_as_packed(tmp_path, monkeypatch):
+    store = fill(tmp_path, [make_frame(0, 20, 3)], finish=False)
+    listed = sealed_segments(tmp_path)
+    store.finish()
+    monkeypatch.setattr("mpmcli.output.result.sealed_segments", lambda directory: listed)
+    packed = tmp_path / "particles.vtkhdf"
+    there = iter([False])
+    exists = type(packed).exists
+    # The packed file appears after the first look for it.
+    monkeypatch.setattr(type(packed), "exists", lambda path: next(there, True) if path == packed else exists(path))
+    assert open_result(tmp_path).kind == "packed"
 
 
 def test_the_stores_work_in_a_prepared_directory(tmp_path):

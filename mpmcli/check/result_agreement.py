@@ -3,9 +3,9 @@
 import numpy as np
 
 from mpmcli.check.result_findings import FrameFindings
-from mpmcli.check.result_scene import SceneFacts
 from mpmcli.check.result_state import TOUCHED
 from mpmcli.output.frame import Frame
+from mpmcli.output.scene_facts import SceneFacts
 from mpmcli.stability.ledger import LedgerRow
 
 # Relative, of numbers that are taken in single precision once more.

@@ -14,9 +14,9 @@ from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_ledger import check_ledger
 from mpmcli.check.result_motion import MomentumCheck, MotionCheck
 from mpmcli.check.result_order import check_order, frames_expected
-from mpmcli.check.result_scene import SceneFacts, scene_facts
 from mpmcli.check.result_state import StateCheck
 from mpmcli.errors import InputError
+from mpmcli.output.scene_facts import SceneFacts, scene_facts
 from mpmcli.output.store import PACKED
 
 Verdict = Literal["stable", "suspect", "unstable"]

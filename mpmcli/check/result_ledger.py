@@ -7,8 +7,8 @@ import numpy as np
 
 from mpmcli.check.result_entries import Entry
 from mpmcli.check.result_findings import FrameFindings
-from mpmcli.check.result_scene import SceneFacts
 from mpmcli.check.result_state import BLOWN_UP, COHERENT_LAWS, CRUSHED, TOUCHED
+from mpmcli.output.scene_facts import SceneFacts
 from mpmcli.stability.ledger import LedgerRow
 from mpmcli.stability.limits import COURANT
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_ledger import LOWER_SAFETY, MARGIN
-from mpmcli.check.result_scene import SceneFacts
 from mpmcli.check.result_state import TOUCHED, extent
 from mpmcli.output.frame import Frame
+from mpmcli.output.scene_facts import SceneFacts
 from mpmcli.stability.ledger import LedgerRow
 from mpmcli.stability.limits import DEFORMATION
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from mpmcli.check.result_entries import RUN_AGAIN, Entry, OpenedResult
 from mpmcli.check.result_findings import FrameFindings
-from mpmcli.check.result_scene import SceneFacts
+from mpmcli.output.scene_facts import SceneFacts
 
 # Relative to the length of the run; frames land on their times exactly.
 TIME_ERROR = 1e-9

@@ -126,9 +126,14 @@ class _SegmentsResult(Result):
         super().__init__(path, FrameIndex.joined(indices))
 
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
-        if not self._segments[k].exists():
-            raise InputError(f"The frames of {self.path} were packed after it was opened: open it again.")
-        return _read_arrays(self._segments[k], names, 0, int(self.particle_counts[k]))
+        try:
+            return _read_arrays(self._segments[k], names, 0, int(self.particle_counts[k]))
+        except InputError:
+            packed = self.path / PACKED
+            if self._segments[k].exists() or not packed.exists():
+                raise
+            # The run has ended since, and its frames were packed: the same ones, and perhaps more.
+            return _read_arrays(packed, names, int(self._index.offsets[k]), int(self.particle_counts[k]))
 
 
 class _SeriesResult(Result):
@@ -195,7 +200,13 @@ def _open_directory(directory: Path) -> Result:
         return _PackedResult(directory / PACKED)
     segments = sealed_segments(directory)
     if segments:
-        return _SegmentsResult(directory, segments)
+        try:
+            return _SegmentsResult(directory, segments)
+        except InputError:
+            # The run may have ended, and its frames been packed, while they were listed.
+            if not (directory / PACKED).exists():
+                raise
+            return _PackedResult(directory / PACKED)
     if (directory / SERIES).exists():
         return _SeriesResult(directory / SERIES)
     record = read_record(directory)

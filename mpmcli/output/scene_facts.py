@@ -1,4 +1,4 @@
-"""What a result's header says of its scene, as far as a check of the frames needs it."""
+"""What a result's header says of its scene, as far as checks and pictures of the frames need it."""
 
 import tomllib
 from dataclasses import dataclass
