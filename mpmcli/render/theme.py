@@ -36,7 +36,13 @@ THEMES: dict[str, Theme] = {
 }
 
 
+def rgb_bytes(color: str) -> tuple[int, int, int]:
+    """Return "#rrggbb" as three numbers from 0 to 255."""
+    red, green, blue = (int(color[k : k + 2], 16) for k in (1, 3, 5))
+    return red, green, blue
+
+
 def rgb(color: str) -> tuple[float, float, float]:
     """Return "#rrggbb" as three numbers from 0 to 1."""
-    red, green, blue = (int(color[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
-    return red, green, blue
+    red, green, blue = rgb_bytes(color)
+    return red / 255.0, green / 255.0, blue / 255.0

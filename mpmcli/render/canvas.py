@@ -1,0 +1,258 @@
+"""What stands around a picture: title, time, colour bar or legend, scale bar, the walls of a flat domain."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mpmcli.render.coloring import Categories, Coloring
+from mpmcli.render.subject import Subject
+from mpmcli.render.theme import Theme, rgb_bytes
+from mpmcli.render.view import View
+
+if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw
+    from PIL.ImageFont import FreeTypeFont
+
+# Sizes in pixels of a picture of 720 rows; they grow with the picture.
+ROWS = 720
+TEXT, SMALL = 17, 14
+PAD = 16
+TOP, BOTTOM = 44, 44
+BAR_WIDTH, TICK = 18, 6
+SWATCH = 16
+# Legends take this share of the width at most; longer names are cut.
+LEGEND_SHARE = 0.3
+# A scale bar is at most this share of the width.
+SCALE_SHARE = 0.18
+TICKS = 6
+NO_NUMBER = "no number"
+# Unit and how many of it make one metre, from the longest.
+LENGTHS = ((1e3, "km"), (1.0, "m"), (1e-2, "cm"), (1e-3, "mm"), (1e-6, "µm"))
+PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""))
+TIMES = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """The frame of all pictures of one film.
+
+    Args:
+        size: of the whole picture, pixels, (width, height).
+        times: of the frames of the result, s, which say how many digits a time needs.
+        colors: what a bar or a legend explains; None for none.
+    """
+
+    size: tuple[int, int]
+    subject: Subject
+    theme: Theme
+    times: Sequence[float]
+    colors: Coloring | Categories | None
+
+    @property
+    def stage(self) -> tuple[int, int, int, int]:
+        """Where the scene itself goes: left, top, right, bottom, pixels."""
+        width, height = self.size
+        top, bottom = self._px(TOP), height - self._px(BOTTOM)
+        return 0, top, max(width - self._column, 16), max(bottom, top + 16)
+
+    @property
+    def stage_size(self) -> tuple[int, int]:
+        """Pixels of the scene itself, (width, height)."""
+        left, top, right, bottom = self.stage
+        return right - left, bottom - top
+
+    def compose(self, picture: np.ndarray, view: View, time: float, missing: int = 0) -> np.ndarray:
+        """Return the whole picture, (height, width, 3) uint8.
+
+        Args:
+            picture: of the scene, of the size of the stage.
+            time: s.
+            missing: particles whose value is not a number.
+        """
+        from PIL import Image, ImageDraw
+
+        canvas = Image.new("RGB", self.size, rgb_bytes(self.theme.ground))
+        left, top, _, _ = self.stage
+        canvas.paste(Image.fromarray(picture), (left, top))
+        draw = ImageDraw.Draw(canvas)
+        if self.subject.dimension == 2:
+            self._walls(draw, view)
+        if view.parallel:
+            self._scale_bar(draw, view)
+        self._heading(draw, time)
+        if isinstance(self.colors, Coloring):
+            self._color_bar(draw, self.colors, missing)
+        elif self.colors is not None:
+            self._legend(draw, self.colors)
+        return np.asarray(canvas)
+
+    @property
+    def _scale(self) -> float:
+        return max(self.size[1] / ROWS, 0.4)
+
+    def _px(self, length: float) -> int:
+        return max(1, round(length * self._scale))
+
+    @property
+    def _column(self) -> int:
+        """Width of what stands on the right."""
+        if self.colors is None:
+            return 0
+        small = _font(self._px(SMALL))
+        if isinstance(self.colors, Coloring):
+            texts, head = self._ticks(self.colors)[1], self._bar_heading(self.colors)
+            ticks = self._px(BAR_WIDTH + TICK + 6) + max(small.getlength(text) for text in texts)
+            rest = self._px(BAR_WIDTH + 6) + small.getlength(NO_NUMBER)
+            wide = max(ticks, rest, *(small.getlength(line) for line in head))
+        else:
+            wide = self._px(SWATCH + 8) + max(small.getlength(name) for name in self.colors.names)
+            wide = min(wide, LEGEND_SHARE * self.size[0])
+        return math.ceil(wide) + 2 * self._px(PAD)
+
+    def _heading(self, draw: "ImageDraw", time: float) -> None:
+        font, small = _font(self._px(TEXT), bold=True), _font(self._px(TEXT))
+        pad, middle = self._px(PAD), self._px(TOP) // 2
+        told = time_text(time, self.times)
+        draw.text((self.size[0] - pad, middle), told, self.theme.text, small, anchor="rm")
+        # The room of the longest time, so that a title does not change its length in a film.
+        room = self.size[0] - 3 * pad - max(small.getlength(time_text(t, self.times)) for t in (*self.times[-1:], time))
+        title = cut(self.subject.title, lambda text: font.getlength(text) <= room)
+        draw.text((pad, middle), title, self.theme.text, font, anchor="lm")
+
+    def _walls(self, draw: "ImageDraw", view: View) -> None:
+        """Draw the walls around the domain, outside of it, so that nothing within is hidden."""
+        left, top, _, _ = self.stage
+        corners = view.pixels(np.array([self.subject.lower, self.subject.upper]))
+        (x0, y1), (x1, y0) = np.rint(corners[:, :2] + (left, top)).astype(int).tolist()
+        w = self._px(2)
+        for box in ((x0 - w, y0 - w, x1 + w, y0), (x0 - w, y1, x1 + w, y1 + w)):
+            draw.rectangle((box[0], box[1], box[2] - 1, box[3] - 1), fill=self.theme.wall)
+        for box in ((x0 - w, y0 - w, x0, y1 + w), (x1, y0 - w, x1 + w, y1 + w)):
+            draw.rectangle((box[0], box[1], box[2] - 1, box[3] - 1), fill=self.theme.wall)
+
+    def _scale_bar(self, draw: "ImageDraw", view: View) -> None:
+        length = round_length(SCALE_SHARE * self.size[0] / view.pixels_per_metre)
+        pixels = round(length * view.pixels_per_metre)
+        pad, w = self._px(PAD), self._px(2)
+        y = self.size[1] - self._px(BOTTOM) // 2
+        tip = self._px(5)
+        draw.rectangle((pad, y - w // 2, pad + pixels - 1, y - w // 2 + w - 1), fill=self.theme.text)
+        for x in (pad, pad + pixels - w):
+            draw.rectangle((x, y - tip, x + w - 1, y + tip), fill=self.theme.text)
+        font = _font(self._px(SMALL))
+        draw.text((pad + pixels + self._px(8), y), length_text(length), self.theme.text, font, anchor="lm")
+
+    def _legend(self, draw: "ImageDraw", colors: Categories) -> None:
+        font = _font(self._px(SMALL))
+        x = self.stage[2] + self._px(PAD)
+        room = self.size[0] - x - self._px(PAD + SWATCH + 8)
+        swatch, step = self._px(SWATCH), self._px(SWATCH + 10)
+        y = self.stage[1] + self._px(PAD)
+        for name, ink in zip(colors.names, colors.inks, strict=True):
+            if y + swatch > self.size[1] - self._px(PAD):
+                break
+            draw.ellipse((x, y, x + swatch, y + swatch), fill=ink)
+            text = cut(name, lambda text: font.getlength(text) <= room)
+            draw.text((x + swatch + self._px(8), y + swatch / 2), text, self.theme.text, font, anchor="lm")
+            y += step
+
+    def _bar_heading(self, colors: Coloring) -> list[str]:
+        unit = self._ticks(colors)[2]
+        return [colors.name, unit] if unit else [colors.name]
+
+    def _color_bar(self, draw: "ImageDraw", colors: Coloring, missing: int) -> None:
+        font = _font(self._px(SMALL))
+        x = self.stage[2] + self._px(PAD)
+        line = self._px(SMALL + 6)
+        y = self.stage[1] + self._px(4)
+        for text in self._bar_heading(colors):
+            draw.text((x, y), text, self.theme.text, font, anchor="lt")
+            y += line
+        top, bottom = y + self._px(8), self.stage[3] - self._px(PAD) - 2 * line
+        width = self._px(BAR_WIDTH)
+        low, high = colors.limits
+        rows = np.linspace(high, low, max(bottom - top, 2))
+        for k, color in enumerate(colors.rgb(rows).tolist()):
+            draw.rectangle((x, top + k, x + width - 1, top + k), fill=tuple(color))
+        places, texts, _ = self._ticks(colors)
+        for place, text in zip(places, texts, strict=True):
+            row = bottom - (place - low) / (high - low) * (bottom - top)
+            start = x + width
+            draw.rectangle((start, round(row), start + self._px(TICK) - 1, round(row)), fill=self.theme.faint)
+            draw.text((start + self._px(TICK + 6), row), text, self.theme.text, font, anchor="lm")
+        if missing:
+            y = bottom + line
+            draw.rectangle((x, y, x + width - 1, y + width - 1), fill=self.theme.missing)
+            draw.text((x + width + self._px(6), y + width / 2), NO_NUMBER, self.theme.text, font, anchor="lm")
+
+    @staticmethod
+    @cache
+    def _ticks(colors: Coloring) -> tuple[list[float], list[str], str]:
+        """Return places, texts, and the unit with what the texts are to be multiplied by."""
+        from matplotlib.ticker import MaxNLocator
+
+        low, high = colors.limits
+        places = [p for p in MaxNLocator(TICKS, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high) if low <= p <= high]
+        places = [float(place) for place in places] or [low, high]
+        largest = max(abs(low), abs(high))
+        factor, unit = 1.0, colors.unit
+        if unit == "Pa" and largest >= 1e3:
+            factor, prefix = next((f, p) for f, p in PREFIXES if largest >= f)
+            unit = prefix + unit
+        elif largest >= 1e5 or largest < 1e-2:
+            power = math.floor(math.log10(largest))
+            factor = 10.0**power
+            unit = f"10{str(power).translate(SUPERSCRIPTS)} {unit}".strip()
+        step = (places[1] - places[0]) / factor if len(places) > 1 else largest / factor
+        digits = max(0, -math.floor(math.log10(abs(step)) + 1e-9)) if step else 0
+        if round(step, digits) and abs(step - round(step, digits)) > 1e-6 * abs(step):
+            digits += 1
+        texts = [f"{place / factor:.{digits}f}".replace("-", "\u2212") for place in places]
+        return places, texts, unit
+
+
+def time_text(time: float, times: Sequence[float]) -> str:
+    """Write a time with as many digits as tell the times of a film apart, for example "t = 0.250 s"."""
+    longest = max([abs(t) for t in times], default=0.0) or abs(time) or 1.0
+    factor, unit = next(((f, u) for f, u in TIMES if longest >= 0.1 * f), TIMES[-1])
+    ordered = np.unique(np.asarray(times, dtype=np.float64)) / factor
+    step = float(np.median(np.diff(ordered))) if len(ordered) > 1 else 0.1
+    digits = min(max(0, math.ceil(-math.log10(step) - 1e-9)), 6)
+    while digits < 6 and abs(step * 10**digits - round(step * 10**digits)) > 0.05:
+        digits += 1
+    return f"t = {time / factor:.{digits}f} {unit}"
+
+
+def round_length(longest: float) -> float:
+    """Return the largest of 1, 2 and 5 times a power of ten that is no longer."""
+    power = 10.0 ** math.floor(math.log10(longest))
+    return max(m * power for m in (1, 2, 5) if m * power <= longest * (1 + 1e-9))
+
+
+def length_text(length: float) -> str:
+    """Write a length in the unit that makes it a short number."""
+    factor, unit = next(((f, u) for f, u in LENGTHS if length >= 0.999 * f), LENGTHS[-1])
+    return f"{length / factor:g} {unit}"
+
+
+def cut(text: str, fits) -> str:
+    """Shorten a text until it fits."""
+    if fits(text):
+        return text
+    while text and not fits(text + "…"):
+        text = text[:-1].rstrip()
+    return text + "…" if text else ""
+
+
+@cache
+def _font(size: int, bold: bool = False) -> "FreeTypeFont":
+    from matplotlib import get_data_path
+    from PIL import ImageFont
+
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/{name}", size)

@@ -1,0 +1,199 @@
+"""`--color-by`: which value of a particle is shown, and between which limits."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+
+from mpmcli.errors import InputError
+from mpmcli.output.frame import Frame
+from mpmcli.output.result import Result
+from mpmcli.render.coloring import Categories, Coloring
+from mpmcli.render.subject import Subject
+from mpmcli.render.theme import Theme
+from mpmcli.scene.schema import ParticleField
+from mpmcli.scene.sentences import listed, nearest
+
+# What every result can show, and what needs a stored field.
+ALWAYS = ("speed", "material", "body", "id")
+DERIVED = ("density", "pressure", "J", "stress")
+# By name of a field: unit, as far as it has one.
+UNITS = {
+    "velocity": "m/s",
+    "density": "kg/m³",
+    "pressure": "Pa",
+    "stress": "Pa",
+    "mass": "kg",
+    "initial_position": "m",
+    "affine": "1/s",
+}
+# Perceptually even; one that goes both ways from its middle for values around a neutral one.
+SEQUENTIAL, DIVERGING = "viridis", "coolwarm"
+# Frames of the result that limits are taken from, at most, evenly spaced.
+LOOKED_AT = 12
+# Share of the particles of a frame that may lie outside of the limits, at each end.
+OUTSIDE = 0.01
+# Bodies, told apart by colour-blind people too (Okabe and Ito 2008, Color universal design).
+BODY_INKS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#b0a410", "#8a8a8a")
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class _Value:
+    """A value before its limits are known; `middle` is the neutral one, where there is one."""
+
+    name: str
+    unit: str
+    fields: tuple[str, ...]
+    of: Callable[[Frame], np.ndarray]
+    middle: float | None = None
+    floor: float | None = None
+
+
+def color_by(
+    name: str,
+    result: Result,
+    subject: Subject,
+    theme: Theme,
+    limits: tuple[float, float] | None = None,
+    cmap: str | None = None,
+) -> Coloring | Categories:
+    """Find what a name means for a result.
+
+    Args:
+        name: one of `ALWAYS` and `DERIVED`, or a stored field: a vector is shown by its length, a tensor by its Frobenius
+            norm, `stress.xy` is one component.
+        limits: of the colour map; by default nearly all particles of a dozen frames lie within.
+        cmap: name of a colour map of matplotlib.
+
+    Raises:
+        InputError: the result stores no such thing, or there is no such colour map.
+    """
+    if name == "material":
+        looks = subject.looks
+        names, inks = tuple(look.name for look in looks), tuple(look.ink for look in looks)
+        return Categories("material", names, inks, subject.material_of)
+    if name == "body":
+        inks = tuple(BODY_INKS[k % len(BODY_INKS)] for k in range(len(subject.bodies)))
+        return Categories("body", subject.bodies, inks, tuple(range(len(subject.bodies))))
+    value = _value(name, result, subject)
+    if limits is None:
+        limits = _limits(value, result)
+    return Coloring(
+        value.name,
+        value.unit,
+        value.fields,
+        value.of,
+        _known_map(cmap) if cmap else SEQUENTIAL if value.middle is None else DIVERGING,
+        limits,
+        theme.missing,
+    )
+
+
+def _value(name: str, result: Result, subject: Subject) -> _Value:
+    stored = result.field_names
+    densities = np.array(subject.densities)
+    if name == "speed":
+        return _Value("speed", "m/s", (), lambda frame: _length(frame.velocity), floor=0.0)
+    if name == "id":
+        return _Value("particle", "", (), lambda frame: np.arange(len(frame.position), dtype=np.float64))
+    if name == "density":
+        if "density" not in stored and "volume_ratio" in stored:
+            fields = ("volume_ratio",)
+            return _Value("density", "kg/m³", fields, lambda f: densities[f.body] / _scalar(f, "volume_ratio"))
+    elif name == "J":
+        if "volume_ratio" in stored:
+            return _Value("J", "", ("volume_ratio",), lambda frame: _scalar(frame, "volume_ratio"), middle=1.0)
+        if "density" in stored:
+            return _Value("J", "", ("density",), lambda f: densities[f.body] / _scalar(f, "density"), middle=1.0)
+        raise _not_stored(name, result, "volume_ratio")
+    elif name == "stress" and "stress" in stored:
+        return _Value("von Mises stress", "Pa", ("stress",), lambda f: _von_mises(f.fields["stress"]), floor=0.0)
+    return _field(name, result, subject.dimension)
+
+
+def _field(name: str, result: Result, d: int) -> _Value:
+    field, _, component = name.partition(".")
+    if field not in (*result.field_names, "velocity"):
+        raise _not_stored(name, result, field)
+    unit = UNITS.get(field, "")
+    fields = () if field == "velocity" else (field,)
+
+    def array(frame: Frame) -> np.ndarray:
+        values = frame.velocity if field == "velocity" else frame.fields[field]
+        return np.asarray(values, dtype=np.float64).reshape(len(frame.position), -1)
+
+    width = array(result.frame(0, fields)).shape[1]
+    plain = field.replace("_", " ")
+    if not component:
+        if width == 1:
+            return _Value(plain, unit, fields, lambda frame: array(frame)[:, 0])
+        return _Value(f"|{plain}|", unit, fields, lambda frame: _length(array(frame)), floor=0.0)
+    known = list(AXES[:d]) if width == d else [a + b for a in AXES[:d] for b in AXES[:d]] if width == d * d else []
+    if component not in known:
+        right = f"its components are {listed(known, 'and')}" if known else "it is one number"
+        raise InputError(f'--color-by {name}: "{field}" has no component "{component}"; {right}.')
+    column = known.index(component)
+    return _Value(f"{plain} {component}", unit, fields, lambda frame: array(frame)[:, column], middle=0.0)
+
+
+def _not_stored(name: str, result: Result, field: str) -> InputError:
+    known = ["velocity", *result.field_names]
+    holds = f'--color-by {name}: {result.path} stores no "{field}", but {listed(known, "and")}'
+    storable = get_args(ParticleField)
+    if field in storable:
+        return InputError(f'{holds}; to store it, add "{field}" to output.fields of the scene and run it again.')
+    guess = nearest(field, [*ALWAYS, *DERIVED, *known, *storable])
+    hint = f'did you mean "{guess}"?' if guess else f"{listed([*ALWAYS, *DERIVED], 'and')} have names of their own."
+    return InputError(f"{holds}; {hint}")
+
+
+def _limits(value: _Value, result: Result) -> tuple[float, float]:
+    """Return limits between which nearly all particles of the whole result lie."""
+    count = min(LOOKED_AT, result.frame_count)
+    lows, highs = [], []
+    for k in np.unique(np.linspace(0, result.frame_count - 1, count).round().astype(int)):
+        values = value.of(result.frame(int(k), value.fields))
+        values = values[np.isfinite(values)]
+        if len(values):
+            low, high = np.quantile(values, (OUTSIDE, 1.0 - OUTSIDE))
+            lows.append(float(low))
+            highs.append(float(high))
+    low, high = (min(lows), max(highs)) if lows else (0.0, 1.0)
+    if value.floor is not None:
+        low = value.floor
+    if value.middle is not None:
+        reach = max(abs(high - value.middle), abs(low - value.middle))
+        low, high = value.middle - reach, value.middle + reach
+    if high - low <= 1e-6 * max(abs(low), abs(high)):
+        # All alike: in the middle of the map, however they are rounded.
+        reach = 0.05 * max(abs(low), abs(high)) or 1.0
+        low, high = low - reach * (value.floor is None), high + reach
+    return low, high
+
+
+def _known_map(name: str) -> str:
+    import matplotlib as mpl
+
+    if name not in mpl.colormaps:
+        guess = nearest(name, list(mpl.colormaps))
+        hint = f'did you mean "{guess}"?' if guess else "viridis, cividis, magma, coolwarm are some."
+        raise InputError(f'--cmap "{name}" is no colour map of matplotlib; {hint}')
+    return name
+
+
+def _scalar(frame: Frame, field: str) -> np.ndarray:
+    return np.asarray(frame.fields[field], dtype=np.float64)
+
+
+def _length(vectors: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.square(np.asarray(vectors, dtype=np.float64)).sum(axis=1))
+
+
+def _von_mises(stress: np.ndarray) -> np.ndarray:
+    """Return sqrt(3/2 s : s), s the deviator of the stress (n, d, d); in 2D, of the stress in the plane."""
+    d = stress.shape[1] if stress.ndim == 3 else round(stress.shape[1] ** 0.5)
+    tensor = np.asarray(stress, dtype=np.float64).reshape(len(stress), d, d)
+    deviator = tensor - np.trace(tensor, axis1=1, axis2=2)[:, None, None] / d * np.eye(d)
+    return np.sqrt(1.5 * np.square(deviator).sum(axis=(1, 2)))

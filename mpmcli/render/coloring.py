@@ -1,0 +1,77 @@
+"""What the colours of particles mean: a value with its unit and limits, or a kind with its name."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mpmcli.output.frame import Frame
+from mpmcli.render.theme import rgb_bytes
+
+
+@dataclass(frozen=True)
+class Coloring:
+    """Colours by value.
+
+    Attributes:
+        name, unit: of the value, for people; the unit is "" where there is none.
+        fields: to be read of each frame.
+        value: gives (n,) float64 for a frame; NaN where there is none.
+        cmap: name of a colour map of matplotlib.
+        limits: the values at its two ends, the same for all frames.
+        missing: "#rrggbb" of what is not a number.
+    """
+
+    name: str
+    unit: str
+    fields: tuple[str, ...]
+    value: Callable[[Frame], np.ndarray]
+    cmap: str
+    limits: tuple[float, float]
+    missing: str
+
+    def values(self, frame: Frame) -> np.ndarray:
+        """Return (n,) float64."""
+        return self.value(frame)
+
+    def particle_rgb(self, frame: Frame) -> np.ndarray:
+        """Return (n, 3) uint8."""
+        return self.rgb(self.value(frame))
+
+    def rgb(self, values: np.ndarray) -> np.ndarray:
+        """Return the colours (..., 3) uint8 of values (...)."""
+        low, high = self.limits
+        known = np.isfinite(values)
+        share = np.where(known, (values - low) / (high - low), 0.0)
+        colors = self._table[np.clip(share * 255.0 + 0.5, 0, 255).astype(np.intp)]
+        colors[~known] = rgb_bytes(self.missing)
+        return colors
+
+    @cached_property
+    def _table(self) -> np.ndarray:
+        import matplotlib as mpl
+
+        return (mpl.colormaps[self.cmap](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0 + 0.5).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Categories:
+    """Colours by kind: of which body, or of which material, a particle is.
+
+    Attributes:
+        name: what the kinds are.
+        names, inks: of each kind; inks are "#rrggbb".
+        kind_of: (b,) kind of each body.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    inks: tuple[str, ...]
+    kind_of: tuple[int, ...]
+    fields: tuple[str, ...] = ()
+
+    def particle_rgb(self, frame: Frame) -> np.ndarray:
+        """Return (n, 3) uint8."""
+        table = np.array([rgb_bytes(ink) for ink in self.inks], np.uint8)
+        return table[np.array(self.kind_of)[np.clip(frame.body, 0, len(self.kind_of) - 1)]]

@@ -1,0 +1,159 @@
+"""The density of the grid, as the solver's kernel makes it of the particles: an image in 2D, a slice in 3D."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.output.frame import Frame
+from mpmcli.output.result import Result
+from mpmcli.output.scene_facts import SceneFacts, scene_facts
+from mpmcli.render.coloring import Coloring
+from mpmcli.render.subject import Subject
+from mpmcli.render.theme import Theme, rgb_bytes
+from mpmcli.render.view import View
+
+# Nodes beyond a wall that a particle within reaches: their mass is that of the mirror image.
+GHOSTS = 2
+# Below this share of the upper limit the picture fades into the ground.
+FADING = 0.1
+# Frames that the limits are taken from, at most.
+LOOKED_AT = 8
+# Share of the nodes with mass that may be denser than the upper limit.
+OUTSIDE = 0.01
+
+
+@dataclass(frozen=True)
+class Slice:
+    """A plane through the domain: all of it in 2D.
+
+    Attributes:
+        across: the two axes of the picture, to the right and up.
+        normal: the axis through it, None in 2D; place: on it, m.
+    """
+
+    across: tuple[int, int]
+    normal: int | None = None
+    place: float = 0.0
+
+
+def slice_of(subject: Subject, camera: str) -> Slice:
+    """Return the plane in the middle of the domain that a camera looks at from the front; "iso" as "front"."""
+    if subject.dimension == 2:
+        return Slice((0, 1))
+    up = int(np.argmax(np.abs(subject.up)))
+    right, depth = (axis for axis in range(3) if axis != up)
+    across, normal = {"top": ((right, depth), up), "side": ((depth, up), right)}.get(camera, ((right, up), depth))
+    return Slice(across, normal, 0.5 * (subject.lower[normal] + subject.upper[normal]))
+
+
+def grid_density(frame: Frame, facts: SceneFacts, plane: Slice) -> np.ndarray:
+    """Return the mass of the grid nodes of a plane over their volume, by quadratic B-splines, walls mirrored.
+
+    Returns:
+        (a, b) float64 along the axes of the plane, nodes on both walls included; kg/m^3 (kg/m^2 over a metre of depth in 2D,
+        which is kg/m^3 alike).
+    """
+    h, d = facts.spacing, facts.dimension
+    cells = np.rint((facts.upper - facts.origin) / h).astype(int)
+    masses = facts.masses(frame.body)
+    place = (np.asarray(frame.position, dtype=np.float64) - facts.origin) / h
+    kept = np.isfinite(place).all(axis=1) & (place >= 0).all(axis=1) & (place <= cells).all(axis=1)
+    weight = np.ones(len(place)) if masses is None else masses / h**d
+    if plane.normal is not None:
+        through = (plane.place - facts.origin[plane.normal]) / h
+        kept &= np.abs(place[:, plane.normal] - through) < 1.5
+        # Between nodes there is no grid, but the kernel is defined there as well.
+        weight = weight * _kernel(place[:, plane.normal] - through)
+    place, weight = place[kept][:, list(plane.across)], weight[kept]
+    size = cells[list(plane.across)] + 1 + 2 * GHOSTS
+    base = np.floor(place - 0.5).astype(np.intp)
+    total = np.zeros(size[0] * size[1])
+    for i in range(3):
+        for j in range(3):
+            node = base + (i, j)
+            share = weight * _kernel(place[:, 0] - node[:, 0]) * _kernel(place[:, 1] - node[:, 1])
+            index = (node[:, 0] + GHOSTS) * size[1] + node[:, 1] + GHOSTS
+            total += np.bincount(index, share, minlength=len(total))
+    return _folded(_folded(total.reshape(size)).T).T
+
+
+def _kernel(x: np.ndarray) -> np.ndarray:
+    """Return the quadratic B-spline at distances x, in cells."""
+    r = np.abs(x)
+    return np.where(r < 0.5, 0.75 - r * r, 0.5 * np.square(np.clip(1.5 - r, 0.0, None)))
+
+
+def _folded(total: np.ndarray) -> np.ndarray:
+    """Add the mirror images at both ends of the first axis to what lies within."""
+    inner = total[GHOSTS:-GHOSTS].copy()
+    inner[0] *= 2.0
+    inner[-1] *= 2.0
+    for k in range(1, GHOSTS + 1):
+        if len(inner) > 2 * k:
+            inner[k] += total[GHOSTS - k]
+            inner[-1 - k] += total[-GHOSTS - 1 + k]
+    return inner
+
+
+class DensityPainter:
+    """Draws the density of the grid in a plane, empty space left free.
+
+    Attributes:
+        fields: that are read of each frame: none.
+        colors: what the colours mean.
+    """
+
+    fields: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        result: Result,
+        subject: Subject,
+        view: View,
+        theme: Theme,
+        plane: Slice,
+        limits: tuple[float, float] | None = None,
+        cmap: str = "viridis",
+    ) -> None:
+        self._view, self._theme, self._plane = view, theme, plane
+        self._facts = scene_facts(result.header)
+        limits = limits or (0.0, self._densest(result))
+        self.colors = Coloring("density", "kg/m³", (), lambda frame: np.empty(0), cmap, limits, theme.missing)
+        low, high = np.array(subject.lower), np.array(subject.upper)
+        corners = np.zeros((2, 3)) + 0.5 * (low + high)
+        corners[:, plane.across] = np.stack([low, high])[:, plane.across]
+        (left, bottom, _), (right, top, _) = view.pixels(corners)
+        self._box = left, top, right, bottom
+
+    def draw(self, frame: Frame) -> np.ndarray:
+        """Return (h, w, 3) uint8."""
+        density = grid_density(frame, self._facts, self._plane)
+        width, height = self._view.size
+        left, top, right, bottom = self._box
+        u = (np.arange(width) + 0.5 - left) / (right - left) * (density.shape[0] - 1)
+        v = (bottom - np.arange(height) - 0.5) / (bottom - top) * (density.shape[1] - 1)
+        values = _between(_between(density, u).T, v)
+        inside = ((v >= 0) & (v <= density.shape[1] - 1))[:, None] & ((u >= 0) & (u <= density.shape[0] - 1))
+        there = np.clip(values / (FADING * self.colors.limits[1]), 0.0, 1.0) * inside
+        ground = np.array(rgb_bytes(self._theme.ground), dtype=np.float64)
+        picture = ground + there[:, :, None] * (self.colors.rgb(values) - ground)
+        return (picture + 0.5).astype(np.uint8)
+
+    def _densest(self, result: Result) -> float:
+        """Return what nearly no node of the whole result exceeds."""
+        found = [0.0]
+        count = min(LOOKED_AT, result.frame_count)
+        for k in np.unique(np.linspace(0, result.frame_count - 1, count).round().astype(int)):
+            density = grid_density(result.frame(int(k), ()), self._facts, self._plane)
+            if (density > 0).any():
+                found.append(float(np.quantile(density[density > 0], 1.0 - OUTSIDE)))
+        return max(found) or 1.0
+
+
+def _between(table: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Interpolate the rows of a table linearly at fractional row numbers, those beyond its ends at its ends."""
+    places = np.clip(places, 0.0, len(table) - 1.0)
+    below = np.minimum(places.astype(np.intp), max(len(table) - 2, 0))
+    share = (places - below)[:, None]
+    above = np.minimum(below + 1, len(table) - 1)
+    return table[below] * (1.0 - share) + table[above] * share

@@ -1,0 +1,44 @@
+"""Shading by depth: what lies behind its surroundings is darker, so that dots show the shape of what they make."""
+
+import numpy as np
+
+from mpmcli.render.view import View
+
+# Share of the light that a deep gap takes.
+STRENGTH = 0.55
+# Depth of a gap that counts as deep, in diameters of a dot.
+DEEP = 4.0
+# Places around a pixel that are looked at, in diameters of a dot.
+REACH = 1.2
+# Farther gaps are another body, not a gap: they count no more than this, in units of `DEEP`.
+MOST = 1.5
+DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
+
+
+def depth_shaded(picture: np.ndarray, depth: np.ndarray, diameter: float, view: View, samples: int) -> np.ndarray:
+    """Darken what lies deeper than what is around it (Boucheny 2009, Eye-dome lighting).
+
+    Args:
+        picture: (h, w, 3) uint8.
+        depth: (h * samples, w * samples), m; inf where there is nothing.
+        diameter: of the dots, m.
+
+    Returns:
+        (h, w, 3) uint8.
+    """
+    # The nearest of the samples of a pixel: its edges belong to what is in front.
+    height, width = view.size[1], view.size[0]
+    nearest = depth.reshape(height, samples, width, samples).min(axis=(1, 3))
+    solid = np.isfinite(nearest)
+    if not solid.any():
+        return picture
+    reach = max(1, round(REACH * diameter * view.pixels_per_metre))
+    bare = np.where(solid, nearest, np.float32(view.far))
+    padded = np.pad(bare, reach, mode="edge")
+    gap = np.zeros_like(bare)
+    for i, j in DIRECTIONS:
+        other = padded[reach + i * reach :, reach + j * reach :][:height, :width]
+        gap += np.clip((bare - other) / np.float32(DEEP * diameter), 0.0, MOST)
+    shade = np.exp(-STRENGTH * 2.0 * gap / len(DIRECTIONS) * 2.0)
+    shade[~solid] = 1.0
+    return (picture * shade[:, :, None] + 0.5).astype(np.uint8)

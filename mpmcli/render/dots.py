@@ -1,0 +1,120 @@
+"""Particles as round dots of their own size: flat in 2D, balls that are shaded by depth in 3D."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mpmcli.output.frame import Frame
+from mpmcli.render.coloring import Categories, Coloring
+from mpmcli.render.depth_shading import depth_shaded
+from mpmcli.render.stage import Stage
+from mpmcli.render.subject import Subject
+from mpmcli.render.theme import Theme
+from mpmcli.render.view import View
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+# Diameter of a dot over the distance between particles: neighbours overlap a little, so that a body looks whole.
+OVERLAP = 1.15
+# Pixels: smaller dots would vanish, so that a single particle is seen.
+SMALLEST = 1.5
+# Up to so many particles each pixel is averaged of four, which makes round edges smooth.
+SMOOTHED = 400_000
+# Sizes of dots in one picture in perspective: each stands for a layer of distances.
+LAYERS = 12
+
+
+class DotsPainter:
+    """Draws frames as dots.
+
+    Args:
+        colors: of the particles.
+        count: particles of the largest frame.
+    """
+
+    def __init__(self, subject: Subject, view: View, theme: Theme, colors: Coloring | Categories, count: int) -> None:
+        self._subject = subject
+        self._view = view
+        self._colors = colors
+        self.fields = colors.fields
+        self._flat = subject.dimension == 2
+        self._stage = Stage(view, theme, samples=2 if count <= SMOOTHED else 1)
+        self._diameters = OVERLAP * np.array(subject.distances)
+        self._actors: dict[int, tuple[pv.PolyData, pv.Actor]] = {}
+        if not self._flat:
+            self._stage.add_light()
+            self._stage.add_box(subject.lower, subject.upper, theme.wall)
+
+    def draw(self, frame: Frame) -> np.ndarray:
+        """Return (h, w, 3) uint8; particles without a place are left out."""
+        placed = np.isfinite(frame.position).all(axis=1)
+        points = np.zeros((int(placed.sum()), 3))
+        points[:, : self._subject.dimension] = frame.position[placed]
+        colors = self._colors.particle_rgb(frame)[placed]
+        sizes = self._pixels(points, frame.body[placed])
+        levels, level_of = self._levels(sizes)
+        for level in set(self._actors) | set(range(len(levels))):
+            chosen = level_of == level if len(levels) > 1 else slice(None)
+            if level < len(levels):
+                self._set(level, points[chosen], colors[chosen], float(levels[level]))
+            else:
+                self._actors[level][1].visibility = False
+        self._stage.render()
+        picture = self._stage.picture()
+        if self._flat:
+            return picture
+        return depth_shaded(picture, self._stage.depth(), float(self._diameters.max()), self._view, self._stage.samples)
+
+    def _pixels(self, points: np.ndarray, body: np.ndarray) -> np.ndarray:
+        """Return the diameter of each dot in pixels, (n,)."""
+        scale = self._view.pixels_per_metre
+        if not self._view.parallel:
+            depth = self._view.pixels(points)[:, 2]
+            scale = scale * self._view.distance / np.maximum(depth, self._view.near)
+        diameters = self._diameters[np.clip(body, 0, len(self._diameters) - 1)]
+        return np.maximum(diameters * scale, SMALLEST)
+
+    def _levels(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the sizes that are drawn, (k,), and which one each dot has, (n,)."""
+        if len(sizes) == 0:
+            return np.empty(0), np.empty(0, np.intp)
+        low, high = float(sizes.min()), float(sizes.max())
+        distinct = np.unique(self._diameters) if self._view.parallel else np.empty(0)
+        if len(distinct) == 1 or high <= 1.02 * low:
+            return np.array([high]), np.zeros(len(sizes), np.intp)
+        ratio = np.log(high / low)
+        level_of = np.minimum((np.log(sizes / low) / ratio * LAYERS).astype(np.intp), LAYERS - 1)
+        return low * np.exp((np.arange(LAYERS) + 0.5) / LAYERS * ratio), level_of
+
+    def _set(self, level: int, points: np.ndarray, colors: np.ndarray, size: float) -> None:
+        """Let the actor of a level show these points."""
+        import pyvista as pv
+        from vtkmodules.util.numpy_support import numpy_to_vtk
+
+        if level not in self._actors:
+            mesh = pv.PolyData(np.zeros((1, 3), np.float32))
+            mesh.point_data["rgb"] = np.zeros((1, 3), np.uint8)
+            actor = self._stage.plotter.add_points(
+                mesh,
+                scalars="rgb",
+                rgb=True,
+                render_points_as_spheres=True,
+                lighting=not self._flat,
+                # Flat dots have the colours of the colour bar, to the last bit.
+                ambient=1.0 if self._flat else 0.45,
+                diffuse=0.0 if self._flat else 0.65,
+                specular=0.0,
+                reset_camera=False,
+            )
+            self._actors[level] = mesh, actor
+        mesh, actor = self._actors[level]
+        actor.visibility = len(points) > 0
+        actor.prop.point_size = size * self._stage.samples
+        if len(points) == 0:
+            return
+        shown = pv.PolyData(points.astype(np.float32))
+        rgb = numpy_to_vtk(np.ascontiguousarray(colors), deep=True)
+        rgb.SetName("rgb")
+        shown.GetPointData().SetScalars(rgb)
+        mesh.ShallowCopy(shown)
