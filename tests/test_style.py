@@ -35,6 +35,7 @@ LEVELS = {
     "materials": 2,
     "scene": 1,
     "errors": 0,
+    "plain_json": 0,
     "plain_text": 0,
     "__init__": 0,
 }

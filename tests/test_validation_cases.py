@@ -70,7 +70,6 @@ def test_a_case_converges_as_it_should(run_of: Callable, record_property: Callab
         assert check.passed, check.sentence
 
 
-@pytest.mark.skipif(not COMMITTED.exists(), reason="scripts/validation_report has not written it yet")
 @pytest.mark.parametrize(("name", "n"), RUNS)
 def test_a_case_gives_the_committed_figures(run_of: Callable, name: str, n: int) -> None:
     values = run_of(name, n).values

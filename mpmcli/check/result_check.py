@@ -1,6 +1,5 @@
 """`mpmcli check RESULT`: whether a run stayed stable and its frames are whole, and where they are not."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,6 +17,7 @@ from mpmcli.check.result_state import StateCheck
 from mpmcli.errors import InputError
 from mpmcli.output.scene_facts import SceneFacts, scene_facts
 from mpmcli.output.store import PACKED
+from mpmcli.plain_json import finite_json
 
 Verdict = Literal["stable", "suspect", "unstable"]
 # How the figures are told to people.
@@ -87,11 +87,11 @@ class ResultCheck:
             "verdict": self.verdict,
             "first_bad_frame": self.first_bad_frame,
             "limit": self.limit,
-            "findings": [_plain(finding.as_dict()) for finding in self.findings],
+            "findings": [finite_json(finding.as_dict()) for finding in self.findings],
             "frames": self.frames,
             "frames_expected": self.frames_expected,
             "particles": self.particles,
-            "figures": _plain(self.figures),
+            "figures": finite_json(self.figures),
             "kind": self.kind,
             "status": self.status,
             "path": str(self.path),
@@ -199,10 +199,3 @@ def _limit_at(opened: OpenedResult, number: int) -> str:
         return str(diagnosed)
     up_to = [entry.row.limit for entry in opened.entries if entry.number <= max(number, 1) and entry.row.limit]
     return up_to[-1] if up_to else ""
-
-
-def _plain(values: dict) -> dict:
-    """Replace what JSON has no number for by None."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in values.items()
-    }

@@ -64,7 +64,7 @@ def command(
     """Run SCENE, a TOML file, and store its particles for ParaView, h5py and learners."""
     from mpmcli.check.finding import passes
     from mpmcli.check.scene_check import check_scene
-    from mpmcli.cli.progress import Progress
+    from mpmcli.cli.simulate_progress import SimulateProgress
     from mpmcli.errors import InputError
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
@@ -91,7 +91,7 @@ def command(
         force=force,
         command=["mpmcli", *sys.argv[1:]],
     )
-    progress = Progress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
+    progress = SimulateProgress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
     progress.notes(loaded.notes)
 
     with progress, interrupts_wait():

@@ -1,12 +1,11 @@
 """Writes a report: report.json, report.md with its figures, and report.html, which holds them itself."""
 
 import json
-import math
 from pathlib import Path
-from typing import Any
 
 from mpmcli.errors import RunError
 from mpmcli.output.durable import sealed, write_text
+from mpmcli.plain_json import finite_json
 from mpmcli.validation.figure_settings import draw_settings
 from mpmcli.validation.figures import draw_case
 from mpmcli.validation.journal import FIGURES
@@ -27,7 +26,7 @@ def write_report(report: Report, directory: Path) -> None:
         pictures[SETTINGS_FIGURE] = draw_settings(report.compared)
     blocks = report_page(report)
     texts = {
-        "report.json": json.dumps(plain(report.as_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n",
+        "report.json": json.dumps(finite_json(report.as_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n",
         "report.md": to_markdown(blocks, FIGURES),
         "report.html": to_html(TITLE, blocks, pictures),
     }
@@ -40,12 +39,3 @@ def write_report(report: Report, directory: Path) -> None:
             write_text(directory / name, text)
     except OSError as error:
         raise RunError(f"The report could not be written to {directory} ({error.strerror or error}).") from error
-
-
-def plain(value: Any) -> Any:
-    """Replace what is not finite by null, as JSON has no infinity."""
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

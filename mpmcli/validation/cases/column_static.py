@@ -126,7 +126,9 @@ class ColumnStatic(WeightedColumn):
     note = (
         "The error of the stress is 3/32 h of its slope, up and down in turn: in a flow v = a x^2 a particle a quarter "
         "of a cell off a node takes a velocity gradient that is 3/16 a h off, as the quadratic weights have a third "
-        "moment there. Forces do not feel it, as it cancels between neighbours."
+        "moment there. Forces do not feel it, as it cancels between neighbours. In single precision heights are off by "
+        "up to 0.5 % of the settlement at 64 cells: in a step of this slow motion particles move by a dozen units in "
+        "the last digit of their places at most, and where by less than half of one, not at all."
     )
 
 

@@ -50,9 +50,9 @@ class EllipticalDrop(Case):
     )
     note = (
         "The surface is as wide as the kernel, which keeps the position error at first order or less: at R/h = 20, "
-        "70 % of its square are within two cells of it. Compressibility widens the drop by up to (A0 R/c)^2/4 = 0.1 % "
+        "73 % of its square are within two cells of it. Compressibility widens the drop by up to (A0 R/c)^2/4 = 0.1 % "
         "as its pressure goes. J grows by det(I + dt C): with dt tr C alone the pressure would work on a volume that "
-        "does not change, and 60 times as much energy would be lost."
+        "does not change, and 76 times as much energy would be lost."
     )
 
     def tables(self, n: int, setting: Setting) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from mpmcli.validation.setting import Setting
 DENSITY, YOUNG, NU = 1000.0, 1e6, 0.3
 MU, LAMBDA = YOUNG / (2 * (1 + NU)), YOUNG * NU / ((1 + NU) * (1 - 2 * NU))
 SIZE = 0.5
-# t L at the end: a shear, and a compression that makes det L = 0, so that J <- J (1 + dt tr C) is exact too.
+# t L at the end: a shear and a compression. F <- (I + dt C) F is exact, and so is J <- J det(I + dt C).
 FINAL = np.array([[-0.06, 0.3], [0.0, 0.0]])
 # A wave runs so far until then, and the middle is so wide, in parts of the size.
 REACH, MIDDLE = 0.2, 0.1

@@ -81,8 +81,8 @@ class Hydrostatic(Case):
     note = (
         "Particles start evenly spaced, with the mass of their spacing, so that it is J p, their force per volume of "
         "that spacing, which carries the weight; the field `pressure` is p, larger by 1/J, 0.39 % in L2. The error is "
-        "that of the topmost layer, where the kernel is not full: a share of density g h on a share h/H of the "
-        "particles is order 3/2; 1.5 h below the surface it is four times smaller."
+        "that of the topmost cell, where the kernel is not full: 5 % of density g h on a share h/H of the particles is "
+        "order 3/2; in the cells below it is five times smaller and less."
     )
 
     def tables(self, n: int, setting: Setting) -> dict[str, Any]:

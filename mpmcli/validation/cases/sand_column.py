@@ -45,13 +45,13 @@ class SandColumn(Case):
         self.levels = {"coarse": (coarse,), "default": (coarse, usual), "fine": (coarse, usual, fine)}
         self.measures = (
             Measure(
-                "run-out off band",
+                "run-out from mid-band",
                 "L0",
                 f"Run-out (L - L0) / L0 of 99 % of the sand, less {sum(runout) / 2:.4g}, the middle of the band.",
                 bound=lambda n: (runout[1] - runout[0]) / 2,
             ),
             Measure(
-                "height off band",
+                "height from mid-band",
                 "L0",
                 f"Height of 99 % of the sand over L0, less {sum(height) / 2:.4g}, the middle of the band.",
                 bound=lambda n: (height[1] - height[0]) / 2,
@@ -105,8 +105,8 @@ class SandColumn(Case):
         reach, top = np.quantile(position.astype(np.float64), 0.99, axis=0) / L0
         runout, height = float(reach - 1), float(top)
         return {
-            "run-out off band": runout - sum(self.runout) / 2,
-            "height off band": height - sum(self.height) / 2,
+            "run-out from mid-band": runout - sum(self.runout) / 2,
+            "height from mid-band": height - sum(self.height) / 2,
             "run-out": runout,
             "height": height,
             "speed at the end": math.sqrt(2 * kinetic / mass / (GRAVITY * self.aspect * L0)),

@@ -64,8 +64,8 @@ class TaylorGreen(Case):
         "the factor of the transfers in full. Particles start at random places in their cells. From a lattice the "
         "decay is right to 1 % until t = 0.3 s, too, but the flow stretches it by exp(pi t) at the corners, and from "
         "t = ln(3)/pi = 0.35 s on, with rows more than 1.5 h apart there, it is torn into sheets: until t = 1 s the "
-        "rate is then 7 % too high at 32 cells and 12 % at 64; with the cut-off of tension, which books every gap as "
-        "a loss of volume, 39 % and 58 %. From random places the cut-off costs less than 1 %."
+        "rate is then 6 % too high at 32 cells and 12 % at 64; with the cut-off of tension, which books every gap as "
+        "a loss of volume, 38 % and 57 %. From random places the cut-off costs less than 1 %."
     )
 
     def tables(self, n: int, setting: Setting) -> dict[str, Any]:

@@ -1,0 +1,72 @@
+"""Progress of a long command for people, on stderr: a bar on a terminal, plain lines elsewhere."""
+
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+
+class ProgressBar:
+    """Counts what is done, and says lines beside it; use it as a context around the work.
+
+    Args:
+        total: what the count ends at.
+        unit: what is counted, in the plural ("frames").
+        quiet: print nothing.
+        pause: seconds between two plain lines of `show`.
+        steady: whether all parts take about as long, so that the bar can tell the time left; else the time taken.
+    """
+
+    def __init__(self, total: int, unit: str, *, quiet: bool, pause: float = 5.0, steady: bool = True) -> None:
+        self._total = total
+        self._unit = unit
+        self._quiet = quiet
+        self._pause = pause
+        self._console = Console(stderr=True)
+        self._bar = Progress(
+            BarColumn(),
+            TextColumn(f"{{task.completed:.0f}}/{total} {unit}"),
+            TimeRemainingColumn() if steady else TimeElapsedColumn(),
+            TextColumn("{task.description}", markup=False),
+            console=self._console,
+            transient=True,
+        )
+        self._task: TaskID | None = None
+        self._spoke = time.perf_counter()
+
+    @property
+    def drawn(self) -> bool:
+        """Whether there is a bar, and no plain line for each `show`."""
+        return self._task is not None
+
+    def __enter__(self) -> "ProgressBar":
+        if not self._quiet and self._console.is_terminal:
+            self._task = self._bar.add_task("", total=self._total)
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self.drawn:
+            self._bar.stop()
+
+    def show(self, done: int, text: str = "", more: str = "") -> None:
+        """Show how many are done, and what is on now; `more` stands in plain lines only."""
+        if self._task is not None:
+            self._bar.update(self._task, completed=done, description=text)
+        elif time.perf_counter() - self._spoke >= self._pause:
+            self._spoke = time.perf_counter()
+            said = text + more
+            self.say(f"{done}/{self._total} {self._unit}" + (f": {said}" if said else ""))
+
+    def say(self, line: str, *, whole: bool = False) -> None:
+        """Print a line; a terminal gets it broken between words, unless it is to be copied `whole`."""
+        if self._quiet:
+            return
+        try:
+            self._console.print(line, markup=False, highlight=False, soft_wrap=whole or not self._console.is_terminal)
+        except (OSError, SystemExit):
+            # Nobody reads along any more (rich exits on a broken pipe): no reason to end the work.
+            self._quiet = True
