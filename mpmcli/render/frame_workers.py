@@ -1,0 +1,206 @@
+"""Renders many frames in several processes at once."""
+
+import os
+import pickle
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, Protocol
+
+from mpmcli.errors import RunError
+
+# Seconds between two looks at whether to stop.
+PAUSE = 0.05
+# Seconds in which a process may clean up before it is killed.
+GRACE = 2.0
+# Lines of what a dead process said that are told.
+LAST_WORDS = 2
+# How many threads the software renderer, numpy, splashsurf and VTK take.
+THREADS = (
+    "LP_NUM_THREADS",
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "RAYON_NUM_THREADS",
+    "VTK_SMP_MAX_THREADS",
+)
+CODE = "import sys; sys.path[:] = {path!r}\nfrom mpmcli.render.frame_worker import main; main()"
+
+
+class Job(Protocol):
+    """What is rendered: of a module that can be imported, since it is pickled."""
+
+    def start(self) -> Callable[[int], Any]:
+        """Return what renders one frame and writes it; called once in each process."""
+        ...
+
+
+def available_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def render_frames(
+    job: Job,
+    ks: Sequence[int],
+    workers: int,
+    *,
+    watch: Callable[[int, Any], None] = lambda k, outcome: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> None:
+    """Render frames, in this process where one is asked for or one frame is left, and otherwise in others.
+
+    The other processes share the cores, by the variables in THREADS where the environment does not set them already.
+    Ctrl-C at the terminal does not reach them. None is left when this returns or raises; frames that are done stay.
+
+    Args:
+        job: see `Job`.
+        ks: the frames, begun in this order.
+        workers: processes at a time, each with one frame.
+        watch: told of each frame as it is done, and what the job returned for it, which can be pickled.
+        stop: asked again and again whether to end.
+
+    Raises:
+        KeyboardInterrupt: `stop` said so.
+        RunError: a process was ended from outside, or crashed.
+        Exception: whatever the job raises, as itself.
+    """
+    count = min(workers, len(ks))
+    if count > 1:
+        _render_beside(job, ks, count, watch, stop)
+    elif ks:
+        render = job.start()
+        for k in ks:
+            if stop():
+                raise KeyboardInterrupt
+            watch(k, render(k))
+
+
+def _render_beside(
+    job: Job, ks: Sequence[int], count: int, watch: Callable[[int, Any], None], stop: Callable[[], bool]
+) -> None:
+    begin = pickle.dumps(job)
+    answers: queue.SimpleQueue[tuple[_Worker, tuple[str, Any] | None]] = queue.SimpleQueue()
+    waiting = iter(ks)
+    left = len(ks)
+    workers: list[_Worker] = []
+    try:
+        for _ in range(count):
+            workers.append(_Worker(max(1, available_cores() // count), answers))
+            workers[-1].send(begin)
+            workers[-1].ask(next(waiting))
+        while left:
+            if stop():
+                raise KeyboardInterrupt
+            try:
+                worker, answer = answers.get(timeout=PAUSE)
+            except queue.Empty:
+                continue
+            if answer is None:
+                raise worker.death()
+            kind, content = answer
+            if kind == "failed":
+                raise content
+            left -= 1
+            done = worker.frame
+            following = next(waiting, None)
+            if following is not None:
+                worker.ask(following)
+            watch(done, content)
+    finally:
+        _close_all(workers, at_work=left > 0)
+
+
+class _Worker:
+    """One process, and the thread that hears its answers; `frame` is what it is at.
+
+    An answer of None means that it ended.
+    """
+
+    def __init__(self, threads: int, answers: "queue.SimpleQueue") -> None:
+        self.frame = -1
+        self._complained = tempfile.TemporaryFile()  # noqa: SIM115
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", CODE.format(path=sys.path)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._complained,
+            env={**dict.fromkeys(THREADS, str(threads)), **os.environ},
+            # Ctrl-C at the terminal is for the process that started this one.
+            start_new_session=True,
+        )
+        self._thread = threading.Thread(target=self._hear, args=(answers,), daemon=True)
+        self._thread.start()
+
+    def ask(self, k: int) -> None:
+        """Let it render a frame."""
+        self.frame = k
+        self.send(pickle.dumps(k))
+
+    def send(self, content: bytes) -> None:
+        """Send it a pickled object; where it has ended, its answers say so."""
+        with suppress(OSError):
+            self.process.stdin.write(content)  # type: ignore[union-attr]
+            self.process.stdin.flush()  # type: ignore[union-attr]
+
+    def dismiss(self, *, at_work: bool) -> None:
+        """Tell it that nothing more comes, and to leave what it is at."""
+        if at_work:
+            self.process.terminate()
+        with suppress(OSError):
+            self.process.stdin.close()  # type: ignore[union-attr]
+
+    def death(self) -> RunError:
+        """Return what is to be said when it has ended by itself."""
+        status = self.process.wait()
+        how = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+        self._complained.seek(0)
+        words = self._complained.read().decode("utf-8", errors="replace").strip().splitlines()[-LAST_WORDS:]
+        said = f", after saying: {' '.join(words).rstrip('.')}" if words else ""
+        return RunError(
+            f"The process that rendered frame {self.frame} {how}{said}; frames that are done are kept, and fewer "
+            "--workers need less memory."
+        )
+
+    def close(self, patience: float) -> None:
+        """Let it end, and end it where it takes longer than so many seconds."""
+        try:
+            with suppress(subprocess.TimeoutExpired):
+                self.process.wait(patience)
+        finally:
+            self.process.kill()
+            self.process.wait()
+            self._thread.join()
+            self.process.stdout.close()  # type: ignore[union-attr]
+            self._complained.close()
+
+    def _hear(self, answers: "queue.SimpleQueue") -> None:
+        while True:
+            try:
+                answer = pickle.load(self.process.stdout)  # type: ignore[arg-type]
+            # It ended, perhaps in the middle of an answer.
+            except Exception:
+                answers.put((self, None))
+                return
+            answers.put((self, answer))
+
+
+def _close_all(workers: Sequence[_Worker], *, at_work: bool) -> None:
+    """End all processes, whatever they are doing."""
+    end = time.monotonic() + GRACE
+    try:
+        for worker in workers:
+            worker.dismiss(at_work=at_work)
+        for worker in workers:
+            worker.close(max(0.0, end - time.monotonic()))
+    except BaseException:
+        # A second Ctrl-C: no more patience.
+        for worker in workers:
+            worker.close(0.0)
+        raise

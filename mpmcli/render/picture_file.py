@@ -1,0 +1,114 @@
+"""PNG files that know what they show: a digest of the settings they were made with, in a text chunk."""
+
+import errno
+import hashlib
+import json
+import os
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpmcli import __version__
+from mpmcli.errors import InputError, MpmcliError, RunError
+from mpmcli.output.durable import sealed
+
+# Of the tEXt chunk that holds the digest.
+KEYWORD = "mpmcli"
+# 1280x720 dots: level 0 takes 11 ms for 2.8 MB, 1 18 ms for 228 kB, 4 22 ms for 207 kB, 9 300 ms for 200 kB.
+COMPRESS_LEVEL = 1
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+# The last chunk, which a file that was cut off has lost.
+END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+# Of a text chunk that is read; a digest is far shorter.
+TEXT_MAX = 4096
+# The disk, not what was asked for.
+DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+
+
+def settings_digest(settings: dict[str, Any]) -> str:
+    """Return a digest of what a picture depends on, the version of mpmcli included: 32 hexadecimal digits.
+
+    Args:
+        settings: what JSON can hold, and numpy's numbers and arrays; the order of its keys does not matter, and
+            numbers count to their last digit.
+
+    Raises:
+        TypeError: something else is in it.
+    """
+    content = {"version": __version__, "settings": settings}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=_plain)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def write_picture(path: Path, image: np.ndarray, digest: str) -> None:
+    """Write a PNG, whole or not at all, in place of what is there; its directory is made where it is missing.
+
+    Args:
+        image: (h, w, 3) uint8.
+        digest: from `settings_digest`; `digest_of` reads it back.
+
+    Raises:
+        InputError: the place cannot be written to.
+        RunError: the disk is full.
+    """
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    text = PngInfo()
+    text.add_text(KEYWORD, digest)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with sealed(path) as temporary:
+            Image.fromarray(image).save(temporary, format="png", compress_level=COMPRESS_LEVEL, pnginfo=text)
+    except OSError as error:
+        raise write_fault(path, error) from error
+
+
+def digest_of(path: Path) -> str | None:
+    """Return the digest in a picture; "" where mpmcli did not make the file or it is not whole, None where none is.
+
+    Only the first chunks and the last one are read.
+    """
+    try:
+        with path.open("rb") as file:
+            digest = _digest_in(file)
+            if not digest:
+                return ""
+            file.seek(-len(END), os.SEEK_END)
+            return digest if file.read() == END else ""
+    except FileNotFoundError:
+        return None
+    except (OSError, struct.error):
+        return ""
+
+
+def write_fault(path: Path, error: OSError) -> MpmcliError:
+    """Return what to raise where a file could not be written: RunError for a fault of the disk, else InputError."""
+    reason = error.strerror or str(error)
+    if error.errno in DISK_FAULTS:
+        return RunError(f"{path} could not be written ({reason}): free some space or write to another disk with -o.")
+    return InputError(f"{path} cannot be written ({reason}): give another place with -o.")
+
+
+def _digest_in(file: Any) -> str:
+    """Return the text of the chunk before the pixels, "" where there is none."""
+    if file.read(len(SIGNATURE)) != SIGNATURE:
+        return ""
+    while True:
+        length, kind = struct.unpack(">I4s", file.read(8))
+        if kind in (b"IDAT", b"IEND"):
+            return ""
+        if kind == b"tEXt" and length <= TEXT_MAX:
+            word, _, text = file.read(length).partition(b"\x00")
+            if word == KEYWORD.encode():
+                return text.decode("latin-1")
+            length = 0
+        file.seek(length + 4, os.SEEK_CUR)
+
+
+def _plain(value: Any) -> Any:
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be part of the settings of a picture")
