@@ -1,0 +1,1 @@
+"""Pictures and films of frames, without a screen."""
