@@ -34,6 +34,7 @@ LEVELS = {
     "boundaries": 2,
     "materials": 2,
     "scene": 1,
+    "child_process": 0,
     "errors": 0,
     "plain_json": 0,
     "plain_text": 0,

@@ -1,0 +1,208 @@
+"""Asks a question of a process of its own, which may crash, hang or talk nonsense, and says what came of it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import IO
+
+PAUSE = 0.01
+# Seconds to wait for a killed process; one that the system cannot end is left behind.
+LAST_WAIT = 5.0
+# Characters of its messages that are kept, from the end.
+COMPLAINT_LENGTH = 2000
+
+
+@dataclass(frozen=True)
+class Question:
+    """A command that answers with JSON objects on stdout, one per line.
+
+    Attributes:
+        command: program and arguments.
+        timeout: seconds after which it is ended.
+        environment: variables added to those of this process; None takes one away.
+        leads_a_group: whether it is ended together with the processes that it has started.
+    """
+
+    command: Sequence[str]
+    timeout: float
+    environment: Mapping[str, str | None] = field(default_factory=dict)
+    leads_a_group: bool = False
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What a process left.
+
+    Attributes:
+        answer: its JSON objects, joined; empty where there were none.
+        fault: "" where it answered and ended well; else what happened, as in "died by SIGSEGV".
+        complaint: the end of what it wrote on stderr.
+    """
+
+    answer: dict
+    fault: str
+    complaint: str
+
+
+def module_command(module: str, *arguments: str) -> list[str]:
+    """Return the command that runs a module of this installation, but none of that name in the current directory."""
+    return [sys.executable, "-P", "-m", module, *arguments]
+
+
+def ask(question: Question) -> Reply:
+    """Ask one process, and wait for it."""
+    return next(iter(ask_each([question], at_once=1)))
+
+
+def ask_each(questions: Sequence[Question], at_once: int) -> Iterator[Reply]:
+    """Ask each process, so many at a time, and yield the replies in order; processes left over are ended."""
+    going: dict[int, _Child] = {}
+    replies: dict[int, Reply] = {}
+    started = 0
+    try:
+        for wanted in range(len(questions)):
+            while wanted not in replies:
+                while started < len(questions) and len(going) < at_once:
+                    try:
+                        going[started] = _Child(questions[started])
+                    except OSError as error:
+                        replies[started] = Reply({}, f"could not be started: {error}", "")
+                    started += 1
+                for number in list(going):
+                    if going[number].has_ended():
+                        child = going.pop(number)
+                        replies[number] = child.reply()
+                        child.close()
+                if wanted not in replies:
+                    time.sleep(PAUSE)
+            yield replies[wanted]
+    finally:
+        for child in going.values():
+            child.close()
+
+
+@contextmanager
+def answering() -> Iterator[Callable[..., None]]:
+    """Let a process that was asked answer by `answer(name=value, ...)`; what libraries print goes to stderr."""
+    _leave_no_core()
+    with os.fdopen(os.dup(1), "w", encoding="utf-8") as answers:
+        os.dup2(2, 1)
+
+        def answer(**values: object) -> None:
+            answers.write(json.dumps(values) + "\n")
+            answers.flush()
+
+        yield answer
+
+
+def _leave_no_core() -> None:
+    try:
+        import resource
+    except ImportError:
+        return  # Windows
+    resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
+
+
+class _Child:
+    """A process that was asked."""
+
+    def __init__(self, question: Question) -> None:
+        self._question = question
+        # The same modules are found as in this process, wherever it was started from.
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(os.path.abspath(place) for place in sys.path)}
+        for name, value in question.environment.items():
+            environment.pop(name, None)
+            if value is not None:
+                environment[name] = value
+        self._grouped = question.leads_a_group and hasattr(os, "killpg")
+        self._late = False
+        self._said, self._complained = _sink(), _sink()
+        try:
+            self._process = subprocess.Popen(
+                list(question.command),
+                stdin=subprocess.DEVNULL,
+                stdout=self._said,
+                stderr=self._complained,
+                env=environment,
+                **({"process_group": 0} if self._grouped else {}),
+            )
+        except BaseException:
+            self._said.close()
+            self._complained.close()
+            raise
+        self._begin = time.monotonic()
+
+    def has_ended(self) -> bool:
+        """Say whether it is over, and end it where its time is."""
+        if self._process.poll() is not None:
+            return True
+        if time.monotonic() - self._begin > self._question.timeout:
+            self._late = True
+            self._end()
+            return True
+        return False
+
+    def reply(self) -> Reply:
+        """Return what it left."""
+        answer = {}
+        for line in _text(self._said).splitlines():
+            try:
+                value = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(value, dict):
+                answer |= value
+        return Reply(answer, self._fault(answer), _text(self._complained)[-COMPLAINT_LENGTH:].strip())
+
+    def close(self) -> None:
+        """End it, whatever it is doing, and let its files go."""
+        if self._process.poll() is None:
+            self._end()
+        self._said.close()
+        self._complained.close()
+
+    def _end(self) -> None:
+        try:
+            if self._grouped:
+                os.killpg(self._process.pid, signal.SIGKILL)
+            else:
+                self._process.kill()
+            self._process.wait(LAST_WAIT)
+        except (OSError, subprocess.TimeoutExpired):
+            pass
+
+    def _fault(self, answer: dict) -> str:
+        status = self._process.returncode
+        if self._late:
+            return f"took longer than {self._question.timeout:g} s"
+        if status and status < 0:
+            return f"died by {_signal_name(-status)}"
+        if status:
+            return f"exited with {status}"
+        return "" if answer else "gave no answer"
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _sink() -> IO[bytes]:
+    # No pipe, which could fill up, and no disk, which may be full, where there is another way.
+    if hasattr(os, "memfd_create"):
+        return os.fdopen(os.memfd_create("mpmcli"), "w+b")
+    return tempfile.TemporaryFile()
+
+
+def _text(sink: IO[bytes]) -> str:
+    sink.seek(0)
+    return sink.read().decode("utf-8", errors="replace")
