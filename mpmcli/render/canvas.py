@@ -1,7 +1,7 @@
 """What stands around a picture: title, time, colour bar or legend, scale bar, the walls of a flat domain."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING
@@ -17,11 +17,14 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
-# Sizes in pixels of a picture of 720 rows; they grow with the picture.
-ROWS = 720
+# Sizes in pixels of a picture of 1280x720; they grow with the picture, and small ones keep a legible text.
+PIXELS = 1280 * 720
+SMALLEST = 0.55
 TEXT, SMALL = 17, 14
 PAD = 16
-TOP, BOTTOM = 44, 44
+TOP, BOTTOM, LABEL, GAP = 44, 44, 26, 8
+# Pixels along a side of what is left for the scene, however much stands around it.
+LEAST = 16
 BAR_WIDTH, TICK = 18, 6
 SWATCH = 16
 # Legends take this share of the width at most; longer names are cut.
@@ -39,61 +42,90 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @dataclass(frozen=True)
 class Canvas:
-    """The frame of all pictures of one film.
+    """The frame of all pictures of one film, or of the pictures of a montage.
 
     Args:
         size: of the whole picture, pixels, (width, height).
         times: of the frames of the result, s, which say how many digits a time needs.
         colors: what a bar or a legend explains; None for none.
+        grid: columns and rows of pictures of the scene.
     """
 
     size: tuple[int, int]
     subject: Subject
     theme: Theme
-    times: Sequence[float]
+    times: tuple[float, ...]
     colors: Coloring | Categories | None
-
-    @property
-    def stage(self) -> tuple[int, int, int, int]:
-        """Where the scene itself goes: left, top, right, bottom, pixels."""
-        width, height = self.size
-        top, bottom = self._px(TOP), height - self._px(BOTTOM)
-        return 0, top, max(width - self._column, 16), max(bottom, top + 16)
+    grid: tuple[int, int] = (1, 1)
 
     @property
     def stage_size(self) -> tuple[int, int]:
-        """Pixels of the scene itself, (width, height)."""
-        left, top, right, bottom = self.stage
-        return right - left, bottom - top
+        """Pixels of each picture of the scene, (width, height)."""
+        left, top, right, bottom = self._stage
+        columns, rows = self.grid
+        gap = self._px(GAP)
+        width = (right - left - (columns - 1) * gap) // columns
+        height = (bottom - top - (rows - 1) * gap) // rows - self._label
+        return max(width, LEAST), max(height, LEAST)
 
-    def compose(self, picture: np.ndarray, view: View, time: float, missing: int = 0) -> np.ndarray:
+    def compose(
+        self, pictures: Sequence[np.ndarray], view: View, times: Sequence[float], missing: int = 0
+    ) -> np.ndarray:
         """Return the whole picture, (height, width, 3) uint8.
 
         Args:
-            picture: of the scene, of the size of the stage.
-            time: s.
+            pictures: of the scene, of the size of the stage, row by row.
+            times: of each, s.
             missing: particles whose value is not a number.
         """
         from PIL import Image, ImageDraw
 
         canvas = Image.new("RGB", self.size, rgb_bytes(self.theme.ground))
-        left, top, _, _ = self.stage
-        canvas.paste(Image.fromarray(picture), (left, top))
         draw = ImageDraw.Draw(canvas)
-        if self.subject.dimension == 2:
-            self._walls(draw, view)
+        for k, (picture, time) in enumerate(zip(pictures, times, strict=True)):
+            x, y = self._place(k)
+            canvas.paste(Image.fromarray(picture), (x, y))
+            if self._label:
+                font = _font(self._px(SMALL))
+                middle = y - self._label // 2
+                draw.text((x + self._px(PAD), middle), time_text(time, self.times), self.theme.text, font, anchor="lm")
+            if self.subject.dimension == 2:
+                self._walls(draw, view, (x, y))
         if view.parallel:
             self._scale_bar(draw, view)
-        self._heading(draw, time)
+        self._heading(draw, times[0] if self.grid == (1, 1) else None)
         if isinstance(self.colors, Coloring):
             self._color_bar(draw, self.colors, missing)
         elif self.colors is not None:
             self._legend(draw, self.colors)
         return np.asarray(canvas)
 
+    def height_for(self, aspect: float) -> int:
+        """Return the height of the whole picture at which those of the scene are so many times as high as wide."""
+        rows = self.grid[1]
+        stage = round(self.stage_size[0] * aspect) + self._label
+        return self._px(TOP) + self._px(BOTTOM) + rows * stage + (rows - 1) * self._px(GAP)
+
+    @property
+    def _stage(self) -> tuple[int, int, int, int]:
+        """Where pictures of the scene go: left, top, right, bottom, pixels."""
+        width, height = self.size
+        return 0, self._px(TOP), width - self._column, height - self._px(BOTTOM)
+
+    @property
+    def _label(self) -> int:
+        """Rows above each picture of a montage, for its time."""
+        return 0 if self.grid == (1, 1) else self._px(LABEL)
+
+    def _place(self, k: int) -> tuple[int, int]:
+        """Return left and top of the k-th picture of the scene."""
+        row, column = divmod(k, self.grid[0])
+        (width, height), (left, top, _, _), gap = self.stage_size, self._stage, self._px(GAP)
+        return left + column * (width + gap), top + row * (height + self._label + gap) + self._label
+
     @property
     def _scale(self) -> float:
-        return max(self.size[1] / ROWS, 0.4)
+        return max(math.sqrt(self.size[0] * self.size[1] / PIXELS), SMALLEST)
 
     def _px(self, length: float) -> int:
         return max(1, round(length * self._scale))
@@ -114,26 +146,27 @@ class Canvas:
             wide = min(wide, LEGEND_SHARE * self.size[0])
         return math.ceil(wide) + 2 * self._px(PAD)
 
-    def _heading(self, draw: "ImageDraw", time: float) -> None:
+    def _heading(self, draw: "ImageDraw", time: float | None) -> None:
         font, small = _font(self._px(TEXT), bold=True), _font(self._px(TEXT))
         pad, middle = self._px(PAD), self._px(TOP) // 2
-        told = time_text(time, self.times)
-        draw.text((self.size[0] - pad, middle), told, self.theme.text, small, anchor="rm")
-        # The room of the longest time, so that a title does not change its length in a film.
-        room = self.size[0] - 3 * pad - max(small.getlength(time_text(t, self.times)) for t in (*self.times[-1:], time))
+        room = self.size[0] - 2 * pad
+        if time is not None:
+            told = time_text(time, self.times)
+            draw.text((self.size[0] - pad, middle), told, self.theme.text, small, anchor="rm")
+            # The room of the longest time, so that a title does not change its length in a film.
+            room -= pad + max(small.getlength(time_text(t, self.times)) for t in (*self.times[-1:], time))
         title = cut(self.subject.title, lambda text: font.getlength(text) <= room)
         draw.text((pad, middle), title, self.theme.text, font, anchor="lm")
 
-    def _walls(self, draw: "ImageDraw", view: View) -> None:
+    def _walls(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
         """Draw the walls around the domain, outside of it, so that nothing within is hidden."""
-        left, top, _, _ = self.stage
         corners = view.pixels(np.array([self.subject.lower, self.subject.upper]))
-        (x0, y1), (x1, y0) = np.rint(corners[:, :2] + (left, top)).astype(int).tolist()
+        (x0, y1), (x1, y0) = np.rint(corners[:, :2] + place).astype(int).tolist()
         w = self._px(2)
-        for box in ((x0 - w, y0 - w, x1 + w, y0), (x0 - w, y1, x1 + w, y1 + w)):
-            draw.rectangle((box[0], box[1], box[2] - 1, box[3] - 1), fill=self.theme.wall)
-        for box in ((x0 - w, y0 - w, x0, y1 + w), (x1, y0 - w, x1 + w, y1 + w)):
-            draw.rectangle((box[0], box[1], box[2] - 1, box[3] - 1), fill=self.theme.wall)
+        level = [(x0 - w, y0 - w, x1 + w, y0), (x0 - w, y1, x1 + w, y1 + w)]
+        upright = [(x0 - w, y0 - w, x0, y1 + w), (x1, y0 - w, x1 + w, y1 + w)]
+        for left, top, right, bottom in (*level, *upright):
+            draw.rectangle((left, top, right - 1, bottom - 1), fill=self.theme.wall)
 
     def _scale_bar(self, draw: "ImageDraw", view: View) -> None:
         length = round_length(SCALE_SHARE * self.size[0] / view.pixels_per_metre)
@@ -149,10 +182,10 @@ class Canvas:
 
     def _legend(self, draw: "ImageDraw", colors: Categories) -> None:
         font = _font(self._px(SMALL))
-        x = self.stage[2] + self._px(PAD)
+        x = self._stage[2] + self._px(PAD)
         room = self.size[0] - x - self._px(PAD + SWATCH + 8)
         swatch, step = self._px(SWATCH), self._px(SWATCH + 10)
-        y = self.stage[1] + self._px(PAD)
+        y = self._stage[1] + self._px(PAD)
         for name, ink in zip(colors.names, colors.inks, strict=True):
             if y + swatch > self.size[1] - self._px(PAD):
                 break
@@ -167,13 +200,13 @@ class Canvas:
 
     def _color_bar(self, draw: "ImageDraw", colors: Coloring, missing: int) -> None:
         font = _font(self._px(SMALL))
-        x = self.stage[2] + self._px(PAD)
+        x = self._stage[2] + self._px(PAD)
         line = self._px(SMALL + 6)
-        y = self.stage[1] + self._px(4)
+        y = self._stage[1] + self._px(4)
         for text in self._bar_heading(colors):
             draw.text((x, y), text, self.theme.text, font, anchor="lt")
             y += line
-        top, bottom = y + self._px(8), self.stage[3] - self._px(PAD) - 2 * line
+        top, bottom = y + self._px(8), self._stage[3] - self._px(PAD) - 2 * line
         width = self._px(BAR_WIDTH)
         low, high = colors.limits
         rows = np.linspace(high, low, max(bottom - top, 2))
@@ -240,7 +273,7 @@ def length_text(length: float) -> str:
     return f"{length / factor:g} {unit}"
 
 
-def cut(text: str, fits) -> str:
+def cut(text: str, fits: Callable[[str], bool]) -> str:
     """Shorten a text until it fits."""
     if fits(text):
         return text

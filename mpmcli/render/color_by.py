@@ -62,8 +62,8 @@ def color_by(
     """Find what a name means for a result.
 
     Args:
-        name: one of `ALWAYS` and `DERIVED`, or a stored field: a vector is shown by its length, a tensor by its Frobenius
-            norm, `stress.xy` is one component.
+        name: one of `ALWAYS` and `DERIVED`, or a stored field: a vector is shown by its length, a tensor by its
+            Frobenius norm, `stress.xy` is one component.
         limits: of the colour map; by default nearly all particles of a dozen frames lie within.
         cmap: name of a colour map of matplotlib.
 
@@ -85,7 +85,7 @@ def color_by(
         value.unit,
         value.fields,
         value.of,
-        _known_map(cmap) if cmap else SEQUENTIAL if value.middle is None else DIVERGING,
+        color_map(cmap, SEQUENTIAL if value.middle is None else DIVERGING),
         limits,
         theme.missing,
     )
@@ -173,9 +173,16 @@ def _limits(value: _Value, result: Result) -> tuple[float, float]:
     return low, high
 
 
-def _known_map(name: str) -> str:
+def color_map(name: str | None, usual: str = SEQUENTIAL) -> str:
+    """Return the name of a colour map, the usual one for None.
+
+    Raises:
+        InputError: matplotlib has no such map.
+    """
     import matplotlib as mpl
 
+    if name is None:
+        return usual
     if name not in mpl.colormaps:
         guess = nearest(name, list(mpl.colormaps))
         hint = f'did you mean "{guess}"?' if guess else "viridis, cividis, magma, coolwarm are some."

@@ -7,6 +7,7 @@ import numpy as np
 from mpmcli.output.frame import Frame
 from mpmcli.output.result import Result
 from mpmcli.output.scene_facts import SceneFacts, scene_facts
+from mpmcli.render.color_by import color_map
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.subject import Subject
 from mpmcli.render.theme import Theme, rgb_bytes
@@ -50,8 +51,7 @@ def grid_density(frame: Frame, facts: SceneFacts, plane: Slice) -> np.ndarray:
     """Return the mass of the grid nodes of a plane over their volume, by quadratic B-splines, walls mirrored.
 
     Returns:
-        (a, b) float64 along the axes of the plane, nodes on both walls included; kg/m^3 (kg/m^2 over a metre of depth in 2D,
-        which is kg/m^3 alike).
+        (a, b) float64 along the axes of the plane, nodes on both walls included, kg/m^3: a 2D scene is a metre deep.
     """
     h, d = facts.spacing, facts.dimension
     cells = np.rint((facts.upper - facts.origin) / h).astype(int)
@@ -70,7 +70,7 @@ def grid_density(frame: Frame, facts: SceneFacts, plane: Slice) -> np.ndarray:
     total = np.zeros(size[0] * size[1])
     for i in range(3):
         for j in range(3):
-            node = base + (i, j)
+            node = base + np.array([i, j])
             share = weight * _kernel(place[:, 0] - node[:, 0]) * _kernel(place[:, 1] - node[:, 1])
             index = (node[:, 0] + GHOSTS) * size[1] + node[:, 1] + GHOSTS
             total += np.bincount(index, share, minlength=len(total))
@@ -95,59 +95,53 @@ def _folded(total: np.ndarray) -> np.ndarray:
     return inner
 
 
+def density_colors(
+    result: Result, plane: Slice, theme: Theme, limits: tuple[float, float] | None = None, cmap: str | None = None
+) -> Coloring:
+    """Return what the colours of a density mean; by default nearly no node of any frame exceeds the upper limit."""
+    if limits is None:
+        facts, found = scene_facts(result.header), [0.0]
+        count = min(LOOKED_AT, result.frame_count)
+        for k in np.unique(np.linspace(0, result.frame_count - 1, count).round().astype(int)):
+            density = grid_density(result.frame(int(k), ()), facts, plane)
+            if (density > 0).any():
+                found.append(float(np.quantile(density[density > 0], 1.0 - OUTSIDE)))
+        limits = 0.0, max(found) or 1.0
+    return Coloring("density", "kg/m³", (), lambda frame: np.empty(0), color_map(cmap), limits, theme.missing)
+
+
 class DensityPainter:
-    """Draws the density of the grid in a plane, empty space left free.
+    """Draws the density of the grid in a plane, which fades out where there is little.
 
     Attributes:
         fields: that are read of each frame: none.
-        colors: what the colours mean.
     """
 
     fields: tuple[str, ...] = ()
 
     def __init__(
-        self,
-        result: Result,
-        subject: Subject,
-        view: View,
-        theme: Theme,
-        plane: Slice,
-        limits: tuple[float, float] | None = None,
-        cmap: str = "viridis",
+        self, facts: SceneFacts, subject: Subject, view: View, theme: Theme, plane: Slice, colors: Coloring
     ) -> None:
-        self._view, self._theme, self._plane = view, theme, plane
-        self._facts = scene_facts(result.header)
-        limits = limits or (0.0, self._densest(result))
-        self.colors = Coloring("density", "kg/m³", (), lambda frame: np.empty(0), cmap, limits, theme.missing)
+        self._facts, self._plane, self._colors = facts, plane, colors
+        self._size, self._ground = view.size, np.array(rgb_bytes(theme.ground), dtype=np.float64)
         low, high = np.array(subject.lower), np.array(subject.upper)
-        corners = np.zeros((2, 3)) + 0.5 * (low + high)
-        corners[:, plane.across] = np.stack([low, high])[:, plane.across]
-        (left, bottom, _), (right, top, _) = view.pixels(corners)
-        self._box = left, top, right, bottom
+        corners = np.tile(0.5 * (low + high), (2, 1))
+        across = list(plane.across)
+        corners[:, across] = np.stack([low, high])[:, across]
+        self._box = view.pixels(corners)[:, :2]
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return (h, w, 3) uint8."""
         density = grid_density(frame, self._facts, self._plane)
-        width, height = self._view.size
-        left, top, right, bottom = self._box
+        width, height = self._size
+        (left, bottom), (right, top) = self._box
         u = (np.arange(width) + 0.5 - left) / (right - left) * (density.shape[0] - 1)
         v = (bottom - np.arange(height) - 0.5) / (bottom - top) * (density.shape[1] - 1)
         values = _between(_between(density, u).T, v)
         inside = ((v >= 0) & (v <= density.shape[1] - 1))[:, None] & ((u >= 0) & (u <= density.shape[0] - 1))
-        there = np.clip(values / (FADING * self.colors.limits[1]), 0.0, 1.0) * inside
-        ground = np.array(rgb_bytes(self._theme.ground), dtype=np.float64)
-        picture = ground + there[:, :, None] * (self.colors.rgb(values) - ground)
+        there = np.clip(values / (FADING * self._colors.limits[1]), 0.0, 1.0) * inside
+        picture = self._ground + there[:, :, None] * (self._colors.rgb(values) - self._ground)
         return (picture + 0.5).astype(np.uint8)
-
-    def _densest(self, result: Result) -> float:
-        """Return what nearly no node of the whole result exceeds."""
-        found = [0.0]
-        count = min(LOOKED_AT, result.frame_count)
-        for k in np.unique(np.linspace(0, result.frame_count - 1, count).round().astype(int)):
-            density = grid_density(result.frame(int(k), ()), self._facts, self._plane)
-            if (density > 0).any():
-                found.append(float(np.quantile(density[density > 0], 1.0 - OUTSIDE)))
-        return max(found) or 1.0
 
 
 def _between(table: np.ndarray, places: np.ndarray) -> np.ndarray:

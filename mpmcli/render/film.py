@@ -1,6 +1,8 @@
 """Films of pictures: H.264 in .mp4 by ffmpeg, and .gif."""
 
 import math
+import os
+import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,6 +21,10 @@ Picture = Path | np.ndarray
 FPS_MIN, FPS_MAX = 0.01, 1000.0
 # Pictures from which the colours of a gif are chosen.
 FEW = 12
+# Before the digest at the end of a film; and the kind of box that players of .mp4 skip.
+KEYWORD = b"mpmcli"
+SKIPPED = b"free"
+DIGEST_MAX = 64
 
 
 def check_film(path: Path, fps: float) -> None:
@@ -34,7 +40,12 @@ def check_film(path: Path, fps: float) -> None:
 
 
 def write_film(
-    pictures: Iterable[Picture], path: Path, fps: float, *, watch: Callable[[int], None] = lambda done: None
+    pictures: Iterable[Picture],
+    path: Path,
+    fps: float,
+    *,
+    digest: str = "",
+    watch: Callable[[int], None] = lambda done: None,
 ) -> None:
     """Write a film, whole or not at all, in place of what is there; the same pictures give the same bytes.
 
@@ -47,6 +58,7 @@ def write_film(
         pictures: files, or (h, w, 3) uint8, all of one size.
         path: its end says which kind: .mp4 or .gif.
         fps: frames per second.
+        digest: from `settings_digest`, which `film_digest` reads back.
         watch: told how many pictures have been taken in, after each.
 
     Raises:
@@ -66,8 +78,30 @@ def write_film(
                 with TemporaryDirectory() as folder:
                     kept = _kept(_images(pictures, watch), Path(folder))
                     write_gif(_few(kept), _images(kept), temporary, fps)
+            with temporary.open("ab") as file:
+                file.write(_end(digest))
     except OSError as error:
         raise write_fault(path, error) from error
+
+
+def film_digest(path: Path) -> str | None:
+    """Return the digest in a film; "" where mpmcli did not make the file, None where none is."""
+    try:
+        with path.open("rb") as file:
+            file.seek(0, os.SEEK_END)
+            file.seek(-min(file.tell(), len(_end("")) + DIGEST_MAX), os.SEEK_CUR)
+            _, found, digest = file.read().rpartition(SKIPPED + KEYWORD)
+    except FileNotFoundError:
+        return None
+    except OSError:
+        return ""
+    return digest.decode("ascii", errors="replace") if found else ""
+
+
+def _end(digest: str) -> bytes:
+    """Return what follows the film: a box that players of .mp4 skip; those of gif do not read beyond its end."""
+    content = KEYWORD + digest.encode("ascii")
+    return struct.pack(">I", 8 + len(content)) + SKIPPED + content
 
 
 def _images(pictures: Iterable[Picture], watch: Callable[[int], None] = lambda done: None) -> Iterator[np.ndarray]:

@@ -1,14 +1,9 @@
 """An off-screen window that is kept for all frames of a film: one rendering gives the picture and its depth."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from mpmcli.render.theme import Theme
 from mpmcli.render.view import View
-
-if TYPE_CHECKING:
-    import pyvista as pv
 
 # Edges of the domain, as pairs of its corners; bit i of a corner's number is its side along axis i.
 EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
@@ -27,9 +22,7 @@ class Stage:
         self.view = view
         self.samples = samples
         width, height = view.size
-        self.plotter: pv.Plotter = pv.Plotter(
-            off_screen=True, window_size=(width * samples, height * samples), lighting="none"
-        )
+        self.plotter = pv.Plotter(off_screen=True, window_size=(width * samples, height * samples), lighting="none")
         self.plotter.render_window.SetMultiSamples(0)
         self.plotter.background_color = theme.ground
         self.plotter.disable_anti_aliasing()
@@ -74,7 +67,7 @@ class Stage:
         return self._averaged(image) if self.samples > 1 else np.ascontiguousarray(image)
 
     def depth(self) -> np.ndarray:
-        """Return the distance along the view of what each sample shows, (h, w) float32, m; inf where there is nothing."""
+        """Return how far away what each sample shows is, (h, w) float32, m; inf where there is nothing."""
         from vtkmodules.util.numpy_support import vtk_to_numpy
         from vtkmodules.vtkCommonCore import vtkFloatArray
 
@@ -83,10 +76,8 @@ class Stage:
         self.plotter.render_window.GetZbufferData(0, 0, width - 1, height - 1, array)
         z = vtk_to_numpy(array).reshape(height, width)[::-1]
         near, far = self.plotter.camera.clipping_range
-        if self.view.parallel:
-            distance = near + z * (far - near)
-        else:
-            distance = near * far / (far - z * (far - near))
+        span = far - near
+        distance = near + z * span if self.view.parallel else near * far / (far - z * span)
         return np.where(z >= 1.0, np.float32(np.inf), distance.astype(np.float32))
 
     def close(self) -> None:

@@ -19,6 +19,8 @@ ANGLE = 24.0
 MARGIN = 0.04
 # Of "iso": degrees that the camera stands to the right of the front, and above the ground.
 AZIMUTH, ELEVATION = 32.0, 24.0
+# Pixels along the sides of a picture that is only thought of.
+SQUARE = 1000
 # Rounds in which the middle of the projected domain is brought to the middle of the picture.
 CENTRING_ROUNDS = 8
 
@@ -102,6 +104,13 @@ def view_of(subject: Subject, camera: str, size: tuple[int, int]) -> View:
     turn, rise = math.radians(AZIMUTH), math.radians(ELEVATION)
     level = math.cos(turn) * front + math.sin(turn) * right
     return _framed(subject, math.cos(rise) * level + math.sin(rise) * up, up, size, parallel=False)
+
+
+def aspect_of(subject: Subject, camera: str) -> float:
+    """Return the height of the domain over its width, as a camera sees it, with the margin around it."""
+    view = view_of(subject, camera, (SQUARE, SQUARE))
+    seen = np.ptp(view.pixels(_corners(subject))[:, :2], axis=0) + 2 * MARGIN * SQUARE
+    return float(seen[1] / seen[0])
 
 
 def _axes(back: np.ndarray, up: np.ndarray) -> np.ndarray:

@@ -1,0 +1,107 @@
+"""`mpmcli render`."""
+
+from pathlib import Path
+
+import click
+
+from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
+from mpmcli.cli.json_output import print_json
+from mpmcli.cli.options import json_option, quiet_option
+
+MODES = ("dots", "surface", "fluid", "density")
+THEMES = ("light", "dark")
+
+
+@click.command("render")
+@click.argument("result", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="OUT",
+    help="A .png for one picture, or a directory; by default the directory render beside the result.",
+)
+@click.option("--mode", type=click.Choice(MODES), default="dots", show_default=True, help="How particles are drawn.")
+@click.option(
+    "--frame",
+    "frames",
+    metavar="N|first|last|all|A:B:S",
+    help="Which frames; the last one by default, all of them for a film or a montage.",
+)
+@click.option(
+    "--color-by",
+    "color",
+    metavar="NAME",
+    help="speed, material, body, density, pressure, J, stress, id or a stored field, stress.xy for a component.",
+)
+@click.option("--clim", metavar="LOW,HIGH", help="Limits of the colours; those of the whole result by default.")
+@click.option("--cmap", metavar="NAME", help="A colour map of matplotlib.")
+@click.option("--size", metavar="WxH", help="Pixels; 1280x720 by default.")
+@click.option(
+    "--camera",
+    default="iso",
+    show_default=True,
+    metavar="iso|front|side|top|x,y,z,x,y,z",
+    help="Of 3D scenes: by name, or where it stands and what it looks at, m.",
+)
+@click.option(
+    "--theme", type=click.Choice(THEMES), default="light", show_default=True, help="Colours around the particles."
+)
+@click.option("--movie", type=click.Path(path_type=Path), metavar="FILE", help="Make a film: .mp4 or .gif.")
+@click.option("--fps", type=float, default=30.0, show_default=True, help="Frames of the film per second.")
+@click.option("--montage", metavar="CxR", help="One picture of evenly spaced frames, in so many columns and rows.")
+@click.option(
+    "--save-surface",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="With --mode surface: write the surfaces for other tools, .vtp and .obj.",
+)
+@click.option("--workers", type=click.IntRange(min=1), help="Processes that render; as many as cores by default.")
+@click.option("--overwrite", is_flag=True, help="Render again what is there, and replace files that others made.")
+@quiet_option
+@json_option
+def command(
+    result: Path,
+    output: Path | None,
+    mode: str,
+    frames: str | None,
+    color: str | None,
+    clim: str | None,
+    cmap: str | None,
+    size: str | None,
+    camera: str,
+    theme: str,
+    movie: Path | None,
+    fps: float,
+    montage: str | None,
+    save_surface: Path | None,
+    workers: int | None,
+    overwrite: bool,
+    quiet: bool,
+    as_json: bool,
+) -> int:
+    """Draw frames of a RESULT without a screen: pictures, a film (--movie) or a montage.
+
+    RESULT is a directory, particles.vtkhdf or particles.pvd, of a run that has ended or goes on. A picture that is
+    there and still right is not made again.
+    """
+    from mpmcli.cli.progress_bar import ProgressBar
+    from mpmcli.output import open_result
+    from mpmcli.render.assignment import Request, assign
+
+    request = Request(
+        output, mode, frames, color, clim, cmap, size, camera, theme, movie, fps, montage, save_surface, overwrite
+    )
+    assignment = assign(open_result(result), request)
+    with ProgressBar(assignment.due, "frames", quiet=quiet) as bar, interrupts_wait():
+        done = assignment.carry_out(workers, watch=bar.show, stop=interrupt_came)
+    for warning in done.warnings:
+        click.echo(f"warning: {warning}", err=True)
+    if not quiet:
+        kept = len(done.pictures) - done.made
+        there = f", {kept} {'was' if kept == 1 else 'were'} there already" if kept else ""
+        bar.say(f"{done.made} picture{'s' if done.made != 1 else ''} made{there}")
+        bar.say(f"film: {done.film}" if done.film else f"pictures: {done.place}", whole=True)
+    if as_json:
+        print_json(done.as_dict())
+    return 0

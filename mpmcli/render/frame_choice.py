@@ -1,0 +1,61 @@
+"""`--frame`: which frames of a result are meant."""
+
+import re
+
+import numpy as np
+
+from mpmcli.errors import InputError
+from mpmcli.output.result import Result
+
+HINT = "give a number, first, last, all, or A:B:S, from A up to but not B in steps of S, as in Python"
+
+
+def choose_frames(text: str, result: Result) -> list[int]:
+    """Return positions in the result of the frames that a text means, in order.
+
+    Args:
+        text: N, "first", "last", "all" or "A:B:S"; a negative number counts from the end.
+
+    Raises:
+        InputError: there is no such frame, or the text means nothing.
+    """
+    count = result.frame_count
+    numbers = result.numbers.tolist()
+    word = text.strip()
+    if word in ("first", "last", "all"):
+        return {"first": [0], "last": [count - 1], "all": list(range(count))}[word]
+    if re.fullmatch(r"-?\d+", word):
+        wanted = int(word) if int(word) >= 0 else int(word) + numbers[-1] + 1
+        if wanted not in numbers:
+            raise InputError(f"--frame {word}: {_holds(result)}.")
+        return [numbers.index(wanted)]
+    found = re.fullmatch(r"(-?\d*):(-?\d*)(?::(-?\d*))?", word)
+    try:
+        parts = [int(part) if part else None for part in (found[1], found[2], found[3])] if found else None
+    except ValueError:
+        parts = None
+    if parts is None or parts[2] == 0:
+        raise InputError(f'--frame "{text}" means no frame: {HINT}.')
+    chosen = list(range(count))[slice(*parts)]
+    if not chosen:
+        raise InputError(f"--frame {word} means no frame: {_holds(result)}.")
+    return chosen
+
+
+def evenly_spaced(ks: list[int], count: int) -> list[int]:
+    """Return at most so many of some frames, evenly spaced, the first and the last among them."""
+    if count == 1:
+        return ks[-1:]
+    places = np.unique(np.linspace(0, len(ks) - 1, count).round().astype(int))
+    return [ks[place] for place in places]
+
+
+def _holds(result: Result) -> str:
+    first, last = int(result.numbers[0]), int(result.numbers[-1])
+    running = (result.record or {}).get("status") == "running"
+    so_far = " so far, as its run goes on" if running else ""
+    return (
+        f"{result.path} holds frame {first} only{so_far}"
+        if first == last
+        else (f"{result.path} holds frames {first} to {last}{so_far}")
+    )

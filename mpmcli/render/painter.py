@@ -1,0 +1,102 @@
+"""The painter of a mode: made once in each process, and used for all its frames."""
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from mpmcli.output.frame import Frame
+from mpmcli.output.result import Result
+from mpmcli.output.scene_facts import scene_facts
+from mpmcli.render.canvas import Canvas
+from mpmcli.render.color_by import color_by
+from mpmcli.render.coloring import Categories, Coloring
+from mpmcli.render.density import DensityPainter, density_colors, slice_of
+from mpmcli.render.dots import DotsPainter
+from mpmcli.render.settings import Settings, require_possible
+from mpmcli.render.subject import Subject, subject_of
+from mpmcli.render.theme import THEMES
+from mpmcli.render.view import View, aspect_of, view_of
+
+# Pictures whose height follows from the scene are no flatter than this, height over width, and no steeper.
+FLATTEST = 0.2
+# The texts around the scene grow with the picture, and the picture with the texts.
+FITTING_ROUNDS = 4
+
+
+class Painter(Protocol):
+    """Draws the scene of a frame.
+
+    Attributes:
+        fields: that are read of each frame.
+    """
+
+    fields: tuple[str, ...]
+
+    def draw(self, frame: Frame) -> np.ndarray:
+        """Return (h, w, 3) uint8, of the size of the view."""
+        ...
+
+
+@dataclass(frozen=True)
+class Studio:
+    """All that pictures of one result with one setting share, but the painter and its window.
+
+    Attributes:
+        settings: with the limits of the colours filled in.
+        colors: what a bar or a legend explains; None for none.
+    """
+
+    result: Result
+    settings: Settings
+    subject: Subject
+    colors: Coloring | Categories | None
+    canvas: Canvas
+    view: View
+
+    def painter(self) -> Painter:
+        """Make the painter; it opens a window."""
+        settings, subject, view = self.settings, self.subject, self.view
+        theme = THEMES[settings.theme]
+        count = int(self.result.particle_counts.max())
+        if settings.mode == "density":
+            assert isinstance(self.colors, Coloring)
+            plane = slice_of(subject, settings.camera)
+            return DensityPainter(scene_facts(self.result.header), subject, view, theme, plane, self.colors)
+        assert self.colors is not None
+        return DotsPainter(subject, view, theme, self.colors, count)
+
+
+def open_studio(result: Result, settings: Settings) -> Studio:
+    """Find out what pictures of a result need, and fill in what the settings leave open.
+
+    Raises:
+        InputError: the colours, the camera or the size are not possible.
+    """
+    subject, theme = subject_of(result), THEMES[settings.theme]
+    camera = settings.camera
+    colors: Coloring | Categories | None
+    if settings.mode == "density":
+        plane = slice_of(subject, camera)
+        colors = density_colors(result, plane, theme, settings.limits, settings.cmap)
+        camera = "front" if camera not in ("side", "top") else camera
+    elif settings.color is None:
+        colors = color_by("material", result, subject, theme) if len(subject.looks) > 1 else None
+    else:
+        colors = color_by(settings.color, result, subject, theme, settings.limits, settings.cmap)
+    if isinstance(colors, Coloring):
+        settings = replace(settings, limits=colors.limits)
+    width, height = settings.size
+    canvas = Canvas((width, height or width), subject, theme, tuple(result.times.tolist()), colors, settings.grid)
+    if height is None:
+        aspect = min(max(aspect_of(subject, camera), FLATTEST), 1.0 / FLATTEST)
+        for _ in range(FITTING_ROUNDS):
+            canvas = replace(canvas, size=(width, canvas.height_for(aspect)))
+        settings = replace(settings, size=canvas.size)
+        require_possible(*canvas.size, f"{width}xauto")
+    return Studio(result, settings, subject, colors, canvas, view_of(subject, camera, canvas.stage_size))
+
+
+def usual_color(subject: Subject) -> str:
+    """Return what dots are coloured by where nobody says: materials where they differ, or else speed."""
+    return "material" if len(subject.looks) > 1 else "speed"
