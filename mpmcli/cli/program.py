@@ -20,6 +20,7 @@ COMMANDS = {
     "schema": "Print the JSON Schema of scenes, for editors.",
     "validate": "Measure speed against error on problems with known answers.",
     "bench": "Compare speed with the MPM examples that Taichi ships.",
+    "doctor": "Say whether everything that mpmcli needs works here.",
     "completion": "Print the script that completes commands in a shell.",
 }
 
