@@ -107,11 +107,7 @@ def raising(error: Exception) -> Callable[[], Finding]:
     [
         (ModuleNotFoundError("No module named 'h5py'", name="h5py"), "missing", "the package h5py is not installed"),
         (ModuleNotFoundError("No module named 'h5py.h5'", name="h5py.h5"), "broken", "ModuleNotFoundError: No module"),
-        (
-            ImportError("libGL.so.1: cannot open\nshared object"),
-            "broken",
-            "ImportError: libGL.so.1: cannot open shared",
-        ),
+        (ImportError("two lines\nof text"), "broken", "ImportError: two lines of text"),
         (RunError("it computed wrong numbers."), "broken", "it computed wrong numbers"),
         (ValueError("3"), "broken", "ValueError: 3"),
     ],
@@ -123,6 +119,18 @@ def test_what_a_trial_raises_is_a_finding_with_a_remedy(error, status, detail):
     assert "\n" not in found.detail
     assert "python -m pip install" in found.remedy
     assert ("--force-reinstall" in found.remedy) == (status == "broken")
+
+
+def test_a_library_that_the_system_lacks_is_named_with_its_package():
+    """On a bare Debian Taichi's first complaint is this one, and no installing of Taichi mends it."""
+    bare = ImportError("libX11.so.6: cannot open shared object file: No such file or directory")
+    found = attempt(Examination("taichi cpu", raising(bare), "taichi"))
+    assert found.status == "broken"
+    assert found.remedy == (
+        "install the system's package of libX11.so.6, on Debian and Ubuntu by `apt-get install libx11-6`"
+    )
+    unknown = "/usr/lib/libfoo-1.2.so.3: file too short"
+    assert finding.library_remedy(unknown) == "install the system's package of libfoo-1.2.so.3"
 
 
 def test_a_remedy_names_the_version_that_is_wanted(monkeypatch):

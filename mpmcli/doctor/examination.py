@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from mpmcli.child_process import Question, Reply, ask_each, module_command
 from mpmcli.doctor import backends, drawing, files, interpreter, machine
-from mpmcli.doctor.finding import STATUSES, Finding, package_remedy
+from mpmcli.doctor.finding import STATUSES, Finding, library_remedy, package_remedy
 from mpmcli.errors import MpmcliError
 
 # Processes at a time: each of them loads libraries, and then waits little.
@@ -95,7 +95,7 @@ def judge(each: Examination, reply: Reply) -> Finding:
 
 def _fault(each: Examination, status: str, detail: str) -> Finding:
     detail = " ".join(detail.split())
-    remedy = each.remedy
+    remedy = library_remedy(detail) or each.remedy
     if each.package and not (remedy and status == "broken"):
         remedy = package_remedy(each.package, again=status == "broken")
     return Finding(status if each.needed else "information", detail, remedy)

@@ -7,6 +7,16 @@ from typing import Literal
 
 # "missing" and "broken" are faults: something that mpmcli needs is not there, or does not work.
 Status = Literal["ok", "information", "missing", "broken"]
+# Libraries of the system that the wheels of our packages load, and who brings them on Debian and Ubuntu.
+SYSTEM_PACKAGES = {
+    "libX11.so.6": "libx11-6",
+    "libXrender.so.1": "libxrender1",
+    "libGL.so.1": "libgl1",
+    "libEGL.so.1": "libegl1",
+    "libstdc++.so.6": "libstdc++6",
+    "libgcc_s.so.1": "libgcc-s1",
+    "libz.so.1": "zlib1g",
+}
 STATUSES: tuple[Status, ...] = ("ok", "information", "missing", "broken")
 
 
@@ -33,6 +43,17 @@ class Finding:
 def package_remedy(package: str, *, again: bool = False) -> str:
     """Return the command that installs a package in the version that mpmcli asks for."""
     return f"{'install it again' if again else 'install it'} by `python -m pip install {_requirement(package, again)}`"
+
+
+def library_remedy(complaint: str) -> str:
+    """Return how to install the library of the system that the dynamic linker misses; "" where it misses none."""
+    missed = re.search(r"(lib[\w.+-]*\.so[\d.]*): (?:cannot open shared object|file too short)", complaint)
+    if missed is None:
+        return ""
+    library = missed[1]
+    package = SYSTEM_PACKAGES.get(library)
+    by = f", on Debian and Ubuntu by `apt-get install {package}`" if package else ""
+    return f"install the system's package of {library}{by}"
 
 
 def _requirement(package: str, again: bool) -> str:
