@@ -133,6 +133,13 @@ def test_a_library_that_the_system_lacks_is_named_with_its_package():
     assert finding.library_remedy(unknown) == "install the system's package of libfoo-1.2.so.3"
 
 
+def test_a_command_that_cannot_be_loaded_sends_to_the_doctor(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mpmcli.cli.schema", None)
+    done = run_here("schema")
+    assert done.status == 1
+    assert done.stderr.rstrip().endswith("(mpmcli doctor says what is missing; --debug shows where)")
+
+
 def test_a_remedy_names_the_version_that_is_wanted(monkeypatch):
     listed = ["h5py>=3.11", "h5py-other>=1", "pytest>=8; extra == 'test'"]
     monkeypatch.setattr(finding.importlib.metadata, "requires", lambda name: listed)

@@ -104,7 +104,9 @@ def run(arguments: list[str]) -> int:
         if debug:
             traceback.print_exc()
         kind = type(error).__name__
-        click.echo(f"error: {kind}: {error} (a fault of mpmcli; --debug shows where)", err=True)
+        # On a bare machine a library of the system may be missing, which a package of ours loads.
+        whose = "mpmcli doctor says what is missing" if isinstance(error, ImportError) else "a fault of mpmcli"
+        click.echo(f"error: {kind}: {error} ({whose}; --debug shows where)", err=True)
         return 1
 
 
