@@ -21,6 +21,7 @@ COMMANDS = {
     "schema": "Print the JSON Schema of scenes, for editors.",
     "validate": "Measure speed against error on problems with known answers.",
     "bench": "Compare speed with the MPM examples that Taichi ships.",
+    "doctor": "Say whether everything that mpmcli needs works here.",
     "completion": "Print the script that completes commands in a shell.",
 }
 
@@ -104,7 +105,9 @@ def run(arguments: list[str]) -> int:
         if debug:
             traceback.print_exc()
         kind = type(error).__name__
-        click.echo(f"error: {kind}: {error} (a fault of mpmcli; --debug shows where)", err=True)
+        # On a bare machine a library of the system may be missing, which a package of ours loads.
+        whose = "mpmcli doctor says what is missing" if isinstance(error, ImportError) else "a fault of mpmcli"
+        click.echo(f"error: {kind}: {error} ({whose}; --debug shows where)", err=True)
         return 1
 
 
