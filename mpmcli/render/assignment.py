@@ -12,7 +12,7 @@ from mpmcli.render.film import check_film, film_digest, write_film
 from mpmcli.render.frame_choice import choose_frames, evenly_spaced
 from mpmcli.render.frame_workers import available_cores
 from mpmcli.render.painter import Studio, open_studio, usual_color
-from mpmcli.render.picture_file import digest_of, settings_digest, write_picture
+from mpmcli.render.picture_file import digest_of, require_writable, settings_digest, write_picture
 from mpmcli.render.pictures import (
     FOREIGN,
     Easel,
@@ -222,12 +222,17 @@ def assign(result: Result, request: Request) -> Assignment:
     else:
         path_of = _paths(result, settings.mode, request, len(ks))
         plan = plan_pictures(result, studio.settings, ks, path_of, overwrite=request.overwrite)
+    for path in (plan[0].path, request.movie):
+        if path is not None:
+            require_writable(path)
     return Assignment(studio, ks, plan, request.movie, request.fps, request.overwrite)
 
 
 def _require_sense(request: Request) -> None:
     if request.movie and request.montage:
         raise InputError("--movie and --montage are two things: ask for one after the other.")
+    if request.save_surface and request.mode != "surface":
+        raise InputError("--save-surface writes the surfaces of --mode surface: ask for that.")
     for option, value in (("--color-by", request.color), ("--clim", request.clim), ("--cmap", request.cmap)):
         allowed = COLORED if option == "--color-by" else (*COLORED, "density")
         if value and request.mode not in allowed:

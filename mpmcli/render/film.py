@@ -91,7 +91,7 @@ def film_digest(path: Path) -> str | None:
             file.seek(0, os.SEEK_END)
             file.seek(-min(file.tell(), len(_end("")) + DIGEST_MAX), os.SEEK_CUR)
             _, found, digest = file.read().rpartition(SKIPPED + KEYWORD)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError:
         return ""
