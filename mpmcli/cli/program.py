@@ -16,6 +16,7 @@ COMMANDS = {
     "simulate": "Run a scene and store its particles.",
     "check": "Say which step is safe and why, or whether a result stayed stable.",
     "info": "Say what a result or a scene holds.",
+    "plot": "Draw a result's ledger: energies, momentum, steps, volumes, reach.",
     "materials": "List laws, presets, their parameters and knobs.",
     "schema": "Print the JSON Schema of scenes, for editors.",
     "validate": "Measure speed against error on problems with known answers.",

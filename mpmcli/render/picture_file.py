@@ -78,7 +78,7 @@ def digest_of(path: Path) -> str | None:
                 return ""
             file.seek(-len(END), os.SEEK_END)
             return digest if file.read() == END else ""
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, struct.error):
         return ""
@@ -87,6 +87,8 @@ def digest_of(path: Path) -> str | None:
 def write_fault(path: Path, error: OSError) -> MpmcliError:
     """Return what to raise where a file could not be written: RunError for a fault of the disk, else InputError."""
     reason = error.strerror or str(error)
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        reason = f"{path.parent} is no directory"
     if error.errno in DISK_FAULTS:
         return RunError(f"{path} could not be written ({reason}): free some space or write to another disk with -o.")
     return InputError(f"{path} cannot be written ({reason}): give another place with -o.")
