@@ -133,7 +133,8 @@ def test_many_frames_are_read_evenly_and_that_is_said(result, monkeypatch):
 
 def test_where_forces_act_the_panels_say_so(tmp_path):
     with drawn(write_made(tmp_path / "result", driven=True)) as panels:
-        assert "Impulse of the walls and forces" in panels and "Change of total energy (forces do work)" in panels
+        assert "Impulse of the walls and forces" in panels
+        assert panels["Change of total energy"].get_ylabel() == "(E - E₀) / largest E, while forces do work"
 
 
 def test_numbers_that_are_not_finite_are_gaps_and_told(tmp_path):
@@ -143,11 +144,24 @@ def test_numbers_that_are_not_finite_are_gaps_and_told(tmp_path):
         kinetic = line(panels["Energy"], "kinetic")[:, 1]
         assert np.flatnonzero(np.isnan(kinetic)).tolist() == [2]
         assert len(panels["Time step, by what bounds it"].collections) == 3
+        # The momentum that is given by the walls is known again after the gap.
+        assert np.flatnonzero(np.isnan(line(panels["Impulse of the walls"], "y")[:, 1])).tolist() == [2, 4]
     outcome = run_here("plot", directory, *SIZE)
     assert outcome.status == 0
     assert outcome.stderr.splitlines()[0] == (
         "The ledger holds numbers that are not finite in frames 2, 4; they are gaps in the figure."
     )
+
+
+def test_a_first_frame_that_is_not_finite_is_not_what_changes_are_counted_from(tmp_path):
+    nothing = {"kinetic": np.nan, "linear_momentum": (np.nan, np.nan)}
+    with drawn(write_made(tmp_path / "result", changes={0: nothing})) as panels:
+        (change,) = series(panels["Change of total energy"])
+        impulse = line(panels["Impulse of the walls"], "y")
+    assert np.isnan(change[0, 1]) and change[1, 1] == 0
+    assert np.isnan(impulse[0, 1])
+    # Half of the mass rests: the floor gives it M g / 2 in a second.
+    assert np.allclose(impulse[1:, 1], MASS * GRAVITY * (TIMES[1:] - TIMES[1]) / 2, atol=1e-12)
 
 
 @pytest.mark.parametrize(

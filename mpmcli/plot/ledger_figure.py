@@ -55,6 +55,11 @@ def draw_ledger(figure: "Figure", history: History, theme: ThemeName) -> list[st
     return [panel.axes.get_title(loc="left") for panel in panels]
 
 
+def _first(values: np.ndarray) -> int:
+    """Return the number of the first row that is known, which changes are counted from."""
+    return int(np.isfinite(values).reshape(len(values), -1).all(1).argmax())
+
+
 def _units(history: History) -> tuple[str, str, str]:
     """Return the units of energy, momentum and angular momentum: in the plane they are per metre of depth."""
     return ("J/m", "N s/m", "N s") if history.facts.dimension == 2 else ("J", "N s", "N m s")
@@ -72,10 +77,10 @@ def _energy(parts: Panel, change: Panel, history: History) -> None:
     ):
         parts.line(values, name, k)
     largest = float(np.nanmax(total)) if np.isfinite(total).any() else 0.0
-    work = " (forces do work)" if history.facts.driven else ""
-    change.title(f"Change of total energy{work}", "(E - E₀) / largest E")
+    work = ", while forces do work" if history.facts.driven else ""
+    change.title("Change of total energy", f"(E - E₀) / largest E{work}")
     if largest > 0:
-        change.line((total - total[0]) / largest, "", None)
+        change.line((total - total[_first(total)]) / largest, "", None)
     change.level(0.0)
 
 
@@ -83,7 +88,8 @@ def _momentum(panel: Panel, history: History) -> None:
     """Draw what gravity does not explain of the momentum: 0 but for rounding until something else acts."""
     facts, columns = history.facts, history.columns
     momentum = columns["linear_momentum"]
-    values = momentum - momentum[0]
+    start = _first(momentum)
+    values = momentum - momentum[start]
     unit = _units(history)[1]
     if facts.gravity is None:
         panel.title("Momentum (gravity is not constant)", f"P - P₀, {unit}")
@@ -92,7 +98,7 @@ def _momentum(panel: Panel, history: History) -> None:
         panel.title(f"Impulse of the {what}", f"P - P₀ - M g t, {unit}")
         # Velocities are those of the middle of the last step.
         middle = history.times - (columns["step_min"] + columns["step_max"]) / 4
-        values = values - columns["mass"][:, None] * facts.gravity * (middle - middle[0])[:, None]
+        values = values - columns["mass"][:, None] * facts.gravity * (middle - middle[start])[:, None]
     for axis in range(facts.dimension):
         panel.line(values[:, axis], AXES[axis], axis)
     panel.level(0.0)
