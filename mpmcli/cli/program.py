@@ -17,6 +17,7 @@ COMMANDS = {
     "check": "Say which step is safe and why, or whether a result stayed stable.",
     "info": "Say what a result or a scene holds.",
     "render": "Draw frames of a result: pictures, films, montages.",
+    "plot": "Draw a result's ledger: energies, momentum, steps, volumes, reach.",
     "materials": "List laws, presets, their parameters and knobs.",
     "schema": "Print the JSON Schema of scenes, for editors.",
     "validate": "Measure speed against error on problems with known answers.",

@@ -102,6 +102,8 @@ def require_writable(path: Path) -> None:
 def write_fault(path: Path, error: OSError) -> MpmcliError:
     """Return what to raise where a file could not be written: RunError for a fault of the disk, else InputError."""
     reason = error.strerror or str(error)
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        reason = f"{path.parent} is no directory"
     if error.errno in DISK_FAULTS:
         return RunError(f"{path} could not be written ({reason}): free some space or write to another disk with -o.")
     return InputError(f"{path} cannot be written ({reason}): give another place with -o.")
