@@ -107,7 +107,8 @@ def run(arguments: list[str]) -> int:
             traceback.print_exc()
         kind = type(error).__name__
         # On a bare machine a library of the system may be missing, which a package of ours loads.
-        whose = "mpmcli doctor says what is missing" if isinstance(error, ImportError) else "a fault of mpmcli"
+        of_system = isinstance(error, ImportError) and not (error.name or "").startswith("mpmcli")
+        whose = "mpmcli doctor says what is missing" if of_system else "a fault of mpmcli"
         click.echo(f"error: {kind}: {error} ({whose}; --debug shows where)", err=True)
         return 1
 

@@ -4,11 +4,11 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from mpmcli.check.result_scene import SceneFacts, scene_facts
 from mpmcli.errors import InputError
 from mpmcli.output.frame import Frame
 from mpmcli.output.ledger_table import TEXT
 from mpmcli.output.result import Result
+from mpmcli.output.scene_facts import SceneFacts, scene_facts
 from mpmcli.stability.ledger import LedgerRow
 
 # Frames whose positions are read; more would not be seen in the figure.
