@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.output.result import Result
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.film import check_film, film_digest, write_film
 from mpmcli.render.frame_choice import choose_frames, evenly_spaced
-from mpmcli.render.frame_workers import available_cores
 from mpmcli.render.painter import Studio, open_studio, usual_color
 from mpmcli.render.picture_file import digest_of, require_writable, settings_digest, write_picture
 from mpmcli.render.pictures import (
