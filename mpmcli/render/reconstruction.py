@@ -110,7 +110,8 @@ def reconstruct(
         weights = _fullness(points, vertices)
         connectivity = mesh.vertex_vertex_connectivity()
         laplacian_smoothing_parallel(mesh, connectivity, iterations=rounds, beta=1.0, weights=weights)
-    vertices = np.clip(vertices, low, high)
+    # The old view is stale: smoothing has put other memory in its place.
+    vertices = np.clip(np.asarray(mesh.vertices), low, high)
     areas = _area_vectors(vertices, triangles)
     triangles = triangles[areas.any(axis=1)]
     return Mesh(
