@@ -52,7 +52,7 @@ def lights_of(subject: Subject, view: View, theme: Theme) -> Lights:
         lamp=_unit(-0.42 * right + 1.0 * above + 0.40 * back - 0.1 * up),
         rim=_unit(0.55 * right + 0.55 * above - 0.75 * back),
         fill=_unit(0.8 * right + 0.25 * above + 0.6 * back),
-        lamp_color=np.array([1.62, 1.55, 1.42]) * (0.80 if dark else 0.78),
+        lamp_color=np.array([1.62, 1.55, 1.42]) * (0.72 if dark else 0.66),
         sky=np.array([0.30, 0.38, 0.52]) * (0.72 if dark else 1.25),
         horizon=np.array([0.22, 0.26, 0.33]) if dark else np.array([0.86, 0.90, 0.95]),
         ground=linear(theme.floor) * (1.0 if dark else 0.42) + (0.03 if dark else 0.0),
@@ -66,16 +66,17 @@ def linear(color: str) -> np.ndarray:
 
 def vertex_code() -> tuple[str, str]:
     """Return what the vertex shader declares and does to hand over what the vertices carry."""
-    declared = f"in vec4 {LIGHT}; in vec3 {TINT}; in vec3 {ROUGH}; in vec3 {OUTWARDS};\nout vec4 carriedLight; out vec3 carriedTint;"
-    declared += "\nout vec3 carriedRough; out vec3 worldPoint; out vec3 worldNormal;"
+    declared = f"in vec4 {LIGHT}; in vec3 {TINT}; in vec3 {ROUGH}; in vec3 {OUTWARDS};\ncentroid out vec4 carriedLight; centroid out vec3 carriedTint;"
+    declared += "\ncentroid out vec3 carriedRough; centroid out vec3 worldPoint; centroid out vec3 worldNormal;"
     done = f"carriedLight = {LIGHT}; carriedTint = {TINT}; carriedRough = {ROUGH};"
     return declared, done + f"\nworldPoint = vertexMC.xyz; worldNormal = {OUTWARDS};"
 
 
-def fragment_code(subject: Subject, view: View, lights: Lights, look: Look, *, by_field: bool) -> tuple[str, str]:
+def fragment_code(subject: Subject, view: View, lights: Lights, look: Look, finer: int, *, by_field: bool) -> tuple[str, str]:
     """Return what the fragment shader declares and does for one material.
 
     Args:
+        finer: pixels of the window to one of the view, along each axis.
         by_field: the tints mean something, so that light must not change them much.
     """
     side = max(np.subtract(subject.upper, subject.lower))
@@ -96,13 +97,14 @@ def fragment_code(subject: Subject, view: View, lights: Lights, look: Look, *, b
         "cameraRight": _vec(view.axes[0]),
         "cameraUp": _vec(view.axes[1]),
     }
-    declared = "in vec4 carriedLight; in vec3 carriedTint; in vec3 carriedRough;\n"
-    declared += "in vec3 worldPoint; in vec3 worldNormal;\n"
+    declared = "centroid in vec4 carriedLight; centroid in vec3 carriedTint; centroid in vec3 carriedRough;\n"
+    declared += "centroid in vec3 worldPoint; centroid in vec3 worldNormal;\n"
     declared += "".join(f"const vec3 {name} = {value};\n" for name, value in constants.items())
+    declared += f"const float grainSize = {max(subject.distances):.9g};\n"
     declared += f"const float wallGap = {1e-5 * side:.9g};\n"
     declared += f"const float thickUnit = {0.3 * volume_length:.9g};\n"
-    declared += f"const vec2 pictureSize = vec2({view.size[0]}.0, {view.size[1]}.0);\n"
-    declared += f"const float pixelsToMetre = {view.pixels_per_metre:.9g};\n"
+    declared += f"const vec2 pictureSize = vec2({finer * view.size[0]}.0, {finer * view.size[1]}.0);\n"
+    declared += f"const float pixelsToMetre = {finer * view.pixels_per_metre:.9g};\n"
     declared += _ROOM
     kind: str = "field" if by_field else look.finish
     if look.name.startswith("lava") and kind == "syrup":
@@ -150,6 +152,9 @@ float lamp = carriedLight.x;
 float sky = carriedLight.y;
 float thick = carriedLight.z / thickUnit;
 vec3 base = carriedTint;
+vec3 gaps = min(worldPoint - lowerWall, upperWall - worldPoint);
+// Where the surface bends into a wall its normals are between the two, and would glint.
+float free_ = smoothstep(0.1, 1.5, min(gaps.x, min(gaps.y, gaps.z)) / grainSize);
 vec3 color = base;
 vec2 here = gl_FragCoord.xy / pictureSize;
 """
@@ -184,35 +189,43 @@ color = tinted * roomLight(reflect(-v, n), 0.22) * mix(0.35, 1.0, sky) * 0.9;
 color += base * 0.35 * (lampColor * lamp * max(dot(n, lampTo), 0.0) + sky * softLight(n));
 """,
     "crumbly": """
-n = normalize(n + 0.55 * carriedRough);
-float grit = 0.93 + 0.14 * carriedRough.x;
-vec3 shade = mix(vec3(0.62, 0.74, 0.95), vec3(1.0), clamp(lamp, 0.0, 1.0));
-color = base * grit * (0.62 * lampColor * lamp * wrapped(dot(n, lampTo), 0.25)
-        + 0.85 * shade * sky * softLight(n) + 0.05);
+n = normalize(n + 0.5 * carriedRough);
+float grit = 0.95 + 0.10 * carriedRough.x;
+vec3 shade = mix(vec3(0.66, 0.78, 1.0), vec3(1.0), clamp(lamp, 0.0, 1.0));
+color = base * grit * (0.62 * lampColor * lamp * wrapped(dot(n, lampTo), 0.45)
+        + 0.95 * shade * (0.25 + 0.75 * sky) * (0.4 * softLight(n) + 0.6 * softLight(upwards)) + 0.06);
 """,
-    "translucent": _BEHIND.replace("BENT", "0.10")
+    "translucent": _BEHIND.replace("BENT", "0.16")
     + """
-float through = exp(-3.2 * thick);
-vec3 deep = pow(base, vec3(1.25));
-vec3 body = mix(deep, base, clamp(lamp, 0.0, 1.0)) * (lampColor * (0.25 + 0.75 * lamp)
-        * wrapped(dot(n, lampTo), 0.55) * 0.8 + (0.25 + 0.75 * sky) * softLight(n));
-body += base * 0.30 * pow(wrapped(-dot(v, lampTo) * 0.5 + 0.5 * dot(n, rimTo), 0.3), 2.0) * lampColor;
-body += pow(base, vec3(0.6)) * 0.25 * pow(1.0 - facing, 2.5) * softLight(n);
-vec3 seen = behind * pow(base / max(max(base.r, base.g), max(base.b, 1e-3)), vec3(1.1));
-color = mix(body, seen, 0.75 * through);
-color += mirror(facing, 0.045) * mix(0.3, 1.0, sky) * roomLight(reflect(-v, n), 0.12) * 0.85;
+float through = exp(-2.0 * thick);
+vec3 pure = base / max(max(base.r, base.g), max(base.b, 1e-3));
+vec3 pale = mix(base, pow(base, vec3(0.55)), 0.55);
+float round_ = wrapped(dot(n, lampTo), 0.6);
+vec3 body = mix(base, pale, 0.25 * round_ + 0.5 * through)
+        * (lampColor * (0.35 + 0.65 * lamp) * round_ * 0.62 + (0.35 + 0.65 * sky) * softLight(n) * 0.75);
+body += pale * 0.30 * pow(wrapped(dot(n, rimTo), 0.4), 2.0) * lampColor * (1.0 - 0.6 * facing);
+body += pale * 0.20 * pow(1.0 - facing, 2.0) * sky;
+vec3 seen = behind * pow(pure, vec3(0.55 + 0.5 * thick));
+color = mix(body, seen, 0.10 + 0.60 * through);
+color += mirror(facing, 0.045) * mix(0.35, 1.0, sky) * roomLight(reflect(-v, n), 0.05) * 0.8;
+color += free_ * lamp * lampColor * 0.5 * pow(max(dot(n, normalize(lampTo + v)), 0.0), 90.0);
 """,
     "water": _BEHIND.replace("BENT", "0.22")
     + """
-vec3 clear = pow(base / max(max(base.r, base.g), max(base.b, 1e-3)), vec3(0.85));
-vec3 dimmed = pow(clear, vec3(min(1.5 * thick, 3.5))) * exp(-0.22 * thick);
-vec3 glow = base * (0.62 * softLight(vec3(upwards)) * (0.3 + 0.7 * sky) + 0.30 * lampColor * lamp);
-vec3 inside = behind * dimmed + glow * (1.0 - exp(-1.25 * thick));
-float shine = mirror(facing, 0.025);
-if (atWall) { shine *= 0.35; }
-color = mix(inside, mix(0.4, 1.0, sky) * roomLight(reflect(-v, n), 0.02), shine);
-color += lamp * (atWall ? 0.0 : 1.0) * lampColor * 1.3 * pow(max(dot(n, normalize(lampTo + v)), 0.0), 220.0);
-color += (atWall ? 0.0 : 0.10) * sky * softLight(n) * pow(1.0 - facing, 2.0);
+vec3 clear = pow(base / max(max(base.r, base.g), max(base.b, 1e-3)), vec3(0.7));
+float depth = 0.20 + thick;
+vec3 dimmed = pow(clear, vec3(1.3 * (1.0 - exp(-1.1 * depth)))) * exp(-0.55 * depth);
+vec3 glow = base * (0.60 * softLight(vec3(upwards)) * (0.3 + 0.7 * sky) + 0.28 * lampColor * lamp);
+vec3 inside = behind * dimmed + glow * (1.0 - exp(-1.3 * depth));
+float shine = mirror(facing, 0.03);
+vec3 mirrored = mix(0.45, 1.0, sky) * roomLight(reflect(-v, n), 0.06);
+if (atWall) { shine *= 0.45; }
+color = mix(inside, mirrored, shine);
+// The film that the eye sees where the surface bends into the glass.
+float bent_ = atWall ? smoothstep(0.05, 0.6, 1.0 - dot(normalize(worldNormal), n)) : 0.0;
+color += bent_ * 0.35 * softLight(vec3(upwards));
+color += free_ * lamp * lampColor * 1.2 * pow(max(dot(n, normalize(lampTo + v)), 0.0), 200.0);
+color += free_ * 0.10 * sky * softLight(n) * pow(1.0 - facing, 2.0);
 """,
     "syrup": _BEHIND.replace("BENT", "0.2")
     + """

@@ -13,9 +13,10 @@ CELLS_LONG, CELLS = 88, 140_000
 REACH = 0.7
 # Optical depth of a cell that is filled by what is wholly opaque.
 DEPTH_OF_CELL = 1.1
-# Directions of the lamp's disk about its middle, and of the sky: (tangent of the angle to the axis, how many, weight).
-LAMP_RADIUS, LAMP_POINTS = 0.16, 3
-SKY_RINGS = ((0.0, 1, 1.0), (0.75, 4, 0.8))
+# Directions of the sky's light: (tangent of the angle to the vertical, how many, weight).
+SKY_RINGS = ((0.0, 1, 1.0), (0.8, 5, 0.8))
+# Share of the light of a cell that spreads to its neighbours from layer to layer: the lamp and the sky are no points.
+LAMP_SPREAD, SKY_SPREAD = 0.35, 1.0
 # Cells above a surface at which its light is looked up, so that it does not stand in its own shade.
 LIFT = 1.4
 
@@ -98,16 +99,11 @@ def occlusion_of(
     for k in range(3):
         depth = _blurred(depth, k)
     toward = blank._local(lamp[None])[0]
-    beams = [(slope, 1.0) for slope in _lamp_slopes(toward)]
-    lamp_share, floor_lamp = _swept(depth, beams)
+    slope = toward[:2] / max(float(toward[2]), 0.3)
+    lamp_share, floor_lamp = _swept(depth, [(slope, 1.0)], LAMP_SPREAD)
     rings = [(_around(slant, k, count), weight) for slant, count, weight in SKY_RINGS for k in range(count)]
-    sky_share, floor_sky = _swept(depth, rings)
+    sky_share, floor_sky = _swept(depth, rings, SKY_SPREAD)
     return Occlusion(lamp_share, sky_share, floor_lamp, floor_sky, axes, flip, corner, edge)
-
-
-def _lamp_slopes(toward: np.ndarray) -> list[np.ndarray]:
-    middle = toward[:2] / max(toward[2], 0.3)
-    return [middle + LAMP_RADIUS * _around(1.0, k, LAMP_POINTS) for k in range(LAMP_POINTS)]
 
 
 def _around(radius: float, k: int, count: int) -> np.ndarray:
@@ -115,7 +111,9 @@ def _around(radius: float, k: int, count: int) -> np.ndarray:
     return radius * np.array([math.cos(angle), math.sin(angle)])
 
 
-def _swept(depth: np.ndarray, beams: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, np.ndarray]:
+def _swept(
+    depth: np.ndarray, beams: list[tuple[np.ndarray, float]], spread: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return what arrives in the cells (a, b, c) and on the floor (a, b), the mean over beams (slope (2,), weight)."""
     layers = np.ascontiguousarray(np.moveaxis(depth, 2, 0))
     arrived, floor = np.zeros_like(layers), np.zeros_like(layers[0])
@@ -126,6 +124,8 @@ def _swept(depth: np.ndarray, beams: list[tuple[np.ndarray, float]]) -> tuple[np
         for k in range(len(layers) - 1, -1, -1):
             arrived[k] += (weight / total) * light
             light = _shifted(light * passed[k], slope)
+            for axis in range(2):
+                light += spread * (_blurred(light, axis) - light)
         floor += (weight / total) * light
     return np.moveaxis(arrived, 0, 2), floor
 

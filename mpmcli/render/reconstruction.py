@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 # Of splashsurf, in particle radii: reach of the kernel's smoothing, and edge of a marching cube.
-SMOOTHING_LENGTH, CUBE = 2.0, 1.0
+SMOOTHING_LENGTH, CUBE = 2.5, 1.1
 # Share of the full density at which the surface lies.
-THRESHOLD = 0.6
+THRESHOLD = 0.5
 # Rounds of Laplacian smoothing, weighted so that thin sheets keep their volume.
-SMOOTHING_ROUNDS = 15
+SMOOTHING_ROUNDS = 40
 # Radii from a wall within which particles have images behind it: the support of the kernel.
 IMAGE_REACH = 2.0 * SMOOTHING_LENGTH
 # Edge of the cells in which particles are counted, in radii, and how many cells there may be.

@@ -19,11 +19,11 @@ from mpmcli.render.view import View
 if TYPE_CHECKING:
     from mpmcli.render.surface import FieldColors
 
-# Samples to a pixel.
-SAMPLES = 4
+# Pixels of the window to one of the picture, along each axis.
+FINER = 2
 # Rounds of smoothing, by finish; crumbs keep their lumps.
 ROUNDS = {"crumbly": 2}
-USUAL_ROUNDS = 15
+USUAL_ROUNDS = 40
 
 
 class SolidStage:
@@ -36,9 +36,11 @@ class SolidStage:
         self.subject, self.view, self.theme, self.colors = subject, view, theme, colors
         self.backdrop = Backdrop(subject, view, theme)
         self.lights = lighting.lights_of(subject, view, theme)
-        self.plotter = pv.Plotter(off_screen=True, window_size=list(view.size), lighting="none")
-        self.plotter.enable_anti_aliasing("msaa", multi_samples=SAMPLES)
+        self.plotter = pv.Plotter(off_screen=True, window_size=[FINER * n for n in view.size], lighting="none")
+        self.plotter.disable_anti_aliasing()
         self.behind, self.room = _texture(), _texture()
+        for texture in (self.behind, self.room):
+            _put(texture, self.backdrop.image(None))
         self.plotter.renderer.SetBackgroundTexture(self.room)
         self.plotter.renderer.TexturedBackgroundOn()
         self.actors: dict[Any, Any] = {}
@@ -61,26 +63,26 @@ class SolidStage:
             # What is clear shows the picture of all the rest.
             for actor in clear:
                 actor.SetVisibility(False)
-            _put(self.behind, self._picture())
+            _put(self.behind, self._window_pixels())
             for actor in clear:
                 actor.SetVisibility(True)
-        return self._picture()
+        return _coarser(self._window_pixels())
 
     def close(self) -> None:
         """Close the window."""
         self.plotter.close()
 
-    def _picture(self) -> np.ndarray:
+    def _window_pixels(self) -> np.ndarray:
         import vtk
         from vtkmodules.util.numpy_support import vtk_to_numpy
 
         window = self.plotter.render_window
         self.view.place(self.plotter)
         window.Render()
-        width, height = self.view.size
+        width, height = window.GetSize()
         pixels = vtk.vtkUnsignedCharArray()
         window.GetPixelData(0, 0, width - 1, height - 1, 0, pixels, 0)
-        return vtk_to_numpy(pixels).reshape(height, width, 3)[::-1].copy()
+        return vtk_to_numpy(pixels).reshape(height, width, 3)[::-1]
 
     def _occlusion(self, groups: list[Group]) -> Occlusion | None:
         if not groups:
@@ -156,7 +158,7 @@ class SolidStage:
         shader.AddVertexShaderReplacement("//VTK::Normal::Dec", True, f"//VTK::Normal::Dec\n{declared}", False)
         shader.AddVertexShaderReplacement("//VTK::Normal::Impl", True, f"//VTK::Normal::Impl\n{done}", False)
         declared, done = lighting.fragment_code(
-            self.subject, self.view, self.lights, group.look, by_field=self.colors is not None
+            self.subject, self.view, self.lights, group.look, FINER, by_field=self.colors is not None
         )
         # After all that the window does itself; its own lights and textures are left out.
         shader.AddFragmentShaderReplacement("//VTK::TCoord::Dec", True, f"//VTK::TCoord::Dec\n{declared}", False)
@@ -171,9 +173,15 @@ class SolidStage:
         low, high = self.subject.lower, self.subject.upper
         box = pv.Box(bounds=(low[0], high[0], low[1], high[1], low[2], high[2]))
         walls = self.plotter.add_mesh(
-            box.extract_all_edges(), color=rgb(self.theme.wall), line_width=1.4, opacity=1.0, lighting=False
+            box.extract_all_edges(), color=rgb(self.theme.wall), line_width=1.3 * FINER, opacity=1.0, lighting=False
         )
         walls.SetPickable(False)
+
+
+def _coarser(pixels: np.ndarray) -> np.ndarray:
+    """Return the means over blocks of `FINER` by `FINER` pixels (h, w, 3) uint8."""
+    total = sum(pixels[i::FINER, j::FINER].astype(np.uint16) for i in range(FINER) for j in range(FINER))
+    return ((total + FINER * FINER // 2) // (FINER * FINER)).astype(np.uint8)
 
 
 def _texture() -> Any:
