@@ -16,7 +16,7 @@ IMAGE_REACH = 2.0 * SMOOTHING_LENGTH
 # Edge of the cells in which particles are counted, in radii, and how many cells there may be.
 FULLNESS_CELL, FULLNESS_CELLS = 4.0, 4e6
 # Shares of room filled, below which a vertex is not smoothed and above which it is smoothed in full.
-ALONE, HALF = 0.12, 0.42
+ALONE, HALF = 0.03, 0.22
 # Radii that a particle may lie outside of the domain and still be drawn.
 STRAY = 4.0
 

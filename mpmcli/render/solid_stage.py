@@ -7,13 +7,14 @@ import numpy as np
 from mpmcli.output.frame import Frame
 from mpmcli.render import lighting
 from mpmcli.render.backdrop import Backdrop
+from mpmcli.render.grains import JITTER, grain_colors, new_grains, pose_grains
 from mpmcli.render.material_groups import Group, groups_of
 from mpmcli.render.occlusion import Occlusion, occlusion_of
-from mpmcli.render.reconstruction import Mesh, drawable, reconstruct
+from mpmcli.render.reconstruction import Mesh, reconstruct
 from mpmcli.render.subject import Subject
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.thickness import thickness_at
-from mpmcli.render.tints import tints_of
+from mpmcli.render.tints import painted, shades, tints_of
 from mpmcli.render.view import View
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ class SolidStage:
     def _posed(self, group: Group, frame: Frame, occlusion: Occlusion | None) -> Any:
         """Return the actor of a group, with the mesh of this frame."""
         if group.look.finish == "grains":
-            raise NotImplementedError
+            return self._posed_grains(group, frame, occlusion)
         attributes = {"rough": group.hashes} if group.look.finish == "crumbly" or group.look.name == "lava" else {}
         if self.colors is not None:
             attributes |= tints_of(group, self.colors, frame)
@@ -116,6 +117,25 @@ class SolidStage:
         actor.SetVisibility(bool(len(mesh.triangles)))
         return actor
 
+    def _posed_grains(self, group: Group, frame: Frame, occlusion: Occlusion | None) -> Any:
+        actor = self.actors.get(group.key)
+        if actor is None:
+            actor = self.actors[group.key] = new_grains(self.view, self.lights, group.distance)
+            self.plotter.renderer.AddActor(actor)
+        color = np.array(rgb(group.look.color))
+        hashes = group.hashes
+        if self.colors is not None:
+            color = shades(np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows], self.colors)
+            # A colour that means something is not varied.
+            hashes = np.zeros_like(hashes)
+        lamp, sky = np.ones((2, len(hashes)))
+        if occlusion is not None:
+            lamp, sky = occlusion.at(group.position, np.broadcast_to(self.subject.up, group.position.shape))
+        moved = np.clip(group.position + JITTER * group.distance * group.hashes[:, ::-1], self.subject.lower, self.subject.upper)
+        pose_grains(actor, moved, grain_colors(color, hashes, lamp, sky))
+        actor.SetVisibility(True)
+        return actor
+
     def _fill(self, actor: Any, mesh: Mesh, group: Group, occlusion: Occlusion | None) -> None:
         import pyvista as pv
 
@@ -128,8 +148,6 @@ class SolidStage:
                 light[:, 2] = thickness_at(self.view, group.position, group.distance, mesh.points)
         tint = np.broadcast_to(lighting.linear(group.look.color), (count, 3))
         if self.colors is not None:
-            from mpmcli.render.tints import painted
-
             tint = painted(mesh.attributes, self.colors)
         rough = mesh.attributes.get("rough", np.zeros((count, 3), dtype=np.float32))
         carried = (light, tint, rough, mesh.normals)
