@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 # Standard deviation of the Gaussian, in distances between particles.
-SPREAD = 0.85
+SPREAD = 1.25
 # Nodes of the grid to a distance, at least.
 FINENESS = 3.0
 # Reach of the Gaussian, in standard deviations.
@@ -15,7 +15,7 @@ REACH = 3.2
 # Radius of the disk that has the area of a particle, in distances.
 DISK = math.sqrt(1.0 / math.pi)
 # Cover of its own place, below which a particle stands alone and is drawn as a disk, and above which it is not.
-ALONE, TOGETHER = 0.36, 0.50
+ALONE, TOGETHER = 0.34, 0.42
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,14 @@ SHARPNESS = 8
 SOFT = 0.016
 # Pixels of a dark rim, at a picture 720 pixels high.
 RIM = 1.5
+# By which share the rim is darker; the usual one is 0.28.
+DARKER = {"grains": 0.15, "crumbly": 0.20}
 # Direction of the light in the picture, to the right and upwards.
 LAMP = (-0.5, 0.87)
 # Radius of a grain of sand, in distances between particles, and by how much grains differ in brightness.
-GRAIN, VARIETY = 0.56, 0.2
+GRAIN, VARIETY = 0.62, 0.17
+# By how much a grain is moved, in distances: heaps are no lattices.
+JITTER = 0.35
 # How rough the edge of crumbs is, as a share of the cover, and at which scale, in distances.
 ROUGHNESS, CRUMB = 0.55, 0.75
 
@@ -57,11 +61,8 @@ class OutlinePainter:
         groups = groups_of(self.subject, frame)
         covers = [self._cover(group) for group in groups]
         if groups:
-            total = sum(covers)
-            # A pixel wide, where the cover falls by its steepest.
-            width_of = max(min(group.distance for group in groups) * SPREAD / self.grid.edge, 0.4)
-            ramp = width_of * math.sqrt(2.0 * math.pi)
-            alpha = np.clip((total - 0.5) * ramp + 0.5, 0.0, 1.0) * self.inside
+            finest = min(group.distance for group in groups)
+            alpha = np.clip(self._inwards(sum(covers), finest) + 0.5, 0.0, 1.0) * self.inside
             drawn = np.zeros_like(picture)
             weight = np.full((height, width), 1e-12, dtype=np.float32)
             for group, cover in zip(groups, covers, strict=True):
@@ -91,10 +92,12 @@ class OutlinePainter:
         if self.colors is not None:
             return self._by_field(group, frame)
         base = np.array(rgb(group.look.color), dtype=np.float32)
-        deviation = SPREAD * group.distance / self.grid.edge
-        # Pixels from the edge, near it.
-        inwards = (cover - 0.5) * (deviation * math.sqrt(2.0 * math.pi))
-        depth, lit = self._relief(cover)
+        ground = np.array(rgb(self.theme.ground), dtype=np.float32)
+        if np.abs(base - ground).max() < 0.15:
+            # White on white: as much of the ink as tells it from the paper.
+            base = base + np.float32(0.25) * (np.array(rgb(group.look.ink), dtype=np.float32) - base)
+        body, lit = self._relief(cover)
+        depth = np.clip(2.0 * body - 1.0, 0.0, 1.0)
         color = _shaded(group.look, base, depth, lit)
         if group.look.finish == "crumbly":
             noise = _finer(
@@ -105,11 +108,22 @@ class OutlinePainter:
             color = color * (1.0 + 0.10 * np.clip(noise, -1.0, 1.0))[..., None]
         if group.look.finish == "grains":
             color = self._grainy(group, base, depth, lit)
+        inwards = self._inwards(cover, group.distance)
         rim = np.clip(1.0 - inwards / (RIM * self.view.size[1] / 720.0), 0.0, 1.0)
-        return color * (1.0 - (0.16 if group.look.finish == "grains" else 0.30) * rim)[..., None]
+        # Drops are all rim, and would be dark.
+        rim *= np.clip(3.0 * body - 0.3, 0.0, 1.0)
+        return color * (1.0 - DARKER.get(group.look.finish, 0.28) * rim)[..., None]
+
+    def _inwards(self, cover: np.ndarray, distance: float) -> np.ndarray:
+        """Return how many pixels (h, w) lie between the edge and each pixel, near it, by the slope of the cover."""
+        steepest = self.grid.edge / (SPREAD * distance * math.sqrt(2.0 * math.pi))
+        rise, slope = np.zeros_like(cover), np.zeros_like(cover)
+        rise[1:-1] = 0.5 * (cover[2:] - cover[:-2])
+        slope[:, 1:-1] = 0.5 * (cover[:, 2:] - cover[:, :-2])
+        return (cover - 0.5) / np.maximum(np.sqrt(rise * rise + slope * slope), 0.12 * steepest)
 
     def _relief(self, cover: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how deep within its body each pixel is, from 0 to 1, and how its edge faces the light, -1 to 1."""
+        """Return the share of body far about each pixel, and how its edge faces the light, from -1 to 1."""
         step = max(int(self.view.size[1] / 240), 1)
         height, width = (size - size % step for size in cover.shape)
         mask = np.clip((cover - 0.5) * 3.0 + 0.5, 0.0, 1.0)
@@ -119,8 +133,8 @@ class OutlinePainter:
         rise, slope = np.gradient(soft)
         scale = 2.5 * SOFT * self.view.size[1] / step
         lit = -(LAMP[0] * slope + LAMP[1] * rise) * scale
-        depth = np.clip(2.0 * soft - 1.0, 0.0, 1.0)
-        return (_finer(values, step, cover.shape) for values in (depth, np.clip(lit, -1.0, 1.0)))
+        found = [_finer(values, step, cover.shape) for values in (soft, np.clip(lit, -1.0, 1.0))]
+        return found[0], found[1]
 
     def _walls(self, step: int, shape: tuple[int, int]) -> tuple[slice, slice]:
         """Return the rows and columns of coarse pixels within the domain."""
@@ -156,15 +170,16 @@ class OutlinePainter:
         """Return colours (h, w, 3) of grains, each a disk of its own brightness, over a darker ground."""
         radius = max(GRAIN * group.distance, 0.6 * self.grid.edge)
         best = np.zeros(self.grid.shape[0] * self.grid.shape[1], dtype=np.int64)
-        for (rows, nodes), _, away in disk_nodes(group.position, radius, self.grid):
+        moved = group.position + JITTER * group.distance * group.hashes[:, 1:]
+        for (rows, nodes), _, away in disk_nodes(moved, radius, self.grid):
             # The nearest particle wins; of two as near, the later.
             key = ((1.0 - away / radius) * 4000).astype(np.int64) + 1
             np.maximum.at(best, nodes, (key << 32) + rows)
         near = (best >> 32).astype(np.float32) / 4000.0
         bright = 1.0 + VARIETY * group.hashes[:, 0] + 0.06 * group.hashes[:, 1]
         own = bright[best & 0xFFFFFFFF].astype(np.float32)
-        ball = np.clip(0.74 + 0.5 * near, 0.0, 1.06)
-        shade = np.where(best > 0, own * ball, 0.70).reshape(self.grid.shape)
+        ball = np.clip(0.88 + 0.22 * near, 0.0, 1.04)
+        shade = np.where(best > 0, own * ball, 0.84).reshape(self.grid.shape)
         return (shade * (1.02 + 0.10 * lit - 0.06 * depth))[..., None] * base
 
 
@@ -196,7 +211,7 @@ def _shaded(look: Look, base: np.ndarray, depth: np.ndarray, lit: np.ndarray) ->
         color = base * 0.96 + (1.0 - depth) * 0.55 * (pale - base)
         return (color + 0.30 * toward * (white - color)) * (1.0 - 0.16 * away)
     if look.finish == "crumbly":
-        shade = np.array([0.70, 0.79, 0.91], dtype=np.float32)
+        shade = np.array([0.74, 0.83, 0.95], dtype=np.float32)
         color = base * (0.90 + 0.10 * depth)
         return color + (0.10 + 0.75 * away) * (shade - color) * (1.0 - 0.5 * depth)
     if look.finish == "metal":
