@@ -129,7 +129,7 @@ def _raise_disks(cover: np.ndarray, position: np.ndarray, radii: np.ndarray, dev
         np.maximum.at(flat, nodes, (0.5 + slope * (radii[rows] - away)).astype(np.float32))
 
 
-def disk_nodes(position: np.ndarray, reach: float, grid: Grid):  # noqa: ANN201
+def disk_nodes(position: np.ndarray, reach: float, grid: Grid):
     """Yield the nodes about particles (n, 2), one step at a time: ((rows, nodes), step, distances (k,), m)."""
     place = (position - np.array(grid.corner)) / grid.edge
     base = np.rint(place).astype(np.int64)

@@ -72,7 +72,9 @@ def vertex_code() -> tuple[str, str]:
     return declared, done + f"\nworldPoint = vertexMC.xyz; worldNormal = {OUTWARDS};"
 
 
-def fragment_code(subject: Subject, view: View, lights: Lights, look: Look, finer: int, *, by_field: bool) -> tuple[str, str]:
+def fragment_code(
+    subject: Subject, view: View, lights: Lights, look: Look, finer: int, *, by_field: bool
+) -> tuple[str, str]:
     """Return what the fragment shader declares and does for one material.
 
     Args:

@@ -151,9 +151,7 @@ class OutlinePainter:
         values = np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows]
         known = np.isfinite(values)
         deviation = SPREAD * group.distance
-        position, source = with_images(
-            group.position, 3.0 * deviation, self.subject.lower, self.subject.upper
-        )
+        position, source = with_images(group.position, 3.0 * deviation, self.subject.lower, self.subject.upper)
         step = _coarseness(group.distance, self.grid)
         grid = _coarser(self.grid, step)
         area = group.distance**2

@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,10 +12,12 @@ import numpy as np
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.durable import sealed, write_text
 from mpmcli.output.frame import Frame
+from mpmcli.output.result import Result, open_result
 from mpmcli.render.coverage import FINENESS, cover_of, grid_over
+from mpmcli.render.frame_workers import render_frames
 from mpmcli.render.material_groups import Group, groups_of
 from mpmcli.render.reconstruction import Mesh, reconstruct
-from mpmcli.render.subject import Subject
+from mpmcli.render.subject import Subject, subject_of
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -84,6 +87,44 @@ def write_series(subject: Subject, directory: Path, frames: Sequence[tuple[int, 
         write_text(path, json.dumps({"file-series-version": "1.0", "files": files}, indent=1) + "\n")
         written.append(path)
     return written
+
+
+@dataclass(frozen=True)
+class SurfaceJob:
+    """The surfaces of frames of a result, as a process of its own writes them."""
+
+    source: Path
+    directory: Path
+
+    def start(self) -> Callable[[int], None]:
+        """Open the result, and return what writes the surfaces of a frame."""
+        result = open_result(self.source)
+        subject = subject_of(result)
+
+        def save(k: int) -> None:
+            save_surface(subject, result.frame(k, ()), self.directory)
+
+        return save
+
+
+def save_surfaces(
+    result: Result,
+    ks: Sequence[int],
+    directory: Path,
+    workers: int,
+    *,
+    watch: Callable[[int, None], None] = lambda k, outcome: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> None:
+    """Write the surfaces of some frames, and the list of them that ParaView opens.
+
+    Raises:
+        InputError: the directory cannot be made.
+        RunError: a file cannot be written, or a process crashed.
+        KeyboardInterrupt: `stop` said so.
+    """
+    render_frames(SurfaceJob(result.path, directory), ks, workers, watch=watch, stop=stop)
+    write_series(subject_of(result), directory, [(int(result.numbers[k]), float(result.times[k])) for k in ks])
 
 
 def _mesh(subject: Subject, group: Group) -> Mesh:

@@ -13,6 +13,7 @@ from mpmcli.render.view import View
 class FieldColors(Protocol):
     """Colours that a surface takes from a field, instead of from its materials."""
 
+    fields: tuple[str, ...]
     cmap: str
     limits: tuple[float, float]
     missing: str
@@ -31,10 +32,15 @@ class Painter(Protocol):
 
 
 class SurfacePainter:
-    """Draws the surfaces of the materials of one run; made once per process."""
+    """Draws the surfaces of the materials of one run; made once per process.
+
+    Attributes:
+        fields: that are read of each frame.
+    """
 
     def __init__(self, subject: Subject, view: View, theme: Theme, colors: FieldColors | None = None) -> None:
         """Choose the way of drawing: in space by triangles, in the plane by the density of particles."""
+        self.fields = () if colors is None else colors.fields
         if subject.dimension == 3:
             from mpmcli.render.solid_stage import SolidStage
 
