@@ -111,9 +111,7 @@ def _around(radius: float, k: int, count: int) -> np.ndarray:
     return radius * np.array([math.cos(angle), math.sin(angle)])
 
 
-def _swept(
-    depth: np.ndarray, beams: list[tuple[np.ndarray, float]], spread: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _swept(depth: np.ndarray, beams: list[tuple[np.ndarray, float]], spread: float) -> tuple[np.ndarray, np.ndarray]:
     """Return what arrives in the cells (a, b, c) and on the floor (a, b), the mean over beams (slope (2,), weight)."""
     layers = np.ascontiguousarray(np.moveaxis(depth, 2, 0))
     arrived, floor = np.zeros_like(layers), np.zeros_like(layers[0])
@@ -145,9 +143,13 @@ def _moved(plane: np.ndarray, count: int, axis: int) -> np.ndarray:
     moved = np.ones_like(plane)
     length = plane.shape[axis]
     if abs(count) < length:
-        to, source = (slice(0, length - count), slice(count, length)) if count > 0 else (
-            slice(-count, length),
-            slice(0, length + count),
+        to, source = (
+            (slice(0, length - count), slice(count, length))
+            if count > 0
+            else (
+                slice(-count, length),
+                slice(0, length + count),
+            )
         )
         if axis == 0:
             moved[to] = plane[source]

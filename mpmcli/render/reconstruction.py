@@ -10,7 +10,7 @@ SMOOTHING_LENGTH, CUBE = 2.5, 1.1
 # Share of the full density at which the surface lies.
 THRESHOLD = 0.5
 # Rounds of Laplacian smoothing, weighted so that thin sheets keep their volume.
-SMOOTHING_ROUNDS = 40
+SMOOTHING_ROUNDS = 20
 # Radii from a wall within which particles have images behind it: the support of the kernel.
 IMAGE_REACH = 2.0 * SMOOTHING_LENGTH
 # Edge of the cells in which particles are counted, in radii, and how many cells there may be.
@@ -95,6 +95,7 @@ def reconstruct(
         iso_surface_threshold=THRESHOLD,
         multi_threading=True,
         subdomain_grid=True,
+        subdomain_grid_auto_disable=False,
     )
     mesh = found.mesh
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 FINER = 2
 # Rounds of smoothing, by finish; crumbs keep their lumps.
 ROUNDS = {"crumbly": 2}
-USUAL_ROUNDS = 40
+USUAL_ROUNDS = 20
 
 
 class SolidStage:
@@ -90,9 +90,7 @@ class SolidStage:
             return None
         position = np.concatenate([group.position for group in groups])
         volumes = np.concatenate([np.full(len(g.position), g.distance**3) for g in groups])
-        opacity = np.concatenate(
-            [np.full(len(g.position), lighting.OPACITY.get(g.look.finish, 1.0)) for g in groups]
-        )
+        opacity = np.concatenate([np.full(len(g.position), lighting.OPACITY.get(g.look.finish, 1.0)) for g in groups])
         return occlusion_of(self.subject, position, volumes, opacity, self.lights.lamp)
 
     def _posed(self, group: Group, frame: Frame, occlusion: Occlusion | None) -> Any:
@@ -131,7 +129,9 @@ class SolidStage:
         lamp, sky = np.ones((2, len(hashes)))
         if occlusion is not None:
             lamp, sky = occlusion.at(group.position, np.broadcast_to(self.subject.up, group.position.shape))
-        moved = np.clip(group.position + JITTER * group.distance * group.hashes[:, ::-1], self.subject.lower, self.subject.upper)
+        moved = np.clip(
+            group.position + JITTER * group.distance * group.hashes[:, ::-1], self.subject.lower, self.subject.upper
+        )
         pose_grains(actor, moved, grain_colors(color, hashes, lamp, sky))
         actor.SetVisibility(True)
         return actor
