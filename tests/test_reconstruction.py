@@ -53,7 +53,9 @@ def test_a_block_in_a_corner_is_flat_on_its_walls() -> None:
     for axis in range(3):
         on_wall = mesh.points[mesh.points[:, axis] < 1e-6]
         others = [k for k in range(3) if k != axis]
-        assert np.ptp(on_wall[:, others], axis=0) == pytest.approx(np.ptp(position[:, others], axis=0), abs=DISTANCE * 2)
+        assert np.ptp(on_wall[:, others], axis=0) == pytest.approx(
+            np.ptp(position[:, others], axis=0), abs=DISTANCE * 2
+        )
         face = np.isclose(mesh.points[mesh.triangles][:, :, axis], 0.0, atol=1e-6).all(axis=1)
         corners = mesh.points[mesh.triangles[face]].astype(float)
         area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -136,7 +138,18 @@ def subject_with(dimension: int, *names: str) -> Subject:
     looks = tuple(LOOKS[name] for name in names)
     spacing = 2 * DISTANCE
     return Subject(
-        "", dimension, LOWER, upper, spacing, up, names, looks, bodies, (DISTANCE,) * len(names), (1e3,) * len(names), ()
+        "",
+        dimension,
+        LOWER,
+        upper,
+        spacing,
+        up,
+        names,
+        looks,
+        bodies,
+        (DISTANCE,) * len(names),
+        (1e3,) * len(names),
+        (),
     )
 
 

@@ -35,6 +35,7 @@ class SurfacePainter:
 
     def __init__(self, subject: Subject, view: View, theme: Theme, colors: FieldColors | None = None) -> None:
         """Choose the way of drawing: in space by triangles, in the plane by the density of particles."""
+        self.view = view
         if subject.dimension == 3:
             from mpmcli.render.solid_stage import SolidStage
 
