@@ -28,7 +28,7 @@ def ball(radius: float, distance: float = DISTANCE) -> np.ndarray:
 def open_edges(mesh: Mesh) -> int:
     """Count edges that do not have exactly one triangle on each side."""
     pairs = np.concatenate([mesh.triangles[:, [k, (k + 1) % 3]] for k in range(3)])
-    edges, count = np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
+    count = np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)[1]
     return int((count != 2).sum())
 
 
