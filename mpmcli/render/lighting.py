@@ -66,10 +66,9 @@ def linear(color: str) -> np.ndarray:
 
 def vertex_code() -> tuple[str, str]:
     """Return what the vertex shader declares and does to hand over what the vertices carry."""
-    declared = f"in vec4 {LIGHT}; in vec3 {TINT}; in vec3 {ROUGH}; in vec3 {OUTWARDS};\ncentroid out vec4 carriedLight; centroid out vec3 carriedTint;"
-    declared += "\ncentroid out vec3 carriedRough; centroid out vec3 worldPoint; centroid out vec3 worldNormal;"
-    done = f"carriedLight = {LIGHT}; carriedTint = {TINT}; carriedRough = {ROUGH};"
-    return declared, done + f"\nworldPoint = vertexMC.xyz; worldNormal = {OUTWARDS};"
+    declared = f"in vec4 {LIGHT};\n" + "".join(f"in vec3 {name};\n" for name in CARRIED[1:])
+    done = f"carriedLight = {LIGHT}; carriedTint = {TINT}; carriedRough = {ROUGH};\n"
+    return declared + _carried("out"), done + f"worldPoint = vertexMC.xyz; worldNormal = {OUTWARDS};"
 
 
 def fragment_code(
@@ -99,8 +98,7 @@ def fragment_code(
         "cameraRight": _vec(view.axes[0]),
         "cameraUp": _vec(view.axes[1]),
     }
-    declared = "centroid in vec4 carriedLight; centroid in vec3 carriedTint; centroid in vec3 carriedRough;\n"
-    declared += "centroid in vec3 worldPoint; centroid in vec3 worldNormal;\n"
+    declared = _carried("in")
     declared += "".join(f"const vec3 {name} = {value};\n" for name, value in constants.items())
     declared += f"const float grainSize = {max(subject.distances):.9g};\n"
     declared += f"const float wallGap = {1e-5 * side:.9g};\n"
@@ -113,6 +111,12 @@ def fragment_code(
         kind = "lava"
     towards = "toCamera" if view.parallel else "normalize(cameraAt - worldPoint)"
     return declared, _COMMON.replace("TOWARDS", towards) + _FINISHES.get(kind, _FINISHES["matte"]) + _TONE
+
+
+def _carried(direction: str) -> str:
+    """Return the declarations of what goes from vertices to fragments, taken where the triangle is in the pixel."""
+    names = ("carriedTint", "carriedRough", "worldPoint", "worldNormal")
+    return f"centroid {direction} vec4 carriedLight;\n" + "".join(f"centroid {direction} vec3 {n};\n" for n in names)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -169,7 +169,7 @@ class OutlinePainter:
         radius = max(GRAIN * group.distance, 0.6 * self.grid.edge)
         best = np.zeros(self.grid.shape[0] * self.grid.shape[1], dtype=np.int64)
         moved = group.position + JITTER * group.distance * group.hashes[:, 1:]
-        for (rows, nodes), _, away in disk_nodes(moved, radius, self.grid):
+        for rows, nodes, away in disk_nodes(moved, radius, self.grid):
             # The nearest particle wins; of two as near, the later.
             key = ((1.0 - away / radius) * 4000).astype(np.int64) + 1
             np.maximum.at(best, nodes, (key << 32) + rows)

@@ -9,8 +9,10 @@ import numpy as np
 SMOOTHING_LENGTH, CUBE = 2.5, 1.1
 # Share of the full density at which the surface lies.
 THRESHOLD = 0.5
+# The same two of surfaces that keep close to the particles.
+CLOSE_LENGTH, CLOSE_THRESHOLD = 1.8, 0.55
 # Rounds of Laplacian smoothing, weighted so that thin sheets keep their volume.
-SMOOTHING_ROUNDS = 40
+SMOOTHING_ROUNDS = 20
 # Radii from a wall within which particles have images behind it: the support of the kernel.
 IMAGE_REACH = 2.0 * SMOOTHING_LENGTH
 # Edge of the cells in which particles are counted, in radii, and how many cells there may be.
@@ -59,6 +61,8 @@ def reconstruct(
     upper: Sequence[float],
     attributes: Mapping[str, np.ndarray] | None = None,
     rounds: int = SMOOTHING_ROUNDS,
+    *,
+    close: bool = False,
 ) -> Mesh:
     """Wrap particles in a surface: splashsurf's level set of their density, smoothed.
 
@@ -73,6 +77,7 @@ def reconstruct(
         lower, upper: corners of the domain, m.
         attributes: (n,) or (n, k) finite numbers each, to be carried over to the vertices.
         rounds: of smoothing; 0 keeps every lump.
+        close: the surface keeps close to the particles, and single ones stay small: right for crumbs, not for sheets.
     """
     from pysplashsurf import laplacian_smoothing_parallel, reconstruction_pipeline
 
@@ -90,11 +95,14 @@ def reconstruct(
         points,
         attributes_to_interpolate={name: np.ascontiguousarray(values[source]) for name, values in carried.items()},
         particle_radius=1.0,
-        smoothing_length=SMOOTHING_LENGTH,
+        smoothing_length=CLOSE_LENGTH if close else SMOOTHING_LENGTH,
         cube_size=CUBE,
-        iso_surface_threshold=THRESHOLD,
+        iso_surface_threshold=CLOSE_THRESHOLD if close else THRESHOLD,
         multi_threading=True,
+        # In vectors the sums of two subdomains over the particles of one node differ in their last bit.
+        simd=False,
         subdomain_grid=True,
+        subdomain_grid_auto_disable=False,
     )
     mesh = found.mesh
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)

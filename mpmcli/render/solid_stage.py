@@ -10,7 +10,7 @@ from mpmcli.render.backdrop import Backdrop
 from mpmcli.render.grains import JITTER, grain_colors, new_grains, pose_grains
 from mpmcli.render.material_groups import Group, groups_of
 from mpmcli.render.occlusion import Occlusion, occlusion_of
-from mpmcli.render.reconstruction import Mesh, reconstruct
+from mpmcli.render.reconstruction import SMOOTHING_ROUNDS, Mesh, reconstruct
 from mpmcli.render.subject import Subject
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.thickness import thickness_at
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 FINER = 2
 # Rounds of smoothing, by finish; crumbs keep their lumps.
 ROUNDS = {"crumbly": 2}
-USUAL_ROUNDS = 40
 
 
 class SolidStage:
@@ -106,7 +105,8 @@ class SolidStage:
             self.subject.lower,
             self.subject.upper,
             attributes,
-            rounds=ROUNDS.get(group.look.finish, USUAL_ROUNDS),
+            rounds=ROUNDS.get(group.look.finish, SMOOTHING_ROUNDS),
+            close=group.look.finish == "crumbly",
         )
         actor = self.actors.get(group.key)
         if actor is None:

@@ -41,6 +41,7 @@ class SurfacePainter:
     def __init__(self, subject: Subject, view: View, theme: Theme, colors: FieldColors | None = None) -> None:
         """Choose the way of drawing: in space by triangles, in the plane by the density of particles."""
         self.fields = () if colors is None else colors.fields
+        self.view = view
         if subject.dimension == 3:
             from mpmcli.render.solid_stage import SolidStage
 
