@@ -94,8 +94,8 @@ def test_smoothing_takes_the_bumps_and_keeps_the_steps():
     slopes = [np.abs(np.diff(depth[50:70, 50:70], axis=1)).mean() * SCALE for depth in (rough, smooth)]
     assert slopes[0] > 0.2
     assert slopes[1] < 0.1 * slopes[0]
-    # No pixel floats between the two layers, which are 3 m apart: each stays within a diameter of where it was.
-    assert np.abs(smooth - rough)[rough < NOTHING].max() < 2 * 0.9 * spacing
+    # No pixel floats between the two layers, which are 3 m apart: at the rims it is 2 radii back, one for each round.
+    assert np.abs(smooth - rough)[rough < NOTHING].max() < 3 * 0.9 * spacing
     np.testing.assert_array_equal(smooth < NOTHING, rough < NOTHING)
 
 
