@@ -53,6 +53,7 @@ def test_only_whole_pictures_of_mpmcli_are_known(tmp_path):
     path = tmp_path / "picture.png"
     assert digest_of(path) is None
     assert digest_of(tmp_path) == ""
+    assert digest_of(Path(__file__) / "picture.png") is None
     Image.fromarray(an_image()).save(path)
     assert digest_of(path) == ""
     path.write_text("mpmcli", encoding="utf-8")
@@ -83,8 +84,8 @@ def test_a_digest_is_found_behind_other_chunks_and_without_the_pixels(tmp_path):
 
 def test_a_place_that_cannot_be_written_is_bad_input(tmp_path):
     (tmp_path / "file").write_text("x", encoding="utf-8")
-    for path in (tmp_path / "file" / "picture.png", tmp_path):
-        with pytest.raises(InputError, match=r"cannot be written \(.+\): give another place with -o\.$"):
+    for path, reason in ((tmp_path / "file" / "picture.png", "file is no directory"), (tmp_path, "Is a directory")):
+        with pytest.raises(InputError, match=rf"cannot be written \(.*{reason}\): give another place with -o\.$"):
             write_picture(path, an_image(), DIGEST)
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 

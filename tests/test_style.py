@@ -35,6 +35,7 @@ LEVELS = {
     "materials": 2,
     "scene": 1,
     "child_process": 0,
+    "cores": 0,
     "errors": 0,
     "plain_json": 0,
     "plain_text": 0,

@@ -14,8 +14,9 @@ from mpmcli.check.scene_limits import SceneLimit
 from mpmcli.check.scene_table import scene_text
 from mpmcli.check.shape_rules import shape_findings
 from mpmcli.check.step_rules import step_findings
+from mpmcli.cores import available_cores
 from mpmcli.scene import LoadedScene
-from mpmcli.solver.backend import Backend, available_cores
+from mpmcli.solver.backend import Backend
 from mpmcli.solver.plan import Plan, make_plan
 
 

@@ -17,10 +17,12 @@ COMMANDS = {
     "check": "Say which step is safe and why, or whether a result stayed stable.",
     "info": "Say what a result or a scene holds.",
     "render": "Draw frames of a result: pictures, films, montages.",
+    "plot": "Draw a result's ledger: energies, momentum, steps, volumes, reach.",
     "materials": "List laws, presets, their parameters and knobs.",
     "schema": "Print the JSON Schema of scenes, for editors.",
     "validate": "Measure speed against error on problems with known answers.",
     "bench": "Compare speed with the MPM examples that Taichi ships.",
+    "doctor": "Say whether everything that mpmcli needs works here.",
     "completion": "Print the script that completes commands in a shell.",
 }
 
@@ -104,7 +106,10 @@ def run(arguments: list[str]) -> int:
         if debug:
             traceback.print_exc()
         kind = type(error).__name__
-        click.echo(f"error: {kind}: {error} (a fault of mpmcli; --debug shows where)", err=True)
+        # On a bare machine a library of the system may be missing, which a package of ours loads.
+        of_system = isinstance(error, ImportError) and not (error.name or "").startswith("mpmcli")
+        whose = "mpmcli doctor says what is missing" if of_system else "a fault of mpmcli"
+        click.echo(f"error: {kind}: {error} ({whose}; --debug shows where)", err=True)
         return 1
 
 

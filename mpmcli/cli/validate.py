@@ -158,7 +158,7 @@ def _run(
     as_json: bool,
 ) -> int:
     from mpmcli.cli.validate_progress import ValidateProgress
-    from mpmcli.solver.backend import available_cores
+    from mpmcli.cores import available_cores
     from mpmcli.validation.journal import Journal
     from mpmcli.validation.matrix import matrix
     from mpmcli.validation.report_files import write_report

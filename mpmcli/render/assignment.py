@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.output.result import Result
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.film import check_film, film_digest, write_film
 from mpmcli.render.frame_choice import choose_frames, evenly_spaced
-from mpmcli.render.frame_workers import available_cores
 from mpmcli.render.painter import Studio, open_studio, usual_color
-from mpmcli.render.picture_file import digest_of, settings_digest, write_picture
+from mpmcli.render.picture_file import digest_of, require_writable, settings_digest, write_picture
 from mpmcli.render.pictures import (
     FOREIGN,
     Easel,
@@ -23,6 +23,7 @@ from mpmcli.render.pictures import (
     picture_name,
     plan_pictures,
 )
+from mpmcli.render.save_surface import save_surfaces, surface_paths
 from mpmcli.render.settings import Mode, Settings, parse_grid, parse_limits, parse_size
 from mpmcli.render.subject import subject_of
 
@@ -95,13 +96,14 @@ class Assignment:
     plan: list[Planned]
     movie: Path | None
     fps: float
+    save_surface: Path | None
     overwrite: bool
 
     @property
     def due(self) -> int:
-        """Number of frames that have to be drawn."""
+        """Number of frames that have to be drawn, or their surfaces written."""
         frames = len(self.ks) if self._is_montage else 1
-        return sum(frames for planned in self.plan if not planned.made)
+        return sum(frames for planned in self.plan if not planned.made) + len(self.ks) * (self.save_surface is not None)
 
     @property
     def _is_montage(self) -> bool:
@@ -126,17 +128,24 @@ class Assignment:
             RunError: a process crashed, or the disk is full.
             KeyboardInterrupt: `stop` said so; pictures that are done stay.
         """
+        workers = workers or available_cores()
+        source, settings = self.studio.result.path, self.studio.settings
         outcomes: dict[int, Outcome] = {}
+        done = 0
 
-        def seen(k: int, outcome: Outcome) -> None:
-            outcomes[k] = outcome
-            watch(len(outcomes))
+        def seen(k: int, outcome: Outcome | None) -> None:
+            nonlocal done
+            done += 1
+            watch(done)
+            if outcome is not None:
+                outcomes[k] = outcome
 
         if self._is_montage:
             self._draw_montage(seen, stop)
         else:
-            source, settings = self.studio.result.path, self.studio.settings
-            make_pictures(source, settings, self.plan, workers or available_cores(), watch=seen, stop=stop)
+            make_pictures(source, settings, self.plan, workers, watch=seen, stop=stop)
+        if self.save_surface is not None:
+            save_surfaces(self.studio.result, self.ks, self.save_surface, workers, watch=seen, stop=stop)
         if self.movie is not None:
             self._put_together(self.movie)
         made = sum(not planned.made for planned in self.plan)
@@ -222,12 +231,24 @@ def assign(result: Result, request: Request) -> Assignment:
     else:
         path_of = _paths(result, settings.mode, request, len(ks))
         plan = plan_pictures(result, studio.settings, ks, path_of, overwrite=request.overwrite)
-    return Assignment(studio, ks, plan, request.movie, request.fps, request.overwrite)
+    if request.save_surface is not None and not request.overwrite:
+        for path in (path for k in ks for path in surface_paths(studio.subject, request.save_surface, k)):
+            if path.exists():
+                raise InputError(f"{path} is there already: give another directory, or --overwrite.")
+    surface = None if request.save_surface is None else request.save_surface / "surface"
+    for path in (plan[0].path, request.movie, surface):
+        if path is not None:
+            require_writable(path)
+    return Assignment(studio, ks, plan, request.movie, request.fps, request.save_surface, request.overwrite)
 
 
 def _require_sense(request: Request) -> None:
     if request.movie and request.montage:
         raise InputError("--movie and --montage are two things: ask for one after the other.")
+    if request.save_surface and request.mode != "surface":
+        raise InputError("--save-surface writes the surfaces of --mode surface: ask for that.")
+    if request.mode == "surface" and request.color == "body":
+        raise InputError("--color-by body is for --mode dots: a surface has no bodies, only materials.")
     for option, value in (("--color-by", request.color), ("--clim", request.clim), ("--cmap", request.cmap)):
         allowed = COLORED if option == "--color-by" else (*COLORED, "density")
         if value and request.mode not in allowed:

@@ -189,7 +189,7 @@ class Canvas:
         for name, ink in zip(colors.names, colors.inks, strict=True):
             if y + swatch > self.size[1] - self._px(PAD):
                 break
-            draw.ellipse((x, y, x + swatch, y + swatch), fill=ink)
+            draw.ellipse((x, y, x + swatch, y + swatch), fill=ink, outline=self.theme.faint)
             text = cut(name, lambda text: font.getlength(text) <= room)
             draw.text((x + swatch + self._px(8), y + swatch / 2), text, self.theme.text, font, anchor="lm")
             y += step

@@ -25,6 +25,7 @@ FEW = 12
 KEYWORD = b"mpmcli"
 SKIPPED = b"free"
 DIGEST_MAX = 64
+NONE = "A film needs at least one picture, and there is none."
 
 
 def check_film(path: Path, fps: float) -> None:
@@ -91,7 +92,7 @@ def film_digest(path: Path) -> str | None:
             file.seek(0, os.SEEK_END)
             file.seek(-min(file.tell(), len(_end("")) + DIGEST_MAX), os.SEEK_CUR)
             _, found, digest = file.read().rpartition(SKIPPED + KEYWORD)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError:
         return ""
@@ -118,7 +119,7 @@ def _images(pictures: Iterable[Picture], watch: Callable[[int], None] = lambda d
         yield image
         watch(done)
     if size is None:
-        raise InputError("A film needs at least one picture, and there is none.")
+        raise InputError(NONE)
 
 
 def _image(picture: Picture) -> np.ndarray:
@@ -140,6 +141,8 @@ def _name(picture: Picture, k: int) -> str:
 
 def _few(pictures: Sequence[Picture]) -> list[np.ndarray]:
     """Return some pictures from first to last, to choose colours from."""
+    if not pictures:
+        raise InputError(NONE)
     count = min(len(pictures), FEW)
     return [_image(pictures[round(k * (len(pictures) - 1) / max(count - 1, 1))]) for k in range(count)]
 

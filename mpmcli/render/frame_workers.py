@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
+from mpmcli.cores import available_cores
 from mpmcli.errors import RunError
 
 # Seconds between two looks at whether to stop.
@@ -39,11 +40,6 @@ class Job(Protocol):
     def start(self) -> Callable[[int], Any]:
         """Return what renders one frame and writes it; called once in each process."""
         ...
-
-
-def available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def render_frames(

@@ -63,6 +63,10 @@ class Studio:
             assert isinstance(self.colors, Coloring)
             plane = slice_of(subject, settings.camera)
             return DensityPainter(scene_facts(self.result.header), subject, view, theme, plane, self.colors)
+        if settings.mode in ("surface", "fluid"):
+            from mpmcli.render.surface import SurfacePainter
+
+            return SurfacePainter(subject, view, theme, self.colors if isinstance(self.colors, Coloring) else None)
         assert self.colors is not None
         return DotsPainter(subject, view, theme, self.colors, count)
 
@@ -80,8 +84,8 @@ def open_studio(result: Result, settings: Settings) -> Studio:
         plane = slice_of(subject, camera)
         colors = density_colors(result, plane, theme, settings.limits, settings.cmap)
         camera = "front" if camera not in ("side", "top") else camera
-    elif settings.color is None:
-        colors = color_by("material", result, subject, theme) if len(subject.looks) > 1 else None
+    elif settings.color is None or (settings.mode == "surface" and settings.color == "material"):
+        colors = _legend(subject) if len(subject.looks) > 1 else None
     else:
         colors = color_by(settings.color, result, subject, theme, settings.limits, settings.cmap)
     if isinstance(colors, Coloring):
@@ -95,6 +99,12 @@ def open_studio(result: Result, settings: Settings) -> Studio:
         settings = replace(settings, size=canvas.size)
         require_possible(*canvas.size, f"{width}xauto")
     return Studio(result, settings, subject, colors, canvas, view_of(subject, camera, canvas.stage_size))
+
+
+def _legend(subject: Subject) -> Categories:
+    """Return the legend of materials that look like what they are."""
+    names, inks = tuple(look.name for look in subject.looks), tuple(look.color for look in subject.looks)
+    return Categories("material", names, inks, subject.material_of)
 
 
 def usual_color(subject: Subject) -> str:

@@ -78,15 +78,32 @@ def digest_of(path: Path) -> str | None:
                 return ""
             file.seek(-len(END), os.SEEK_END)
             return digest if file.read() == END else ""
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, struct.error):
         return ""
 
 
+def require_writable(path: Path) -> None:
+    """Raise InputError where a file cannot be made, before any work is put into it; nothing is made.
+
+    A disk may still refuse when it is written.
+    """
+    directory = path.parent
+    while not directory.exists() and directory != directory.parent:
+        directory = directory.parent
+    if path.is_dir():
+        raise InputError(f"{path} is a directory, and a file is to be written: give another place.")
+    if not directory.is_dir() or not os.access(directory, os.W_OK | os.X_OK):
+        what = "is not a directory" if not directory.is_dir() else "does not let files be made in it"
+        raise InputError(f"{path} cannot be written, as {directory} {what}: give another place.")
+
+
 def write_fault(path: Path, error: OSError) -> MpmcliError:
     """Return what to raise where a file could not be written: RunError for a fault of the disk, else InputError."""
     reason = error.strerror or str(error)
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        reason = f"{path.parent} is no directory"
     if error.errno in DISK_FAULTS:
         return RunError(f"{path} could not be written ({reason}): free some space or write to another disk with -o.")
     return InputError(f"{path} cannot be written ({reason}): give another place with -o.")

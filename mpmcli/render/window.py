@@ -72,14 +72,9 @@ def choose_window() -> str:
     return _chosen.name
 
 
-def try_windows(command: Sequence[str] | None = None, timeout: float = TIMEOUT) -> Iterator[Attempt]:
-    """Try each window that may do, in a process of its own, and stop at the first that draws.
-
-    Args:
-        command: what runs as `mpmcli.render.window_probe`, with the class that has to come after it.
-        timeout: seconds that each may take.
-    """
-    command = command or module_command("mpmcli.render.window_probe")
+def try_windows(timeout: float = TIMEOUT) -> Iterator[Attempt]:
+    """Try each window that may do, in a process of its own of so many seconds, and stop at the first that draws."""
+    command = module_command("mpmcli.render.window_probe")
     given = users_setting()
     for setting in [given] if given else _candidates():
         # VTK may have another one for what the user wants; among ours each has its turn.
@@ -118,7 +113,7 @@ def remedy(attempts: Sequence[Attempt]) -> str:
         return f'VTK {here} needs a screen; update it by `python -m pip install "vtk>={wanted}"`'
     return (
         "install Mesa's software renderer, on Debian and Ubuntu by `apt-get install libegl1 libgl1-mesa-dri` "
-        "or, smaller, `libosmesa6`"
+        "or `libosmesa6`"
     )
 
 

@@ -25,7 +25,7 @@ def draw_point(wanted: str | None) -> dict[str, str]:
         wanted: the class that the window has to have, None for any.
     """
     try:
-        import vtkmodules.vtkRenderingOpenGL2  # the classes that draw
+        import vtkmodules.vtkRenderingOpenGL2  # noqa: F401 (brings the classes that draw)
         from vtkmodules.vtkCommonCore import vtkPoints
         from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
         from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper, vtkRenderer, vtkRenderWindow
@@ -56,11 +56,18 @@ def draw_point(wanted: str | None) -> dict[str, str]:
     window.SetSize(SIZE, SIZE)
     window.AddRenderer(renderer)
     window.Render()
-    middle, corner = _pixel(window, SIZE // 2), _pixel(window, 1)
-    if not (_alike(middle, RED) and _alike(corner, BLUE)):
-        return {"problem": f"draws {middle} on {corner} instead of {RED} on {BLUE}"}
+    problem = picture_problem(_pixel(window, SIZE // 2), _pixel(window, 1))
+    if problem:
+        return {"problem": problem}
     said = window.ReportCapabilities()
     return {"window": came, "renderer": _told(said, "renderer"), "version": _told(said, "version")}
+
+
+def picture_problem(middle: tuple[int, ...], corner: tuple[int, ...]) -> str:
+    """Return what is wrong with the colours, 0 to 255, of the point and of its background; "" for nothing."""
+    if _alike(middle, RED) and _alike(corner, BLUE):
+        return ""
+    return f"draws {middle} on {corner} instead of {RED} on {BLUE}"
 
 
 def _pixel(window: object, place: int) -> tuple[int, ...]:

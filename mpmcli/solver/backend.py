@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import multiprocessing
 import os
 import platform
 import tempfile
@@ -13,6 +12,7 @@ from typing import Literal
 
 import taichi as ti
 
+from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 
 Arch = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
@@ -46,11 +46,6 @@ class Backend:
     def on_cpu(self) -> bool:
         """Whether kernels run on the CPU, where the scatter needs no atomics."""
         return self.arch == "cpu"
-
-
-def available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else multiprocessing.cpu_count()
 
 
 def start_backend(

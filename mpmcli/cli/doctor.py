@@ -1,0 +1,38 @@
+"""`mpmcli doctor`."""
+
+import click
+
+from mpmcli.cli.json_output import print_json
+from mpmcli.cli.options import json_option
+
+
+@click.command("doctor")
+@json_option
+def command(as_json: bool) -> int:
+    """Say whether everything that mpmcli needs works on this machine.
+
+    Python, Taichi and its backends, VTK and its window, libraries, disk and memory are tried, each in a process of
+    its own, and get one line each, with the remedy where something is wrong. The exit code is 1 where something
+    needed is missing or broken; a GPU that is not here is neither.
+    """
+    from mpmcli.doctor.examination import EXAMINATIONS, examine
+
+    width = max(len(each.name) for each in EXAMINATIONS)
+    found = []
+    for name, finding in examine(EXAMINATIONS):
+        found.append((name, finding))
+        if not as_json:
+            remedy = f"; {finding.remedy}" if finding.remedy else ""
+            click.echo(f"{finding.status:<11}  {name:<{width}}  {finding.detail}{remedy}", err=True)
+    faults = [name for name, finding in found if finding.is_fault]
+    if as_json:
+        checks = [
+            {"name": name, "status": finding.status, "detail": finding.detail, "remedy": finding.remedy}
+            for name, finding in found
+        ]
+        print_json({"ok": not faults, "checks": checks})
+    elif faults:
+        click.echo(f"\nnot everything that mpmcli needs works: {', '.join(faults)}", err=True)
+    else:
+        click.echo("\neverything that mpmcli needs works", err=True)
+    return 1 if faults else 0

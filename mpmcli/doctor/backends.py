@@ -1,0 +1,46 @@
+"""Taichi on each of its backends, by really starting it."""
+
+import importlib.metadata
+
+from mpmcli.doctor.finding import Finding
+
+
+def cpu() -> Finding:
+    """Examine the backend that always has to work."""
+    from mpmcli.solver.trial import try_backend
+
+    started = try_backend("cpu")
+    threads = f"{started.threads} thread{'s' if started.threads > 1 else ''}"
+    return Finding("ok", f"Taichi {importlib.metadata.version('taichi')}, {threads}")
+
+
+def cuda() -> Finding:
+    """Examine NVIDIA's GPUs, which --arch auto takes where there are any."""
+    return _gpu("cuda")
+
+
+def vulkan() -> Finding:
+    """Examine Vulkan, whose device may be software."""
+    return _gpu("vulkan")
+
+
+def metal() -> Finding:
+    """Examine Apple's GPUs, which --arch auto takes where there are any."""
+    return _gpu("metal")
+
+
+def _gpu(arch: str) -> Finding:
+    try:
+        from mpmcli.solver.trial import backend_is_here, try_backend
+    except ImportError as error:
+        return Finding("information", f"not tried, since Taichi cannot be loaded ({error})")
+    if not backend_is_here(arch):
+        return Finding("information", "not here")
+    try_backend(arch)
+    from mpmcli.doctor.devices import device_names
+
+    devices = device_names(arch)
+    names = ", ".join(device.name for device in devices) or "device of unknown name"
+    if devices and all(device.is_software for device in devices):
+        return Finding("information", f"software only: {names}", "--arch cpu uses the processor directly")
+    return Finding("ok", names)

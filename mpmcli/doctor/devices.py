@@ -1,0 +1,78 @@
+"""The names of GPUs, asked of their drivers, as Taichi does not say them."""
+
+import ctypes
+import sys
+from dataclasses import dataclass
+
+NAME_LENGTH = 256
+# Of VkPhysicalDeviceProperties: where type and name lie, and more than its size; the type of a processor.
+VULKAN_TYPE, VULKAN_NAME, VULKAN_SIZE, VULKAN_CPU = 16, 20, 4096, 4
+VULKAN_LIBRARIES = {"linux": "libvulkan.so.1", "win32": "vulkan-1.dll", "darwin": "libvulkan.1.dylib"}
+CUDA_LIBRARIES = {"linux": "libcuda.so.1", "win32": "nvcuda.dll"}
+
+
+@dataclass(frozen=True)
+class Device:
+    """A device by its driver's name; `is_software` where the processor plays it."""
+
+    name: str
+    is_software: bool = False
+
+
+def device_names(arch: str) -> list[Device]:
+    """Return the devices of a backend; none where the driver does not say."""
+    asked = {"cuda": (_cuda, CUDA_LIBRARIES), "vulkan": (_vulkan, VULKAN_LIBRARIES)}
+    if arch not in asked:
+        return []
+    ask, libraries = asked[arch]
+    try:
+        return ask(ctypes.CDLL(libraries[sys.platform]))
+    except (OSError, KeyError, AttributeError):
+        return []
+
+
+def _cuda(driver: ctypes.CDLL) -> list[Device]:
+    count, name = ctypes.c_int(), ctypes.create_string_buffer(NAME_LENGTH)
+    if driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)):
+        return []
+    devices = []
+    for number in range(count.value):
+        handle = ctypes.c_int()
+        if not driver.cuDeviceGet(ctypes.byref(handle), number) and not driver.cuDeviceGetName(
+            name, NAME_LENGTH, handle
+        ):
+            devices.append(Device(name.value.decode(errors="replace")))
+    return devices
+
+
+class _InstanceInfo(ctypes.Structure):
+    """VkInstanceCreateInfo; sType is 1, everything else may be nothing."""
+
+    _fields_ = (
+        ("sType", ctypes.c_int),
+        ("pNext", ctypes.c_void_p),
+        ("flags", ctypes.c_uint32),
+        ("pApplicationInfo", ctypes.c_void_p),
+        ("enabledLayerCount", ctypes.c_uint32),
+        ("ppEnabledLayerNames", ctypes.c_void_p),
+        ("enabledExtensionCount", ctypes.c_uint32),
+        ("ppEnabledExtensionNames", ctypes.c_void_p),
+    )
+
+
+def _vulkan(loader: ctypes.CDLL) -> list[Device]:
+    instance, count = ctypes.c_void_p(), ctypes.c_uint32()
+    if loader.vkCreateInstance(ctypes.byref(_InstanceInfo(sType=1)), None, ctypes.byref(instance)):
+        return []
+    loader.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), None)
+    handles = (ctypes.c_void_p * count.value)()
+    loader.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), handles)
+    devices = []
+    for handle in handles[: count.value]:
+        properties = ctypes.create_string_buffer(VULKAN_SIZE)
+        loader.vkGetPhysicalDeviceProperties(ctypes.c_void_p(handle), properties)
+        kind = int.from_bytes(properties[VULKAN_TYPE : VULKAN_TYPE + 4], sys.byteorder)
+        name = properties[VULKAN_NAME : VULKAN_NAME + NAME_LENGTH].split(b"\0")[0].decode(errors="replace")
+        devices.append(Device(name, kind == VULKAN_CPU))
+    loader.vkDestroyInstance(instance, None)
+    return devices

@@ -1,0 +1,58 @@
+"""What draws: VTK's window, PyVista, the surface of particles, matplotlib and Pillow."""
+
+import importlib.metadata
+
+from mpmcli.doctor.finding import Finding
+
+
+def vtk() -> Finding:
+    """Examine VTK by letting it draw, which ends the process where its window is missing; so that has its own."""
+    from vtkmodules.vtkCommonCore import vtkVersion
+
+    from mpmcli.render.window import remedy, try_windows, why_none
+
+    version = vtkVersion.GetVTKVersion()
+    attempts = list(try_windows())
+    window = attempts[-1].window
+    if window is None:
+        return Finding("missing", f"{version}, no OpenGL window opens ({why_none(attempts)})", remedy(attempts))
+    return Finding("ok", f"{version}, {window.name} on {window.renderer}, OpenGL {window.version}")
+
+
+def pyvista() -> Finding:
+    """Examine PyVista by loading it."""
+    import pyvista
+
+    return Finding("ok", pyvista.__version__)
+
+
+def pysplashsurf() -> Finding:
+    """Examine the reconstruction of surfaces on a cube of particles."""
+    import numpy as np
+    import pysplashsurf
+
+    axis = np.arange(4, dtype=np.float32)
+    cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    surface, _ = pysplashsurf.reconstruction_pipeline(
+        cube, particle_radius=0.5, smoothing_length=2.0, cube_size=1.0, iso_surface_threshold=0.6
+    )
+    version = importlib.metadata.version("pysplashsurf")
+    if not surface.ncells:
+        return Finding("broken", f"{version}, finds no surface around a cube of particles")
+    return Finding("ok", version)
+
+
+def matplotlib() -> Finding:
+    """Examine matplotlib by loading it."""
+    import matplotlib
+
+    return Finding("ok", matplotlib.__version__)
+
+
+def pillow() -> Finding:
+    """Examine Pillow by letting it write a letter."""
+    import PIL
+    from PIL import Image, ImageDraw
+
+    ImageDraw.Draw(Image.new("RGB", (16, 16))).text((0, 0), "a")
+    return Finding("ok", PIL.__version__)

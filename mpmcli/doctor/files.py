@@ -1,0 +1,56 @@
+"""What writes files: HDF5 with its filters, and ffmpeg with its encoder."""
+
+import io
+import subprocess
+
+from mpmcli.doctor.finding import Finding, package_remedy
+
+# Seconds; it takes a tenth of one.
+FFMPEG_TIMEOUT = 20.0
+
+
+def hdf5() -> Finding:
+    """Examine h5py by writing and reading back a file in memory, with the filters that results have."""
+    import h5py
+    import numpy as np
+
+    versions = f"h5py {h5py.version.version}, HDF5 {h5py.version.hdf5_version}"
+    values = np.arange(3000, dtype=np.float32).reshape(1000, 3)
+    with io.BytesIO() as memory:
+        with h5py.File(memory, "w", libver=("v110", "v110")) as file:
+            file.create_dataset("values", data=values, chunks=(100, 3), compression="gzip", shuffle=True)
+        with h5py.File(memory, "r") as file:
+            stored = file["values"]
+            filters = [name for name, on in (("gzip", stored.compression == "gzip"), ("shuffle", stored.shuffle)) if on]
+            intact = np.array_equal(stored[:], values)
+    if not intact or len(filters) < 2:
+        return Finding("broken", f"{versions}, gzip and shuffle do not give back what was written")
+    return Finding("ok", f"{versions}, filters gzip and shuffle")
+
+
+def ffmpeg() -> Finding:
+    """Examine the program that makes films by letting it encode one image."""
+    import imageio_ffmpeg
+
+    try:
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        return Finding("missing", str(error).partition("\n")[0], package_remedy("imageio-ffmpeg", again=True))
+    version = imageio_ffmpeg.get_ffmpeg_version()
+    source = ["-f", "lavfi", "-i", "color=s=16x16", "-frames:v", "1"]
+    done = subprocess.run(
+        [program, "-v", "error", *source, "-c:v", "libx264", "-f", "null", "-"],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=FFMPEG_TIMEOUT,
+    )
+    if done.returncode:
+        first = (done.stderr.strip().splitlines() or [f"exited with {done.returncode}"])[0]
+        return Finding(
+            "broken",
+            f"{version}, libx264 does not encode ({first}): {program}",
+            "unset IMAGEIO_FFMPEG_EXE if it is set, or " + package_remedy("imageio-ffmpeg", again=True),
+        )
+    return Finding("ok", f"{version}, encoder libx264")

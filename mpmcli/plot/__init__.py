@@ -1,0 +1,1 @@
+"""The ledger of a result as one figure."""

@@ -1,0 +1,124 @@
+"""What a figure of a result shows over time: the columns of its ledger, and how far the particles reach."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from mpmcli.errors import InputError
+from mpmcli.output.frame import Frame
+from mpmcli.output.ledger_table import TEXT
+from mpmcli.output.result import Result
+from mpmcli.output.scene_facts import SceneFacts, scene_facts
+from mpmcli.stability.ledger import LedgerRow
+
+# Frames whose positions are read; more would not be seen in the figure.
+FRAMES_MAX = 200
+# More bodies than this are shown as one.
+BODIES_MAX = 6
+# Frames that a note names.
+NAMED = 5
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far the particles reach, in some of the frames.
+
+    Attributes:
+        times: (F,) s.
+        names: of B bodies, or one name for all of them.
+        lowest, highest: (F, B, d) m, NaN where a body has no particle.
+    """
+
+    times: np.ndarray
+    names: tuple[str, ...]
+    lowest: np.ndarray
+    highest: np.ndarray
+
+
+@dataclass(frozen=True)
+class History:
+    """One run over time.
+
+    Attributes:
+        title: of the scene.
+        facts: what is known of the scene; particles: in the last frame; kind, status: of the result.
+        columns: (T,) float64 per column of the ledger, momenta (T, components); NaN where it is not finite.
+        limits: T names of the bound on the step, "" at the initial state.
+        reach: see `Reach`.
+        notes: sentences about what the figure does not show.
+    """
+
+    title: str
+    facts: SceneFacts
+    particles: int
+    status: str
+    columns: dict[str, np.ndarray]
+    limits: tuple[str, ...]
+    reach: Reach
+    notes: tuple[str, ...]
+
+    @property
+    def times(self) -> np.ndarray:
+        """(T,) s."""
+        return self.columns["time"]
+
+
+def read_history(result: Result) -> History:
+    """Read what a figure of a result shows.
+
+    Raises:
+        InputError: a frame cannot be read, or the ledger does not belong to the frames.
+    """
+    rows = result.ledger
+    if len(rows) != result.frame_count:
+        raise InputError(f"{result.path} is damaged: it has {result.frame_count} frames and {len(rows)} ledger rows.")
+    columns, broken = {}, []
+    for name in (entry.name for entry in fields(LedgerRow) if entry.name != TEXT):
+        values = np.array([getattr(row, name) for row in rows], dtype=np.float64)
+        columns[name] = np.where(np.isfinite(values), values, np.nan)
+        broken.append(~np.isfinite(values).reshape(len(rows), -1).all(1))
+    facts = scene_facts(result.header)
+    record = result.record or {}
+    notes = _gaps(np.flatnonzero(np.any(broken, 0)), result.numbers)
+    chosen = np.unique(np.linspace(0, result.frame_count - 1, FRAMES_MAX).round().astype(int))
+    if len(chosen) < result.frame_count:
+        notes.append(f"The reach of the particles is read from {len(chosen)} of {result.frame_count} frames.")
+    return History(
+        title=str(result.header.get("title", "")) or result.path.stem,
+        facts=facts,
+        particles=int(result.particle_counts[-1]),
+        status=str(record.get("status", "")),
+        columns=columns,
+        limits=tuple(row.limit for row in rows),
+        reach=_reach(result, chosen, facts),
+        notes=tuple(notes),
+    )
+
+
+def _gaps(rows: np.ndarray, numbers: np.ndarray) -> list[str]:
+    if len(rows) == 0:
+        return []
+    named = ", ".join(str(numbers[k]) for k in rows[:NAMED])
+    more = f" and {len(rows) - NAMED} more" if len(rows) > NAMED else ""
+    frames = "frame" if len(rows) == 1 else "frames"
+    return [f"The ledger holds numbers that are not finite in {frames} {named}{more}; they are gaps in the figure."]
+
+
+def _reach(result: Result, chosen: np.ndarray, facts: SceneFacts) -> Reach:
+    apart = 1 < len(facts.bodies) <= BODIES_MAX
+    labels = range(len(facts.bodies)) if apart else [None]
+    found = [[_extent(frame, label) for label in labels] for frame in (result.frame(int(k), ()) for k in chosen)]
+    both = np.array(found).reshape(len(chosen), len(labels), 2, result.dimension)
+    names = facts.bodies if apart else (facts.bodies[0] if len(facts.bodies) == 1 else "all bodies",)
+    return Reach(result.times[chosen], names, both[:, :, 0], both[:, :, 1])
+
+
+def _extent(frame: Frame, label: int | None) -> np.ndarray:
+    """Return the lowest and the highest coordinates of a body, or of all, that are finite: (2, d)."""
+    position = frame.position.astype(np.float64)
+    kept = np.isfinite(position).all(1)
+    if label is not None:
+        kept &= frame.body == label
+    if not kept.any():
+        return np.full((2, position.shape[1]), np.nan)
+    return np.array([position[kept].min(0), position[kept].max(0)])

@@ -1,0 +1,158 @@
+"""Draws the ledger of a run: energies, momenta, steps and what bounds them, volumes, speeds, and where matter is."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mpmcli.plot.history import History
+from mpmcli.plot.panels import Panel
+from mpmcli.plot.style import THEMES, ThemeName, drawing, pixels
+from mpmcli.stability.limits import COURANT
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+AXES = "xyz"
+# The order of the colours is that of the legend.
+LIMITS = ("wave", "speed", "force", "viscosity", "deformation", "forced", "maximum")
+
+
+def ledger_picture(history: History, size: tuple[int, int], theme: ThemeName) -> tuple[np.ndarray, list[str]]:
+    """Return the figure of a run as an image, and the titles of its panels.
+
+    Args:
+        size: pixels, wide and high.
+
+    Returns:
+        (h, w, 3) uint8, the same for the same history.
+    """
+    with drawing(size, THEMES[theme]) as figure:
+        titles = draw_ledger(figure, history, theme)
+        return pixels(figure), titles
+
+
+def draw_ledger(figure: "Figure", history: History, theme: ThemeName) -> list[str]:
+    """Draw a run into an empty figure and return the titles of its panels, in the order of its axes."""
+    d = history.facts.dimension
+    # Each row for itself, as they differ in their number of panels.
+    rows = figure.add_gridspec(3, 1)
+    places = [cell for row, count in enumerate((4, 4, d)) for cell in rows[row].subgridspec(1, count)]
+    panels = [Panel(figure.add_subplot(place), history.times, THEMES[theme]) for place in places]
+    _energy(panels[0], panels[1], history)
+    _momentum(panels[2], history)
+    _angular_momentum(panels[3], history)
+    _step(panels[4], history)
+    _courant(panels[5], history)
+    _volume(panels[6], history)
+    _speed(panels[7], history)
+    for axis, panel in enumerate(panels[8:]):
+        _reach(panel, history, axis)
+    for panel in panels:
+        panel.finish()
+    status = f", {history.status}" if history.status else ""
+    said = f"{history.particles:,} particles, {len(history.times)} frames{status}"
+    figure.suptitle(f"{history.title}: {said}", x=0.012, ha="left", fontsize=11)
+    return [panel.axes.get_title(loc="left") for panel in panels]
+
+
+def _first(values: np.ndarray) -> int:
+    """Return the number of the first row that is known, which changes are counted from."""
+    return int(np.isfinite(values).reshape(len(values), -1).all(1).argmax())
+
+
+def _units(history: History) -> tuple[str, str, str]:
+    """Return the units of energy, momentum and angular momentum: in the plane they are per metre of depth."""
+    return ("J/m", "N s/m", "N s") if history.facts.dimension == 2 else ("J", "N s", "N m s")
+
+
+def _energy(parts: Panel, change: Panel, history: History) -> None:
+    unit, columns = _units(history)[0], history.columns
+    potential = columns["potential"]
+    above = potential - np.nanmin(potential) if np.isfinite(potential).any() else potential
+    total = columns["kinetic"] + columns["elastic"] + above
+    parts.title("Energy", f"{unit}, potential above its lowest")
+    parts.line(total, "total", None, linewidth=2.0)
+    for k, (name, values) in enumerate(
+        (("kinetic", columns["kinetic"]), ("elastic", columns["elastic"]), ("potential", above))
+    ):
+        parts.line(values, name, k)
+    largest = float(np.nanmax(total)) if np.isfinite(total).any() else 0.0
+    work = ", while forces do work" if history.facts.driven else ""
+    change.title("Change of total energy", f"(E - E₀) / largest E{work}")
+    if largest > 0:
+        change.line((total - total[_first(total)]) / largest, "", None)
+    change.level(0.0)
+
+
+def _momentum(panel: Panel, history: History) -> None:
+    """Draw what gravity does not explain of the momentum: 0 but for rounding until something else acts."""
+    facts, columns = history.facts, history.columns
+    momentum = columns["linear_momentum"]
+    start = _first(momentum)
+    values = momentum - momentum[start]
+    unit = _units(history)[1]
+    if facts.gravity is None:
+        panel.title("Momentum (gravity is not constant)", f"P - P₀, {unit}")
+    else:
+        what = "walls and forces" if facts.driven else "walls"
+        panel.title(f"Impulse of the {what}", f"P - P₀ - M g t, {unit}")
+        # Velocities are those of the middle of the last step.
+        middle = history.times - (columns["step_min"] + columns["step_max"]) / 4
+        values = values - columns["mass"][:, None] * facts.gravity * (middle - middle[start])[:, None]
+    for axis in range(facts.dimension):
+        panel.line(values[:, axis], AXES[axis], axis)
+    panel.level(0.0)
+
+
+def _angular_momentum(panel: Panel, history: History) -> None:
+    values, unit = history.columns["angular_momentum"], _units(history)[2]
+    panel.title("Angular momentum", f"about the domain's corner, {unit}")
+    if values.shape[1] == 1:
+        panel.line(values[:, 0], "z", 2)
+    else:
+        for axis in range(3):
+            panel.line(values[:, axis], AXES[axis], axis)
+    panel.level(0.0)
+
+
+def _step(panel: Panel, history: History) -> None:
+    panel.title("Time step, by what bounds it", "smallest to largest, s")
+    columns = history.columns
+    names = [name for name in LIMITS if name in history.limits]
+    names += sorted(set(history.limits) - {"", *LIMITS})
+    for name in names:
+        chosen = np.array([limit == name for limit in history.limits])
+        color = LIMITS.index(name) if name in LIMITS else None
+        panel.between_frames(columns["step_min"], columns["step_max"], chosen, name, color)
+    if not names:
+        panel.say("no step yet")
+    panel.logarithmic([columns["step_min"], columns["step_max"]])
+
+
+def _courant(panel: Panel, history: History) -> None:
+    panel.title("Courant number", "largest displacement in a step, cells")
+    panel.steps(history.columns["courant_max"], 0)
+    panel.level(COURANT, f"limit {COURANT:g}", 1)
+    panel.from_zero()
+
+
+def _volume(panel: Panel, history: History) -> None:
+    panel.title("Volume ratio J", "smallest to largest")
+    panel.band(history.columns["volume_ratio_min"], history.columns["volume_ratio_max"], "", 2)
+    panel.level(1.0)
+
+
+def _speed(panel: Panel, history: History) -> None:
+    panel.title("Largest speed", "m/s")
+    panel.line(history.columns["speed_max"], "", 0)
+    panel.from_zero()
+
+
+def _reach(panel: Panel, history: History, axis: int) -> None:
+    facts, reach = history.facts, history.reach
+    panel.title(f"Reach along {AXES[axis]}", "lowest to highest particle, m")
+    for k, name in enumerate(reach.names):
+        panel.band(reach.lowest[:, k, axis], reach.highest[:, k, axis], name, k, times=reach.times)
+    if facts.origin is not None and facts.upper is not None:
+        panel.level(float(facts.origin[axis]), "walls")
+        panel.level(float(facts.upper[axis]))

@@ -1,0 +1,227 @@
+"""The stage of 3D surfaces: one off-screen window, its meshes replaced with every frame."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mpmcli.output.frame import Frame
+from mpmcli.render import lighting
+from mpmcli.render.backdrop import Backdrop
+from mpmcli.render.grains import JITTER, grain_colors, new_grains, pose_grains
+from mpmcli.render.material_groups import Group, groups_of
+from mpmcli.render.occlusion import Occlusion, occlusion_of
+from mpmcli.render.reconstruction import Mesh, reconstruct
+from mpmcli.render.subject import Subject
+from mpmcli.render.theme import Theme, rgb
+from mpmcli.render.thickness import thickness_at
+from mpmcli.render.tints import painted, shades, tints_of
+from mpmcli.render.view import View
+
+if TYPE_CHECKING:
+    from mpmcli.render.surface import FieldColors
+
+# Pixels of the window to one of the picture, along each axis.
+FINER = 2
+# Rounds of smoothing, by finish; crumbs keep their lumps.
+ROUNDS = {"crumbly": 2}
+USUAL_ROUNDS = 40
+
+
+class SolidStage:
+    """Draws a 3D run as bodies in a lit room."""
+
+    def __init__(self, subject: Subject, view: View, theme: Theme, colors: "FieldColors | None" = None) -> None:
+        """Open the window; nothing is drawn yet."""
+        import pyvista as pv
+
+        self.subject, self.view, self.theme, self.colors = subject, view, theme, colors
+        self.backdrop = Backdrop(subject, view, theme)
+        self.lights = lighting.lights_of(subject, view, theme)
+        self.plotter = pv.Plotter(off_screen=True, window_size=[FINER * n for n in view.size], lighting="none")
+        self.plotter.disable_anti_aliasing()
+        self.behind, self.room = _texture(), _texture()
+        for texture in (self.behind, self.room):
+            _put(texture, self.backdrop.image(None))
+        self.plotter.renderer.SetBackgroundTexture(self.room)
+        self.plotter.renderer.TexturedBackgroundOn()
+        self.actors: dict[Any, Any] = {}
+        self._add_walls()
+        view.place(self.plotter)
+
+    def draw(self, frame: Frame) -> np.ndarray:
+        """Return the picture of a frame, (h, w, 3) uint8."""
+        groups = groups_of(self.subject, frame)
+        occlusion = self._occlusion(groups)
+        clear = []
+        for actor in self.actors.values():
+            actor.SetVisibility(False)
+        for group in groups:
+            actor = self._posed(group, frame, occlusion)
+            if group.look.finish in lighting.CLEAR and self.colors is None:
+                clear.append(actor)
+        _put(self.room, self.backdrop.image(occlusion))
+        if clear:
+            # What is clear shows the picture of all the rest.
+            for actor in clear:
+                actor.SetVisibility(False)
+            _put(self.behind, self._window_pixels())
+            for actor in clear:
+                actor.SetVisibility(True)
+        return _coarser(self._window_pixels())
+
+    def close(self) -> None:
+        """Close the window."""
+        self.plotter.close()
+
+    def _window_pixels(self) -> np.ndarray:
+        import vtk
+        from vtkmodules.util.numpy_support import vtk_to_numpy
+
+        window = self.plotter.render_window
+        self.view.place(self.plotter)
+        window.Render()
+        width, height = window.GetSize()
+        pixels = vtk.vtkUnsignedCharArray()
+        window.GetPixelData(0, 0, width - 1, height - 1, 0, pixels, 0)
+        return vtk_to_numpy(pixels).reshape(height, width, 3)[::-1]
+
+    def _occlusion(self, groups: list[Group]) -> Occlusion | None:
+        if not groups:
+            return None
+        position = np.concatenate([group.position for group in groups])
+        volumes = np.concatenate([np.full(len(g.position), g.distance**3) for g in groups])
+        opacity = np.concatenate([np.full(len(g.position), lighting.OPACITY.get(g.look.finish, 1.0)) for g in groups])
+        return occlusion_of(self.subject, position, volumes, opacity, self.lights.lamp)
+
+    def _posed(self, group: Group, frame: Frame, occlusion: Occlusion | None) -> Any:
+        """Return the actor of a group, with the mesh of this frame."""
+        if group.look.finish == "grains":
+            return self._posed_grains(group, frame, occlusion)
+        attributes = {"rough": group.hashes} if group.look.finish == "crumbly" or group.look.name == "lava" else {}
+        if self.colors is not None:
+            attributes |= tints_of(group, self.colors, frame)
+        mesh = reconstruct(
+            group.position,
+            group.distance,
+            self.subject.lower,
+            self.subject.upper,
+            attributes,
+            rounds=ROUNDS.get(group.look.finish, USUAL_ROUNDS),
+        )
+        actor = self.actors.get(group.key)
+        if actor is None:
+            actor = self.actors[group.key] = self._new_actor(group)
+        self._fill(actor, mesh, group, occlusion)
+        actor.SetVisibility(bool(len(mesh.triangles)))
+        return actor
+
+    def _posed_grains(self, group: Group, frame: Frame, occlusion: Occlusion | None) -> Any:
+        actor = self.actors.get(group.key)
+        if actor is None:
+            actor = self.actors[group.key] = new_grains(self.view, self.lights, group.distance)
+            self.plotter.renderer.AddActor(actor)
+        color = np.array(rgb(group.look.color))
+        hashes = group.hashes
+        if self.colors is not None:
+            color = shades(np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows], self.colors)
+            # A colour that means something is not varied.
+            hashes = np.zeros_like(hashes)
+        lamp, sky = np.ones((2, len(hashes)))
+        if occlusion is not None:
+            lamp, sky = occlusion.at(group.position, np.broadcast_to(self.subject.up, group.position.shape))
+        moved = np.clip(
+            group.position + JITTER * group.distance * group.hashes[:, ::-1], self.subject.lower, self.subject.upper
+        )
+        pose_grains(actor, moved, grain_colors(color, hashes, lamp, sky))
+        actor.SetVisibility(True)
+        return actor
+
+    def _fill(self, actor: Any, mesh: Mesh, group: Group, occlusion: Occlusion | None) -> None:
+        import pyvista as pv
+
+        data = pv.PolyData.from_regular_faces(mesh.points, mesh.triangles) if len(mesh.points) else pv.PolyData()
+        count = len(mesh.points)
+        light = np.ones((count, 4), dtype=np.float32)
+        if occlusion is not None and count:
+            light[:, 0], light[:, 1] = occlusion.at(mesh.points, mesh.normals)
+            if group.look.finish in lighting.CLEAR:
+                light[:, 2] = thickness_at(self.view, group.position, group.distance, mesh.points)
+        tint = np.broadcast_to(lighting.linear(group.look.color), (count, 3))
+        if self.colors is not None:
+            tint = painted(mesh.attributes, self.colors)
+        rough = mesh.attributes.get("rough", np.zeros((count, 3), dtype=np.float32))
+        carried = (light, tint, rough, mesh.normals)
+        for name, values in zip(lighting.CARRIED, carried, strict=True):
+            data.point_data[name] = np.ascontiguousarray(values, dtype=np.float32)
+        # Only because the window declares textures of meshes that have these.
+        data.point_data["places"] = np.zeros((count, 2), dtype=np.float32)
+        data.GetPointData().SetActiveTCoords("places")
+        actor.GetMapper().SetInputData(data)
+
+    def _new_actor(self, group: Group) -> Any:
+        import vtk
+
+        mapper = vtk.vtkPolyDataMapper()
+        mapper.ScalarVisibilityOff()
+        # The shader wants metres.
+        mapper.SetVBOShiftScaleMethod(0)
+        for name in lighting.CARRIED:
+            mapper.MapDataArrayToVertexAttribute(name, name, 0, -1)
+        actor = vtk.vtkActor()
+        actor.SetMapper(mapper)
+        actor.GetProperty().BackfaceCullingOn()
+        actor.GetProperty().SetTexture(lighting.BEHIND, self.behind)
+        shader = actor.GetShaderProperty()
+        declared, done = lighting.vertex_code()
+        shader.AddVertexShaderReplacement("//VTK::Normal::Dec", True, f"//VTK::Normal::Dec\n{declared}", False)
+        shader.AddVertexShaderReplacement("//VTK::Normal::Impl", True, f"//VTK::Normal::Impl\n{done}", False)
+        declared, done = lighting.fragment_code(
+            self.subject, self.view, self.lights, group.look, FINER, by_field=self.colors is not None
+        )
+        # After all that the window does itself; its own lights and textures are left out.
+        shader.AddFragmentShaderReplacement("//VTK::TCoord::Dec", True, f"//VTK::TCoord::Dec\n{declared}", False)
+        shader.AddFragmentShaderReplacement("//VTK::Light::Impl", True, "", False)
+        shader.AddFragmentShaderReplacement("//VTK::TCoord::Impl", True, done, False)
+        self.plotter.renderer.AddActor(actor)
+        return actor
+
+    def _add_walls(self) -> None:
+        import pyvista as pv
+
+        low, high = self.subject.lower, self.subject.upper
+        box = pv.Box(bounds=(low[0], high[0], low[1], high[1], low[2], high[2]))
+        walls = self.plotter.add_mesh(
+            box.extract_all_edges(), color=rgb(self.theme.wall), line_width=1.3 * FINER, opacity=1.0, lighting=False
+        )
+        walls.SetPickable(False)
+
+
+def _coarser(pixels: np.ndarray) -> np.ndarray:
+    """Return the means over blocks of `FINER` by `FINER` pixels (h, w, 3) uint8."""
+    total = sum(pixels[i::FINER, j::FINER].astype(np.uint16) for i in range(FINER) for j in range(FINER))
+    return ((total + FINER * FINER // 2) // (FINER * FINER)).astype(np.uint8)
+
+
+def _texture() -> Any:
+    import vtk
+
+    texture = vtk.vtkTexture()
+    texture.SetInputData(vtk.vtkImageData())
+    texture.SetColorModeToDirectScalars()
+    texture.InterpolateOn()
+    texture.MipmapOff()
+    texture.RepeatOff()
+    texture.EdgeClampOn()
+    return texture
+
+
+def _put(texture: Any, picture: np.ndarray) -> None:
+    """Put a picture (h, w, 3) uint8 into a texture."""
+    import vtk
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+
+    image = vtk.vtkImageData()
+    height, width = picture.shape[:2]
+    image.SetDimensions(width, height, 1)
+    image.GetPointData().SetScalars(numpy_to_vtk(picture[::-1].reshape(-1, 3), deep=True))
+    texture.SetInputData(image)

@@ -1,0 +1,207 @@
+"""`mpmcli render` as it is called: files, films, what is kept, what is refused in one sentence."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from command import run_here
+from drawn_results import JELLY, WATER, frame, header, lattice, write
+from PIL import Image
+
+from mpmcli.output import Result, VtkSeriesStore, open_result
+from mpmcli.output.store import SEGMENTS
+
+FRAMES = 6
+
+
+def made(directory: Path, **options) -> Result:
+    """A block of water that slides to the right under one of jelly; the pressure of one particle is not a number."""
+    block = lattice((0.1, 0.1), (0.4, 0.3), 0.025)
+    places = np.concatenate([block, block + np.array([0.0, 0.25])])
+    body = np.repeat([0, 1], len(block))
+    pressure = np.linspace(0.0, 1e4, len(places))
+    pressure[5] = np.nan
+    frames = [
+        frame(k, places + np.array([0.08 * k, 0.0]), body, velocity=0 * places + k, pressure=pressure)
+        for k in range(FRAMES)
+    ]
+    return write(directory, header((1.0, 0.6), 0.05, [WATER, JELLY]), frames, **options)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    made(tmp_path / "run")
+    return tmp_path / "run"
+
+
+def rendered(*arguments: object) -> dict:
+    outcome = run_here("render", *arguments, "--size", "320x180", "--json", "--quiet")
+    assert outcome.status == 0, outcome.stderr
+    return json.loads(outcome.stdout)
+
+
+def refused(*arguments: object) -> str:
+    """The one sentence of bad input."""
+    outcome = run_here("render", *arguments)
+    assert outcome.status == 2 and outcome.stdout == "", outcome
+    lines = outcome.stderr.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: ") and lines[0].endswith("."), lines
+    return lines[0]
+
+
+def test_a_picture_of_the_last_frame_lies_beside_the_result(run: Path) -> None:
+    said = rendered(run)
+    assert said["pictures"] == [str(run / "render" / "dots_000005.png")] and said["made"] == 1
+    with Image.open(said["pictures"][0]) as picture:
+        assert picture.size == (320, 180)
+
+
+def test_what_is_there_is_not_made_again_unless_something_changed(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    first = rendered(run, "-o", out, "--frame", "0:4", "--workers", 1)
+    assert first["made"] == 4 and [Path(p).name for p in first["pictures"]] == [f"dots_{k:06d}.png" for k in range(4)]
+    written = {path: path.stat().st_mtime_ns for path in out.iterdir()}
+    again = rendered(run, "-o", out, "--frame", "all", "--workers", 1)
+    assert again["made"] == 2
+    assert all(path.stat().st_mtime_ns == time for path, time in written.items())
+    pixels = (out / "dots_000000.png").read_bytes()
+    # Another setting is another picture; the same one again is the same, to the last byte.
+    assert rendered(run, "-o", out, "--frame", 0, "--theme", "dark")["made"] == 1
+    assert (out / "dots_000000.png").read_bytes() != pixels
+    assert rendered(run, "-o", out, "--frame", 0)["made"] == 1
+    assert (out / "dots_000000.png").read_bytes() == pixels
+    assert rendered(run, "-o", out, "--frame", 0, "--overwrite")["made"] == 1
+    assert (out / "dots_000000.png").read_bytes() == pixels
+
+
+def test_several_processes_make_the_same_pictures(run: Path, tmp_path: Path) -> None:
+    for workers in (1, 2):
+        said = rendered(run, "-o", tmp_path / str(workers), "--frame", "0:2", "--workers", workers)
+        assert said["made"] == 2
+    for name in ("dots_000000.png", "dots_000001.png"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
+
+
+def test_a_film_has_its_frames_and_its_length(run: Path, tmp_path: Path) -> None:
+    film = tmp_path / "film.mp4"
+    said = rendered(run, "--movie", film, "--fps", 12, "--workers", 1)
+    assert said["film"] == str(film) and said["made"] == FRAMES
+    count, seconds = imageio_ffmpeg.count_frames_and_secs(str(film))
+    assert count == FRAMES and seconds == pytest.approx(FRAMES / 12, abs=0.02)
+    facts = next(imageio_ffmpeg.read_frames(str(film)))
+    assert facts["size"] == (320, 180) and facts["codec"].startswith("h264")
+    # The same film of the same pictures is left alone; another rate makes another one of them.
+    before = film.stat().st_mtime_ns
+    assert rendered(run, "--movie", film, "--fps", 12)["made"] == 0
+    assert film.stat().st_mtime_ns == before
+    assert rendered(run, "--movie", film, "--fps", 24)["made"] == 0
+    assert imageio_ffmpeg.count_frames_and_secs(str(film))[1] == pytest.approx(FRAMES / 24, abs=0.02)
+
+
+def test_a_gif_is_read_by_another_reader(run: Path, tmp_path: Path) -> None:
+    film = tmp_path / "film.gif"
+    rendered(run, "--movie", film, "--frame", "::2", "--fps", 10, "--workers", 1)
+    with Image.open(film) as gif:
+        assert gif.n_frames == 3 and gif.info["duration"] == 100 and gif.size == (320, 180)
+
+
+def test_a_montage_is_one_picture_of_evenly_spaced_frames(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "montage.png"
+    outcome = run_here("render", run, "-o", out, "--montage", "3x2", "--quiet")
+    assert outcome.status == 0, outcome.stderr
+    with Image.open(out) as picture:
+        width, height = picture.size
+        pixels = np.asarray(picture)
+    assert width == 1280 and 300 < height < 900
+    # Water moves to the right from frame to frame: its ink is in six places.
+    blue = (pixels == (0x2F, 0x7F, 0xD0)).all(axis=2)
+    blue[:, int(0.9 * width) :] = False  # the legend
+    columns = blue.any(axis=0)
+    assert np.count_nonzero(np.diff(columns.astype(int)) == 1) >= 3
+    again = tmp_path / "again.png"
+    run_here("render", run, "-o", again, "--montage", "3x2", "--quiet")
+    assert out.read_bytes() == again.read_bytes()
+
+
+def test_a_run_under_way_is_drawn_up_to_its_last_sealed_frame(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    made(run, finish=False)
+    # A frame that is being written.
+    (run / SEGMENTS / f"frame_{FRAMES:06d}.vtkhdf.tmp").write_bytes(b"half")
+    assert (run / SEGMENTS).is_dir() and not (run / "particles.vtkhdf").exists()
+    said = rendered(run, "--frame", "last")
+    assert Path(said["pictures"][0]).name == f"dots_{FRAMES - 1:06d}.png"
+    # It is not in the way of the run, which packs its frames in the end.
+    assert "holds frames 0 to 5" in refused(run, "--frame", FRAMES)
+
+
+def test_what_cannot_be_shown_as_it_is_is_said(run: Path) -> None:
+    outcome = run_here("render", run, "--color-by", "pressure", "--size", "320x180", "--frame", 0)
+    assert outcome.status == 0
+    assert "warning: the pressure of up to 1 particles is not a number, first in frame 0" in outcome.stderr
+    assert "#ff00c8" in outcome.stderr
+
+
+def test_bad_input_gets_one_sentence_and_nothing_is_written(run: Path, tmp_path: Path) -> None:
+    before = sorted(tmp_path.rglob("*"))
+    assert "--frame 9: " in refused(run, "--frame", 9)
+    assert 'stores no "density", but velocity and pressure' in refused(run, "--color-by", "density")
+    assert "does not exist" in refused(tmp_path / "nowhere")
+    assert "is not possible" in refused(run, "--size", "99999x99999")
+    assert "is no size" in refused(run, "--size", "big")
+    assert "would be no film" in refused(run, "--movie", tmp_path / "film.avi")
+    assert "frames per second" in refused(run, "--movie", tmp_path / "film.mp4", "--fps", 0)
+    assert "two things" in refused(run, "--movie", tmp_path / "film.mp4", "--montage", "2x2")
+    assert "for a film, give --movie" in refused(run, "-o", tmp_path / "x.mp4")
+    assert "name a directory" in refused(run, "-o", tmp_path / "x.png", "--frame", "all")
+    assert "is no colour map" in refused(run, "--color-by", "speed", "--cmap", "nonsense")
+    assert "stand for a value" in refused(run, "--color-by", "material", "--clim", "0,1")
+    assert "has colours of its own" in refused(run, "--mode", "density", "--color-by", "speed")
+    assert "six numbers" in refused(run, "--camera", "under")
+    assert "--save-surface" in refused(run, "--save-surface", tmp_path / "s")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_files_of_others_are_left_alone(run: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine.png"
+    Image.new("RGB", (10, 10)).save(mine)
+    text = mine.read_bytes()
+    assert "mpmcli did not make it" in refused(run, "-o", mine)
+    assert "mpmcli did not make it" in refused(run, "-o", mine, "--montage", "2x2")
+    film = tmp_path / "film.mp4"
+    film.write_bytes(b"a film of mine")
+    assert "mpmcli did not make it" in refused(run, "--movie", film)
+    assert mine.read_bytes() == text and film.read_bytes() == b"a film of mine"
+    assert rendered(run, "-o", mine, "--overwrite")["made"] == 1
+    (tmp_path / "file").write_text("no directory")
+    assert "is a file, not a directory" in refused(run, "-o", tmp_path / "file", "--frame", "all")
+
+
+def test_places_that_cannot_be_written_are_named(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no directory")
+    outcome = run_here("render", run, "-o", tmp_path / "file" / "x.png", "--size", "64x64")
+    assert outcome.status == 2 and "cannot be written" in outcome.stderr and "Traceback" not in outcome.stderr
+
+
+def test_without_a_window_the_setting_at_fault_is_named(run: Path, run_python: Callable) -> None:
+    """VTK kills the interpreter where no window opens, as on a bare machine: another process has to find that out."""
+    words = ["-m", "mpmcli", "render", run, "--size", "64x64"]
+    done = run_python(words, check=False, environment={"VTK_DEFAULT_OPENGL_WINDOW": "nonsense"})
+    assert done.status == 2 and done.stdout == ""
+    assert done.stderr.startswith("error: ") and "VTK_DEFAULT_OPENGL_WINDOW" in done.stderr
+    assert not (run / "render").exists()
+
+
+def test_series_are_drawn_too(tmp_path: Path, run: Path) -> None:
+    source = open_result(run)
+    store = VtkSeriesStore(tmp_path / "series", source.header)
+    for k, entry in enumerate(source.frames()):
+        store.write(entry, source.ledger[k])
+    series = store.finish()
+    places = [(run, tmp_path / "1.png"), (series, tmp_path / "2.png")]
+    pictures = [rendered(path, "-o", out, "--frame", 2)["pictures"][0] for path, out in places]
+    one, other = (np.asarray(Image.open(path)) for path in pictures)
+    np.testing.assert_array_equal(one, other)

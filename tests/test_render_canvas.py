@@ -1,0 +1,141 @@
+"""What stands around a picture: lengths and times that are right, texts that fit, colours that agree."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drawn_results import JELLY, WATER, frame, header, write
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mpmcli.output import Result
+from mpmcli.render.canvas import Canvas, cut, length_text, round_length, time_text
+from mpmcli.render.color_by import color_by
+from mpmcli.render.coloring import Coloring
+from mpmcli.render.subject import subject_of
+from mpmcli.render.theme import THEMES, rgb_bytes
+from mpmcli.render.view import view_of
+
+LIGHT = THEMES["light"]
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    facts = header((2.0, 1.0), 0.1, [WATER, JELLY])
+    return write(tmp_path_factory.mktemp("canvas") / "run", facts, [frame(k, np.ones((4, 2))) for k in range(5)])
+
+
+def canvas_of(result: Result, size: tuple[int, int] = (800, 500), by: str = "speed", **options) -> Canvas:
+    subject = subject_of(result)
+    colors = color_by(by, result, subject, LIGHT, limits=(0.0, 8.0) if by == "speed" else None)
+    return Canvas(size, subject, LIGHT, tuple(result.times.tolist()), colors, **options)
+
+
+def composed(canvas: Canvas, count: int = 1, missing: int = 0) -> np.ndarray:
+    view = view_of(canvas.subject, "iso", canvas.stage_size)
+    width, height = canvas.stage_size
+    blank = np.full((height, width, 3), 255, np.uint8)
+    return canvas.compose([blank] * count, view, [0.01 * k for k in range(count)], missing)
+
+
+def count_of(picture: np.ndarray, color: str) -> int:
+    return int((picture == rgb_bytes(color)).all(axis=2).sum())
+
+
+def test_the_scale_bar_is_as_long_as_it_says(result: Result) -> None:
+    canvas = canvas_of(result)
+    picture = composed(canvas)
+    view = view_of(canvas.subject, "iso", canvas.stage_size)
+    text = (picture == rgb_bytes(LIGHT.text)).all(axis=2)
+    # The longest run of pixels in the lower margin is the bar.
+    row = max(text[-40:], key=lambda row: row[: len(row) // 2].sum())
+    ends = np.flatnonzero(row)
+    run = ends[: np.argmax(np.diff(ends, append=ends[-1] + 2) > 1) + 1]
+    metres = len(run) / view.pixels_per_metre
+    assert metres == pytest.approx(round_length(metres * 1.01), rel=0.02)
+
+
+def test_walls_are_drawn_around_the_domain_and_nowhere_within(result: Result) -> None:
+    canvas = canvas_of(result)
+    picture = composed(canvas)
+    view = view_of(canvas.subject, "iso", canvas.stage_size)
+    (x0, y1, _), (x1, y0, _) = view.pixels(np.array([canvas.subject.lower, canvas.subject.upper]))
+    top = (500 - canvas.stage_size[1]) // 2
+    rows, columns = np.nonzero((picture == rgb_bytes(LIGHT.wall)).all(axis=2))
+    assert columns.min() >= x0 - 3 and columns.max() <= x1 + 3
+    assert rows.min() - top >= y0 - 3 and rows.max() - top <= y1 + 3
+    within = (columns > x0) & (columns < x1 - 1) & (rows - top > y0) & (rows - top < y1 - 1)
+    assert not within.any()
+
+
+def test_the_bar_shows_the_colours_of_its_values(result: Result) -> None:
+    canvas = canvas_of(result)
+    assert isinstance(canvas.colors, Coloring)
+    picture = composed(canvas)
+    bottom, top = (tuple(color) for color in canvas.colors.rgb(np.array([0.0, 8.0])).tolist())
+    places = [np.flatnonzero((picture == color).all(axis=2).any(axis=1)) for color in (top, bottom)]
+    assert places[0].mean() < places[1].mean()
+    assert count_of(picture, LIGHT.missing) == 0
+    assert count_of(composed(canvas, missing=3), LIGHT.missing) > 50
+
+
+def test_the_legend_has_each_material(result: Result) -> None:
+    canvas = canvas_of(result, by="material")
+    picture = composed(canvas)
+    assert all(count_of(picture, look.ink) > 100 for look in canvas.subject.looks)
+
+
+@pytest.mark.parametrize("size", [(64, 64), (90, 400), (400, 90), (320, 180), (2000, 1500)])
+@pytest.mark.parametrize("by", ["speed", "material"])
+def test_every_size_is_possible(result: Result, size: tuple[int, int], by: str) -> None:
+    assert composed(canvas_of(result, size, by)).shape == (size[1], size[0], 3)
+    assert composed(canvas_of(result, size, by, grid=(3, 2)), 5).shape == (size[1], size[0], 3)
+
+
+def test_a_montage_places_its_pictures_in_rows(result: Result) -> None:
+    canvas = canvas_of(result, grid=(3, 2))
+    width, height = canvas.stage_size
+    inks = ["#102030", "#203040", "#304050", "#405060", "#506070"]
+    pictures = [np.full((height, width, 3), rgb_bytes(ink), np.uint8) for ink in inks]
+    view = view_of(canvas.subject, "iso", canvas.stage_size)
+    whole = canvas.compose(pictures, view, [0.0] * 5)
+    middles = []
+    for ink in inks:
+        rows, columns = np.nonzero((whole == rgb_bytes(ink)).all(axis=2))
+        middles.append((rows.mean(), columns.mean()))
+    rows, columns = np.array(middles).T
+    np.testing.assert_allclose(rows[:3], rows[0], atol=3)
+    assert rows[3] > rows[0] + 0.9 * height and (np.diff(columns[:3]) > 0.9 * width).all()
+    assert columns[3] == pytest.approx(columns[0], abs=3)
+
+
+def test_a_height_that_follows_from_the_scene_leaves_no_empty_band(result: Result) -> None:
+    canvas = canvas_of(result, (900, 900), grid=(2, 2))
+    for _ in range(4):
+        canvas = replace(canvas, size=(900, canvas.height_for(0.5)))
+    width, height = canvas.stage_size
+    assert height / width == pytest.approx(0.5, abs=2 / width)
+
+
+@given(st.floats(1e-12, 1e12))
+def test_round_lengths_are_round_and_no_longer(longest: float) -> None:
+    length = round_length(longest)
+    assert length <= longest * (1 + 1e-9) < 2.5 * length * (1 + 1e-6)
+    digits = f"{length:.6e}".partition("e")[0]
+    assert float(digits) in (1.0, 2.0, 5.0)
+
+
+def test_lengths_and_times_have_the_unit_that_suits_them() -> None:
+    assert [length_text(x) for x in (5.0, 0.2, 2e-3, 5e-5, 2e3)] == ["5 m", "20 cm", "2 mm", "50 µm", "2 km"]
+    assert time_text(0.25, [0.01 * k for k in range(101)]) == "t = 0.25 s"
+    assert time_text(0.5, [0.25 * k for k in range(11)]) == "t = 0.50 s"
+    assert time_text(3e-6, [1e-6 * k for k in range(101)]) == "t = 3 µs"
+    assert time_text(0.012, [2e-3 * k for k in range(10)]) == "t = 12 ms"
+    assert time_text(0.0, [0.0]) == "t = 0.0 s"
+
+
+@given(st.text(max_size=40), st.integers(0, 40))
+def test_texts_are_cut_to_fit(text: str, room: int) -> None:
+    shorter = cut(text, lambda candidate: len(candidate) <= room)
+    assert len(shorter) <= max(room, 0) or shorter == ""
+    assert shorter == text if len(text) <= room else shorter == "" or shorter.endswith("…")

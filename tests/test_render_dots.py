@@ -1,0 +1,161 @@
+"""Dots, looked at as pixels: where they are, how large, in which colour, and what is in front."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_results import WATER, frame, header, lattice, write
+
+from mpmcli.output import Frame, Result
+from mpmcli.render.color_by import color_by
+from mpmcli.render.dots import OVERLAP, DotsPainter
+from mpmcli.render.subject import Subject, subject_of
+from mpmcli.render.theme import THEMES, rgb_bytes
+from mpmcli.render.view import View, view_of
+from mpmcli.render.window import choose_window
+
+LIGHT = THEMES["light"]
+SIZE = (320, 240)
+H = 0.05
+
+
+def painted(
+    directory: Path, frames: list[Frame], size: tuple[float, ...], by: str = "speed", camera: str = "iso", **options
+) -> tuple[list[np.ndarray], View, Result, Subject]:
+    """Draw frames of a domain that begins at the origin."""
+    choose_window()
+    result = write(directory / "run", header(size, H, [WATER]), frames)
+    subject = subject_of(result)
+    view = view_of(subject, camera, SIZE)
+    colors = color_by(by, result, subject, LIGHT, **options)
+    painter = DotsPainter(subject, view, LIGHT, colors, int(result.particle_counts.max()))
+    return [painter.draw(result.frame(k, painter.fields)) for k in range(len(frames))], view, result, subject
+
+
+def ink(picture: np.ndarray) -> np.ndarray:
+    """Where something was drawn."""
+    return (picture != rgb_bytes(LIGHT.ground)).any(axis=2)
+
+
+def at(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """The colours at places (n, 2 or more), from the left and from the top."""
+    column, row = np.floor(pixels[:, :2]).astype(int).T
+    return picture[row, column]
+
+
+def deep(points: np.ndarray) -> np.ndarray:
+    """Points of a plane as VTK has them."""
+    return np.concatenate([points, np.zeros((len(points), 3 - points.shape[1]))], axis=1)
+
+
+def test_dots_cover_their_particles_and_nothing_else(tmp_path: Path) -> None:
+    block = lattice((0.2, 0.1), (0.7, 0.4), H / 2)
+    (picture,), view, _, subject = painted(tmp_path, [frame(0, block)], (1.0, 0.75))
+    drawn = ink(picture)
+    assert at(drawn, view.pixels(deep(block))).all()
+    # The area of a block, and half a dot around it, nothing else.
+    scale, reach = view.pixels_per_metre, 0.5 * OVERLAP * subject.distances[0]
+    (x0, y1, _), (x1, y0, _) = view.pixels(np.array([[0.2, 0.1, 0.0], [0.7, 0.4, 0.0]]))
+    rows, columns = np.nonzero(drawn)
+    assert columns.min() + 1 >= x0 - reach * scale - 1 and columns.max() <= x1 + reach * scale + 1
+    assert rows.min() + 1 >= y0 - reach * scale - 1 and rows.max() <= y1 + reach * scale + 1
+    assert drawn.sum() >= 0.95 * (x1 - x0) * (y1 - y0)
+
+
+def test_a_dot_is_round_and_as_large_as_it_should_be(tmp_path: Path) -> None:
+    place = np.array([[0.5, 0.375]])
+    (picture,), view, _, subject = painted(tmp_path, [frame(0, place)], (1.0, 0.75))
+    radius = 0.5 * OVERLAP * subject.distances[0] * view.pixels_per_metre
+    rows, columns = np.nonzero(ink(picture))
+    x, y, _ = view.pixels(deep(place))[0]
+    distance = np.hypot(columns + 0.5 - x, rows + 0.5 - y)
+    assert distance.max() <= radius + 1.0
+    assert len(rows) == pytest.approx(np.pi * radius**2, abs=2 * np.pi * radius)
+    assert np.ptp(rows) == pytest.approx(np.ptp(columns), abs=1)
+
+
+def test_colours_follow_a_known_gradient(tmp_path: Path) -> None:
+    block = lattice((0.1, 0.1), (0.9, 0.6), H / 2)
+    gradient = frame(0, block, pressure=1000.0 * block[:, 0])
+    options = {"by": "pressure", "limits": (0.0, 1000.0), "cmap": "gray"}
+    (picture,), view, _, _ = painted(tmp_path, [gradient], (1.0, 0.75), **options)
+    seen = at(picture, view.pixels(deep(block))).astype(float)
+    # Exactly the colour of the value, as 256 steps of grey have it.
+    np.testing.assert_allclose(seen, np.repeat(255.0 * block[:, :1], 3, axis=1), atol=1.01)
+
+
+def test_nan_is_drawn_in_its_colour_and_lost_particles_are_left_out(tmp_path: Path) -> None:
+    places = np.array([[0.3, 0.3], [0.7, 0.3], [np.nan, 0.5]])
+    values = np.array([np.nan, 5.0, 5.0])
+    options = {"by": "pressure", "limits": (0.0, 10.0)}
+    (picture,), view, _, _ = painted(tmp_path, [frame(0, places, pressure=values)], (1.0, 0.75), **options)
+    left, right = at(picture, view.pixels(deep(places[:2])))
+    assert tuple(left) == rgb_bytes(LIGHT.missing) and tuple(right) != rgb_bytes(LIGHT.missing)
+    rows, columns = np.nonzero(ink(picture))
+    near = view.pixels(deep(places[:2]))[:, :2]
+    assert all(np.hypot(near[:, 0] - c, near[:, 1] - r).min() < 20 for r, c in zip(rows, columns, strict=True))
+
+
+def test_empty_frames_single_particles_and_full_ones_alternate(tmp_path: Path) -> None:
+    block = lattice((0.2, 0.1), (0.7, 0.4), H / 2)
+    frames = [frame(0, block), frame(1, np.empty((0, 2))), frame(2, block[:1]), frame(3, block)]
+    pictures, view, _, _ = painted(tmp_path, frames, (1.0, 0.75))
+    assert not ink(pictures[1]).any()
+    assert ink(pictures[2]).any() and ink(pictures[2]).sum() < 100
+    assert at(ink(pictures[2]), view.pixels(deep(block[:1]))).all()
+    np.testing.assert_array_equal(pictures[0], pictures[3])
+
+
+def test_the_nearer_ball_hides_the_farther_one(tmp_path: Path) -> None:
+    places = np.array([[0.5, 0.3, 0.4], [0.5, 0.7, 0.4], [0.9, 0.5, 0.4]])
+    still = frame(0, places, pressure=np.array([0.0, 1.0, 1.0]))
+    # The front camera looks along y.
+    options = {"by": "pressure", "camera": "front", "limits": (0.0, 1.0), "cmap": "gray"}
+    (picture,), view, _, _ = painted(tmp_path, [still], (1.0, 1.0, 0.75), **options)
+    hidden, seen = at(picture, view.pixels(places[[0, 2]]))
+    assert hidden.max() < 60 and seen.min() > 120
+
+
+def test_perspective_makes_near_balls_larger(tmp_path: Path) -> None:
+    places = np.array([[0.5, 0.02, 0.5], [0.5, 0.98, 0.5]])
+    choose_window()
+    result = write(tmp_path / "run", header((1.0, 1.0, 1.0), 0.2, [WATER]), [frame(0, places)])
+    subject = replace(subject_of(result), lower=(0.0, 0.0, 0.0))
+    view = view_of(subject, "0.2,-2,0.5,0.5,0.5,0.5", (600, 400))
+    painter = DotsPainter(subject, view, LIGHT, color_by("speed", result, subject, LIGHT), 2)
+    drawn = painter.draw(result.frame(0)) < 120
+    diameters = []
+    for place in places:
+        x, y, depth = view.pixels(place[None])[0]
+        column = drawn[:, int(x)].any(axis=1)
+        around = column[max(0, int(y) - 40) : int(y) + 40]
+        diameters.append(around.sum())
+        expected = OVERLAP * subject.distances[0] * view.pixels_per_metre * view.distance / depth
+        # Layers of distance leave 2 % here, pixels one.
+        assert diameters[-1] == pytest.approx(expected, rel=0.08, abs=2.0)
+    assert diameters[0] > 1.3 * diameters[1]
+
+
+def test_what_lies_behind_its_surroundings_is_darker(tmp_path: Path) -> None:
+    # Two layers of the same colour, the upper one with a hole through which the lower one is seen.
+    lower = lattice((0.1, 0.1, 0.0), (0.9, 0.9, H / 2), H / 2)
+    upper = lower + np.array([0.0, 0.0, 0.2])
+    hole = np.hypot(upper[:, 0] - 0.5, upper[:, 1] - 0.5) < 0.08
+    # In the middle of the balls: lit alike, whatever their place.
+    (picture,), view, _, _ = painted(
+        tmp_path, [frame(0, np.concatenate([lower, upper[~hole]]))], (1.0, 1.0, 1.0), camera="top"
+    )
+    brightness = picture.astype(float).mean(axis=2)
+    inside = at(brightness, view.pixels(lower[hole]))
+    open_places = upper[np.hypot(upper[:, 0] - 0.5, upper[:, 1] - 0.25) < 0.08]
+    outside = at(brightness, view.pixels(open_places))
+    assert inside.mean() < 0.85 * outside.mean()
+
+
+def test_the_same_frame_gives_the_same_pixels(tmp_path: Path) -> None:
+    block = lattice((0.2, 0.2, 0.1), (0.8, 0.8, 0.4), H / 2)
+    (first,), _, result, subject = painted(tmp_path, [frame(0, block)], (1.0, 1.0, 0.75))
+    view = view_of(subject, "iso", SIZE)
+    again = DotsPainter(subject, view, LIGHT, color_by("speed", result, subject, LIGHT), len(block))
+    np.testing.assert_array_equal(first, again.draw(result.frame(0)))
