@@ -60,6 +60,8 @@ def test_spheres_over_the_edge_are_cut():
     pixels = np.array([[0.0, 0.0, 5.0], [-500.0, 30.0, 5.0], [40.0, 900.0, 5.0]])
     depth = sphere_depths(pixels, np.full(3, SCALE), 0.1, SHAPE)
     assert (depth < NOTHING).sum() == pytest.approx(np.pi * 10**2 / 4, abs=10)
+    corners = np.array([[-10.0, -10.0, 5.0], [89.5, 69.5, 5.0], [-9.5, 69.5, 5.0], [89.5, -9.5, 5.0]])
+    assert (sphere_depths(corners, np.full(4, SCALE), 0.1, SHAPE) == NOTHING).all()
     assert (sphere_depths(np.empty((0, 3)), np.empty(0), 0.1, SHAPE) == NOTHING).all()
 
 
@@ -143,14 +145,24 @@ def test_deposit_keeps_the_middle():
     assert image[40, 50] == pytest.approx(3.0)
 
 
-def test_blur_has_its_width():
-    image = np.zeros(SHAPE, np.float32)
-    image[30, 40] = 1.0
-    result = blurred(image, 3.0)
+@pytest.mark.parametrize("deviation", [0.5, 3.0, 9.0, 14.3, 40.0])
+def test_blur_has_its_width(deviation: float):
+    reach = int(4 * deviation)
+    image = np.zeros((2 * reach + 1, 2 * reach + 3), np.float32)
+    image[reach, reach + 1] = 1.0
+    result = blurred(image, deviation)
     assert result.sum() == pytest.approx(1.0, rel=1e-5)
-    variance = ((np.arange(80) - 40) ** 2 * result.sum(axis=0)).sum()
-    # Cut off at three standard deviations, a Gaussian loses 2.7 % of its variance.
-    assert variance == pytest.approx(9.0, rel=0.03)
+    offset = np.arange(2 * reach + 3) - reach - 1
+    # Cut off at three standard deviations a Gaussian loses 2.7 % of its variance. Boxes are odd numbers of pixels: one
+    # of three that is two wider adds (low + 1) / 3, so that they are within half of that; low is 17 or more.
+    # At half a pixel the samples are too few for the integral: their sum is 2 exp(-2) / (1 + 2 exp(-2)) = 0.213.
+    expected = 0.213 if deviation == 0.5 else deviation**2
+    assert (offset**2 * result.sum(axis=0)).sum() == pytest.approx(expected, rel=0.04)
+    assert (offset * result.sum(axis=0)).sum() == pytest.approx(0.0, abs=1e-3)
+    # Its height in the middle, of a Gaussian in two dimensions; three boxes of 2 deviations have 3 / 8 to 0.399.
+    if deviation > 1:
+        share = 1.0 if deviation < 8 else (0.375 * np.sqrt(2 * np.pi)) ** 2
+        assert result.max() == pytest.approx(share / (2 * np.pi * deviation**2), rel=0.05)
 
 
 def test_normals_of_a_plane_and_of_a_sphere():

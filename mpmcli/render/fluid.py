@@ -10,21 +10,25 @@ import numpy as np
 
 from mpmcli.output.frame import Frame
 from mpmcli.render.depth_shading import depth_shaded
-from mpmcli.render.fluid_room import SAMPLES, Caster, Room, sampled
-from mpmcli.render.fluid_shading import displayed, lights_of, linear, optics_of, shaded, transmitted
+from mpmcli.render.fluid_room import DIAMETER, SAMPLES, Room
+from mpmcli.render.fluid_shading import displayed, fluid_lights, linear, optics_of, shaded, transmitted
+from mpmcli.render.lighting import lights_of
 from mpmcli.render.liquid_surface import Liquid, Surface, layers_of, scale_at, surface_of, window_of
+from mpmcli.render.material_groups import Group, groups_of
 from mpmcli.render.pixel_rays import plane
-from mpmcli.render.screen_space import NOTHING
+from mpmcli.render.screen_space import NOTHING, sampled
 from mpmcli.render.subject import Subject
-from mpmcli.render.theme import Theme, rgb
+from mpmcli.render.theme import Theme, rgb_bytes
 from mpmcli.render.view import View
 
-# Radius of the dots, in distances between particles: they overlap a little.
-DOT_RADIUS = 0.575
-# Grains differ by so much in brightness, so that they can be told apart.
-TONE = 0.10
-# What stands out of a surface by less than this, in distances between particles, lies in it.
-LIES_IN = 1.0
+# Dots differ by so much in brightness, up or down, so that they can be told apart.
+TONE = 0.05
+# What is behind a surface by less than this, in distances between particles, lies on it, as the edges of the domain do.
+LIES_ON = 0.3
+# Share of the shadow on the floor that is not seen through a liquid.
+FALLS_THROUGH = 0.5
+# Distance from a particle to which it changes the picture, in distances between particles.
+LEAVES_TRACES = 4.0
 # The most of a liquid that bends what lies behind it, in lengths of the scene.
 BENDS = 0.3
 
@@ -46,35 +50,31 @@ class Sample:
 
 
 class FluidPainter:
-    """Draws the frames of one run in 3D."""
+    """Draws the frames of one run in 3D.
+
+    Attributes:
+        fields: that are read of each frame: none.
+    """
+
+    fields: tuple[str, ...] = ()
 
     def __init__(self, subject: Subject, view: View, theme: Theme) -> None:
         self._subject, self._view = subject, view
         extent = np.subtract(subject.upper, subject.lower)
         # What a liquid takes of the light is told by the size of the scene: a beaker and a reservoir look alike.
         self._length = float(np.cbrt(np.prod(np.maximum(extent, 1e-3 * extent.max()))))
-        self._room = Room(subject, view, theme, self._length)
-        self._lights = lights_of(theme, view.axes @ self._room.lamp, view.axes @ np.array(subject.up))
-        self._looks = np.array([rgb(look.color) for look in subject.looks])
+        lamp = lights_of(subject, view, theme).lamp
+        self._room = Room(subject, view, theme, lamp)
+        self._lights = fluid_lights(theme, view.axes @ lamp, view.axes @ np.array(subject.up))
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return the picture of a frame, (h, w, 3) uint8; particles without a place (NaN) are left out."""
-        placed = np.isfinite(frame.position).all(axis=1)
-        position = np.asarray(frame.position[placed], np.float64)
-        body = np.clip(frame.body[placed], 0, len(self._subject.bodies) - 1)
-        kind = np.array(self._subject.material_of)[body]
-        distance = np.array(self._subject.distances)[body]
-        solid = ~np.array([look.liquid for look in self._subject.looks])[kind]
-        number = np.flatnonzero(placed)
-        colors = self._colors(kind[solid], number[solid])
-        picture, depth = self._room.things(position[solid], colors, DOT_RADIUS * distance[solid])
-        casters = [
-            Caster(position[kind == k], distance[kind == k] ** 3, look) for k, look in enumerate(self._subject.looks)
-        ]
-        image = self._room.base([caster for caster in casters if len(caster.position)])
-        diameter = 2 * DOT_RADIUS * float(distance[solid].max()) if solid.any() else None
-        samples = self._samples(picture, depth, diameter)
-        liquids = [self._liquid(casters[k]) for k, look in enumerate(self._subject.looks) if look.liquid]
+        groups = groups_of(self._subject, frame)
+        solids = [group for group in groups if not group.look.liquid]
+        picture, depth = self._room.things(solids, [_colors(group) for group in solids])
+        image = self._room.base(groups)
+        samples = self._samples(picture, depth, max((group.distance for group in solids), default=None))
+        liquids = [self._liquid(group, frame) for group in groups if group.look.liquid]
         liquids = [liquid for liquid in liquids if len(liquid.pixels)]
         window = window_of(liquids, self._view)
         if window is None:
@@ -85,40 +85,39 @@ class FluidPainter:
             self._pour(image, samples, surface, liquids, layers)
         return (displayed(image) * 255 + 0.5).astype(np.uint8)
 
-    def _colors(self, kind: np.ndarray, number: np.ndarray) -> np.ndarray:
-        """Return the colours of dots (n, 3) uint8, a little lighter or darker each by its number."""
-        tone = 1 + TONE * (np.modf(number * 0.6180339887498949)[0] - 0.5)
-        return np.clip(255 * self._looks[kind] * tone[:, None] + 0.5, 0, 255).astype(np.uint8)
+    def _liquid(self, group: Group, frame: Frame) -> Liquid:
+        """Return those particles of a liquid that may be seen."""
+        view = self._view
+        pixels = view.pixels(group.position)
+        seen = np.flatnonzero(pixels[:, 2] > max(view.near, 2 * group.distance))
+        scale = scale_at(view, pixels[seen, 2])
+        reach = (LEAVES_TRACES * group.distance * scale)[:, None]
+        inside = (pixels[seen, :2] > -reach).all(axis=1) & (pixels[seen, :2] < np.array(view.size) + reach).all(axis=1)
+        seen, scale = seen[inside], scale[inside]
+        body = np.clip(frame.body[group.rows[seen]], 0, len(self._subject.bodies) - 1)
+        volume = np.array(self._subject.distances)[body] ** 3
+        return Liquid(group.look, group.distance, group.position[seen], pixels[seen], scale, volume)
 
-    def _liquid(self, caster: Caster) -> Liquid:
-        """Return those particles of a liquid that are before the camera."""
-        distance = float(np.cbrt(caster.volume.max())) if len(caster.volume) else 0.0
-        pixels = self._view.pixels(caster.position)
-        front = pixels[:, 2] > 1e-3 * self._view.near
-        pixels = pixels[front]
-        scale = scale_at(self._view, pixels[:, 2])
-        return Liquid(caster.look, distance, caster.position[front], pixels, scale, caster.volume[front])
-
-    def _samples(self, picture: np.ndarray, depth: np.ndarray, diameter: float | None) -> list[Sample]:
+    def _samples(self, picture: np.ndarray, depth: np.ndarray, distance: float | None) -> list[Sample]:
         """Part a picture with several samples to a pixel, leaving out what shows nothing.
 
         Args:
-            diameter: of the dots, m; None where there are only lines.
+            distance: between the dots, m; None where there are only lines.
         """
         width, height = self._view.size
         shade = None
-        if diameter is not None:
+        if distance is not None:
             white = np.full((height, width, 3), 255, np.uint8)
-            shade = depth_shaded(white, depth, diameter, self._view, SAMPLES)[..., 0] / np.float32(255)
+            shade = depth_shaded(white, depth, DIAMETER * distance, self._view, SAMPLES)[..., 0] / np.float32(255)
         samples = []
         for i in range(SAMPLES):
             for j in range(SAMPLES):
-                distance = depth[i::SAMPLES, j::SAMPLES]
-                row, column = np.nonzero(np.isfinite(distance))
+                far = depth[i::SAMPLES, j::SAMPLES]
+                row, column = np.nonzero(np.isfinite(far))
                 color = picture[i::SAMPLES, j::SAMPLES][row, column] / np.float32(255)
                 if shade is not None:
                     color *= shade[row, column, None]
-                samples.append(Sample(row, column, linear(color), distance[row, column]))
+                samples.append(Sample(row, column, linear(color), far[row, column]))
         return samples
 
     def _pour(
@@ -133,9 +132,10 @@ class FluidPainter:
         picture, part = surface.window.inner(self._view.size)
         depth = np.full(image.shape[:2], NOTHING, np.float32)
         depth[picture] = np.where(surface.alpha > 0, surface.depth, NOTHING)[part]
-        depth -= np.float32(LIES_IN * min(liquid.distance for liquid in liquids))
+        depth += np.float32(LIES_ON * min(liquid.distance for liquid in liquids))
         before = [sample.distance < depth[sample.row, sample.column] for sample in samples]
-        behind = image.copy()
+        # Part of the light that a liquid takes from the floor beside it falls through it on the floor under it.
+        behind = image + np.float32(FALLS_THROUGH) * (self._room.bare - image)
         _add(behind, [_chosen(sample, ~front) for sample, front in zip(samples, before, strict=True)])
         alpha = np.zeros((*image.shape[:2], 1), np.float32)
         alpha[picture] = surface.alpha[part][..., None]
@@ -186,6 +186,12 @@ class FluidPainter:
                 self._lights,
             )
         return light
+
+
+def _colors(group: Group) -> np.ndarray:
+    """Return the colours of dots (n, 3) uint8, each a little lighter or darker."""
+    tone = 1 + TONE * group.hashes[:, :1]
+    return np.clip(np.array(rgb_bytes(group.look.color)) * tone + 0.5, 0, 255).astype(np.uint8)
 
 
 def _chosen(sample: Sample, which: np.ndarray) -> Sample:

@@ -43,10 +43,10 @@ class Optics:
 
 FINISHES: dict[Finish, Optics] = {
     "water": Optics(
-        depths=6.0, milk=0.4, body=0.66, deepening=0.12, gloss=1.6, sharpness=260.0, reflection=1.0, bend=0.08
+        depths=6.0, milk=0.4, body=0.6, deepening=0.12, gloss=1.6, sharpness=260.0, reflection=1.0, bend=0.06
     ),
     "syrup": Optics(
-        depths=38.0, milk=1.0, body=1.1, deepening=0.2, gloss=1.0, sharpness=160.0, reflection=0.9, bend=0.08
+        depths=32.0, milk=1.0, body=0.88, deepening=0.2, gloss=1.0, sharpness=160.0, reflection=0.9, bend=0.06
     ),
     "matte": Optics(
         depths=200.0, milk=400.0, body=0.9, deepening=0.0, gloss=0.10, sharpness=18.0, reflection=0.15, bend=0.0
@@ -103,11 +103,11 @@ class Lights:
         return self.floor + (sky - self.floor) * low + np.float32(0.9 * self.strength) * box
 
 
-def lights_of(theme: Theme, lamp: np.ndarray, up: np.ndarray) -> Lights:
+def fluid_lights(theme: Theme, lamp: np.ndarray, up: np.ndarray) -> Lights:
     """Return the lights of a theme, for a lamp in a direction."""
     if theme.name == "dark":
         zenith, horizon = np.array([0.10, 0.15, 0.24]), np.array([0.30, 0.36, 0.46])
-        return _lights(lamp, up, zenith, horizon, 0.6 * linear(np.array(rgb(theme.floor))), 0.85, 0.30)
+        return _lights(lamp, up, zenith, horizon, 0.6 * linear(np.array(rgb(theme.floor))), 0.95, 0.36)
     zenith, horizon = np.array([0.25, 0.47, 0.85]), np.array([0.93, 0.96, 1.0])
     return _lights(lamp, up, zenith, horizon, 0.8 * linear(np.array(rgb(theme.floor))), 0.75, 0.45)
 

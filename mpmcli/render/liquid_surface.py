@@ -14,12 +14,16 @@ from mpmcli.render.view import View
 # Radius of the spheres that stand for particles, in distances between particles: they overlap.
 RADIUS = 0.9
 # What is within this of a particle is liquid, however far it is from the next: a drop.
-CORE = 0.6
+CORE = 0.5
+# Particles within this of a wall are mirrored in it.
+MIRRORED = 1.2
 # Standard deviations, in distances between particles: of the smoothing of the depth, the outline, the thickness and
 # the normals.
-SMOOTHING, OUTLINE, SPREAD, SOFTNESS = 2.2, 0.8, 0.8, 0.4
+SMOOTHING, OUTLINE, SPREAD, SOFTNESS = 2.2, 1.1, 1.2, 0.4
 # The widest that any of them may be, pixels.
 WIDEST = 60.0
+# The largest sphere that is drawn as it is, pixels; larger ones, which are smoothed over as much, are drawn coarsely.
+LARGEST = 24.0
 
 
 @dataclass(frozen=True)
@@ -113,13 +117,18 @@ def window_of(liquids: Sequence[Liquid], view: View) -> Window | None:
 
 def surface_of(liquids: Sequence[Liquid], window: Window, view: View, subject: Subject) -> Surface:
     """Find the surface of the liquids, all of them as one body."""
-    local = [_moved(liquid, window) for liquid in liquids]
-    depth, owner, core = _nearest(local, window)
+    inside = all(_is_inside(liquid, subject) for liquid in liquids)
+    whole = [_mirrored(liquid, view, subject) if inside else liquid for liquid in liquids]
+    depth, owner, core = _nearest([_moved(liquid, window) for liquid in whole], window)
+    entry, exit_ = _passage(window, view, subject) if inside else (None, None)
+    if exit_ is not None:
+        beyond = depth > exit_
+        depth[beyond] = NOTHING
+        core &= ~beyond
     known = depth < NOTHING
     distance = max(liquid.distance for liquid in liquids)
     scale = scale_at(view, np.where(known, depth, view.distance))
     depth = smoothed(depth, np.minimum(SMOOTHING * distance * scale, WIDEST), RADIUS * distance)
-    entry = _entry(liquids, window, view, subject)
     if entry is not None:
         # The walls hold the liquid: its spheres do not stand out of the domain.
         depth = np.where(known & (entry < NOTHING), np.maximum(depth, entry), depth)
@@ -183,20 +192,53 @@ def _nearest(liquids: Sequence[Liquid], window: Window) -> tuple[np.ndarray, np.
         radius = RADIUS * liquid.distance
         seen = ~hidden(liquid.pixels, max(liquid.size, 2.0), 2 * radius)
         pixels, scale = liquid.pixels[seen], liquid.scale[seen]
-        near = sphere_depths(pixels, scale, radius, window.shape)
-        core |= sphere_depths(pixels, scale, CORE * liquid.distance, window.shape) < NOTHING
+        near = _spheres(pixels, scale, radius, window.shape)
+        core |= _spheres(pixels, scale, CORE * liquid.distance, window.shape) < NOTHING
         owner[near < depth] = k
         depth = np.minimum(depth, near)
     return depth, owner, core
 
 
-def _entry(liquids: Sequence[Liquid], window: Window, view: View, subject: Subject) -> np.ndarray | None:
-    """Return where the rays of pixels enter the domain, m; None when a part of the liquids is outside of it."""
+def _spheres(pixels: np.ndarray, scale: np.ndarray, radius: float, shape: tuple[int, int]) -> np.ndarray:
+    """Return `sphere_depths`, worked out for squares of pixels where the spheres are large."""
+    side = int(np.ceil(radius * float(scale.max()) / LARGEST)) if len(scale) else 1
+    if side <= 1:
+        return sphere_depths(pixels, scale, radius, shape)
+    rows, columns = shape
+    coarse = sphere_depths(pixels / (side, side, 1), scale / side, radius, (-(-rows // side), -(-columns // side)))
+    return np.repeat(np.repeat(coarse, side, axis=0), side, axis=1)[:rows, :columns]
+
+
+def _is_inside(liquid: Liquid, subject: Subject) -> bool:
+    slack = 0.3 * liquid.distance
+    low, high = np.array(subject.lower) - slack, np.array(subject.upper) + slack
+    return bool(((liquid.position >= low) & (liquid.position <= high)).all())
+
+
+def _mirrored(liquid: Liquid, view: View, subject: Subject) -> Liquid:
+    """Add the mirror images of the particles at the walls: the surface then meets a wall without a gap or a dent."""
+    images = []
+    for axis in range(3):
+        for wall in (subject.lower[axis], subject.upper[axis]):
+            near = np.abs(liquid.position[:, axis] - wall) < MIRRORED * liquid.distance
+            image = liquid.position[near]
+            image[:, axis] = 2 * wall - image[:, axis]
+            images.append(image)
+    added = np.concatenate(images)
+    pixels = view.pixels(added)
+    front = pixels[:, 2] > max(view.near, liquid.distance)
+    added, pixels = added[front], pixels[front]
+    return replace(
+        liquid,
+        position=np.concatenate([liquid.position, added]),
+        pixels=np.concatenate([liquid.pixels, pixels]),
+        scale=np.concatenate([liquid.scale, scale_at(view, pixels[:, 2])]),
+    )
+
+
+def _passage(window: Window, view: View, subject: Subject) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the rays of pixels enter the domain and where they leave it, m; `NOTHING` twice where they miss."""
     low, high = np.array(subject.lower), np.array(subject.upper)
-    for liquid in liquids:
-        slack = 0.3 * liquid.distance
-        if (liquid.position < low - slack).any() or (liquid.position > high + slack).any():
-            return None
     start, direction = rays(view, window.left, window.top, *window.shape)
     first, last = np.full(window.shape, -np.inf), np.full(window.shape, np.inf)
     for axis in range(3):
@@ -204,7 +246,8 @@ def _entry(liquids: Sequence[Liquid], window: Window, view: View, subject: Subje
         along = np.where(np.abs(along) < 1e-12, 1e-12, along)
         one, other = (low[axis] - start[..., axis]) / along, (high[axis] - start[..., axis]) / along
         first, last = np.maximum(first, np.minimum(one, other)), np.minimum(last, np.maximum(one, other))
-    return np.where(first <= last, first, NOTHING).astype(np.float32)
+    hit = first <= last
+    return tuple(np.where(hit, distance, NOTHING).astype(np.float32) for distance in (first, last))
 
 
 def _softened(normal: np.ndarray, known: np.ndarray, deviation: float) -> np.ndarray:
