@@ -160,7 +160,8 @@ def test_bad_input_gets_one_sentence_and_nothing_is_written(run: Path, tmp_path:
     assert "is no colour map" in refused(run, "--color-by", "speed", "--cmap", "nonsense")
     assert "stand for a value" in refused(run, "--color-by", "material", "--clim", "0,1")
     assert "has colours of its own" in refused(run, "--mode", "density", "--color-by", "speed")
-    assert "six numbers" in refused(run, "--camera", "under")
+    assert "drawn in its plane" in refused(run, "--camera", "side")
+    assert "shows a slice" in refused(run, "--mode", "density", "--camera", "1,2,3,4,5,6")
     assert "--save-surface" in refused(run, "--save-surface", tmp_path / "s")
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -205,3 +206,30 @@ def test_series_are_drawn_too(tmp_path: Path, run: Path) -> None:
     pictures = [rendered(path, "-o", out, "--frame", 2)["pictures"][0] for path, out in places]
     one, other = (np.asarray(Image.open(path)) for path in pictures)
     np.testing.assert_array_equal(one, other)
+
+
+def test_surfaces_are_drawn_and_saved_for_other_tools(run: Path, tmp_path: Path) -> None:
+    import pyvista as pv
+
+    out, meshes = tmp_path / "out", tmp_path / "meshes"
+    said = rendered(run, "--mode", "surface", "-o", out, "--frame", "0:2", "--save-surface", meshes, "--workers", 1)
+    assert said["made"] == 2
+    names = {f"surface_{name}_{k:06d}.{kind}" for name in ("water", "jelly") for k in (0, 1) for kind in ("vtp", "obj")}
+    assert {path.name for path in meshes.iterdir()} == names | {"surface_water.vtp.series", "surface_jelly.vtp.series"}
+    # The block of water has 12 by 8 particles, each of which stands for its square; its corners are rounded.
+    water = pv.read(meshes / "surface_water_000001.vtp")
+    assert water.area == pytest.approx(12 * 8 * 0.025**2, rel=0.08)
+    assert water.center[0] == pytest.approx(0.25 + 0.08, abs=0.003)
+    sentence = refused(run, "--mode", "surface", "-o", out, "--frame", "0:2", "--save-surface", meshes)
+    assert "is there already" in sentence and "surface_water_000000.vtp" in sentence
+    listed = json.loads((meshes / "surface_water.vtp.series").read_text())
+    assert [entry["time"] for entry in listed["files"]] == [0.0, 0.01]
+
+
+def test_colours_of_a_surface_are_those_of_a_field_where_asked(run: Path, tmp_path: Path) -> None:
+    pictures = []
+    for k, words in enumerate(([], ["--color-by", "speed", "--clim", "0,10"])):
+        said = rendered(run, "--mode", "surface", *words, "-o", tmp_path / f"{k}.png")
+        pictures.append(np.asarray(Image.open(said["pictures"][0])))
+    assert (pictures[0] != pictures[1]).any()
+    assert "a surface has no bodies" in refused(run, "--mode", "surface", "--color-by", "body")

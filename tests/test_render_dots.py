@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from drawn_results import WATER, frame, header, lattice, write
 
@@ -151,6 +152,21 @@ def test_what_lies_behind_its_surroundings_is_darker(tmp_path: Path) -> None:
     open_places = upper[np.hypot(upper[:, 0] - 0.5, upper[:, 1] - 0.25) < 0.08]
     outside = at(brightness, view.pixels(open_places))
     assert inside.mean() < 0.85 * outside.mean()
+
+
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
+    block = lattice((0.2, 0.2, 0.1), (0.8, 0.8, 0.4), H / 2)
+    _, _, result, subject = painted(tmp_path, [frame(0, block)], (1.0, 1.0, 0.75))
+    view = view_of(subject, "iso", SIZE)
+    painter = DotsPainter(subject, view, LIGHT, color_by("speed", result, subject, LIGHT), len(block))
+    still = result.frame(0)
+    used = []
+    for _ in range(3):
+        for _ in range(25):
+            painter.draw(still)
+        used.append(psutil.Process().memory_info().rss)
+    # A picture and its depth alone are 4 MB with the samples of each pixel: 25 of them would be 100.
+    assert used[2] - used[0] < 10e6
 
 
 def test_the_same_frame_gives_the_same_pixels(tmp_path: Path) -> None:

@@ -61,6 +61,7 @@ def test_points_fall_where_vtk_puts_them(camera: str) -> None:
 @pytest.mark.parametrize("size", [(320, 200), (90, 400)])
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_the_camera_frames_the_domain(subject: Subject, camera: str, size: tuple[int, int]) -> None:
+    camera = camera if subject.dimension == 3 else "iso"
     seen = view_of(subject, camera, size).pixels(corners(subject))[:, :2]
     free = np.stack([seen.min(axis=0), np.array(size) - seen.max(axis=0)]) / size
     # In the middle, nothing outside, and no smaller than it must be.
@@ -99,6 +100,12 @@ def test_any_other_camera_is_refused_in_a_sentence(text: str) -> None:
         return
     with pytest.raises(InputError, match="or six numbers"):
         view_of(SUBJECT, text, (320, 200))
+
+
+def test_a_flat_scene_has_no_other_side() -> None:
+    for camera in ("side", "top", "1,2,3,4,5,6"):
+        with pytest.raises(InputError, match="drawn in its plane"):
+            view_of(FLAT, camera, (320, 200))
 
 
 def test_a_camera_needs_something_to_look_at() -> None:

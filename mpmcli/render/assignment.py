@@ -26,6 +26,7 @@ from mpmcli.render.pictures import (
 from mpmcli.render.save_surface import save_surfaces, surface_paths
 from mpmcli.render.settings import Mode, Settings, parse_grid, parse_limits, parse_size
 from mpmcli.render.subject import subject_of
+from mpmcli.render.view import CAMERAS
 
 # Where pictures go, beside the result.
 DIRECTORY = "render"
@@ -249,6 +250,8 @@ def _require_sense(request: Request) -> None:
         raise InputError("--save-surface writes the surfaces of --mode surface: ask for that.")
     if request.mode == "surface" and request.color == "body":
         raise InputError("--color-by body is for --mode dots: a surface has no bodies, only materials.")
+    if request.mode == "density" and request.camera not in CAMERAS:
+        raise InputError(f"--mode density shows a slice: give --camera {', '.join(CAMERAS[1:])}.")
     for option, value in (("--color-by", request.color), ("--clim", request.clim), ("--cmap", request.cmap)):
         allowed = COLORED if option == "--color-by" else (*COLORED, "density")
         if value and request.mode not in allowed:

@@ -84,12 +84,14 @@ def view_of(subject: Subject, camera: str, size: tuple[int, int]) -> View:
 
     Args:
         camera: one of `CAMERAS`, or six numbers with commas between: where it stands and what it looks at, m. A 2D
-            scene is looked at in its plane, whatever is asked for but six numbers.
+            scene is always looked at from the front.
         size: pixels, (width, height).
 
     Raises:
-        InputError: `camera` is none of these.
+        InputError: `camera` is none of these, or not for a scene in 2D.
     """
+    if subject.dimension == 2 and camera not in ("iso", "front"):
+        raise InputError(f"--camera {camera} is for scenes in 3D: this one is in 2D, and drawn in its plane.")
     if camera not in CAMERAS:
         return _free_view(subject, camera, size)
     up = np.array(subject.up)
