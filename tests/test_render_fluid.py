@@ -92,6 +92,7 @@ def test_liquid_covers_what_its_particles_cover(camera: str):
     must = covered(points, view, 0.4 * DISTANCE)
     assert must.sum() > 1000
     assert different[must].mean() > 0.99
+    assert different[covered(points[-2:], view, 0.4 * DISTANCE)].mean() > 0.9
     # A particle's sphere, an outline that is smoothed over as much again, and a pixel.
     may = covered(points, view, 1.8 * DISTANCE + 1.5 / view.pixels_per_metre)
     if camera == "front":
@@ -108,6 +109,16 @@ def test_nothing_and_one_particle_are_drawn(painter: FluidPainter, empty: np.nda
     size = DISTANCE * FRONT.pixels_per_metre
     assert 1 <= different.sum() <= np.pi * (1.5 * size + 2) ** 2
     assert changed(painter.draw(frame_of((one, JELLY))), empty)[row, column]
+
+
+def test_drop_that_is_alone_has_its_size():
+    view = view_of(SUBJECT, "0.8,-0.5,0.5,0.8,0.4,0.5", SIZE)
+    painter = FluidPainter(SUBJECT, view, THEMES["dark"])
+    drop = np.array([[0.8, 0.4, 0.5]])
+    different = changed(painter.draw(frame_of((drop, WATER))), painter.draw(frame_of()))
+    size = DISTANCE * view.pixels_per_metre
+    # As much as a ball of the volume of a particle, whose radius is 0.62 distances, or somewhat less; not a dot.
+    assert np.pi * (0.4 * size) ** 2 < different.sum() < np.pi * (0.62 * size + 1) ** 2
 
 
 def test_places_that_are_not_numbers_are_left_out(painter: FluidPainter):

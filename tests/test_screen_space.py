@@ -77,6 +77,21 @@ def test_what_is_called_hidden_is_not_seen():
     np.testing.assert_array_equal(sphere_depths(pixels[~behind], scale[~behind], radius, SHAPE), whole)
 
 
+def test_only_what_is_covered_all_around_is_hidden():
+    screen = np.array([(5.0 + 10 * i, 5.0 + 10 * j, 1.0) for i in range(3) for j in range(3)])
+
+    def middle(others: np.ndarray, depth: float) -> bool:
+        return bool(hidden(np.append(others, [[15.0, 15.0, depth]], axis=0), 10.0, 0.2)[-1])
+
+    assert middle(screen, 1.21)
+    assert not middle(screen, 1.19)
+    # A hole in any corner of the screen may show it.
+    for k in (0, 2, 3, 8):
+        assert not middle(np.delete(screen, k, axis=0), 1.21)
+    assert not hidden(screen, 10.0, 0.2).any()
+    assert len(hidden(np.empty((0, 3)), 10.0, 0.2)) == 0
+
+
 def test_smoothing_keeps_a_slope():
     _across, down = np.meshgrid(np.arange(80), np.arange(60))
     slope = (5.0 + 0.001 * down + 0.002 * _across).astype(np.float32)
