@@ -26,6 +26,7 @@ LIGHT = THEMES["light"]
 class ByColumn:
     """Colours by x, from 0 to 1; particles in `unknown` have no number."""
 
+    fields: tuple[str, ...] = ()
     cmap: str = "viridis"
     limits: tuple[float, float] = (0.0, 1.0)
     missing: str = "#ff00c8"
