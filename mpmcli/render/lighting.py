@@ -52,7 +52,7 @@ def lights_of(subject: Subject, view: View, theme: Theme) -> Lights:
         lamp=_unit(-0.42 * right + 1.0 * above + 0.40 * back - 0.1 * up),
         rim=_unit(0.55 * right + 0.55 * above - 0.75 * back),
         fill=_unit(0.8 * right + 0.25 * above + 0.6 * back),
-        lamp_color=np.array([1.62, 1.55, 1.42]) * (0.72 if dark else 0.66),
+        lamp_color=np.array([1.50, 1.56, 1.66]) * 0.72 if dark else np.array([1.62, 1.55, 1.42]) * 0.66,
         sky=np.array([0.30, 0.38, 0.52]) * (0.72 if dark else 1.25),
         horizon=np.array([0.22, 0.26, 0.33]) if dark else np.array([0.86, 0.90, 0.95]),
         ground=linear(theme.floor) * (1.0 if dark else 0.42) + (0.03 if dark else 0.0),

@@ -73,6 +73,9 @@ class OutlinePainter:
             picture += alpha[..., None] * (drawn - picture)
         return (255.0 * np.clip(picture, 0.0, 1.0) + 0.5).astype(np.uint8)[::-1]
 
+    def close(self) -> None:
+        """Do nothing: there is no window."""
+
     def _cover(self, group: Group) -> np.ndarray:
         """Return the share of each pixel's surroundings that a group covers, (h, w); its edge is where it is 1/2."""
         step = _coarseness(group.distance, self.grid)
