@@ -20,7 +20,7 @@ FULLNESS_CELL, FULLNESS_CELLS = 4.0, 4e6
 # Shares of room filled, below which a vertex is not smoothed and above which it is smoothed in full.
 ALONE, HALF = 0.03, 0.22
 # Radii from a wall within which a particle touches it, and the edge of the cells in which such are looked for.
-CONTACT, CONTACT_CELL = 1.8, 2.0
+CONTACT, CONTACT_CELL = 3.0, 2.0
 # Radii that a particle may lie outside of the domain and still be drawn.
 STRAY = 4.0
 
