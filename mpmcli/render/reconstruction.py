@@ -19,6 +19,8 @@ IMAGE_REACH = 2.0 * SMOOTHING_LENGTH
 FULLNESS_CELL, FULLNESS_CELLS = 4.0, 4e6
 # Shares of room filled, below which a vertex is not smoothed and above which it is smoothed in full.
 ALONE, HALF = 0.03, 0.22
+# Radii from a wall within which a particle touches it, and the edge of the cells in which such are looked for.
+CONTACT, CONTACT_CELL = 3.0, 2.0
 # Radii that a particle may lie outside of the domain and still be drawn.
 STRAY = 4.0
 
@@ -119,9 +121,11 @@ def reconstruct(
         connectivity = mesh.vertex_vertex_connectivity()
         laplacian_smoothing_parallel(mesh, connectivity, iterations=rounds, beta=1.0, weights=weights)
     # The old view is stale: smoothing has put other memory in its place.
-    vertices = np.clip(np.asarray(mesh.vertices), low, high)
-    areas = _area_vectors(vertices, triangles)
-    triangles = triangles[areas.any(axis=1)]
+    raw = np.asarray(mesh.vertices)
+    vertices = np.clip(raw, low, high)
+    kept = _area_vectors(vertices, triangles).any(axis=1)
+    kept &= ~_pressed_flat(raw, vertices, triangles, particles, low, high)
+    triangles = triangles[kept]
     return Mesh(
         points=(vertices * radius + middle).astype(np.float32),
         triangles=triangles,
@@ -166,6 +170,43 @@ def _with_images(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple
             sources.append(source[near])
         points, source = np.concatenate(images), np.concatenate(sources)
     return points, source
+
+
+def _pressed_flat(
+    raw: np.ndarray,
+    vertices: np.ndarray,
+    triangles: np.ndarray,
+    particles: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> np.ndarray:
+    """Return which triangles (t,) are those of an image that its particle, close to a wall, does not touch.
+
+    Cut off at the wall, such an image is a sheet without thickness that lies on it.
+
+    Args:
+        raw, vertices: (v, 3) before and after they were cut off at the walls, in radii.
+        particles: (n, 3) without images.
+    """
+    flat = np.zeros(len(triangles), dtype=bool)
+    for axis in range(3):
+        others = [k for k in range(3) if k != axis]
+        shape = tuple(np.maximum(np.ceil((high - low)[others] / CONTACT_CELL).astype(int), 1) + 2)
+        for wall, inwards in ((low[axis], 1.0), (high[axis], -1.0)):
+            beyond = inwards * (raw[:, axis] - wall) < 0.0
+            rows = np.flatnonzero(beyond[triangles].all(axis=1))
+            if not len(rows):
+                continue
+            close = particles[inwards * (particles[:, axis] - wall) < CONTACT][:, others]
+            at = np.minimum(((close - low[others]) / CONTACT_CELL).astype(int) + 1, np.array(shape) - 2)
+            touched = np.zeros(shape, dtype=bool)
+            touched[at[:, 0], at[:, 1]] = True
+            for side in range(2):
+                touched |= np.roll(touched, 1, axis=side) | np.roll(touched, -1, axis=side)
+            middles = vertices[triangles[rows]].mean(axis=1)[:, others]
+            at = np.minimum(((middles - low[others]) / CONTACT_CELL).astype(int) + 1, np.array(shape) - 2)
+            flat[rows] |= ~touched[at[:, 0], at[:, 1]]
+    return flat
 
 
 def _fullness(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
