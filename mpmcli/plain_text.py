@@ -1,4 +1,4 @@
-"""Tables and sizes as plain text."""
+"""Tables, sizes and titles as plain text."""
 
 SIZES = ("B", "kB", "MB", "GB", "TB", "PB")
 
@@ -14,6 +14,11 @@ def text_table(head: tuple[str, ...], rows: list[tuple[str, ...]], left: set[int
         for row in [head, *rows]
     ]
     return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
+
+
+def one_line(text: str) -> str:
+    """Return a text without line breaks and other characters that nothing is drawn for, as a font needs it."""
+    return " ".join("".join(character if character.isprintable() else " " for character in text).split())
 
 
 def size_text(count: float) -> str:

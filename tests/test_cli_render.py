@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -13,6 +14,7 @@ from PIL import Image
 
 from mpmcli.output import Result, VtkSeriesStore, open_result
 from mpmcli.output.store import SEGMENTS
+from mpmcli.render.assignment import Request, assign
 
 FRAMES = 6
 
@@ -101,6 +103,15 @@ def test_a_film_has_its_frames_and_its_length(run: Path, tmp_path: Path) -> None
     assert imageio_ffmpeg.count_frames_and_secs(str(film))[1] == pytest.approx(FRAMES / 24, abs=0.02)
 
 
+def test_an_interrupt_ends_a_film_that_is_put_together(run: Path, tmp_path: Path) -> None:
+    film = tmp_path / "film.mp4"
+    settings = Request(movie=film, output=tmp_path / "out", size="64x64")
+    assign(open_result(run), replace(settings, movie=None, frames="all")).carry_out(1)
+    with pytest.raises(KeyboardInterrupt):
+        assign(open_result(run), settings).carry_out(1, stop=lambda: True)
+    assert not film.exists() and len(list((tmp_path / "out").iterdir())) == FRAMES
+
+
 def test_a_gif_is_read_by_another_reader(run: Path, tmp_path: Path) -> None:
     film = tmp_path / "film.gif"
     rendered(run, "--movie", film, "--frame", "::2", "--fps", 10, "--workers", 1)
@@ -141,7 +152,7 @@ def test_a_run_under_way_is_drawn_up_to_its_last_sealed_frame(tmp_path: Path) ->
 def test_what_cannot_be_shown_as_it_is_is_said(run: Path) -> None:
     outcome = run_here("render", run, "--color-by", "pressure", "--size", "320x180", "--frame", 0)
     assert outcome.status == 0
-    assert "warning: the pressure of up to 1 particles is not a number, first in frame 0" in outcome.stderr
+    assert "warning: the pressure of 1 particle is not a number, first in frame 0" in outcome.stderr
     assert "#ff00c8" in outcome.stderr
 
 

@@ -5,17 +5,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 from command import run_here
-from made_result import GRAVITY, LIMITS, MASS, PAUSE, STEP, made_row, write_made
+from made_result import GRAVITY, LIMITS, MASS, PAUSE, STEP, made_header, made_row, write_made
 from PIL import Image
 
 from mpmcli.output import open_result
 from mpmcli.plot import history
 from mpmcli.plot.history import read_history
-from mpmcli.plot.ledger_figure import draw_ledger
+from mpmcli.plot.ledger_figure import draw_ledger, ledger_picture
 from mpmcli.plot.style import THEMES, drawing
 from mpmcli.render.picture_file import settings_digest, write_picture
 
@@ -231,3 +232,17 @@ def test_bad_input_is_refused_with_one_sentence(result, tmp_path, monkeypatch, a
     assert (outcome.status, outcome.stdout) == (2, "") and outcome.stderr.startswith(sentence), outcome.stderr
     assert len(outcome.stderr.splitlines()) == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "result"]
+
+
+def test_titles_may_hold_what_matplotlib_or_its_font_stumbles_over(tmp_path, recwarn):
+    """A $ begins a formula elsewhere, a line break moves everything down, and the font has no Chinese."""
+    title = "costs $5, or $x^{\n\tand 水 " + "a" * 100
+    header = made_header(2) | {"title": title, "bodies": ["$left^{", "ri\nght"]}
+    with mock.patch("made_result.made_header", return_value=header):
+        write_made(tmp_path / "result", frames=3)
+    history = read_history(open_result(tmp_path / "result"))
+    assert history.title.startswith("costs $5, or $x^{ and 水 aaa") and history.reach.names == ("$left^{", "ri ght")
+    picture, _ = ledger_picture(history, (400, 300), "light")
+    # The first row of panels is not pushed down, nor the title beyond the edge.
+    assert (picture[:, -3:] == 255).all()
+    assert not recwarn.list

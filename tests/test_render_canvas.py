@@ -1,6 +1,7 @@
 """What stands around a picture: lengths and times that are right, texts that fit, colours that agree."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,10 @@ from hypothesis import strategies as st
 from mpmcli.output import Result
 from mpmcli.render.canvas import Canvas, cut, length_text, round_length, time_text
 from mpmcli.render.color_by import color_by
-from mpmcli.render.coloring import Coloring
+from mpmcli.render.coloring import Categories, Coloring
+from mpmcli.render.painter import open_studio
+from mpmcli.render.pictures import picture_digest
+from mpmcli.render.settings import Settings
 from mpmcli.render.subject import subject_of
 from mpmcli.render.theme import THEMES, rgb_bytes
 from mpmcli.render.view import view_of
@@ -85,6 +89,51 @@ def test_the_legend_has_each_material(result: Result) -> None:
     assert all(count_of(picture, look.ink) > 60 for look in canvas.subject.looks)
 
 
+def test_a_legend_says_how_many_kinds_it_has_no_room_for(result: Result) -> None:
+    canvas = canvas_of(result, by="body")
+    inks = tuple(f"#{k:02x}2030" for k in range(1, 41))
+    many = Categories("body", tuple(f"body {k}" for k in range(40)), inks, tuple(range(40)))
+    picture = composed(replace(canvas, colors=many))
+    shown = [count_of(picture, ink) > 60 for ink in inks]
+    told = sum(shown)
+    assert 5 < told < 40 and all(shown[:told])
+    # "and 25 more" stands below the last of them, in a fainter colour.
+    rows = np.nonzero((picture == rgb_bytes(LIGHT.faint)).all(axis=2))[0]
+    assert rows.max() > np.nonzero((picture == rgb_bytes(inks[told - 1])).all(axis=2))[0].max() + 5
+
+
+def test_titles_and_names_may_hold_what_no_font_has(tmp_path: Path) -> None:
+    facts = header((1.0, 1.0), 0.1, [WATER, JELLY])
+    facts |= {"title": "two\nlines,\ta tab\r\x01 and \u6c34", "bodies": ["left\nhand", " \t "]}
+    result = write(tmp_path / "run", facts, [frame(0, np.ones((4, 2)))])
+    subject = subject_of(result)
+    assert subject.title == "two lines, a tab and \u6c34" and subject.bodies == ("left hand", "")
+    assert composed(canvas_of(result, by="body")).shape == (500, 800, 3)
+
+
+def test_walls_of_a_slice_are_where_its_domain_ends(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", header((1.0, 2.0, 0.5), 0.1, [WATER]), [frame(0, np.ones((1, 3)))])
+    studio = open_studio(run, Settings("density", None, (640, 360), camera="side"))
+    width, height = studio.canvas.stage_size
+    blank = np.full((height, width, 3), 255, np.uint8)
+    picture = studio.canvas.compose([blank], studio.view, [0.0])[:, :width]
+    rows, columns = np.nonzero((picture == rgb_bytes(LIGHT.wall)).all(axis=2))
+    scale = studio.view.pixels_per_metre
+    # 2 m by 0.5 m, and a line on each side.
+    assert np.ptp(columns) == pytest.approx(2.0 * scale, abs=5) and np.ptp(rows) == pytest.approx(0.5 * scale, abs=5)
+    assert not open_studio(run, Settings("dots", "speed", (640, 360), camera="side")).canvas.walls
+
+
+def test_a_picture_depends_on_how_its_time_is_written(tmp_path: Path) -> None:
+    """While a run goes on, milliseconds become seconds: a film must not have both."""
+    facts, settings = header((1.0, 1.0), 0.1, [WATER]), Settings("dots", "speed", (64, 64), limits=(0.0, 1.0))
+    digests = []
+    for count in (3, 4, 12):
+        run = write(tmp_path / str(count), facts, [frame(k, np.ones((1, 2))) for k in range(count)])
+        digests.append(picture_digest(run, settings, [1]))
+    assert digests[0] == digests[1] != digests[2]
+
+
 @pytest.mark.parametrize("size", [(64, 64), (90, 400), (400, 90), (320, 180), (2000, 1500)])
 @pytest.mark.parametrize("by", ["speed", "material"])
 def test_every_size_is_possible(result: Result, size: tuple[int, int], by: str) -> None:
@@ -132,6 +181,10 @@ def test_lengths_and_times_have_the_unit_that_suits_them() -> None:
     assert time_text(3e-6, [1e-6 * k for k in range(101)]) == "t = 3 µs"
     assert time_text(0.012, [2e-3 * k for k in range(10)]) == "t = 12 ms"
     assert time_text(0.0, [0.0]) == "t = 0.0 s"
+    # Digits that no step needs are left out, those of an eighth are not.
+    assert time_text(1.0, [k / 30 for k in range(31)]) == "t = 1.000 s"
+    assert time_text(1e4, [1e4 * k / 3 for k in range(4)]) == "t = 10000.0 s"
+    assert time_text(0.125, [0.125 * k for k in range(9)]) == "t = 0.125 s"
 
 
 @given(st.text(max_size=40), st.integers(0, 40))

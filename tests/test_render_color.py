@@ -1,5 +1,6 @@
 """What colours mean: values, limits, maps, and the sentences for what is not stored."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
@@ -136,3 +137,23 @@ def test_only_nan_still_has_limits(tmp_path: Path) -> None:
     empty = write(tmp_path / "empty", facts, [frame(0, np.empty((0, 2)), stress=np.empty((0, 2, 2)))])
     for name in ("speed", "stress", "id"):
         assert color_by(name, empty, subject_of(empty), LIGHT).particle_rgb(empty.frame(0)).shape == (0, 3)
+
+
+def test_extremes_are_coloured_without_a_complaint(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+    places = np.zeros((4, 2))
+    big = np.array([-1.7e308, 0.0, 1.0, 1.7e308])
+    ratio = np.array([0.0, 0.5, 1.0, 2.0])
+    wide = replace(frame(0, places, volume_ratio=ratio), fields={"volume_ratio": ratio, "wide": big, "tiny": big * 0})
+    run = write(tmp_path / "run", header((1.0, 1.0), 0.05, [WATER]), [wide])
+    pictured = {}
+    for name in ("density", "wide", "tiny"):
+        colors = color_by(name, run, subject_of(run), LIGHT)
+        assert isinstance(colors, Coloring) and np.isfinite(np.ptp(colors.limits))
+        pictured[name] = colors.particle_rgb(run.frame(0, colors.fields))
+    # No volume: its density is no number.
+    assert tuple(pictured["density"][0]) == rgb_bytes(LIGHT.missing)
+    assert tuple(pictured["wide"][0]) != tuple(pictured["wide"][3])
+    narrow = color_by("wide", run, subject_of(run), LIGHT, limits=(0.0, 1e-300))
+    assert isinstance(narrow, Coloring)
+    assert len(np.unique(narrow.particle_rgb(run.frame(0, narrow.fields)), axis=0)) == 2
+    assert not recwarn.list

@@ -9,6 +9,7 @@ from mpmcli.output.frame import Frame
 from mpmcli.output.ledger_table import TEXT
 from mpmcli.output.result import Result
 from mpmcli.output.scene_facts import SceneFacts, scene_facts
+from mpmcli.plain_text import one_line
 from mpmcli.stability.ledger import LedgerRow
 
 # Frames whose positions are read; more would not be seen in the figure.
@@ -84,7 +85,7 @@ def read_history(result: Result) -> History:
     if len(chosen) < result.frame_count:
         notes.append(f"The reach of the particles is read from {len(chosen)} of {result.frame_count} frames.")
     return History(
-        title=str(result.header.get("title", "")) or result.path.stem,
+        title=one_line(str(result.header.get("title", ""))) or result.path.stem,
         facts=facts,
         particles=int(result.particle_counts[-1]),
         status=str(record.get("status", "")),
@@ -110,6 +111,7 @@ def _reach(result: Result, chosen: np.ndarray, facts: SceneFacts) -> Reach:
     found = [[_extent(frame, label) for label in labels] for frame in (result.frame(int(k), ()) for k in chosen)]
     both = np.array(found).reshape(len(chosen), len(labels), 2, result.dimension)
     names = facts.bodies if apart else (facts.bodies[0] if len(facts.bodies) == 1 else "all bodies",)
+    names = tuple(one_line(name) for name in names)
     return Reach(result.times[chosen], names, both[:, :, 0], both[:, :, 1])
 
 

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 AXES = "xyz"
+# Characters of the title of a scene.
+TITLE_MAX = 64
 # The order of the colours is that of the legend.
 LIMITS = ("wave", "speed", "force", "viscosity", "deformation", "forced", "maximum")
 
@@ -51,7 +53,8 @@ def draw_ledger(figure: "Figure", history: History, theme: ThemeName) -> list[st
         panel.finish()
     status = f", {history.status}" if history.status else ""
     said = f"{history.particles:,} particles, {len(history.times)} frames{status}"
-    figure.suptitle(f"{history.title}: {said}", x=0.012, ha="left", fontsize=11)
+    title = history.title if len(history.title) <= TITLE_MAX else f"{history.title[: TITLE_MAX - 1]}…"
+    figure.suptitle(f"{title}: {said}", x=0.012, ha="left", fontsize=11)
     return [panel.axes.get_title(loc="left") for panel in panels]
 
 

@@ -1,5 +1,6 @@
 """How figures look: colours that are told apart by colour-blind people too, on light and on dark."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -73,7 +74,10 @@ def drawing(size: tuple[int, int], theme: Theme) -> "Iterator[Figure]":
 
 def pixels(figure: "Figure") -> np.ndarray:
     """Return a figure as an image, (h, w, 3) uint8; to be called within `drawing`."""
-    figure.canvas.draw()
+    with warnings.catch_warnings():
+        # A letter that the font has not is a box in the picture, which says enough.
+        warnings.filterwarnings("ignore", "Glyph", UserWarning)
+        figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[:, :, :3].copy()  # type: ignore[attr-defined]
 
 
@@ -81,6 +85,8 @@ def _settings(theme: Theme) -> dict[str, object]:
     return {
         "font.family": "DejaVu Sans",
         "font.size": 8.0,
+        # A title may hold a $.
+        "text.parse_math": False,
         "axes.titlesize": 9.0,
         "axes.titleweight": "bold",
         "axes.titlelocation": "left",

@@ -148,7 +148,7 @@ class Assignment:
         if self.save_surface is not None:
             save_surfaces(self.studio.result, self.ks, self.save_surface, workers, watch=seen, stop=stop)
         if self.movie is not None:
-            self._put_together(self.movie)
+            self._put_together(self.movie, stop)
         made = sum(not planned.made for planned in self.plan)
         return Done([planned.path for planned in self.plan], made, self.movie, self._warnings(outcomes))
 
@@ -164,10 +164,14 @@ class Assignment:
 
         write_picture(planned.path, Easel(self.studio).picture(self.ks, watched), planned.digest)
 
-    def _put_together(self, movie: Path) -> None:
+    def _put_together(self, movie: Path, stop: Callable[[], bool]) -> None:
+        def watched(_: int) -> None:
+            if stop():
+                raise KeyboardInterrupt
+
         digest = settings_digest({"pictures": [planned.digest for planned in self.plan], "fps": self.fps})
         if self.overwrite or film_digest(movie) != digest:
-            write_film([planned.path for planned in self.plan], movie, self.fps, digest=digest)
+            write_film([planned.path for planned in self.plan], movie, self.fps, digest=digest, watch=watched)
 
     def _warnings(self, outcomes: dict[int, Outcome]) -> list[str]:
         """Say what could not be shown as it is, once for all frames."""
@@ -176,18 +180,15 @@ class Assignment:
         colors = self.studio.colors
         missing = [k for k in sorted(outcomes) if outcomes[k].missing]
         if missing and isinstance(colors, Coloring):
-            most = max(outcomes[k].missing for k in missing)
+            most = _particles([outcomes[k].missing for k in missing])
             told.append(
-                f"the {colors.name} of up to {most} particles is not a number, first in frame {numbers[missing[0]]}: "
-                f"they are drawn in {colors.missing}"
+                f"the {colors.name} of {most} is not a number, first in frame {numbers[missing[0]]}: drawn in "
+                f"{colors.missing}"
             )
         lost = [k for k in sorted(outcomes) if outcomes[k].lost]
         if lost:
-            most = max(outcomes[k].lost for k in lost)
-            told.append(
-                f"up to {most} particles have no place (their position is not a number), first in frame "
-                f"{numbers[lost[0]]}: they are not drawn"
-            )
+            most = _particles([outcomes[k].lost for k in lost])
+            told.append(f"the position of {most} is not a number, first in frame {numbers[lost[0]]}: not drawn")
         return told
 
 
@@ -259,6 +260,12 @@ def _require_sense(request: Request) -> None:
                 f"{option} says nothing in --mode {request.mode}, which has colours of its own: use --mode "
                 f"{' or '.join(allowed)}."
             )
+
+
+def _particles(counts: list[int]) -> str:
+    most = max(counts)
+    upto = "up to " if len(counts) > 1 and min(counts) < most else ""
+    return f"{upto}{most} particle{'s' if most > 1 else ''}"
 
 
 def _directory(result: Result) -> Path:

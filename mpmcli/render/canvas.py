@@ -37,6 +37,7 @@ NO_NUMBER = "no number"
 LENGTHS = ((1e3, "km"), (1.0, "m"), (1e-2, "cm"), (1e-3, "mm"), (1e-6, "µm"))
 PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""))
 TIMES = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
+DIGITS_MAX = 6
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -49,6 +50,7 @@ class Canvas:
         times: of the frames of the result, s, which say how many digits a time needs.
         colors: what a bar or a legend explains; None for none.
         grid: columns and rows of pictures of the scene.
+        walls: whether the walls of the domain are drawn around each of them, which are seen from the front.
     """
 
     size: tuple[int, int]
@@ -57,6 +59,7 @@ class Canvas:
     times: tuple[float, ...]
     colors: Coloring | Categories | None
     grid: tuple[int, int] = (1, 1)
+    walls: bool = True
 
     @property
     def stage_size(self) -> tuple[int, int]:
@@ -89,7 +92,7 @@ class Canvas:
                 font = _font(self._px(SMALL))
                 middle = y - self._label // 2
                 draw.text((x + self._px(PAD), middle), time_text(time, self.times), self.theme.text, font, anchor="lm")
-            if self.subject.dimension == 2:
+            if self.walls:
                 self._walls(draw, view, (x, y))
         if view.parallel:
             self._scale_bar(draw, view)
@@ -161,7 +164,8 @@ class Canvas:
     def _walls(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
         """Draw the walls around the domain, outside of it, so that nothing within is hidden."""
         corners = view.pixels(np.array([self.subject.lower, self.subject.upper]))
-        (x0, y1), (x1, y0) = np.rint(corners[:, :2] + place).astype(int).tolist()
+        edges = np.rint(corners[:, :2] + place).astype(int)
+        (x0, y0), (x1, y1) = edges.min(axis=0).tolist(), edges.max(axis=0).tolist()
         w = self._px(2)
         level = [(x0 - w, y0 - w, x1 + w, y0), (x0 - w, y1, x1 + w, y1 + w)]
         upright = [(x0 - w, y0 - w, x0, y1 + w), (x1, y0 - w, x1 + w, y1 + w)]
@@ -186,13 +190,16 @@ class Canvas:
         room = self.size[0] - x - self._px(PAD + SWATCH + 8)
         swatch, step = self._px(SWATCH), self._px(SWATCH + 10)
         y = self._stage[1] + self._px(PAD)
-        for name, ink in zip(colors.names, colors.inks, strict=True):
-            if y + swatch > self.size[1] - self._px(PAD):
-                break
+        rows = max(1, int((self.size[1] - self._px(PAD) - swatch - y) / step) + 1)
+        told = rows - 1 if len(colors.names) > rows else rows
+        for name, ink in zip(colors.names[:told], colors.inks, strict=False):
             draw.ellipse((x, y, x + swatch, y + swatch), fill=ink, outline=self.theme.faint)
             text = cut(name, lambda text: font.getlength(text) <= room)
             draw.text((x + swatch + self._px(8), y + swatch / 2), text, self.theme.text, font, anchor="lm")
             y += step
+        if told < len(colors.names):
+            more = cut(f"and {len(colors.names) - told} more", lambda text: font.getlength(text) <= room)
+            draw.text((x + swatch + self._px(8), y + swatch / 2), more, self.theme.faint, font, anchor="lm")
 
     def _bar_heading(self, colors: Coloring) -> list[str]:
         unit = self._ticks(colors)[2]
@@ -255,9 +262,10 @@ def time_text(time: float, times: Sequence[float]) -> str:
     factor, unit = next(((f, u) for f, u in TIMES if longest >= 0.1 * f), TIMES[-1])
     ordered = np.unique(np.asarray(times, dtype=np.float64)) / factor
     step = float(np.median(np.diff(ordered))) if len(ordered) > 1 else 0.1
-    digits = min(max(0, math.ceil(-math.log10(step) - 1e-9)), 6)
-    while digits < 6 and abs(step * 10**digits - round(step * 10**digits)) > 0.05:
-        digits += 1
+    least = min(max(0, math.ceil(-math.log10(step) - 1e-9)), DIGITS_MAX)
+    # A quarter has two digits; of a third or a thirtieth, one more than they need is enough.
+    exact = (least + more for more in range(3) if abs(step * 10 ** (least + more) % 1 - 0.5) >= 0.45)
+    digits = min(next(exact, least + 1), DIGITS_MAX)
     return f"t = {time / factor:.{digits}f} {unit}"
 
 

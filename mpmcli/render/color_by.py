@@ -10,6 +10,7 @@ from mpmcli.errors import InputError
 from mpmcli.output.frame import Frame
 from mpmcli.output.result import Result
 from mpmcli.render.coloring import Categories, Coloring
+from mpmcli.render.settings import LIMIT_MAX, LIMIT_MIN
 from mpmcli.render.subject import Subject
 from mpmcli.render.theme import Theme
 from mpmcli.scene.schema import ParticleField
@@ -133,6 +134,7 @@ def _field(name: str, result: Result, d: int) -> _Value:
     known = list(AXES[:d]) if width == d else [a + b for a in AXES[:d] for b in AXES[:d]] if width == d * d else []
     if component not in known:
         right = f"its components are {listed(known, 'and')}" if known else "it is one number"
+        right = right if known or width == 1 else f"its {width} have no names"
         raise InputError(f'--color-by {name}: "{field}" has no component "{component}"; {right}.')
     column = known.index(component)
     return _Value(f"{plain} {component}", unit, fields, lambda frame: array(frame)[:, column], middle=0.0)
@@ -154,8 +156,9 @@ def _limits(value: _Value, result: Result) -> tuple[float, float]:
     count = min(LOOKED_AT, result.frame_count)
     lows, highs = [], []
     for k in np.unique(np.linspace(0, result.frame_count - 1, count).round().astype(int)):
-        values = value.of(result.frame(int(k), value.fields))
-        values = values[np.isfinite(values)]
+        with np.errstate(all="ignore"):
+            values = value.of(result.frame(int(k), value.fields))
+        values = np.clip(values[np.isfinite(values)], -LIMIT_MAX, LIMIT_MAX)
         if len(values):
             low, high = np.quantile(values, (OUTSIDE, 1.0 - OUTSIDE))
             lows.append(float(low))
@@ -166,9 +169,10 @@ def _limits(value: _Value, result: Result) -> tuple[float, float]:
     if value.middle is not None:
         reach = max(abs(high - value.middle), abs(low - value.middle))
         low, high = value.middle - reach, value.middle + reach
-    if high - low <= 1e-6 * max(abs(low), abs(high)):
+    if high - low <= max(1e-6 * max(abs(low), abs(high)), LIMIT_MIN):
         # All alike: in the middle of the map, however they are rounded.
-        reach = 0.05 * max(abs(low), abs(high)) or 1.0
+        reach = 0.05 * max(abs(low), abs(high))
+        reach = reach if reach > LIMIT_MIN else 1.0
         low, high = low - reach * (value.floor is None), high + reach
     return low, high
 

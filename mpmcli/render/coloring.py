@@ -33,17 +33,20 @@ class Coloring:
 
     def values(self, frame: Frame) -> np.ndarray:
         """Return (n,) float64."""
-        return self.value(frame)
+        # A quotient by zero is no number, and drawn as such.
+        with np.errstate(all="ignore"):
+            return self.value(frame)
 
     def particle_rgb(self, frame: Frame) -> np.ndarray:
         """Return (n, 3) uint8."""
-        return self.rgb(self.value(frame))
+        return self.rgb(self.values(frame))
 
     def rgb(self, values: np.ndarray) -> np.ndarray:
         """Return the colours (..., 3) uint8 of values (...)."""
         low, high = self.limits
         known = np.isfinite(values)
-        share = np.where(known, (values - low) / (high - low), 0.0)
+        with np.errstate(all="ignore"):
+            share = np.where(known, (values - low) / (high - low), 0.0)
         colors = self._table[np.clip(share * 255.0 + 0.5, 0, 255).astype(np.intp)]
         colors[~known] = rgb_bytes(self.missing)
         return colors

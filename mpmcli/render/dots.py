@@ -41,6 +41,7 @@ class DotsPainter:
         self._flat = subject.dimension == 2
         self._stage = Stage(view, theme, samples=2 if count <= SMOOTHED else 1)
         self._diameters = OVERLAP * np.array(subject.distances)
+        self._corner = np.array(subject.lower)
         self._actors: dict[int, tuple[pv.PolyData, pv.Actor]] = {}
         if not self._flat:
             self._stage.add_light()
@@ -107,13 +108,15 @@ class DotsPainter:
                 specular=0.0,
                 reset_camera=False,
             )
+            # VTK has places in single precision, which is too coarse where the domain lies far from the origin.
+            actor.position = tuple(self._corner.tolist())
             self._actors[level] = mesh, actor
         mesh, actor = self._actors[level]
         actor.visibility = len(points) > 0
         actor.prop.point_size = size * self._stage.samples
         if len(points) == 0:
             return
-        shown = pv.PolyData(points.astype(np.float32))
+        shown = pv.PolyData((points - self._corner).astype(np.float32))
         rgb = numpy_to_vtk(np.ascontiguousarray(colors), deep=True)
         rgb.SetName("rgb")
         shown.GetPointData().SetScalars(rgb)

@@ -97,7 +97,10 @@ def open_studio(result: Result, settings: Settings) -> Studio:
     if isinstance(colors, Coloring):
         settings = replace(settings, limits=colors.limits)
     width, height = settings.size
-    canvas = Canvas((width, height or width), subject, theme, tuple(result.times.tolist()), colors, settings.grid)
+    times = tuple(result.times.tolist())
+    # Elsewhere in 3D they are the edges of a box, and part of the scene.
+    walls = subject.dimension == 2 or settings.mode == "density"
+    canvas = Canvas((width, height or width), subject, theme, times, colors, settings.grid, walls)
     if height is None:
         aspect = min(max(aspect_of(subject, camera), FLATTEST), 1.0 / FLATTEST)
         for _ in range(FITTING_ROUNDS):

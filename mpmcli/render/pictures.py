@@ -9,6 +9,7 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.output.frame import Frame
 from mpmcli.output.result import Result, open_result
+from mpmcli.render.canvas import time_text
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.frame_workers import render_frames
 from mpmcli.render.painter import Painter, Studio, open_studio
@@ -110,9 +111,14 @@ class Easel:
 def picture_digest(result: Result, settings: Settings, ks: Sequence[int]) -> str:
     """Return a digest of what a picture of some frames depends on.
 
-    The ledger's row stands for the particles: it holds their energies and momenta to the last bit.
+    The ledger's row stands for the particles: it holds their energies and momenta to the last bit. How a time is
+    written hangs on the other frames, which grow more while a run goes on.
     """
-    frames = [[int(result.numbers[k]), int(result.particle_counts[k]), repr(result.ledger[k])] for k in ks]
+    times = result.times.tolist()
+    frames = [
+        [int(result.numbers[k]), int(result.particle_counts[k]), repr(result.ledger[k]), time_text(times[k], times)]
+        for k in ks
+    ]
     return settings_digest({**asdict(settings), "scene": result.header.get("scene", ""), "frames": frames})
 
 

@@ -12,6 +12,9 @@ MODES: tuple[Mode, ...] = ("dots", "surface", "fluid", "density")
 # Pixels along a side, and altogether: more would be a slip of the pen, and not fit into the memory of a renderer.
 SIDE_MIN, SIDE_MAX = 64, 16_384
 PIXELS_MAX = 64_000_000
+# Of limits of colours and the distance between them, as numbers end not far beyond; of that distance over the limits,
+# as closer ones round to the same.
+LIMIT_MAX, LIMIT_MIN, NARROWEST = 1e300, 1e-300, 1e-12
 # Pictures in a montage, along each side.
 GRID_MAX = 20
 
@@ -87,4 +90,7 @@ def parse_limits(text: str) -> tuple[float, float]:
         numbers = []
     if len(numbers) != 2 or not all(map(math.isfinite, numbers)) or not numbers[0] < numbers[1]:
         raise InputError(f'--clim "{text}" is no range: give the lower and the upper limit, such as 0,2.5.')
-    return numbers[0], numbers[1]
+    low, high = numbers
+    if max(-low, high) > LIMIT_MAX or not high - low >= max(LIMIT_MIN, NARROWEST * max(abs(low), abs(high))):
+        raise InputError(f'--clim "{text}" is too wide or too narrow for colours: give limits such as 0,2.5.')
+    return low, high

@@ -9,6 +9,7 @@ import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.output.result import Result
+from mpmcli.plain_text import one_line
 from mpmcli.render.look import OTHERS, Look, look_of
 
 # Particles to a cell where the scene does not say, in 2D and 3D.
@@ -62,12 +63,12 @@ def subject_of(result: Result) -> Subject:
         upper = lower + np.array(header.get("size") or domain["size"], dtype=np.float64)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{result.path} does not say what its domain is, so that no picture can be framed.") from error
-    bodies = tuple(str(name) for name in header.get("bodies", ())) or ("all",)
+    bodies = tuple(one_line(str(name)) for name in header.get("bodies", ())) or ("all",)
     tables = tables if len(tables) == len(bodies) else [{} for _ in bodies]
     looks, material_of = _materials(bodies, [table.get("material", {}) for table in tables])
     flat = [0.0] * (3 - d)
     return Subject(
-        title=str(header.get("title") or ""),
+        title=one_line(str(header.get("title") or "")),
         dimension=d,
         lower=(*lower.tolist(), *flat),
         upper=(*upper.tolist(), *flat),
