@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpmcli.check.deformation import deformation_rate
 from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_ledger import LOWER_SAFETY, MARGIN
 from mpmcli.check.result_scene import SceneFacts
@@ -83,13 +84,13 @@ class MotionCheck:
         self._before = None
 
     def _deformation(self, number: int, frame: Frame, row: LedgerRow) -> None:
-        """As the limit on the step has it: |tr C| dt where a law keeps J alone, else the largest row sum of |C| dt."""
+        """As the limit on the step has it."""
         n, d = frame.position.shape
         C = frame.fields["affine"].reshape(n, d, d)
-        rate = np.abs(C).sum(2).max(1)
+        rate = deformation_rate(C, keeps_J=False)
         if "fluid" in self._facts.laws:
             fluid = frame.material == self._facts.laws.index("fluid")
-            rate[fluid] = np.abs(np.trace(C, axis1=1, axis2=2))[fluid]
+            rate[fluid] = deformation_rate(C[fluid], keeps_J=True)
         p = int(np.argmax(rate))
         deformation = float(rate[p]) * row.step_max
         self.deformation = max(self.deformation or 0.0, deformation)
