@@ -163,7 +163,7 @@ class MomentumCheck:
     Velocities are those of the middle of the last step, which is as long as one of those before the frame.
 
     The momentum along an axis is kept while no particle comes near a wall normal to it, or a wall that sticks. The
-    angular momentum is kept without gravity and far from all walls.
+    angular momentum is kept without gravity and far from all walls, by transfers that keep it.
 
     Attributes:
         drift: largest difference, relative to sqrt(2 M E_kin), a bound on sum m |v|; None where it was never sure.
@@ -218,7 +218,7 @@ class MomentumCheck:
         unknown = row.mass * np.abs(facts.gravity) * (row.step_max - row.step_min) / 4
         difference = (np.abs(np.array(row.linear_momentum) - expected) - unknown)[self._free].max()
         angular = 0.0
-        if not facts.gravity.any() and self._free.all():
+        if facts.spin_kept and not facts.gravity.any() and self._free.all():
             turned = np.abs(np.array(row.angular_momentum) - np.array(first.angular_momentum)).max()
             angular = float(turned) / float(np.linalg.norm(facts.upper - facts.origin))
         if scale == 0 or not np.isfinite(scale):
