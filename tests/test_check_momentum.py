@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from mpmcli.check.result_scene import SceneFacts, scene_facts
 
 from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_motion import MomentumCheck
-from mpmcli.check.result_scene import SceneFacts, scene_facts
 from mpmcli.output.frame import Frame
 from mpmcli.stability.ledger import LedgerRow
 
