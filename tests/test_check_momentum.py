@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from mpmcli.check.result_scene import SceneFacts, scene_facts
 
 from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_motion import MomentumCheck
 from mpmcli.output.frame import Frame
+from mpmcli.output.scene_facts import SceneFacts, scene_facts
 from mpmcli.stability.ledger import LedgerRow
 
 SCENE = """\

@@ -12,7 +12,8 @@ from mpmcli.render.look import LOOKS
 from mpmcli.render.subject import Subject
 from mpmcli.render.theme import THEMES
 from mpmcli.render.view import View, view_of
-from mpmcli.render.window import choose_window
+
+pytestmark = pytest.mark.usefixtures("drawing")
 
 SIZE = (320, 180)
 SPACING = 0.04
@@ -62,12 +63,6 @@ def covered(points: np.ndarray, view: View, radius: float) -> np.ndarray:
 def changed(image: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return the pixels (h, w) that differ visibly."""
     return np.abs(image.astype(int) - other).max(axis=2) > 3
-
-
-@pytest.fixture(scope="module", autouse=True)
-def window():
-    """Open windows that need no screen."""
-    choose_window()
 
 
 @pytest.fixture(scope="module")

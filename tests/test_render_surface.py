@@ -1,6 +1,5 @@
 """Pictures of surfaces: they cover what their particles cover, and mean what their colours say."""
 
-import os
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -15,7 +14,7 @@ from mpmcli.render.surface import SurfacePainter
 from mpmcli.render.theme import THEMES
 from mpmcli.render.view import View, view_of
 
-os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+pytestmark = pytest.mark.usefixtures("drawing")
 
 SIZE = (320, 180)
 DISTANCE = 0.025
