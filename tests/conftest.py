@@ -106,3 +106,15 @@ def backend_of() -> "Iterator[Callable[..., Backend]]":
 
     yield start
     stop_backend()
+
+
+@pytest.fixture(scope="session")
+def drawing() -> str:
+    """The window that draws without a screen; a test that asks for it is skipped where there is none."""
+    from mpmcli.errors import InputError
+    from mpmcli.render.window import choose_window
+
+    try:
+        return choose_window()
+    except InputError as error:
+        pytest.skip(str(error))

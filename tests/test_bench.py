@@ -76,7 +76,9 @@ class TestOurs:
         assert particles.count == case.particles
         assert particles.count * particles.mass == pytest.approx(DENSITY * EDGE**case.dimension)
 
-    @pytest.mark.parametrize("case", [SMALL_2D, SMALL_3D], ids=lambda case: case.peer)
+    @pytest.mark.parametrize(
+        "case", [SMALL_2D, pytest.param(SMALL_3D, marks=pytest.mark.slow)], ids=lambda case: case.peer
+    )
     def test_both_move_alike(self, case: BenchCase, run_python: Callable, tmp_path: Path) -> None:
         """The same physics: from the same block, before a wall is in reach, both give the same positions.
 

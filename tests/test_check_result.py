@@ -261,10 +261,10 @@ def test_steps_that_are_too_long_are_found(run, checked, courant, severity):
 
 @pytest.mark.parametrize(("deformation", "severity"), [(0.5, None), (0.7, "warning"), (1.5, "error")])
 def test_particles_that_deform_too_much_in_a_step_are_found(run, checked, deformation, severity):
-    """A fluid by |tr C| dt, whatever its shear; a solid by the largest row sum of |C| dt."""
+    """A fluid by (|tr C| + sqrt(-det C)) dt; a solid by the largest row sum of |C + C^T| dt / 2, however it spins."""
     rate = deformation / run.rows[K].step_max
-    fluid = checked(run.with_value(K, "affine", 3, [rate, 5 * rate, 5 * rate, 0.0]))
-    solid = checked(run.with_value(K, "affine", run.particles - 1, [0.25 * rate, 0.75 * rate, 0.0, 0.0]))
+    fluid = checked(run.with_value(K, "affine", 3, [0.4 * rate, 0.6 * rate, 0.6 * rate, 0.0]))
+    solid = checked(run.with_value(K, "affine", run.particles - 1, [0.25 * rate, 9.75 * rate, -8.25 * rate, 0.0]))
     for check in (fluid, solid):
         assert [(f.rule, f.severity, f.frame) for f in check.findings] == (
             [("deformation", severity, K)] if severity else []

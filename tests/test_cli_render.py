@@ -17,6 +17,8 @@ from mpmcli.output import Result, VtkSeriesStore, open_result
 from mpmcli.output.store import SEGMENTS
 from mpmcli.render.assignment import Request, assign
 
+pytestmark = pytest.mark.usefixtures("drawing")
+
 FRAMES = 6
 
 

@@ -13,6 +13,9 @@ from mpmcli.scene import load_scene
 from mpmcli.scene.presets import PRESETS
 
 SCENES = sorted(CONFIGS.glob("*.toml"))
+# In 3D each has a twin in 2D of the same materials, and other scenes run in 3D. The dam break is the demo that
+# test_readme.py runs, and the drop a validation case.
+SLOW = {"jelly_stack_3d", "sand_column_3d", "snowball_wall_3d", "dam_break_2d", "elliptical_drop_2d"}
 
 
 def test_these_are_the_scenes():
@@ -71,7 +74,9 @@ def test_a_config_says_how_many_particles_it_has(path):
     assert said == pytest.approx(particles, rel=0.05)
 
 
-@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in SLOW)) for path in SCENES]
+)
 def test_a_config_runs(path, tmp_path):
     """A few steps to the first frames, which land on their times; nothing is lost, and energy is not made."""
     scene = load_scene(path, laws=parameter_models()).scene

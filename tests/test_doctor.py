@@ -134,10 +134,19 @@ def test_a_library_that_the_system_lacks_is_named_with_its_package():
 
 
 def test_a_command_that_cannot_be_loaded_sends_to_the_doctor(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mpmcli.cli.schema", None)
+    def bare(name):
+        raise ImportError("libX11.so.6: cannot open shared object file: No such file or directory", name="taichi_core")
+
+    monkeypatch.setattr("mpmcli.cli.program.importlib.import_module", bare)
     done = run_here("schema")
     assert done.status == 1
     assert done.stderr.rstrip().endswith("(mpmcli doctor says what is missing; --debug shows where)")
+
+
+def test_a_part_of_mpmcli_that_is_missing_is_no_case_for_the_doctor(monkeypatch):
+    monkeypatch.setitem(sys.modules, "mpmcli.cli.schema", None)
+    done = run_here("schema")
+    assert done.status == 1 and done.stderr.rstrip().endswith("(a fault of mpmcli; --debug shows where)")
 
 
 def test_a_remedy_names_the_version_that_is_wanted(monkeypatch):

@@ -156,7 +156,7 @@ def test_initial_deformation_is_a_stress(backend, precision, rounding):
     np.testing.assert_array_equal(frame.position, frame.fields["initial_position"])
 
 
-@pytest.mark.parametrize("exponent", [1.0, 7.0])
+@pytest.mark.parametrize("exponent", [pytest.param(1.0, marks=pytest.mark.slow), 7.0])
 def test_a_hydrostatic_column_stays_at_rest(backend, precision, exponent):
     """It carries its own weight from the start: max |v| < 1e-3 sqrt(g H), where it is 0.06 to 0.14 without."""
     g, H = 9.81, 0.5

@@ -133,6 +133,7 @@ def test_cubic_splines_keep_both_momenta(backend_of: Callable) -> None:
     assert linear < 1e-13 and angular < 1e-13
 
 
+@pytest.mark.slow
 def test_aflip_keeps_momentum_and_angular_momentum_to_first_order(backend_of: Callable) -> None:
     """Linear momentum to round-off. Angular momentum is lost as positions follow the nodes: dt sum m v_nodes x v_own.
 
@@ -172,7 +173,7 @@ def test_pull_reaches_the_own_velocities_of_aflip(backend_of: Callable) -> None:
 
 
 @pytest.mark.parametrize("kernel", ["quadratic", pytest.param("cubic", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("transfer", ["pic", "aflip"])
+@pytest.mark.parametrize("transfer", [pytest.param("pic", marks=pytest.mark.slow), "aflip"])
 @pytest.mark.parametrize("acceleration", ["-1 if X > 0.5 else 0", "-y"])
 def test_a_force_of_any_kind_pulls_with_every_scheme(
     backend_of: Callable, acceleration: str, transfer: str, kernel: str

@@ -81,8 +81,9 @@ def predicted(dimension: int) -> float:
 @pytest.mark.parametrize(
     ("dimension", "steps"),
     [
-        (2, 100_000),
+        (2, 10_000),
         (3, 10_000),
+        pytest.param(2, 100_000, marks=pytest.mark.slow),
         pytest.param(3, 100_000, marks=pytest.mark.slow),
     ],
 )

@@ -14,7 +14,8 @@ from mpmcli.render.dots import OVERLAP, DotsPainter
 from mpmcli.render.subject import Subject, subject_of
 from mpmcli.render.theme import THEMES, rgb_bytes
 from mpmcli.render.view import View, view_of
-from mpmcli.render.window import choose_window
+
+pytestmark = pytest.mark.usefixtures("drawing")
 
 LIGHT = THEMES["light"]
 SIZE = (320, 240)
@@ -25,7 +26,6 @@ def painted(
     directory: Path, frames: list[Frame], size: tuple[float, ...], by: str = "speed", camera: str = "iso", **options
 ) -> tuple[list[np.ndarray], View, Result, Subject]:
     """Draw frames of a domain that begins at the origin."""
-    choose_window()
     result = write(directory / "run", header(size, H, [WATER]), frames)
     subject = subject_of(result)
     view = view_of(subject, camera, SIZE)
@@ -79,7 +79,6 @@ def test_a_dot_is_round_and_as_large_as_it_should_be(tmp_path: Path) -> None:
 @pytest.mark.parametrize("size", [(1.0, 0.75), (1.0, 0.75, 0.5)])
 def test_far_from_the_origin_dots_are_where_they_are(tmp_path: Path, size: tuple[float, ...]) -> None:
     """Single precision has steps of 6 cm at 1000 km, so places have to be those from the domain's corner."""
-    choose_window()
     block = lattice((0.2,) * len(size), (0.45,) * len(size), H / 2)
     pictures = []
     for origin in (0.0, 1e6):
@@ -139,7 +138,6 @@ def test_the_nearer_ball_hides_the_farther_one(tmp_path: Path) -> None:
 
 def test_perspective_makes_near_balls_larger(tmp_path: Path) -> None:
     places = np.array([[0.5, 0.02, 0.5], [0.5, 0.98, 0.5]])
-    choose_window()
     result = write(tmp_path / "run", header((1.0, 1.0, 1.0), 0.2, [WATER]), [frame(0, places)])
     subject = replace(subject_of(result), lower=(0.0, 0.0, 0.0))
     view = view_of(subject, "0.2,-2,0.5,0.5,0.5,0.5", (600, 400))

@@ -14,7 +14,6 @@ from mpmcli.render.stage import Stage
 from mpmcli.render.subject import Subject
 from mpmcli.render.theme import THEMES
 from mpmcli.render.view import CAMERAS, MARGIN, aspect_of, view_of
-from mpmcli.render.window import choose_window
 
 SUBJECT = Subject(
     title="",
@@ -39,8 +38,7 @@ def corners(subject: Subject) -> np.ndarray:
 
 
 @pytest.mark.parametrize("camera", [*CAMERAS, "4,-3,5,0.5,1,2.5", "0.5,1,9,0.5,1,2.5"])
-def test_points_fall_where_vtk_puts_them(camera: str) -> None:
-    choose_window()
+def test_points_fall_where_vtk_puts_them(drawing: str, camera: str) -> None:
     from vtkmodules.vtkRenderingCore import vtkCoordinate
 
     view = view_of(SUBJECT, camera, (320, 200))

@@ -15,7 +15,7 @@ STEPS = 10_000
 SECONDS = 5.0
 H = 0.1
 EPSILON = {"f32": 2.0**-24, "f64": 2.0**-53}
-PRECISIONS = ["f64", "f32"]
+PRECISIONS = ["f64", pytest.param("f32", marks=pytest.mark.slow)]
 
 
 def free_scene(dimension: int, precision: str, gravity: list[float] | None = None) -> Scene:
@@ -74,7 +74,7 @@ def drift(before: BodyState, after: BodyState) -> tuple[float, float]:
 
 @pytest.mark.parametrize(
     ("precision", "dimension"),
-    [("f64", 2), ("f64", 3), ("f32", 2), pytest.param("f32", 3, marks=pytest.mark.slow)],
+    [("f64", 2), ("f64", 3), *(pytest.param("f32", dimension, marks=pytest.mark.slow) for dimension in (2, 3))],
 )
 def test_momenta_over_ten_thousand_steps(
     backend_of: Callable, precision: str, dimension: int, record_property: Callable

@@ -53,7 +53,9 @@ def test_a_lost_particle_ends_the_run_soon(outcome: dict) -> None:
     assert "particle 10" in lost["sentence"]
 
 
-@pytest.mark.parametrize("law", ["snow", "neo_hookean", "fixed_corotated", "viscoplastic"])
+@pytest.mark.parametrize(
+    "law", ["snow", "neo_hookean", pytest.param("fixed_corotated", marks=pytest.mark.slow), "viscoplastic"]
+)
 def test_no_step_exceeds_the_limit_of_its_moment(law: str, backend_of: Callable, record_property: Callable) -> None:
     """A block hits a wall at a fifth of its wave speed: no step is longer than the state then allows.
 
@@ -85,7 +87,7 @@ def test_no_step_exceeds_the_limit_of_its_moment(law: str, backend_of: Callable,
     assert smallest < 0.95 * at_start
 
 
-@pytest.mark.parametrize("J", [0.8, 1.1, 1.2])
+@pytest.mark.parametrize("J", [0.8, pytest.param(1.1, marks=pytest.mark.slow), 1.2])
 @pytest.mark.parametrize("law", ["fluid", "viscoplastic", "neo_hookean"])
 def test_the_step_does_not_drive_what_it_follows(law: str, J: float, backend_of: Callable) -> None:
     """A lone particle that takes tension, let go at J, oscillates for 2,000 steps of the solver's own choice.

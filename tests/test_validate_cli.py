@@ -30,6 +30,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         ([BAR, "--resume", "--overwrite", "-o", "x"], "give one of them"),
         ([BAR, "--resolution", "9"], "--resolution is for --write-scene"),
         (["--write-scene"], "prints the scene of one case; name it"),
+        ([BAR, "--list", "--write-scene"], "give one of them"),
         ([BAR, "--levels", "finest"], "'finest' is not one of 'coarse', 'default', 'fine'"),
         ([BAR, "--workers", "0"], "0 is not in the range x>=1"),
         ([BAR, "-o", "."], "exists and is not empty: --resume keeps"),

@@ -35,6 +35,7 @@ def test_snow_under_its_own_weight_is_as_high_as_the_sum_of_its_stretches() -> N
     assert confined_height(DEPTH) == pytest.approx(height, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_steep_sand_is_rejected_by_the_band_of_the_column(backend_of: Callable, record_property: Callable) -> None:
     """A friction angle of 63 degrees runs out to half of the lower end of the band (verification: 7.5)."""
     case, setting = all_cases()["sand_column_2"], Setting()

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpmcli.check.deformation import deformation_rate
 from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_ledger import LOWER_SAFETY, MARGIN
 from mpmcli.check.result_state import TOUCHED, extent
@@ -83,13 +84,13 @@ class MotionCheck:
         self._before = None
 
     def _deformation(self, number: int, frame: Frame, row: LedgerRow) -> None:
-        """As the limit on the step has it: |tr C| dt where a law keeps J alone, else the largest row sum of |C| dt."""
+        """As the limit on the step has it."""
         n, d = frame.position.shape
         C = frame.fields["affine"].reshape(n, d, d)
-        rate = np.abs(C).sum(2).max(1)
+        rate = deformation_rate(C, keeps_J=False)
         if "fluid" in self._facts.laws:
             fluid = frame.material == self._facts.laws.index("fluid")
-            rate[fluid] = np.abs(np.trace(C, axis1=1, axis2=2))[fluid]
+            rate[fluid] = deformation_rate(C[fluid], keeps_J=True)
         p = int(np.argmax(rate))
         deformation = float(rate[p]) * row.step_max
         self.deformation = max(self.deformation or 0.0, deformation)
@@ -162,7 +163,7 @@ class MomentumCheck:
     Velocities are those of the middle of the last step, which is as long as one of those before the frame.
 
     The momentum along an axis is kept while no particle comes near a wall normal to it, or a wall that sticks. The
-    angular momentum is kept without gravity and far from all walls.
+    angular momentum is kept without gravity and far from all walls, by transfers that keep it.
 
     Attributes:
         drift: largest difference, relative to sqrt(2 M E_kin), a bound on sum m |v|; None where it was never sure.
@@ -217,7 +218,7 @@ class MomentumCheck:
         unknown = row.mass * np.abs(facts.gravity) * (row.step_max - row.step_min) / 4
         difference = (np.abs(np.array(row.linear_momentum) - expected) - unknown)[self._free].max()
         angular = 0.0
-        if not facts.gravity.any() and self._free.all():
+        if facts.spin_kept and not facts.gravity.any() and self._free.all():
             turned = np.abs(np.array(row.angular_momentum) - np.array(first.angular_momentum)).max()
             angular = float(turned) / float(np.linalg.norm(facts.upper - facts.origin))
         if scale == 0 or not np.isfinite(scale):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpmcli.check.deformation import deformation_rate
 from mpmcli.materials.law import Law, StateBound
 from mpmcli.materials.registry import laws
 from mpmcli.scene import Body, Scene, SceneBounds, highest_speed
@@ -130,9 +131,9 @@ def _motion_limits(scene: Scene, bounds: SceneBounds) -> Iterator[SceneLimit]:
     h = scene.domain.spacing
     fastest = max(scene.bodies, key=highest_speed)
     initial, reached = highest_speed(fastest), bounds.speed
-    gradients = {body.name: _initial_gradient(body, scene.dimension) for body in scene.bodies}
-    steepest = max(gradients, key=lambda name: gradients[name])
-    gradient = gradients[steepest]
+    rates = {body.name: _initial_rate(body, scene.dimension) for body in scene.bodies}
+    quickest = max(rates, key=lambda name: rates[name])
+    rate = rates[quickest]
     impact = IMPACT_GRADIENT * reached / h
     for value, name, state, body, meaning, cause in (
         (
@@ -144,12 +145,12 @@ def _motion_limits(scene: Scene, bounds: SceneBounds) -> Iterator[SceneLimit]:
             f"the fastest particle starts at {initial:.4g} m/s, and a cell is {h:.4g} m wide",
         ),
         (
-            deformation_limit(gradient),
+            deformation_limit(rate),
             "deformation",
             "rest",
-            steepest,
-            f"starting at {gradient:.3g} /s",
-            f"its velocity gradient is {gradient:.4g} /s",
+            quickest,
+            f"starting at {rate:.3g} /s",
+            f'body "{quickest}" deforms at {rate:.4g} /s',
         ),
         (
             speed_limit(h, JET * reached, bounds.gravity),
@@ -173,13 +174,12 @@ def _motion_limits(scene: Scene, bounds: SceneBounds) -> Iterator[SceneLimit]:
             yield SceneLimit(value, name, body, state, meaning, why, f"{FIX[name][:1].upper()}{FIX[name][1:]}.")
 
 
-def _initial_gradient(body: Body, dimension: int) -> float:
-    """Return the rate of deformation at the start as the solver measures it: |tr C|, or the largest row sum of |C|."""
+def _initial_rate(body: Body, dimension: int) -> float:
+    """Return how fast a body deforms at the start, 1/s."""
     if body.velocity_gradient is None and not moves_unevenly(body):
         return 0.0
     _, C = initial_motion(body, body_points(body) if moves_unevenly(body) else np.zeros((1, dimension)))
-    keeps_J = law_of(body, dimension).deformation == "J"
-    rates = np.abs(np.trace(C, axis1=1, axis2=2)) if keeps_J else np.abs(C).sum(axis=2).max(axis=1)
+    rates = deformation_rate(C, keeps_J=law_of(body, dimension).deformation == "J")
     return float(np.max(rates, initial=0.0, where=np.isfinite(rates)))
 
 

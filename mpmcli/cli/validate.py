@@ -77,6 +77,8 @@ def command(
         raise InputError("--resume and --overwrite are about an earlier report: name its directory with -o.")
     if resume and overwrite:
         raise InputError("--resume keeps what is there and --overwrite removes it; give one of them.")
+    if listing and write_scene:
+        raise InputError("--list lists the cases and --write-scene prints the scene of one; give one of them.")
     cases = _chosen(names)
     if listing:
         return _list(cases, level, as_json)
@@ -186,10 +188,7 @@ def _run(
         raise
     if output is not None:
         write_report(report, output)
-    if not quiet:
-        click.echo(report.table(), err=True)
-        if output is not None:
-            click.echo(f"report: {output / 'report.html'}", err=True)
+    progress.close(report, output)
     if as_json:
         print_json(report.as_dict())
     return 0 if report.passed else 1

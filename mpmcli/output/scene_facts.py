@@ -21,6 +21,7 @@ class SceneFacts:
         origin, upper: corners of the domain, (d,), m.
         gravity: (d,), m/s^2; None where it depends on time.
         driven: whether forces act, or gravity depends on time: energy and momentum have a source then.
+        spin_kept: whether the transfers keep angular momentum, as those of APIC do.
         sticking: per axis, whether a face normal to it sticks.
         bodies, laws: names, in the order of the labels in the frames.
         densities: at rest, of each body, kg/m^3.
@@ -36,6 +37,7 @@ class SceneFacts:
     upper: np.ndarray | None
     gravity: np.ndarray | None
     driven: bool
+    spin_kept: bool
     sticking: tuple[bool, ...] | None
     bodies: tuple[str, ...]
     laws: tuple[str, ...]
@@ -97,6 +99,7 @@ def scene_facts(header: dict[str, Any]) -> SceneFacts:
         upper=None if origin is None or size is None else origin + size,
         gravity=None if timed else _vector(gravity, d),
         driven=timed or bool(scene.get("forces")),
+        spin_kept=scene.get("solver", {}).get("transfer", "apic") == "apic",
         sticking=_sticking(domain.get("walls"), d),
         bodies=tuple(header.get("bodies", ())),
         laws=tuple(header.get("materials", ())),

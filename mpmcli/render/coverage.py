@@ -1,7 +1,7 @@
 """How much of the plane is covered by particles in 2D: their area, spread over a grid by a Gaussian."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,13 +124,12 @@ def _raise_disks(cover: np.ndarray, position: np.ndarray, radii: np.ndarray, dev
     """Raise the cover to that of disks: 1/2 on the rim, and as steep there as on an edge."""
     slope = 1.0 / (deviation * math.sqrt(2.0 * math.pi))
     flat = cover.reshape(-1)
-    for place, _, away in disk_nodes(position, float(radii.max()) + grid.edge, grid):
-        rows, nodes = place
+    for rows, nodes, away in disk_nodes(position, float(radii.max()) + grid.edge, grid):
         np.maximum.at(flat, nodes, (0.5 + slope * (radii[rows] - away)).astype(np.float32))
 
 
-def disk_nodes(position: np.ndarray, reach: float, grid: Grid):
-    """Yield the nodes about particles (n, 2), one step at a time: ((rows, nodes), step, distances (k,), m)."""
+def disk_nodes(position: np.ndarray, reach: float, grid: Grid) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield the nodes about particles (n, 2), in turn: rows, nodes and distances, m, (k,)."""
     place = (position - np.array(grid.corner)) / grid.edge
     base = np.rint(place).astype(np.int64)
     count = math.ceil(reach / grid.edge)
@@ -140,4 +139,4 @@ def disk_nodes(position: np.ndarray, reach: float, grid: Grid):
             away = grid.edge * np.hypot(column - place[:, 0], row - place[:, 1])
             hit = (away <= reach) & (column >= 0) & (column < grid.shape[1]) & (row >= 0) & (row < grid.shape[0])
             rows = np.flatnonzero(hit)
-            yield (rows, row[rows] * grid.shape[1] + column[rows]), (right, down), away[rows]
+            yield rows, row[rows] * grid.shape[1] + column[rows], away[rows]

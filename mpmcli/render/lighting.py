@@ -52,7 +52,7 @@ def lights_of(subject: Subject, view: View, theme: Theme) -> Lights:
         lamp=_unit(-0.42 * right + 1.0 * above + 0.40 * back - 0.1 * up),
         rim=_unit(0.55 * right + 0.55 * above - 0.75 * back),
         fill=_unit(0.8 * right + 0.25 * above + 0.6 * back),
-        lamp_color=np.array([1.62, 1.55, 1.42]) * (0.72 if dark else 0.66),
+        lamp_color=np.array([1.50, 1.56, 1.66]) * 0.72 if dark else np.array([1.62, 1.55, 1.42]) * 0.66,
         sky=np.array([0.30, 0.38, 0.52]) * (0.72 if dark else 1.25),
         horizon=np.array([0.22, 0.26, 0.33]) if dark else np.array([0.86, 0.90, 0.95]),
         ground=linear(theme.floor) * (1.0 if dark else 0.42) + (0.03 if dark else 0.0),
@@ -66,10 +66,9 @@ def linear(color: str) -> np.ndarray:
 
 def vertex_code() -> tuple[str, str]:
     """Return what the vertex shader declares and does to hand over what the vertices carry."""
-    declared = f"in vec4 {LIGHT}; in vec3 {TINT}; in vec3 {ROUGH}; in vec3 {OUTWARDS};\ncentroid out vec4 carriedLight; centroid out vec3 carriedTint;"
-    declared += "\ncentroid out vec3 carriedRough; centroid out vec3 worldPoint; centroid out vec3 worldNormal;"
-    done = f"carriedLight = {LIGHT}; carriedTint = {TINT}; carriedRough = {ROUGH};"
-    return declared, done + f"\nworldPoint = vertexMC.xyz; worldNormal = {OUTWARDS};"
+    declared = f"in vec4 {LIGHT};\n" + "".join(f"in vec3 {name};\n" for name in CARRIED[1:])
+    done = f"carriedLight = {LIGHT}; carriedTint = {TINT}; carriedRough = {ROUGH};\n"
+    return declared + _carried("out"), done + f"worldPoint = vertexMC.xyz; worldNormal = {OUTWARDS};"
 
 
 def fragment_code(
@@ -99,8 +98,7 @@ def fragment_code(
         "cameraRight": _vec(view.axes[0]),
         "cameraUp": _vec(view.axes[1]),
     }
-    declared = "centroid in vec4 carriedLight; centroid in vec3 carriedTint; centroid in vec3 carriedRough;\n"
-    declared += "centroid in vec3 worldPoint; centroid in vec3 worldNormal;\n"
+    declared = _carried("in")
     declared += "".join(f"const vec3 {name} = {value};\n" for name, value in constants.items())
     declared += f"const float grainSize = {max(subject.distances):.9g};\n"
     declared += f"const float wallGap = {1e-5 * side:.9g};\n"
@@ -113,6 +111,12 @@ def fragment_code(
         kind = "lava"
     towards = "toCamera" if view.parallel else "normalize(cameraAt - worldPoint)"
     return declared, _COMMON.replace("TOWARDS", towards) + _FINISHES.get(kind, _FINISHES["matte"]) + _TONE
+
+
+def _carried(direction: str) -> str:
+    """Return the declarations of what goes from vertices to fragments, taken where the triangle is in the pixel."""
+    names = ("carriedTint", "carriedRough", "worldPoint", "worldNormal")
+    return f"centroid {direction} vec4 carriedLight;\n" + "".join(f"centroid {direction} vec3 {n};\n" for n in names)
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
@@ -194,8 +198,8 @@ color += base * 0.35 * (lampColor * lamp * max(dot(n, lampTo), 0.0) + sky * soft
 n = normalize(n + 0.5 * carriedRough);
 float grit = 0.95 + 0.10 * carriedRough.x;
 vec3 shade = mix(vec3(0.66, 0.78, 1.0), vec3(1.0), clamp(lamp, 0.0, 1.0));
-color = base * grit * (0.62 * lampColor * lamp * wrapped(dot(n, lampTo), 0.45)
-        + 0.95 * shade * (0.25 + 0.75 * sky) * (0.4 * softLight(n) + 0.6 * softLight(upwards)) + 0.06);
+color = base * grit * (0.60 * lampColor * lamp * wrapped(dot(n, lampTo), 0.45)
+        + 1.05 * shade * (0.35 + 0.65 * sky) * (0.4 * softLight(n) + 0.6 * softLight(upwards)) + 0.10);
 """,
     "translucent": _BEHIND.replace("BENT", "0.16")
     + """
@@ -219,8 +223,8 @@ float depth = 0.20 + thick;
 vec3 dimmed = pow(clear, vec3(1.3 * (1.0 - exp(-1.1 * depth)))) * exp(-0.55 * depth);
 vec3 glow = base * (0.60 * softLight(vec3(upwards)) * (0.3 + 0.7 * sky) + 0.28 * lampColor * lamp);
 vec3 inside = behind * dimmed + glow * (1.0 - exp(-1.3 * depth));
-float shine = mirror(facing, 0.03);
-vec3 mirrored = mix(0.45, 1.0, sky) * roomLight(reflect(-v, n), 0.06);
+float shine = mirror(facing, 0.05);
+vec3 mirrored = mix(0.45, 1.0, sky) * roomLight(reflect(-v, n), 0.06) * 1.15;
 if (atWall) { shine *= 0.45; }
 color = mix(inside, mirrored, shine);
 // The film that the eye sees where the surface bends into the glass.

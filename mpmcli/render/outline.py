@@ -73,6 +73,9 @@ class OutlinePainter:
             picture += alpha[..., None] * (drawn - picture)
         return (255.0 * np.clip(picture, 0.0, 1.0) + 0.5).astype(np.uint8)[::-1]
 
+    def close(self) -> None:
+        """Do nothing: there is no window."""
+
     def _cover(self, group: Group) -> np.ndarray:
         """Return the share of each pixel's surroundings that a group covers, (h, w); its edge is where it is 1/2."""
         step = _coarseness(group.distance, self.grid)
@@ -89,30 +92,31 @@ class OutlinePainter:
 
     def _colored(self, group: Group, cover: np.ndarray, frame: Frame) -> np.ndarray:
         """Return the colours (h, w, 3) of a group, wherever it is."""
+        body, lit = self._relief(cover)
         if self.colors is not None:
-            return self._by_field(group, frame)
+            color = self._by_field(group, frame)
+        else:
+            color = self._by_look(group, np.clip(2.0 * body - 1.0, 0.0, 1.0), lit)
+        rim = np.clip(1.0 - self._inwards(cover, group.distance) / (RIM * self.view.size[1] / 720.0), 0.0, 1.0)
+        # Drops are all rim, and would be dark.
+        rim *= np.clip(3.0 * body - 0.3, 0.0, 1.0)
+        return color * (1.0 - DARKER.get(group.look.finish, 0.28) * rim)[..., None]
+
+    def _by_look(self, group: Group, depth: np.ndarray, lit: np.ndarray) -> np.ndarray:
+        """Return the colours (h, w, 3) of the material of a group, by depth and light as `_relief` finds them."""
         base = np.array(rgb(group.look.color), dtype=np.float32)
         ground = np.array(rgb(self.theme.ground), dtype=np.float32)
         if np.abs(base - ground).max() < 0.15:
             # White on white: as much of the ink as tells it from the paper.
             base = base + np.float32(0.25) * (np.array(rgb(group.look.ink), dtype=np.float32) - base)
-        body, lit = self._relief(cover)
-        depth = np.clip(2.0 * body - 1.0, 0.0, 1.0)
+        if group.look.finish == "grains":
+            return self._grainy(group, base, depth, lit)
         color = _shaded(group.look, base, depth, lit)
         if group.look.finish == "crumbly":
-            noise = _finer(
-                self._crumbs(group, _coarser(self.grid, _coarseness(group.distance, self.grid))),
-                _coarseness(group.distance, self.grid),
-                self.grid.shape,
-            )
+            step = _coarseness(group.distance, self.grid)
+            noise = _finer(self._crumbs(group, _coarser(self.grid, step)), step, self.grid.shape)
             color = color * (1.0 + 0.10 * np.clip(noise, -1.0, 1.0))[..., None]
-        if group.look.finish == "grains":
-            color = self._grainy(group, base, depth, lit)
-        inwards = self._inwards(cover, group.distance)
-        rim = np.clip(1.0 - inwards / (RIM * self.view.size[1] / 720.0), 0.0, 1.0)
-        # Drops are all rim, and would be dark.
-        rim *= np.clip(3.0 * body - 0.3, 0.0, 1.0)
-        return color * (1.0 - DARKER.get(group.look.finish, 0.28) * rim)[..., None]
+        return color
 
     def _inwards(self, cover: np.ndarray, distance: float) -> np.ndarray:
         """Return how many pixels (h, w) lie between the edge and each pixel, near it, by the slope of the cover."""
@@ -169,7 +173,7 @@ class OutlinePainter:
         radius = max(GRAIN * group.distance, 0.6 * self.grid.edge)
         best = np.zeros(self.grid.shape[0] * self.grid.shape[1], dtype=np.int64)
         moved = group.position + JITTER * group.distance * group.hashes[:, 1:]
-        for (rows, nodes), _, away in disk_nodes(moved, radius, self.grid):
+        for rows, nodes, away in disk_nodes(moved, radius, self.grid):
             # The nearest particle wins; of two as near, the later.
             key = ((1.0 - away / radius) * 4000).astype(np.int64) + 1
             np.maximum.at(best, nodes, (key << 32) + rows)

@@ -63,9 +63,15 @@ class Studio:
             assert isinstance(self.colors, Coloring)
             plane = slice_of(subject, settings.camera)
             return DensityPainter(scene_facts(self.result.header), subject, view, theme, plane, self.colors)
+        if settings.mode == "fluid" and subject.dimension == 3:
+            from mpmcli.render.fluid import FluidPainter
+
+            return FluidPainter(subject, view, theme)
         if settings.mode in ("surface", "fluid"):
             from mpmcli.render.surface import SurfacePainter
 
+            if settings.mode == "fluid":
+                subject = _grained(subject)
             return SurfacePainter(subject, view, theme, self.colors if isinstance(self.colors, Coloring) else None)
         assert self.colors is not None
         return DotsPainter(subject, view, theme, self.colors, count)
@@ -102,6 +108,12 @@ def open_studio(result: Result, settings: Settings) -> Studio:
         settings = replace(settings, size=canvas.size)
         require_possible(*canvas.size, f"{width}xauto")
     return Studio(result, settings, subject, colors, canvas, view_of(subject, camera, canvas.stage_size))
+
+
+def _grained(subject: Subject) -> Subject:
+    """Let everything that is no liquid be drawn as grains."""
+    looks = (look if look.liquid else replace(look, finish="grains") for look in subject.looks)
+    return replace(subject, looks=tuple(looks))
 
 
 def _legend(subject: Subject) -> Categories:

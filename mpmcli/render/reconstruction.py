@@ -9,14 +9,18 @@ import numpy as np
 SMOOTHING_LENGTH, CUBE = 2.5, 1.1
 # Share of the full density at which the surface lies.
 THRESHOLD = 0.5
+# The same two of surfaces that keep close to the particles.
+CLOSE_LENGTH, CLOSE_THRESHOLD = 1.8, 0.55
 # Rounds of Laplacian smoothing, weighted so that thin sheets keep their volume.
-SMOOTHING_ROUNDS = 40
+SMOOTHING_ROUNDS = 20
 # Radii from a wall within which particles have images behind it: the support of the kernel.
 IMAGE_REACH = 2.0 * SMOOTHING_LENGTH
 # Edge of the cells in which particles are counted, in radii, and how many cells there may be.
 FULLNESS_CELL, FULLNESS_CELLS = 4.0, 4e6
 # Shares of room filled, below which a vertex is not smoothed and above which it is smoothed in full.
 ALONE, HALF = 0.03, 0.22
+# Radii from a wall within which a particle touches it, and the edge of the cells in which such are looked for.
+CONTACT, CONTACT_CELL = 3.0, 2.0
 # Radii that a particle may lie outside of the domain and still be drawn.
 STRAY = 4.0
 
@@ -59,6 +63,8 @@ def reconstruct(
     upper: Sequence[float],
     attributes: Mapping[str, np.ndarray] | None = None,
     rounds: int = SMOOTHING_ROUNDS,
+    *,
+    close: bool = False,
 ) -> Mesh:
     """Wrap particles in a surface: splashsurf's level set of their density, smoothed.
 
@@ -73,6 +79,7 @@ def reconstruct(
         lower, upper: corners of the domain, m.
         attributes: (n,) or (n, k) finite numbers each, to be carried over to the vertices.
         rounds: of smoothing; 0 keeps every lump.
+        close: the surface keeps close to the particles, and single ones stay small: right for crumbs, not for sheets.
     """
     from pysplashsurf import laplacian_smoothing_parallel, reconstruction_pipeline
 
@@ -90,11 +97,14 @@ def reconstruct(
         points,
         attributes_to_interpolate={name: np.ascontiguousarray(values[source]) for name, values in carried.items()},
         particle_radius=1.0,
-        smoothing_length=SMOOTHING_LENGTH,
+        smoothing_length=CLOSE_LENGTH if close else SMOOTHING_LENGTH,
         cube_size=CUBE,
-        iso_surface_threshold=THRESHOLD,
+        iso_surface_threshold=CLOSE_THRESHOLD if close else THRESHOLD,
         multi_threading=True,
+        # In vectors the sums of two subdomains over the particles of one node differ in their last bit.
+        simd=False,
         subdomain_grid=True,
+        subdomain_grid_auto_disable=False,
     )
     mesh = found.mesh
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
@@ -111,9 +121,11 @@ def reconstruct(
         connectivity = mesh.vertex_vertex_connectivity()
         laplacian_smoothing_parallel(mesh, connectivity, iterations=rounds, beta=1.0, weights=weights)
     # The old view is stale: smoothing has put other memory in its place.
-    vertices = np.clip(np.asarray(mesh.vertices), low, high)
-    areas = _area_vectors(vertices, triangles)
-    triangles = triangles[areas.any(axis=1)]
+    raw = np.asarray(mesh.vertices)
+    vertices = np.clip(raw, low, high)
+    kept = _area_vectors(vertices, triangles).any(axis=1)
+    kept &= ~_pressed_flat(raw, vertices, triangles, particles, low, high)
+    triangles = triangles[kept]
     return Mesh(
         points=(vertices * radius + middle).astype(np.float32),
         triangles=triangles,
@@ -158,6 +170,43 @@ def _with_images(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple
             sources.append(source[near])
         points, source = np.concatenate(images), np.concatenate(sources)
     return points, source
+
+
+def _pressed_flat(
+    raw: np.ndarray,
+    vertices: np.ndarray,
+    triangles: np.ndarray,
+    particles: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> np.ndarray:
+    """Return which triangles (t,) are those of an image that its particle, close to a wall, does not touch.
+
+    Cut off at the wall, such an image is a sheet without thickness that lies on it.
+
+    Args:
+        raw, vertices: (v, 3) before and after they were cut off at the walls, in radii.
+        particles: (n, 3) without images.
+    """
+    flat = np.zeros(len(triangles), dtype=bool)
+    for axis in range(3):
+        others = [k for k in range(3) if k != axis]
+        shape = tuple(np.maximum(np.ceil((high - low)[others] / CONTACT_CELL).astype(int), 1) + 2)
+        for wall, inwards in ((low[axis], 1.0), (high[axis], -1.0)):
+            beyond = inwards * (raw[:, axis] - wall) < 0.0
+            rows = np.flatnonzero(beyond[triangles].all(axis=1))
+            if not len(rows):
+                continue
+            close = particles[inwards * (particles[:, axis] - wall) < CONTACT][:, others]
+            at = np.minimum(((close - low[others]) / CONTACT_CELL).astype(int) + 1, np.array(shape) - 2)
+            touched = np.zeros(shape, dtype=bool)
+            touched[at[:, 0], at[:, 1]] = True
+            for side in range(2):
+                touched |= np.roll(touched, 1, axis=side) | np.roll(touched, -1, axis=side)
+            middles = vertices[triangles[rows]].mean(axis=1)[:, others]
+            at = np.minimum(((middles - low[others]) / CONTACT_CELL).astype(int) + 1, np.array(shape) - 2)
+            flat[rows] |= ~touched[at[:, 0], at[:, 1]]
+    return flat
 
 
 def _fullness(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from mpmcli.render.backdrop import Backdrop
 from mpmcli.render.grains import JITTER, grain_colors, new_grains, pose_grains
 from mpmcli.render.material_groups import Group, groups_of
 from mpmcli.render.occlusion import Occlusion, occlusion_of
-from mpmcli.render.reconstruction import Mesh, reconstruct
+from mpmcli.render.reconstruction import SMOOTHING_ROUNDS, Mesh, reconstruct
 from mpmcli.render.subject import Subject
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.thickness import thickness_at
@@ -20,11 +20,10 @@ from mpmcli.render.view import View
 if TYPE_CHECKING:
     from mpmcli.render.surface import FieldColors
 
-# Pixels of the window to one of the picture, along each axis.
-FINER = 2
+# Pixels of the window to one of the picture, along each axis, and the longest side of a window.
+FINER, LONGEST = 2, 8192
 # Rounds of smoothing, by finish; crumbs keep their lumps.
 ROUNDS = {"crumbly": 2}
-USUAL_ROUNDS = 40
 
 
 class SolidStage:
@@ -37,7 +36,8 @@ class SolidStage:
         self.subject, self.view, self.theme, self.colors = subject, view, theme, colors
         self.backdrop = Backdrop(subject, view, theme)
         self.lights = lighting.lights_of(subject, view, theme)
-        self.plotter = pv.Plotter(off_screen=True, window_size=[FINER * n for n in view.size], lighting="none")
+        self.finer = FINER if FINER * max(view.size) <= LONGEST else 1
+        self.plotter = pv.Plotter(off_screen=True, window_size=[self.finer * n for n in view.size], lighting="none")
         self.plotter.disable_anti_aliasing()
         self.behind, self.room = _texture(), _texture()
         for texture in (self.behind, self.room):
@@ -67,7 +67,7 @@ class SolidStage:
             _put(self.behind, self._window_pixels())
             for actor in clear:
                 actor.SetVisibility(True)
-        return _coarser(self._window_pixels())
+        return _coarser(self._window_pixels(), self.finer)
 
     def close(self) -> None:
         """Close the window."""
@@ -106,7 +106,8 @@ class SolidStage:
             self.subject.lower,
             self.subject.upper,
             attributes,
-            rounds=ROUNDS.get(group.look.finish, USUAL_ROUNDS),
+            rounds=ROUNDS.get(group.look.finish, SMOOTHING_ROUNDS),
+            close=group.look.finish == "crumbly",
         )
         actor = self.actors.get(group.key)
         if actor is None:
@@ -176,7 +177,7 @@ class SolidStage:
         shader.AddVertexShaderReplacement("//VTK::Normal::Dec", True, f"//VTK::Normal::Dec\n{declared}", False)
         shader.AddVertexShaderReplacement("//VTK::Normal::Impl", True, f"//VTK::Normal::Impl\n{done}", False)
         declared, done = lighting.fragment_code(
-            self.subject, self.view, self.lights, group.look, FINER, by_field=self.colors is not None
+            self.subject, self.view, self.lights, group.look, self.finer, by_field=self.colors is not None
         )
         # After all that the window does itself; its own lights and textures are left out.
         shader.AddFragmentShaderReplacement("//VTK::TCoord::Dec", True, f"//VTK::TCoord::Dec\n{declared}", False)
@@ -191,15 +192,19 @@ class SolidStage:
         low, high = self.subject.lower, self.subject.upper
         box = pv.Box(bounds=(low[0], high[0], low[1], high[1], low[2], high[2]))
         walls = self.plotter.add_mesh(
-            box.extract_all_edges(), color=rgb(self.theme.wall), line_width=1.3 * FINER, opacity=1.0, lighting=False
+            box.extract_all_edges(),
+            color=rgb(self.theme.wall),
+            line_width=1.3 * self.finer,
+            opacity=1.0,
+            lighting=False,
         )
         walls.SetPickable(False)
 
 
-def _coarser(pixels: np.ndarray) -> np.ndarray:
-    """Return the means over blocks of `FINER` by `FINER` pixels (h, w, 3) uint8."""
-    total = sum(pixels[i::FINER, j::FINER].astype(np.uint16) for i in range(FINER) for j in range(FINER))
-    return ((total + FINER * FINER // 2) // (FINER * FINER)).astype(np.uint8)
+def _coarser(pixels: np.ndarray, step: int) -> np.ndarray:
+    """Return the means over blocks of `step` by `step` pixels (h, w, 3) uint8."""
+    total = sum(pixels[i::step, j::step].astype(np.uint16) for i in range(step) for j in range(step))
+    return ((total + step * step // 2) // (step * step)).astype(np.uint8)
 
 
 def _texture() -> Any:

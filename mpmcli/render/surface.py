@@ -30,6 +30,10 @@ class Painter(Protocol):
         """Return the picture of a frame, (h, w, 3) uint8."""
         ...
 
+    def close(self) -> None:
+        """Let go of what the painter holds."""
+        ...
+
 
 class SurfacePainter:
     """Draws the surfaces of the materials of one run; made once per process.
@@ -41,6 +45,7 @@ class SurfacePainter:
     def __init__(self, subject: Subject, view: View, theme: Theme, colors: FieldColors | None = None) -> None:
         """Choose the way of drawing: in space by triangles, in the plane by the density of particles."""
         self.fields = () if colors is None else colors.fields
+        self.view = view
         if subject.dimension == 3:
             from mpmcli.render.solid_stage import SolidStage
 
@@ -53,3 +58,7 @@ class SurfacePainter:
     def draw(self, frame: Frame) -> np.ndarray:
         """Return the picture of a frame, (h, w, 3) uint8."""
         return self.painter.draw(frame)
+
+    def close(self) -> None:
+        """Let go of the window, if there is one."""
+        self.painter.close()

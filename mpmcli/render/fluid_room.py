@@ -1,0 +1,95 @@
+"""The room around a liquid: what lies behind it and before it, the floor, and the shadows on it."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mpmcli.render.backdrop import Backdrop
+from mpmcli.render.fluid_shading import linear
+from mpmcli.render.lighting import OPACITY
+from mpmcli.render.material_groups import Group
+from mpmcli.render.occlusion import occlusion_of
+from mpmcli.render.stage import Stage
+from mpmcli.render.subject import Subject
+from mpmcli.render.theme import Theme
+from mpmcli.render.view import View
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+# Samples along each axis of a pixel in what VTK draws.
+SAMPLES = 2
+# Diameter of the dots, in distances between particles: they overlap a little; and the smallest, pixels.
+DIAMETER, SMALLEST = 1.15, 1.5
+
+
+class Room:
+    """The background, the floor and its shadows, and one off-screen window for lines and dots."""
+
+    def __init__(self, subject: Subject, view: View, theme: Theme, lamp: np.ndarray) -> None:
+        self._subject, self._view, self._lamp = subject, view, lamp
+        self._backdrop = Backdrop(subject, view, theme)
+        self._stage = Stage(replace(view, size=(view.size[0] * SAMPLES, view.size[1] * SAMPLES)), theme)
+        self._stage.add_box(subject.lower, subject.upper, theme.wall, width=1.6 * SAMPLES)
+        # The background without shadows (h, w, 3), in amounts of light.
+        self.bare = linear(self._backdrop.image(None) / np.float32(255))
+        self._actors: dict[tuple[int, int], pv.Actor] = {}
+        self._empty: tuple[np.ndarray, np.ndarray] | None = None
+
+    def things(self, groups: list[Group], colors: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Draw lines and dots; return their picture (2h, 2w, 3) uint8 and depth (2h, 2w), inf where there is nothing.
+
+        Args:
+            groups: what is drawn as dots.
+            colors: (n, 3) uint8 of each group.
+        """
+        if not groups and self._empty is not None:
+            return self._empty
+        for actor in self._actors.values():
+            actor.SetVisibility(False)
+        for group, color in zip(groups, colors, strict=True):
+            self._show(group, color)
+        self._stage.render()
+        seen = self._stage.picture(), self._stage.depth()
+        if not groups:
+            self._empty = seen
+        return seen
+
+    def base(self, groups: list[Group]) -> np.ndarray:
+        """Return the background (h, w, 3) in amounts of light, with the shadows that particles throw on the floor."""
+        occlusion = None
+        if groups:
+            position = np.concatenate([group.position for group in groups])
+            counts = [len(group.position) for group in groups]
+            volumes = np.repeat([group.distance**3 for group in groups], counts)
+            opacity = np.repeat([OPACITY.get(group.look.finish, 1.0) for group in groups], counts)
+            occlusion = occlusion_of(self._subject, position, volumes, opacity, self._lamp)
+        return linear(self._backdrop.image(occlusion) / np.float32(255))
+
+    def _show(self, group: Group, colors: np.ndarray) -> None:
+        """Let the next picture show the dots of a group."""
+        import pyvista as pv
+
+        cloud = pv.PolyData(group.position.astype(np.float32))
+        cloud["color"] = colors
+        if group.key not in self._actors:
+            if not self._actors:
+                self._stage.add_light()
+            self._actors[group.key] = self._stage.plotter.add_points(
+                cloud,
+                scalars="color",
+                rgb=True,
+                render_points_as_spheres=True,
+                reset_camera=False,
+                ambient=0.45,
+                diffuse=0.65,
+                specular=0.0,
+            )
+        actor = self._actors[group.key]
+        actor.mapper.dataset = cloud
+        actor.SetVisibility(True)
+        # Dots of one group have one size, that of those in the middle.
+        distance = max(float(np.median(self._view.pixels(group.position)[:, 2])), self._view.near)
+        scale = self._view.pixels_per_metre * (1.0 if self._view.parallel else self._view.distance / distance)
+        actor.prop.point_size = max(DIAMETER * group.distance * scale, SMALLEST) * SAMPLES

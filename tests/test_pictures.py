@@ -1,0 +1,80 @@
+"""The pictures of the README: there is one of every example scene, they are small, and the script makes them."""
+
+import importlib.machinery
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from command import ROOT, run_here
+from PIL import Image
+
+from mpmcli.render.picture_file import digest_of
+
+PICTURES = ROOT / "docs" / "pictures"
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BYTES_MAX = 3e6
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The script, which needs its neighbours, and leaves no compiled files among them."""
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    loader = importlib.machinery.SourceFileLoader("picture_table", str(ROOT / "scripts" / "picture_table"))
+    module = importlib.util.module_from_spec(importlib.util.spec_from_loader("picture_table", loader))
+    loader.exec_module(module)
+    return module
+
+
+def test_every_scene_has_a_picture_on_the_page(script: ModuleType) -> None:
+    names = sorted(path.stem for path in (ROOT / "configs").glob("*.toml"))
+    assert sorted(script.MONTAGES) == names
+    section = README[README.index("<!-- pictures:") : README.index("<!-- end of pictures -->")]
+    shown = re.findall(r"\(docs/pictures/(\w+)\.png\)", section)
+    assert sorted(shown) == names
+    assert sorted(path.stem for path in PICTURES.glob("*.png")) == names
+    for _, options in script.MONTAGES.values():
+        assert options in section
+
+
+def test_pictures_are_small_and_of_mpmcli() -> None:
+    assert sum(path.stat().st_size for path in PICTURES.iterdir()) < BYTES_MAX
+    for path in PICTURES.iterdir():
+        assert digest_of(path), path.name
+        with Image.open(path) as picture:
+            # Not blank, and nothing but what a page can hold.
+            colors = np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)
+            assert picture.width == 760 and len(colors) > 20
+
+
+def test_a_smaller_file_has_the_same_pixels(script: ModuleType, tmp_path: Path) -> None:
+    from mpmcli.render.picture_file import write_picture
+
+    gradient = np.add.outer(np.arange(200), np.arange(300))[:, :, None] // np.array([2, 3, 4])
+    image = gradient.astype(np.uint8)
+    write_picture(tmp_path / "a.png", image, "some digest")
+    before = (tmp_path / "a.png").stat().st_size
+    script.compress(tmp_path / "a.png")
+    assert digest_of(tmp_path / "a.png") == "some digest"
+    with Image.open(tmp_path / "a.png") as picture:
+        np.testing.assert_array_equal(np.asarray(picture), image)
+    assert (tmp_path / "a.png").stat().st_size <= before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["elliptical_drop_2d", "stirred_tank_2d"])
+def test_the_committed_picture_is_what_the_scene_gives(script: ModuleType, tmp_path: Path, name: str) -> None:
+    """Run and drawn again; another machine may round some pixels of an edge otherwise."""
+    grid, options = script.MONTAGES[name]
+    assert run_here("simulate", ROOT / "configs" / f"{name}.toml", "-o", tmp_path / "run", "--quiet").status == 0
+    words = ["--montage", grid, *options.split(), "--size", f"{script.WIDTH}xauto", "-o", tmp_path / "again.png"]
+    done = run_here("render", tmp_path / "run", *words)
+    assert done.status == 0, done.stderr
+    again, committed = (np.asarray(Image.open(path)) for path in (tmp_path / "again.png", PICTURES / f"{name}.png"))
+    assert again.shape == committed.shape
+    differs = np.abs(again.astype(int) - committed).max(axis=2) > 8
+    assert differs.mean() < 0.01
