@@ -1,6 +1,7 @@
 """`mpmcli render` as it is called: files, films, what is kept, what is refused in one sentence."""
 
 import json
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -61,6 +62,14 @@ def test_a_picture_of_the_last_frame_lies_beside_the_result(run: Path) -> None:
     assert said["pictures"] == [str(run / "render" / "dots_000005.png")] and said["made"] == 1
     with Image.open(said["pictures"][0]) as picture:
         assert picture.size == (320, 180)
+
+
+def test_matplotlib_does_not_talk_in_between(run: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Without a home it explains in several lines where it keeps its cache."""
+    logging.getLogger("matplotlib").setLevel(logging.NOTSET)
+    rendered(run)
+    logging.getLogger("matplotlib.font_manager").warning("created a temporary cache directory")
+    assert not caplog.records
 
 
 def test_what_is_there_is_not_made_again_unless_something_changed(run: Path, tmp_path: Path) -> None:

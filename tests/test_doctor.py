@@ -231,6 +231,32 @@ def test_a_program_without_the_encoder_is_found_out(monkeypatch, tmp_path):
     assert "IMAGEIO_FFMPEG_EXE" in found.remedy
 
 
+@pytest.mark.parametrize(("text", "reason"), [("exit 3", "exited with 3"), (None, "No such file")])
+def test_a_program_of_the_user_that_is_no_ffmpeg_is_named(monkeypatch, tmp_path, text, reason):
+    program = tmp_path / "ffmpeg"
+    if text:
+        program.write_text(f"#!/bin/sh\n{text}\n")
+        program.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+    import imageio_ffmpeg
+
+    monkeypatch.setattr(imageio_ffmpeg._utils, "get_ffmpeg_exe", lambda: str(program))
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(program))
+    found = files.ffmpeg()
+    assert found.status == "broken" and found.detail.startswith(f"{program} is no ffmpeg that runs (")
+    assert reason in found.detail and "unset IMAGEIO_FFMPEG_EXE" in found.remedy
+
+
+def test_a_sermon_becomes_one_line_of_how_it_begins_and_ends():
+    """NumPy explains at length why it cannot be loaded, and says last what is missing."""
+    sermon = "\n\nNumPy cannot be loaded.\n" + "Read this.\n" * 200 + "libstdc++.so.6: file too short\n"
+    each = next(each for each in EXAMINATIONS if each.name == "taichi cuda")
+    reply = Reply({"status": "information", "detail": f"not tried ({sermon})", "remedy": ""}, "", "")
+    for found in (judge(each, reply), attempt(Examination("hdf5", raising(ImportError(sermon)), "h5py"))):
+        assert "\n" not in found.detail and len(found.detail) < 320
+        assert "NumPy cannot be loaded." in found.detail and "libstdc++.so.6: file too short" in found.detail
+
+
 def refuse(place: Path) -> None:
     raise PermissionError(13, "Permission denied")
 

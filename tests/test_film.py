@@ -194,8 +194,9 @@ def test_without_ffmpeg_one_sentence_says_so(pictures, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("script", "sentence"),
     [
-        ("echo 'the encoder is not there' >&2; exit 3", "film.mp4, with status 3: the encoder is not there"),
-        ("cat > /dev/null; exit 1", "film.mp4, with status 1: it said nothing"),
+        ("echo 'the encoder is not there' >&2; exit 3", "film.mp4, its status is 3: the encoder is not there"),
+        ("cat > /dev/null; exit 1", "film.mp4, its status is 1: it said nothing"),
+        ("kill -25 $$", "film.mp4, it was ended by signal 25: it said nothing"),
     ],
 )
 def test_an_ffmpeg_that_fails_ends_the_film_and_keeps_the_old_one(pictures, tmp_path, monkeypatch, script, sentence):

@@ -124,14 +124,22 @@ def test_walls_of_a_slice_are_where_its_domain_ends(tmp_path: Path) -> None:
     assert not open_studio(run, Settings("dots", "speed", (640, 360), camera="side")).canvas.walls
 
 
-def test_a_picture_depends_on_how_its_time_is_written(tmp_path: Path) -> None:
-    """While a run goes on, milliseconds become seconds: a film must not have both."""
+@pytest.mark.parametrize("planned", [True, False])
+def test_a_film_writes_all_times_alike_also_while_its_run_goes_on(tmp_path: Path, planned: bool) -> None:
+    """Those of the first frames could be milliseconds, and those of the last seconds."""
     facts, settings = header((1.0, 1.0), 0.1, [WATER]), Settings("dots", "speed", (64, 64), limits=(0.0, 1.0))
-    digests = []
-    for count in (3, 4, 12):
-        run = write(tmp_path / str(count), facts, [frame(k, np.ones((1, 2))) for k in range(count)])
+    pause = 0.1 if planned else 0.01
+    digests, labels = [], []
+    for count in (2, 11):
+        frames = [replace(frame(k, np.ones((1, 2))), time=pause * k) for k in range(count)]
+        run = write(tmp_path / str(count), facts, frames)
         digests.append(picture_digest(run, settings, [1]))
-    assert digests[0] == digests[1] != digests[2]
+        labels.append(time_text(pause, open_studio(run, settings).canvas.times))
+    if planned:
+        assert digests[0] == digests[1] and labels == ["t = 0.1 s"] * 2
+    else:
+        # Not the times of its scene: those that are there, and a picture is drawn again when they say it otherwise.
+        assert digests[0] != digests[1] and labels == ["t = 10 ms", "t = 0.01 s"]
 
 
 @pytest.mark.parametrize("size", [(64, 64), (90, 400), (400, 90), (320, 180), (2000, 1500)])

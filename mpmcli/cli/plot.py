@@ -1,5 +1,6 @@
 """`mpmcli plot`."""
 
+import logging
 import re
 from pathlib import Path
 
@@ -44,6 +45,8 @@ def command(
     from mpmcli.plot.ledger_figure import ledger_picture
     from mpmcli.render.picture_file import digest_of, settings_digest, write_picture
 
+    # Without a home it tells at length where it keeps its cache.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     width_height = _size(size)
     opened = open_result(result)
     path = output or (opened.path if opened.path.is_dir() else opened.path.parent) / DEFAULT

@@ -1,5 +1,6 @@
 """`mpmcli render`."""
 
+import logging
 from pathlib import Path
 
 import click
@@ -89,6 +90,8 @@ def command(
     from mpmcli.output import open_result
     from mpmcli.render.assignment import Request, assign
 
+    # Without a home it tells at length where it keeps its cache.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     request = Request(
         output, mode, frames, color, clim, cmap, size, camera, theme, movie, fps, montage, save_surface, overwrite
     )

@@ -1,7 +1,7 @@
 """Runs every examination in a process of its own, so that none can stop the others, and reports in order."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from mpmcli.child_process import Question, Reply, ask_each, module_command
 from mpmcli.doctor import backends, drawing, files, interpreter, machine
@@ -14,6 +14,8 @@ AT_ONCE = 2
 TIMEOUT = 60.0
 # Three windows may be tried, each as long as the first picture may wait.
 WINDOW_TIMEOUT = 400.0
+# Characters of a detail.
+LONGEST = 300
 
 
 @dataclass(frozen=True)
@@ -88,14 +90,20 @@ def judge(each: Examination, reply: Reply) -> Finding:
     if reply.answer.get("status") not in STATUSES:
         return _fault(each, "broken", f"its trial {reply.fault or 'gave no answer'}")
     finding = Finding(**reply.answer)
+    finding = replace(finding, detail=_line(finding.detail))
     if reply.fault and not finding.is_fault:
         return _fault(each, "broken", f"{finding.detail}; then its trial {reply.fault}")
     return finding
 
 
 def _fault(each: Examination, status: str, detail: str) -> Finding:
-    detail = " ".join(detail.split())
     remedy = library_remedy(detail) or each.remedy
     if each.package and not (remedy and status == "broken"):
         remedy = package_remedy(each.package, again=status == "broken")
-    return Finding(status if each.needed else "information", detail, remedy)
+    return Finding(status if each.needed else "information", _line(detail), remedy)
+
+
+def _line(detail: str) -> str:
+    """Return a detail as one line that is not too long: of a sermon, how it begins and how it ends."""
+    line = " ".join(detail.split())
+    return line if len(line) <= LONGEST else f"{line[: LONGEST // 3]} ... {line[-2 * LONGEST // 3 :]}"

@@ -36,7 +36,12 @@ def ffmpeg() -> Finding:
         program = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
         return Finding("missing", str(error).partition("\n")[0], package_remedy("imageio-ffmpeg", again=True))
-    version = imageio_ffmpeg.get_ffmpeg_version()
+    remedy = "unset IMAGEIO_FFMPEG_EXE if it is set, or " + package_remedy("imageio-ffmpeg", again=True)
+    try:
+        version = imageio_ffmpeg.get_ffmpeg_version()
+    except (OSError, subprocess.CalledProcessError, ValueError) as error:
+        reason = f"exited with {error.returncode}" if isinstance(error, subprocess.CalledProcessError) else error
+        return Finding("broken", f"{program} is no ffmpeg that runs ({reason})", remedy)
     source = ["-f", "lavfi", "-i", "color=s=16x16", "-frames:v", "1"]
     done = subprocess.run(
         [program, "-v", "error", *source, "-c:v", "libx264", "-f", "null", "-"],
@@ -48,9 +53,5 @@ def ffmpeg() -> Finding:
     )
     if done.returncode:
         first = (done.stderr.strip().splitlines() or [f"exited with {done.returncode}"])[0]
-        return Finding(
-            "broken",
-            f"{version}, libx264 does not encode ({first}): {program}",
-            "unset IMAGEIO_FFMPEG_EXE if it is set, or " + package_remedy("imageio-ffmpeg", again=True),
-        )
+        return Finding("broken", f"{version}, libx264 does not encode ({first}): {program}", remedy)
     return Finding("ok", f"{version}, encoder libx264")

@@ -283,7 +283,8 @@ def _montage_path(result: Result, mode: str, output: Path | None) -> Path:
 
 def _require_png(output: Path) -> None:
     if output.suffix.lower() != ".png":
-        hint = "for a film, give --movie" if output.suffix.lower() in (".mp4", ".gif") else "pictures are .png"
+        film = output.suffix.lower() in (".mp4", ".gif")
+        hint = "for a film, give --movie" if film else "pictures are .png, and a directory with a dot has to be there"
         raise InputError(f"-o {output} would be no picture: {hint}.")
 
 

@@ -99,8 +99,9 @@ def _finish(process: subprocess.Popen, said: IO[bytes], name: Path) -> None:
     if status != 0:
         said.seek(0)
         words = " ".join(said.read().decode("utf-8", errors="replace").split("\n")[-LAST_WORDS - 1 :]).strip()
+        how = f"it was ended by signal {-status}" if status < 0 else f"its status is {status}"
         raise RunError(
-            f"ffmpeg failed to write {name}, with status {status}: {words.rstrip('.') or 'it said nothing'}."
+            f"ffmpeg failed to write {name}, {how}: {words.rstrip('.') or 'it said nothing'}; mpmcli doctor tries it."
         )
 
 

@@ -97,7 +97,7 @@ def open_studio(result: Result, settings: Settings) -> Studio:
     if isinstance(colors, Coloring):
         settings = replace(settings, limits=colors.limits)
     width, height = settings.size
-    times = tuple(result.times.tolist())
+    times = expected_times(result)
     # Elsewhere in 3D they are the edges of a box, and part of the scene.
     walls = subject.dimension == 2 or settings.mode == "density"
     canvas = Canvas((width, height or width), subject, theme, times, colors, settings.grid, walls)
@@ -114,6 +114,19 @@ def _grained(subject: Subject) -> Subject:
     """Let everything that is no liquid be drawn as grains."""
     looks = (look if look.liquid else replace(look, finish="grains") for look in subject.looks)
     return replace(subject, looks=tuple(looks))
+
+
+def expected_times(result: Result) -> tuple[float, ...]:
+    """Return times that all labels of a film are written for, s: some of those of the whole run, if it goes on too.
+
+    Otherwise milliseconds would become seconds while a film of a run under way is drawn.
+    """
+    facts = scene_facts(result.header)
+    if facts.end is not None and facts.frames is not None and facts.frames > 1:
+        step = facts.end / (facts.frames - 1)
+        if np.allclose(result.times, result.numbers * step, rtol=1e-3, atol=1e-3 * step):
+            return 0.0, step, min(2 * step, facts.end), facts.end
+    return tuple(result.times.tolist())
 
 
 def _legend(subject: Subject) -> Categories:

@@ -12,7 +12,7 @@ from mpmcli.output.result import Result, open_result
 from mpmcli.render.canvas import time_text
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.frame_workers import render_frames
-from mpmcli.render.painter import Painter, Studio, open_studio
+from mpmcli.render.painter import Painter, Studio, expected_times, open_studio
 from mpmcli.render.picture_file import digest_of, settings_digest, write_picture
 from mpmcli.render.settings import Settings
 from mpmcli.render.window import choose_window
@@ -112,14 +112,14 @@ def picture_digest(result: Result, settings: Settings, ks: Sequence[int]) -> str
     """Return a digest of what a picture of some frames depends on.
 
     The ledger's row stands for the particles: it holds their energies and momenta to the last bit. How a time is
-    written hangs on the other frames, which grow more while a run goes on.
+    written hangs on other frames.
     """
-    times = result.times.tolist()
-    frames = [
-        [int(result.numbers[k]), int(result.particle_counts[k]), repr(result.ledger[k]), time_text(times[k], times)]
-        for k in ks
-    ]
-    return settings_digest({**asdict(settings), "scene": result.header.get("scene", ""), "frames": frames})
+    times = expected_times(result)
+    labels = [time_text(float(result.times[k]), times) for k in ks]
+    frames = [[int(result.numbers[k]), int(result.particle_counts[k]), repr(result.ledger[k])] for k in ks]
+    return settings_digest(
+        {**asdict(settings), "scene": result.header.get("scene", ""), "frames": frames, "labels": labels}
+    )
 
 
 def plan_pictures(
