@@ -11,7 +11,7 @@ from drawn_results import WATER, frame, header, lattice, write
 from mpmcli.output import Frame, Result
 from mpmcli.render.color_by import color_by
 from mpmcli.render.dots import OVERLAP, DotsPainter
-from mpmcli.render.screen_space import hidden
+from mpmcli.render.hidden import hidden
 from mpmcli.render.subject import Subject, subject_of
 from mpmcli.render.theme import THEMES, rgb_bytes
 from mpmcli.render.view import View, view_of

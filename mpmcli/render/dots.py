@@ -8,7 +8,7 @@ import numpy as np
 from mpmcli.output.frame import Frame
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.depth_shading import depth_shaded
-from mpmcli.render.screen_space import hidden
+from mpmcli.render.hidden import hidden
 from mpmcli.render.stage import Stage
 from mpmcli.render.subject import Subject
 from mpmcli.render.theme import Theme

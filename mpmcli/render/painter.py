@@ -64,11 +64,11 @@ class Studio:
             plane = slice_of(subject, settings.camera)
             return DensityPainter(scene_facts(self.result.header), subject, view, theme, plane, self.colors)
         if settings.mode == "fluid" and subject.dimension == 3:
-            from mpmcli.render.fluid import FluidPainter
+            from mpmcli.render.liquids.fluid import FluidPainter
 
             return FluidPainter(subject, view, theme)
         if settings.mode in ("surface", "fluid"):
-            from mpmcli.render.surface import SurfacePainter
+            from mpmcli.render.surfaces.surface import SurfacePainter
 
             if settings.mode == "fluid":
                 subject = _grained(subject)
