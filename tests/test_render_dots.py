@@ -11,6 +11,7 @@ from drawn_results import WATER, frame, header, lattice, write
 from mpmcli.output import Frame, Result
 from mpmcli.render.color_by import color_by
 from mpmcli.render.dots import OVERLAP, DotsPainter
+from mpmcli.render.screen_space import hidden
 from mpmcli.render.subject import Subject, subject_of
 from mpmcli.render.theme import THEMES, rgb_bytes
 from mpmcli.render.view import View, view_of
@@ -169,6 +170,25 @@ def test_what_lies_behind_its_surroundings_is_darker(tmp_path: Path) -> None:
     open_places = upper[np.hypot(upper[:, 0] - 0.5, upper[:, 1] - 0.25) < 0.08]
     outside = at(brightness, view.pixels(open_places))
     assert inside.mean() < 0.85 * outside.mean()
+
+
+@pytest.mark.parametrize("camera", ["top", "iso"])
+def test_dots_that_are_left_out_change_no_pixel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, camera: str) -> None:
+    block = lattice((0.1, 0.1, 0.0), (0.9, 0.9, 0.5), H / 2)
+    block += np.random.default_rng(1).normal(0.0, 0.1 * H / 2, block.shape)
+    fields = {"pressure": np.random.default_rng(2).random(len(block))}
+    options = {"by": "pressure", "camera": camera, "limits": (0.0, 1.0)}
+    (fewer,), *_ = painted(tmp_path / "1", [frame(0, block, **fields)], (1.0, 1.0, 0.75), **options)
+    left_out = []
+
+    def none(pixels: np.ndarray, *arguments: object, **options: object) -> np.ndarray:
+        left_out.append(hidden(pixels, *arguments, **options).mean())
+        return np.zeros(len(pixels), dtype=bool)
+
+    monkeypatch.setattr("mpmcli.render.dots.hidden", none)
+    (all_of_them,), *_ = painted(tmp_path / "2", [frame(0, block, **fields)], (1.0, 1.0, 0.75), **options)
+    assert left_out[0] > 0.05
+    np.testing.assert_array_equal(fewer, all_of_them)
 
 
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:

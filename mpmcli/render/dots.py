@@ -1,5 +1,6 @@
 """Particles as round dots of their own size: flat in 2D, balls that are shaded by depth in 3D."""
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from mpmcli.output.frame import Frame
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.depth_shading import depth_shaded
+from mpmcli.render.screen_space import hidden
 from mpmcli.render.stage import Stage
 from mpmcli.render.subject import Subject
 from mpmcli.render.theme import Theme
@@ -52,8 +54,11 @@ class DotsPainter:
         placed = np.isfinite(frame.position).all(axis=1)
         points = np.zeros((int(placed.sum()), 3))
         points[:, : self._subject.dimension] = frame.position[placed]
-        colors = self._colors.particle_rgb(frame)[placed]
-        sizes = self._pixels(points, frame.body[placed])
+        colors, body = self._colors.particle_rgb(frame)[placed], frame.body[placed]
+        sizes = self._pixels(points, body)
+        if not self._flat and len(points):
+            seen = ~self._hidden(points, sizes)
+            points, colors, sizes = points[seen], colors[seen], sizes[seen]
         levels, level_of = self._levels(sizes)
         for level in set(self._actors) | set(range(len(levels))):
             chosen = level_of == level if len(levels) > 1 else slice(None)
@@ -75,6 +80,19 @@ class DotsPainter:
             scale = scale * self._view.distance / np.maximum(depth, self._view.near)
         diameters = self._diameters[np.clip(body, 0, len(self._diameters) - 1)]
         return np.maximum(diameters * scale, SMALLEST)
+
+    def _hidden(self, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+        """Tell the dots behind others that cover them whole, (n,) bool: leaving them out changes no pixel."""
+        pixels = self._view.pixels(points)
+        inside = (pixels[:, :2] >= 0).all(axis=1) & (pixels[:, :2] < self._view.size).all(axis=1) & (pixels[:, 2] > 0)
+        result = np.zeros(len(points), dtype=bool)
+        # A sample may be missing at the edge of a disc; one that lies in a square covers it and its eight neighbours.
+        edge = 1.0 / self._stage.samples
+        side = (0.5 * float(sizes.min()) - edge) / math.sqrt(8.0)
+        if side >= 0.5 * edge and inside.any():
+            reach = math.ceil((0.5 * float(sizes.max()) + edge) / side)
+            result[inside] = hidden(pixels[inside], side, float(self._diameters.max()), reach, cover=1)
+        return result
 
     def _levels(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the sizes that are drawn, (k,), and which one each dot has, (n,)."""
