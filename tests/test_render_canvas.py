@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mpmcli.output import Result
-from mpmcli.render.canvas import Canvas, cut, length_text, round_length, time_text
+from mpmcli.render.canvas import Canvas, cut, length_text, round_length, ticks_of, time_text
 from mpmcli.render.color_by import color_by
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.painter import open_studio
@@ -172,6 +172,30 @@ def test_a_height_that_follows_from_the_scene_leaves_no_empty_band(result: Resul
         canvas = replace(canvas, size=(900, canvas.height_for(0.5)))
     width, height = canvas.stage_size
     assert height / width == pytest.approx(0.5, abs=2 / width)
+
+
+@pytest.mark.parametrize(("size", "least"), [((800, 500), 5), ((300, 150), 3), ((300, 120), 2), ((200, 90), 0)])
+def test_numbers_beside_the_bar_have_room(result: Result, size: tuple[int, int], least: int) -> None:
+    """Numbers are 8 pixels high in small pictures: ticks have to be further apart, however low the picture."""
+    picture = composed(canvas_of(result, size))
+    rows = np.flatnonzero((picture == rgb_bytes(LIGHT.faint)).all(axis=2).any(axis=1))
+    assert len(rows) >= least
+    assert len(rows) == 0 or np.diff(rows, append=10**6).min() >= 10
+
+
+def test_pressures_beyond_reason_have_few_digits(result: Result) -> None:
+    colors = replace(canvas_of(result).colors, unit="Pa")
+    for high, unit in ((7.3, "Pa"), (2e5, "kPa"), (3e9, "GPa"), (3e12, "GPa"), (1e30, "10³⁰ Pa")):
+        _, texts, told = ticks_of(replace(colors, limits=(0.0, high)), 6)
+        assert told == unit and max(map(len, texts)) <= 5
+
+
+def test_times_of_a_montage_do_not_run_into_each_other(result: Result) -> None:
+    canvas = canvas_of(result, (160, 120), grid=(6, 1), by="material")
+    picture = composed(canvas, 5)
+    above = picture[24:36, : 5 * canvas.stage_size[0]]
+    assert (above == rgb_bytes(LIGHT.ground)).all()
+    assert not (composed(canvas_of(result, (900, 300), grid=(6, 1)), 5)[30:60, :600] == 255).all()
 
 
 @given(st.floats(1e-12, 1e12))

@@ -89,9 +89,7 @@ class Canvas:
             x, y = self._place(k)
             canvas.paste(Image.fromarray(picture), (x, y))
             if self._label:
-                font = _font(self._px(SMALL))
-                middle = y - self._label // 2
-                draw.text((x + self._px(PAD), middle), time_text(time, self.times), self.theme.text, font, anchor="lm")
+                self._time(draw, time, (x, y - self._label // 2))
             if self.walls:
                 self._walls(draw, view, (x, y))
         if view.parallel:
@@ -161,6 +159,14 @@ class Canvas:
         title = cut(self.subject.title, lambda text: font.getlength(text) <= room)
         draw.text((pad, middle), title, self.theme.text, font, anchor="lm")
 
+    def _time(self, draw: "ImageDraw", time: float, place: tuple[int, int]) -> None:
+        """Write the time above a picture of a montage, where there is room for it."""
+        font, told = _font(self._px(SMALL)), time_text(time, self.times)
+        free = self.stage_size[0] - font.getlength(told)
+        if free >= 0:
+            start = place[0] + min(self._px(PAD), free)
+            draw.text((start, place[1]), told, self.theme.text, font, anchor="lm")
+
     def _walls(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
         """Draw the walls around the domain, outside of it, so that nothing within is hidden."""
         corners = view.pixels(np.array([self.subject.lower, self.subject.upper]))
@@ -205,6 +211,17 @@ class Canvas:
         unit = self._ticks(colors)[2]
         return [colors.name, unit] if unit else [colors.name]
 
+    def _bar_span(self, colors: Coloring) -> tuple[int, int]:
+        """Return about between which rows the bar stands, before it is known what its heading says."""
+        line = self._px(SMALL + 6)
+        top = self._px(TOP) + self._px(4) + (2 if colors.unit else 1) * line + self._px(8)
+        return top, self.size[1] - self._px(BOTTOM) - self._px(PAD) - 2 * line
+
+    def _ticks(self, colors: Coloring) -> tuple[list[float], list[str], str]:
+        """Return places, texts and unit of as many ticks as the bar has room for."""
+        top, bottom = self._bar_span(colors)
+        return ticks_of(colors, max(1, min(TICKS, int((bottom - top) / (1.5 * self._px(SMALL))))))
+
     def _color_bar(self, draw: "ImageDraw", colors: Coloring, missing: int) -> None:
         font = _font(self._px(SMALL))
         x = self._stage[2] + self._px(PAD)
@@ -213,7 +230,9 @@ class Canvas:
         for text in self._bar_heading(colors):
             draw.text((x, y), text, self.theme.text, font, anchor="lt")
             y += line
-        top, bottom = y + self._px(8), self._stage[3] - self._px(PAD) - 2 * line
+        top, bottom = y + self._px(8), self._bar_span(colors)[1]
+        if bottom - top < line:
+            return
         width = self._px(BAR_WIDTH)
         low, high = colors.limits
         rows = np.linspace(high, low, max(bottom - top, 2))
@@ -230,30 +249,30 @@ class Canvas:
             draw.rectangle((x, y, x + width - 1, y + width - 1), fill=self.theme.missing)
             draw.text((x + width + self._px(6), y + width / 2), NO_NUMBER, self.theme.text, font, anchor="lm")
 
-    @staticmethod
-    @cache
-    def _ticks(colors: Coloring) -> tuple[list[float], list[str], str]:
-        """Return places, texts, and the unit with what the texts are to be multiplied by."""
-        from matplotlib.ticker import MaxNLocator
 
-        low, high = colors.limits
-        places = [p for p in MaxNLocator(TICKS, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high) if low <= p <= high]
-        places = [float(place) for place in places] or [low, high]
-        largest = max(abs(low), abs(high))
-        factor, unit = 1.0, colors.unit
-        if unit == "Pa" and largest >= 1e3:
-            factor, prefix = next((f, p) for f, p in PREFIXES if largest >= f)
-            unit = prefix + unit
-        elif largest >= 1e5 or largest < 1e-2:
-            power = math.floor(math.log10(largest))
-            factor = 10.0**power
-            unit = f"10{str(power).translate(SUPERSCRIPTS)} {unit}".strip()
-        step = (places[1] - places[0]) / factor if len(places) > 1 else largest / factor
-        digits = max(0, -math.floor(math.log10(abs(step)) + 1e-9)) if step else 0
-        if round(step, digits) and abs(step - round(step, digits)) > 1e-6 * abs(step):
-            digits += 1
-        texts = [f"{place / factor:.{digits}f}".replace("-", "\u2212") for place in places]
-        return places, texts, unit
+@cache
+def ticks_of(colors: Coloring, most: int) -> tuple[list[float], list[str], str]:
+    """Return places, texts, and the unit with what the texts are to be multiplied by; there are about so many."""
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = colors.limits
+    places = [p for p in MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high) if low <= p <= high]
+    places = [float(place) for place in places] or [low, high]
+    largest = max(abs(low), abs(high))
+    factor, unit = 1.0, colors.unit
+    if unit == "Pa" and 1e3 <= largest < 1e13:
+        factor, prefix = next((f, p) for f, p in PREFIXES if largest >= f)
+        unit = prefix + unit
+    elif largest >= 1e5 or largest < 1e-2:
+        power = math.floor(math.log10(largest))
+        factor = 10.0**power
+        unit = f"10{str(power).translate(SUPERSCRIPTS)} {unit}".strip()
+    step = (places[1] - places[0]) / factor if len(places) > 1 else largest / factor
+    digits = max(0, -math.floor(math.log10(abs(step)) + 1e-9)) if step else 0
+    if round(step, digits) and abs(step - round(step, digits)) > 1e-6 * abs(step):
+        digits += 1
+    texts = [f"{place / factor:.{digits}f}".replace("-", "\u2212") for place in places]
+    return places, texts, unit
 
 
 def time_text(time: float, times: Sequence[float]) -> str:
