@@ -100,7 +100,9 @@ def open_studio(result: Result, settings: Settings) -> Studio:
     times = expected_times(result)
     # Elsewhere in 3D they are the edges of a box, and part of the scene.
     walls = subject.dimension == 2 or settings.mode == "density"
-    canvas = Canvas((width, height or width), subject, theme, times, colors, settings.grid, walls)
+    # In perspective a length has no one size.
+    parallel = view_of(subject, camera, (width, width)).parallel
+    canvas = Canvas((width, height or width), subject, theme, times, colors, settings.grid, walls, parallel)
     if height is None:
         aspect = min(max(aspect_of(subject, camera), FLATTEST), 1.0 / FLATTEST)
         for _ in range(FITTING_ROUNDS):
