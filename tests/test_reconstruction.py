@@ -7,9 +7,9 @@ import pytest
 
 from mpmcli.output import Frame
 from mpmcli.render.look import LOOKS
-from mpmcli.render.reconstruction import Mesh, reconstruct
-from mpmcli.render.save_surface import flat_mesh, save_surface, surface_paths, write_series
 from mpmcli.render.subject import Subject
+from mpmcli.render.surfaces.reconstruction import Mesh, reconstruct
+from mpmcli.render.surfaces.save_surface import flat_mesh, save_surface, surface_paths, write_series
 
 LOWER, UPPER = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 DISTANCE = 0.02

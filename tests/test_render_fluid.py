@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mpmcli.output.frame import Frame
-from mpmcli.render.fluid import FluidPainter
+from mpmcli.render.liquids.fluid import FluidPainter
 from mpmcli.render.look import LOOKS
 from mpmcli.render.subject import Subject
 from mpmcli.render.theme import THEMES

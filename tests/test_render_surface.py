@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from mpmcli.output import Frame
-from mpmcli.render.lighting import lights_of
 from mpmcli.render.look import LOOKS
 from mpmcli.render.subject import Subject
-from mpmcli.render.surface import SurfacePainter
+from mpmcli.render.surfaces.lighting import lights_of
+from mpmcli.render.surfaces.surface import SurfacePainter
 from mpmcli.render.theme import THEMES
 from mpmcli.render.view import View, view_of
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from mpmcli.render.screen_space import (
+from mpmcli.render.hidden import hidden
+from mpmcli.render.liquids.screen_space import (
     NOTHING,
     blurred,
     deposited,
-    hidden,
     normals,
     smoothed,
     sphere_depths,

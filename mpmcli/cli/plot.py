@@ -43,7 +43,7 @@ def command(
     from mpmcli.output import open_result
     from mpmcli.plot.history import read_history
     from mpmcli.plot.ledger_figure import ledger_picture
-    from mpmcli.render.picture_file import digest_of, settings_digest, write_picture
+    from mpmcli.render.files.picture_file import digest_of, settings_digest, write_picture
 
     # Without a home it tells at length where it keeps its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)

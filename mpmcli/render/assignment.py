@@ -9,10 +9,10 @@ from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.output.result import Result
 from mpmcli.render.coloring import Coloring
-from mpmcli.render.film import check_film, film_digest, write_film
+from mpmcli.render.files.film import check_film, film_digest, write_film
+from mpmcli.render.files.picture_file import digest_of, require_writable, settings_digest, write_picture
 from mpmcli.render.frame_choice import choose_frames, evenly_spaced
 from mpmcli.render.painter import Studio, open_studio, usual_color
-from mpmcli.render.picture_file import digest_of, require_writable, settings_digest, write_picture
 from mpmcli.render.pictures import (
     FOREIGN,
     Easel,
@@ -23,9 +23,9 @@ from mpmcli.render.pictures import (
     picture_name,
     plan_pictures,
 )
-from mpmcli.render.save_surface import save_surfaces, surface_paths
 from mpmcli.render.settings import Mode, Settings, parse_grid, parse_limits, parse_size
 from mpmcli.render.subject import subject_of
+from mpmcli.render.surfaces.save_surface import save_surfaces, surface_paths
 from mpmcli.render.view import CAMERAS
 
 # Where pictures go, beside the result.

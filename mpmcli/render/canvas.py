@@ -51,6 +51,7 @@ class Canvas:
         colors: what a bar or a legend explains; None for none.
         grid: columns and rows of pictures of the scene.
         walls: whether the walls of the domain are drawn around each of them, which are seen from the front.
+        scale_bar: whether there is room for one below.
     """
 
     size: tuple[int, int]
@@ -60,6 +61,7 @@ class Canvas:
     colors: Coloring | Categories | None
     grid: tuple[int, int] = (1, 1)
     walls: bool = True
+    scale_bar: bool = True
 
     @property
     def stage_size(self) -> tuple[int, int]:
@@ -92,8 +94,8 @@ class Canvas:
                 self._time(draw, time, (x, y - self._label // 2))
             if self.walls:
                 self._walls(draw, view, (x, y))
-        if view.parallel:
-            self._scale_bar(draw, view)
+        if self.scale_bar:
+            self._draw_scale_bar(draw, view)
         self._heading(draw, times[0] if self.grid == (1, 1) else None)
         if isinstance(self.colors, Coloring):
             self._color_bar(draw, self.colors, missing)
@@ -105,13 +107,17 @@ class Canvas:
         """Return the height of the whole picture at which those of the scene are so many times as high as wide."""
         rows = self.grid[1]
         stage = round(self.stage_size[0] * aspect) + self._label
-        return self._px(TOP) + self._px(BOTTOM) + rows * stage + (rows - 1) * self._px(GAP)
+        return self._px(TOP) + self._bottom + rows * stage + (rows - 1) * self._px(GAP)
 
     @property
     def _stage(self) -> tuple[int, int, int, int]:
         """Where pictures of the scene go: left, top, right, bottom, pixels."""
         width, height = self.size
-        return 0, self._px(TOP), width - self._column, height - self._px(BOTTOM)
+        return 0, self._px(TOP), width - self._column, height - self._bottom
+
+    @property
+    def _bottom(self) -> int:
+        return self._px(BOTTOM if self.scale_bar else GAP)
 
     @property
     def _label(self) -> int:
@@ -178,11 +184,11 @@ class Canvas:
         for left, top, right, bottom in (*level, *upright):
             draw.rectangle((left, top, right - 1, bottom - 1), fill=self.theme.wall)
 
-    def _scale_bar(self, draw: "ImageDraw", view: View) -> None:
+    def _draw_scale_bar(self, draw: "ImageDraw", view: View) -> None:
         length = round_length(SCALE_SHARE * self.size[0] / view.pixels_per_metre)
         pixels = round(length * view.pixels_per_metre)
         pad, w = self._px(PAD), self._px(2)
-        y = self.size[1] - self._px(BOTTOM) // 2
+        y = self.size[1] - self._bottom // 2
         tip = self._px(5)
         draw.rectangle((pad, y - w // 2, pad + pixels - 1, y - w // 2 + w - 1), fill=self.theme.text)
         for x in (pad, pad + pixels - w):
@@ -215,7 +221,7 @@ class Canvas:
         """Return about between which rows the bar stands, before it is known what its heading says."""
         line = self._px(SMALL + 6)
         top = self._px(TOP) + self._px(4) + (2 if colors.unit else 1) * line + self._px(8)
-        return top, self.size[1] - self._px(BOTTOM) - self._px(PAD) - 2 * line
+        return top, self.size[1] - self._bottom - self._px(PAD) - 2 * line
 
     def _ticks(self, colors: Coloring) -> tuple[list[float], list[str], str]:
         """Return places, texts and unit of as many ticks as the bar has room for."""

@@ -8,7 +8,7 @@ import numpy as np
 from mpmcli.output.frame import Frame
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.depth_shading import depth_shaded
-from mpmcli.render.screen_space import hidden
+from mpmcli.render.hidden import hidden
 from mpmcli.render.stage import Stage
 from mpmcli.render.subject import Subject
 from mpmcli.render.theme import Theme
@@ -43,6 +43,7 @@ class DotsPainter:
         self._flat = subject.dimension == 2
         self._stage = Stage(view, theme, samples=2 if count <= SMOOTHED else 1)
         self._diameters = OVERLAP * np.array(subject.distances)
+        self._levels = self._all_levels()
         self._corner = np.array(subject.lower)
         self._actors: dict[int, tuple[pv.PolyData, pv.Actor]] = {}
         if not self._flat:
@@ -59,13 +60,11 @@ class DotsPainter:
         if not self._flat and len(points):
             seen = ~self._hidden(points, sizes)
             points, colors, sizes = points[seen], colors[seen], sizes[seen]
-        levels, level_of = self._levels(sizes)
-        for level in set(self._actors) | set(range(len(levels))):
-            chosen = level_of == level if len(levels) > 1 else slice(None)
-            if level < len(levels):
-                self._set(level, points[chosen], colors[chosen], float(levels[level]))
-            else:
-                self._actors[level][1].visibility = False
+        # In between, the size whose ratio to that of the dot is nearest to one.
+        level_of = np.searchsorted(np.sqrt(self._levels[1:] * self._levels[:-1]), sizes)
+        for level, size in enumerate(self._levels.tolist()):
+            chosen = level_of == level
+            self._set(level, points[chosen], colors[chosen], size)
         self._stage.render()
         picture = self._stage.picture()
         if self._flat:
@@ -94,17 +93,15 @@ class DotsPainter:
             result[inside] = hidden(pixels[inside], side, float(self._diameters.max()), reach, cover=1)
         return result
 
-    def _levels(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the sizes that are drawn, (k,), and which one each dot has, (n,)."""
-        if len(sizes) == 0:
-            return np.empty(0), np.empty(0, np.intp)
-        low, high = float(sizes.min()), float(sizes.max())
-        distinct = np.unique(self._diameters) if self._view.parallel else np.empty(0)
-        if len(distinct) == 1 or high <= 1.02 * low:
-            return np.array([high]), np.zeros(len(sizes), np.intp)
-        ratio = np.log(high / low)
-        level_of = np.minimum((np.log(sizes / low) / ratio * LAYERS).astype(np.intp), LAYERS - 1)
-        return low * np.exp((np.arange(LAYERS) + 0.5) / LAYERS * ratio), level_of
+    def _all_levels(self) -> np.ndarray:
+        """Return the sizes that dots are drawn in, pixels, rising: the same ones in all frames."""
+        view = self._view
+        if view.parallel:
+            return np.unique(np.maximum(self._diameters * view.pixels_per_metre, SMALLEST))
+        nearest, farthest = (view.pixels_per_metre * view.distance / depth for depth in (view.near, view.far))
+        low = max(float(self._diameters.min()) * farthest, SMALLEST)
+        high = max(float(self._diameters.max()) * nearest, low)
+        return np.geomspace(low, high, LAYERS) if high > 1.02 * low else np.array([high])
 
     def _set(self, level: int, points: np.ndarray, colors: np.ndarray, size: float) -> None:
         """Let the actor of a level show these points."""

@@ -64,11 +64,11 @@ class Studio:
             plane = slice_of(subject, settings.camera)
             return DensityPainter(scene_facts(self.result.header), subject, view, theme, plane, self.colors)
         if settings.mode == "fluid" and subject.dimension == 3:
-            from mpmcli.render.fluid import FluidPainter
+            from mpmcli.render.liquids.fluid import FluidPainter
 
             return FluidPainter(subject, view, theme)
         if settings.mode in ("surface", "fluid"):
-            from mpmcli.render.surface import SurfacePainter
+            from mpmcli.render.surfaces.surface import SurfacePainter
 
             if settings.mode == "fluid":
                 subject = _grained(subject)
@@ -100,7 +100,9 @@ def open_studio(result: Result, settings: Settings) -> Studio:
     times = expected_times(result)
     # Elsewhere in 3D they are the edges of a box, and part of the scene.
     walls = subject.dimension == 2 or settings.mode == "density"
-    canvas = Canvas((width, height or width), subject, theme, times, colors, settings.grid, walls)
+    # In perspective a length has no one size.
+    parallel = view_of(subject, camera, (width, width)).parallel
+    canvas = Canvas((width, height or width), subject, theme, times, colors, settings.grid, walls, parallel)
     if height is None:
         aspect = min(max(aspect_of(subject, camera), FLATTEST), 1.0 / FLATTEST)
         for _ in range(FITTING_ROUNDS):

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mpmcli.render.backdrop import Backdrop
-from mpmcli.render.fluid_shading import linear
-from mpmcli.render.lighting import OPACITY
-from mpmcli.render.material_groups import Group
-from mpmcli.render.occlusion import occlusion_of
+from mpmcli.render.liquids.fluid_shading import linear
 from mpmcli.render.stage import Stage
 from mpmcli.render.subject import Subject
+from mpmcli.render.surfaces.backdrop import Backdrop
+from mpmcli.render.surfaces.lighting import OPACITY
+from mpmcli.render.surfaces.material_groups import Group
+from mpmcli.render.surfaces.occlusion import occlusion_of
 from mpmcli.render.theme import Theme
 from mpmcli.render.view import View
 

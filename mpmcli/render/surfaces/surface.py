@@ -47,11 +47,11 @@ class SurfacePainter:
         self.fields = () if colors is None else colors.fields
         self.view = view
         if subject.dimension == 3:
-            from mpmcli.render.solid_stage import SolidStage
+            from mpmcli.render.surfaces.solid_stage import SolidStage
 
             self.painter: Painter = SolidStage(subject, view, theme, colors)
         else:
-            from mpmcli.render.outline import OutlinePainter
+            from mpmcli.render.surfaces.outline import OutlinePainter
 
             self.painter = OutlinePainter(subject, view, theme, colors)
 

@@ -10,14 +10,14 @@ import numpy as np
 
 from mpmcli.output.frame import Frame
 from mpmcli.render.depth_shading import depth_shaded
-from mpmcli.render.fluid_room import DIAMETER, SAMPLES, Room
-from mpmcli.render.fluid_shading import displayed, fluid_lights, linear, optics_of, shaded, transmitted
-from mpmcli.render.lighting import lights_of
-from mpmcli.render.liquid_surface import Liquid, Surface, layers_of, scale_at, surface_of, window_of
-from mpmcli.render.material_groups import Group, groups_of
-from mpmcli.render.pixel_rays import plane
-from mpmcli.render.screen_space import NOTHING, sampled
+from mpmcli.render.liquids.fluid_room import DIAMETER, SAMPLES, Room
+from mpmcli.render.liquids.fluid_shading import displayed, fluid_lights, linear, optics_of, shaded, transmitted
+from mpmcli.render.liquids.liquid_surface import Liquid, Surface, layers_of, scale_at, surface_of, window_of
+from mpmcli.render.liquids.pixel_rays import plane
+from mpmcli.render.liquids.screen_space import NOTHING, sampled
 from mpmcli.render.subject import Subject
+from mpmcli.render.surfaces.lighting import lights_of
+from mpmcli.render.surfaces.material_groups import Group, groups_of
 from mpmcli.render.theme import Theme, rgb_bytes
 from mpmcli.render.view import View
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpmcli.output.frame import Frame
-from mpmcli.render.material_groups import Group
+from mpmcli.render.surfaces.material_groups import Group
 from mpmcli.render.theme import rgb
 
 if TYPE_CHECKING:
-    from mpmcli.render.surface import FieldColors
+    from mpmcli.render.surfaces.surface import FieldColors
 
 # Colours in a table of a colour map.
 STEPS = 1024

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from mpmcli.render.occlusion import Occlusion
 from mpmcli.render.subject import Subject
+from mpmcli.render.surfaces.occlusion import Occlusion
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.view import View
 

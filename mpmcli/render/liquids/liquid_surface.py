@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mpmcli.render.hidden import hidden
+from mpmcli.render.liquids.pixel_rays import plane, rays
+from mpmcli.render.liquids.screen_space import NOTHING, blurred, normals, smoothed, sphere_depths, thickness
 from mpmcli.render.look import Look
-from mpmcli.render.pixel_rays import plane, rays
-from mpmcli.render.screen_space import NOTHING, blurred, hidden, normals, smoothed, sphere_depths, thickness
 from mpmcli.render.subject import Subject
 from mpmcli.render.view import View
 

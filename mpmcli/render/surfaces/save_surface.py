@@ -13,11 +13,11 @@ from mpmcli.errors import InputError, RunError
 from mpmcli.output.durable import sealed, write_text
 from mpmcli.output.frame import Frame
 from mpmcli.output.result import Result, open_result
-from mpmcli.render.coverage import FINENESS, cover_of, grid_over
 from mpmcli.render.frame_workers import render_frames
-from mpmcli.render.material_groups import Group, groups_of
-from mpmcli.render.reconstruction import Mesh, reconstruct
 from mpmcli.render.subject import Subject, subject_of
+from mpmcli.render.surfaces.coverage import FINENESS, cover_of, grid_over
+from mpmcli.render.surfaces.material_groups import Group, groups_of
+from mpmcli.render.surfaces.reconstruction import Mesh, reconstruct
 
 if TYPE_CHECKING:
     import pyvista as pv

@@ -11,10 +11,10 @@ import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.output.durable import sealed
-from mpmcli.render.gif import FPS_MAX as GIF_FPS_MAX
-from mpmcli.render.gif import write_gif
-from mpmcli.render.h264 import write_h264
-from mpmcli.render.picture_file import write_fault
+from mpmcli.render.files.gif import FPS_MAX as GIF_FPS_MAX
+from mpmcli.render.files.gif import write_gif
+from mpmcli.render.files.h264 import write_h264
+from mpmcli.render.files.picture_file import write_fault
 
 Picture = Path | np.ndarray
 # Beyond these it is a slip of the pen.

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpmcli.output.frame import Frame
-from mpmcli.render.coverage import SPREAD, Grid, cover_of, disk_nodes, gaussian, spread, with_images
 from mpmcli.render.look import Look
-from mpmcli.render.material_groups import Group, groups_of
 from mpmcli.render.subject import Subject
+from mpmcli.render.surfaces.coverage import SPREAD, Grid, cover_of, disk_nodes, gaussian, spread, with_images
+from mpmcli.render.surfaces.material_groups import Group, groups_of
+from mpmcli.render.surfaces.tints import shades
 from mpmcli.render.theme import Theme, rgb
-from mpmcli.render.tints import shades
 from mpmcli.render.view import View
 
 if TYPE_CHECKING:
-    from mpmcli.render.surface import FieldColors
+    from mpmcli.render.surfaces.surface import FieldColors
 
 # Steepness of the share of each of the bodies that meet in a pixel.
 SHARPNESS = 8

@@ -6,8 +6,8 @@ import numpy as np
 
 from mpmcli.output.frame import Frame
 from mpmcli.render.look import Look
-from mpmcli.render.reconstruction import drawable
 from mpmcli.render.subject import Subject
+from mpmcli.render.surfaces.reconstruction import drawable
 
 
 @dataclass(frozen=True)

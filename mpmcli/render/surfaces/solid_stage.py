@@ -5,20 +5,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mpmcli.output.frame import Frame
-from mpmcli.render import lighting
-from mpmcli.render.backdrop import Backdrop
-from mpmcli.render.grains import JITTER, grain_colors, new_grains, pose_grains
-from mpmcli.render.material_groups import Group, groups_of
-from mpmcli.render.occlusion import Occlusion, occlusion_of
-from mpmcli.render.reconstruction import SMOOTHING_ROUNDS, Mesh, reconstruct
 from mpmcli.render.subject import Subject
+from mpmcli.render.surfaces import lighting
+from mpmcli.render.surfaces.backdrop import Backdrop
+from mpmcli.render.surfaces.grains import JITTER, grain_colors, new_grains, pose_grains
+from mpmcli.render.surfaces.material_groups import Group, groups_of
+from mpmcli.render.surfaces.occlusion import Occlusion, occlusion_of
+from mpmcli.render.surfaces.reconstruction import SMOOTHING_ROUNDS, Mesh, reconstruct
+from mpmcli.render.surfaces.thickness import thickness_at
+from mpmcli.render.surfaces.tints import painted, shades, tints_of
 from mpmcli.render.theme import Theme, rgb
-from mpmcli.render.thickness import thickness_at
-from mpmcli.render.tints import painted, shades, tints_of
 from mpmcli.render.view import View
 
 if TYPE_CHECKING:
-    from mpmcli.render.surface import FieldColors
+    from mpmcli.render.surfaces.surface import FieldColors
 
 # Pixels of the window to one of the picture, along each axis, and the longest side of a window.
 FINER, LONGEST = 2, 8192
