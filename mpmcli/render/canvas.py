@@ -237,7 +237,7 @@ class Canvas:
             draw.text((x, y), text, self.theme.text, font, anchor="lt")
             y += line
         top, bottom = y + self._px(8), self._bar_span(colors)[1]
-        if bottom - top < line:
+        if bottom - top < 2 * line:
             return
         width = self._px(BAR_WIDTH)
         low, high = colors.limits
