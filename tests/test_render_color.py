@@ -78,6 +78,11 @@ def test_limits_hold_nearly_all_particles_of_all_frames(result: Result, subject:
     assert 0.0 < (everything > speed.limits[1]).mean() < 0.01
     J = color_by("J", result, subject, LIGHT)
     assert J.cmap == "coolwarm" and sum(J.limits) == pytest.approx(2.0)
+    shear = color_by("stress.xy", result, subject, LIGHT)
+    assert shear.cmap == "coolwarm" and sum(shear.limits) == pytest.approx(0.0)
+    # What never changes its sign has no neutral value, and neither have limits on one side of it.
+    assert color_by("velocity.y", result, subject, LIGHT).cmap == "viridis"
+    assert color_by("stress.xy", result, subject, LIGHT, limits=(0.0, 1.0)).cmap == "viridis"
     even = color_by("pressure", result, subject, LIGHT)
     assert even.limits[0] < 2.0e4 < even.limits[1]
     assert color_by("speed", result, subject, LIGHT, limits=(1.0, 3.0)).limits == (1.0, 3.0)

@@ -37,6 +37,8 @@ LOOKED_AT = 12
 OUTSIDE = 0.01
 # Bodies, told apart by colour-blind people too (Okabe and Ito 2008, Color universal design).
 BODY_INKS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#b0a410", "#8a8a8a")
+# Values that go beyond the neutral one by less than this share of their range, on one side, go one way only.
+ONE_SIDED = 0.02
 AXES = "xyz"
 
 
@@ -81,12 +83,13 @@ def color_by(
     value = _value(name, result, subject)
     if limits is None:
         limits = _limits(value, result)
+    two_way = value.middle is not None and limits[0] < value.middle < limits[1]
     return Coloring(
         value.name,
         value.unit,
         value.fields,
         value.of,
-        color_map(cmap, SEQUENTIAL if value.middle is None else DIVERGING),
+        color_map(cmap, DIVERGING if two_way else SEQUENTIAL),
         limits,
         theme.missing,
     )
@@ -166,7 +169,7 @@ def _limits(value: _Value, result: Result) -> tuple[float, float]:
     low, high = (min(lows), max(highs)) if lows else (0.0, 1.0)
     if value.floor is not None:
         low = value.floor
-    if value.middle is not None:
+    if value.middle is not None and min(high - value.middle, value.middle - low) > ONE_SIDED * (high - low):
         reach = max(abs(high - value.middle), abs(low - value.middle))
         low, high = value.middle - reach, value.middle + reach
     if high - low <= max(1e-6 * max(abs(low), abs(high)), LIMIT_MIN):
