@@ -190,6 +190,17 @@ def test_dots_that_are_left_out_change_no_pixel(tmp_path: Path, monkeypatch: pyt
     np.testing.assert_array_equal(fewer, all_of_them)
 
 
+@pytest.mark.parametrize("camera", ["0.5,0.5,0.25,0.5,0.5,0.1", "0.5,0.5,0.25,0.5,0.5,0.2499"])
+def test_a_camera_among_the_dots_takes_no_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, camera: str) -> None:
+    """The nearest dots are larger than the picture: squares and rims of that size took minutes, and gigabytes."""
+    reaches = []
+    monkeypatch.setattr("mpmcli.render.dots.hidden", lambda *arguments, **options: reaches.append(arguments[3]))
+    block = lattice((0.2, 0.2, 0.1), (0.8, 0.8, 0.4), H / 2)
+    near = np.array([[0.5, 0.5, 0.249]])
+    (picture,), *_ = painted(tmp_path, [frame(0, np.concatenate([block, near]))], (1.0, 1.0, 0.75), camera=camera)
+    assert ink(picture).mean() > 0.5 and not reaches
+
+
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
     block = lattice((0.2, 0.2, 0.1), (0.8, 0.8, 0.4), H / 2)
     _, _, result, subject = painted(tmp_path, [frame(0, block)], (1.0, 1.0, 0.75))

@@ -25,6 +25,8 @@ SMALLEST = 1.5
 SMOOTHED = 400_000
 # Sizes of dots in one picture in perspective: each stands for a layer of distances.
 LAYERS = 12
+# Squares on each side of its own in which it is looked for what hides a dot.
+FARTHEST = 16
 
 
 class DotsPainter:
@@ -89,7 +91,10 @@ class DotsPainter:
         edge = 1.0 / self._stage.samples
         side = (0.5 * float(sizes.min()) - edge) / math.sqrt(8.0)
         if side >= 0.5 * edge and inside.any():
-            reach = math.ceil((0.5 * float(sizes.max()) + edge) / side)
+            reach = math.ceil((0.5 * float(sizes[inside].max()) + edge) / side)
+            # From a camera among the dots the nearest ones fill the picture, and to compare takes longer than to draw.
+            if reach > FARTHEST:
+                return result
             result[inside] = hidden(pixels[inside], side, float(self._diameters.max()), reach, cover=1)
         return result
 
