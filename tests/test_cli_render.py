@@ -16,6 +16,7 @@ from PIL import Image
 from mpmcli.output import Result, VtkSeriesStore, open_result
 from mpmcli.output.store import SEGMENTS
 from mpmcli.render.assignment import Request, assign
+from mpmcli.render.files.picture_file import settings_digest, write_picture
 
 pytestmark = pytest.mark.usefixtures("drawing")
 
@@ -192,13 +193,16 @@ def test_files_of_others_are_left_alone(run: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine.png"
     Image.new("RGB", (10, 10)).save(mine)
     text = mine.read_bytes()
-    assert "mpmcli did not make it" in refused(run, "-o", mine)
-    assert "mpmcli did not make it" in refused(run, "-o", mine, "--montage", "2x2")
+    assert "mpmcli render did not make it" in refused(run, "-o", mine)
+    assert "mpmcli render did not make it" in refused(run, "-o", mine, "--montage", "2x2")
     film = tmp_path / "film.mp4"
     film.write_bytes(b"a film of mine")
-    assert "mpmcli did not make it" in refused(run, "--movie", film)
+    assert "mpmcli render did not make it" in refused(run, "--movie", film)
     assert mine.read_bytes() == text and film.read_bytes() == b"a film of mine"
     assert rendered(run, "-o", mine, "--overwrite")["made"] == 1
+    # The picture of a ledger is no frame.
+    write_picture(tmp_path / "ledger.png", np.zeros((5, 5, 3), np.uint8), "plot " + settings_digest({}))
+    assert "mpmcli render did not make it" in refused(run, "-o", tmp_path / "ledger.png")
     (tmp_path / "file").write_text("no directory")
     assert "is a file, not a directory" in refused(run, "-o", tmp_path / "file", "--frame", "all")
 

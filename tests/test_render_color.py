@@ -144,6 +144,21 @@ def test_only_nan_still_has_limits(tmp_path: Path) -> None:
         assert color_by(name, empty, subject_of(empty), LIGHT).particle_rgb(empty.frame(0)).shape == (0, 3)
 
 
+def test_stress_has_all_three_axes_in_2d_too(tmp_path: Path) -> None:
+    """Runs in the plane strain out of it: the solver stores nine numbers."""
+    stress = np.random.default_rng(5).standard_normal((4, 3, 3))
+    facts = header((1.0, 1.0), 0.05, [WATER])
+    run = write(tmp_path / "run", facts, [frame(0, np.zeros((4, 2)), stress=stress.reshape(4, 9), way=stress[:, 0])])
+    subject = subject_of(run)
+    for name, expected in (("xy", stress[:, 0, 1]), ("yx", stress[:, 1, 0]), ("zz", stress[:, 2, 2])):
+        np.testing.assert_allclose(values(f"stress.{name}", run, subject, 0), expected, rtol=1e-6)
+    np.testing.assert_allclose(values("way.z", run, subject, 0), stress[:, 0, 2], rtol=1e-6)
+    deviator = stress - np.trace(stress, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+    np.testing.assert_allclose(
+        values("stress", run, subject, 0), np.sqrt(1.5 * (deviator**2).sum(axis=(1, 2))), rtol=1e-6
+    )
+
+
 def test_extremes_are_coloured_without_a_complaint(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
     places = np.zeros((4, 2))
     big = np.array([-1.7e308, 0.0, 1.0, 1.7e308])

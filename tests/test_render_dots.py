@@ -10,7 +10,7 @@ from drawn_results import WATER, frame, header, lattice, write
 
 from mpmcli.output import Frame, Result
 from mpmcli.render.color_by import color_by
-from mpmcli.render.dots import OVERLAP, DotsPainter
+from mpmcli.render.dots import OVERLAP, DotsPainter, samples_of
 from mpmcli.render.hidden import hidden
 from mpmcli.render.subject import Subject, subject_of
 from mpmcli.render.theme import THEMES, rgb_bytes
@@ -188,6 +188,32 @@ def test_dots_that_are_left_out_change_no_pixel(tmp_path: Path, monkeypatch: pyt
     (all_of_them,), *_ = painted(tmp_path / "2", [frame(0, block, **fields)], (1.0, 1.0, 0.75), **options)
     assert left_out[0] > 0.05
     np.testing.assert_array_equal(fewer, all_of_them)
+
+
+@pytest.mark.parametrize("camera", ["0.5,0.5,0.25,0.5,0.5,0.1", "0.5,0.5,0.25,0.5,0.5,0.2499"])
+def test_a_camera_among_the_dots_takes_no_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, camera: str) -> None:
+    """The nearest dots are larger than the picture: squares and rims of that size took minutes, and gigabytes."""
+    reaches = []
+    monkeypatch.setattr("mpmcli.render.dots.hidden", lambda *arguments, **options: reaches.append(arguments[3]))
+    block = lattice((0.2, 0.2, 0.1), (0.8, 0.8, 0.4), H / 2)
+    near = np.array([[0.5, 0.5, 0.249]])
+    (picture,), *_ = painted(tmp_path, [frame(0, np.concatenate([block, near]))], (1.0, 1.0, 0.75), camera=camera)
+    assert ink(picture).mean() > 0.5 and not reaches
+
+
+def test_pictures_and_dots_are_no_larger_than_what_can_be_drawn(tmp_path: Path) -> None:
+    """A window of more than 16384 pixels is black, and a dot of more than 255 is one of 255."""
+    assert samples_of((1280, 720), 1000, 5.0) == 2
+    # Wide, large, many dots, large ones.
+    large = [((15_000, 100), 1000, 5.0), ((7000, 7000), 1000, 5.0), ((1280, 720), 10**6, 5.0), ((900, 900), 9, 200.0)]
+    assert [samples_of(*each) for each in large] == [1] * 4
+    result = write(tmp_path / "run", header((1.0, 0.5), 0.4, [WATER]), [frame(0, np.array([[0.5, 0.25]]))])
+    subject = subject_of(result)
+    view = view_of(subject, "iso", (900, 500))
+    painter = DotsPainter(subject, view, LIGHT, color_by("speed", result, subject, LIGHT), 1)
+    across = ink(painter.draw(result.frame(0))).any(axis=0).sum()
+    expected = OVERLAP * subject.distances[0] * view.pixels_per_metre
+    assert 150 < expected < 255 and across == pytest.approx(expected, abs=3)
 
 
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:

@@ -106,6 +106,13 @@ def test_a_flat_scene_has_no_other_side() -> None:
             view_of(FLAT, camera, (320, 200))
 
 
+def test_a_camera_is_not_beyond_what_numbers_reach() -> None:
+    for camera in ("1e300,0,0,0,0,0", "0,0,0,0,1e12,0"):
+        with pytest.raises(InputError, match="too far from the domain"):
+            view_of(SUBJECT, camera, (320, 200))
+    assert np.isfinite(view_of(SUBJECT, "1e4,0,0,0,0,0", (320, 200)).far)
+
+
 def test_a_camera_needs_something_to_look_at() -> None:
     with pytest.raises(InputError, match="looks at where it stands"):
         view_of(SUBJECT, "1,2,3,1,2,3", (320, 200))

@@ -18,6 +18,7 @@ from mpmcli.render.pictures import (
     Easel,
     Outcome,
     Planned,
+    is_foreign,
     make_pictures,
     picture_digest,
     picture_name,
@@ -227,7 +228,7 @@ def assign(result: Result, request: Request) -> Assignment:
         path = _montage_path(result, settings.mode, request.output)
         digest = picture_digest(result, studio.settings, ks)
         there = digest_of(path)
-        if there == "" and not request.overwrite:
+        if is_foreign(there) and not request.overwrite:
             raise InputError(FOREIGN.format(path=path))
         plan = [Planned(ks[0], path, digest, there == digest and not request.overwrite)]
     else:

@@ -114,10 +114,10 @@ def _value(name: str, result: Result, subject: Subject) -> _Value:
         raise _not_stored(name, result, "volume_ratio")
     elif name == "stress" and "stress" in stored:
         return _Value("von Mises stress", "Pa", ("stress",), lambda f: _von_mises(f.fields["stress"]), floor=0.0)
-    return _field(name, result, subject.dimension)
+    return _field(name, result)
 
 
-def _field(name: str, result: Result, d: int) -> _Value:
+def _field(name: str, result: Result) -> _Value:
     field, _, component = name.partition(".")
     if field not in (*result.field_names, "velocity"):
         raise _not_stored(name, result, field)
@@ -134,7 +134,9 @@ def _field(name: str, result: Result, d: int) -> _Value:
         if width == 1:
             return _Value(plain, unit, fields, lambda frame: array(frame)[:, 0])
         return _Value(f"|{plain}|", unit, fields, lambda frame: _length(array(frame)), floor=0.0)
-    known = list(AXES[:d]) if width == d else [a + b for a in AXES[:d] for b in AXES[:d]] if width == d * d else []
+    # In 2D the stress has all three axes, and so may other fields.
+    known = next((list(AXES[:n]) for n in (2, 3) if width == n), [])
+    known = next(([a + b for a in AXES[:n] for b in AXES[:n]] for n in (2, 3) if width == n * n), known)
     if component not in known:
         right = f"its components are {listed(known, 'and')}" if known else "it is one number"
         right = right if known or width == 1 else f"its {width} have no names"
@@ -206,7 +208,7 @@ def _length(vectors: np.ndarray) -> np.ndarray:
 
 
 def _von_mises(stress: np.ndarray) -> np.ndarray:
-    """Return sqrt(3/2 s : s), s the deviator of the stress (n, d, d); in 2D, of the stress in the plane."""
+    """Return sqrt(3/2 s : s), s the deviator of the stress (n, 3, 3), or of that in the plane (n, 2, 2)."""
     d = stress.shape[1] if stress.ndim == 3 else round(stress.shape[1] ** 0.5)
     tensor = np.asarray(stress, dtype=np.float64).reshape(len(stress), d, d)
     deviator = tensor - np.trace(tensor, axis1=1, axis2=2)[:, None, None] / d * np.eye(d)

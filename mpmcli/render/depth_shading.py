@@ -32,7 +32,8 @@ def depth_shaded(picture: np.ndarray, depth: np.ndarray, diameter: float, view: 
     solid = np.isfinite(nearest)
     if not solid.any():
         return picture
-    reach = max(1, round(REACH * diameter * view.pixels_per_metre))
+    # From very near a dot is larger than the picture.
+    reach = max(1, min(round(REACH * diameter * view.pixels_per_metre), max(view.size)))
     bare = np.where(solid, nearest, np.float32(view.far))
     padded = np.pad(bare, reach, mode="edge")
     gap = np.zeros_like(bare)

@@ -23,8 +23,14 @@ OVERLAP = 1.15
 SMALLEST = 1.5
 # Up to so many particles each pixel is averaged of four, which makes round edges smooth.
 SMOOTHED = 400_000
+# Pixels across a dot; larger ones are drawn as large as this.
+DOT_MAX = 255
+# Pixels along a side that software draws, and black beyond; and altogether, each of which takes 45 bytes.
+SIDE_MAX, PIXELS_MAX = 16_384, 64_000_000
 # Sizes of dots in one picture in perspective: each stands for a layer of distances.
 LAYERS = 12
+# Squares on each side of its own in which it is looked for what hides a dot.
+FARTHEST = 16
 
 
 class DotsPainter:
@@ -41,8 +47,9 @@ class DotsPainter:
         self._colors = colors
         self.fields = colors.fields
         self._flat = subject.dimension == 2
-        self._stage = Stage(view, theme, samples=2 if count <= SMOOTHED else 1)
         self._diameters = OVERLAP * np.array(subject.distances)
+        largest = float(self._diameters.max()) * view.pixels_per_metre
+        self._stage = Stage(view, theme, samples=samples_of(view.size, count, largest))
         self._levels = self._all_levels()
         self._corner = np.array(subject.lower)
         self._actors: dict[int, tuple[pv.PolyData, pv.Actor]] = {}
@@ -89,7 +96,10 @@ class DotsPainter:
         edge = 1.0 / self._stage.samples
         side = (0.5 * float(sizes.min()) - edge) / math.sqrt(8.0)
         if side >= 0.5 * edge and inside.any():
-            reach = math.ceil((0.5 * float(sizes.max()) + edge) / side)
+            reach = math.ceil((0.5 * float(sizes[inside].max()) + edge) / side)
+            # From a camera among the dots the nearest ones fill the picture, and to compare takes longer than to draw.
+            if reach > FARTHEST:
+                return result
             result[inside] = hidden(pixels[inside], side, float(self._diameters.max()), reach, cover=1)
         return result
 
@@ -136,3 +146,9 @@ class DotsPainter:
         rgb.SetName("rgb")
         shown.GetPointData().SetScalars(rgb)
         mesh.ShallowCopy(shown)
+
+
+def samples_of(size: tuple[int, int], count: int, largest: float) -> int:
+    """Return how many pixels along each axis are drawn for one of a picture, with so many dots, the largest so wide."""
+    possible = 2 * max(size) <= SIDE_MAX and 4 * size[0] * size[1] <= PIXELS_MAX and 2 * largest <= DOT_MAX
+    return 2 if possible and count <= SMOOTHED else 1

@@ -1,5 +1,6 @@
 """Pictures of frames as files: which are to be made, and the making of them, in several processes."""
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,7 +18,7 @@ from mpmcli.render.painter import Painter, Studio, expected_times, open_studio
 from mpmcli.render.settings import Settings
 from mpmcli.render.window import choose_window
 
-FOREIGN = "{path} is there already, and mpmcli did not make it: give another place with -o, or --overwrite."
+FOREIGN = "{path} is there already, and mpmcli render did not make it: give another place with -o, or --overwrite."
 
 
 @dataclass(frozen=True)
@@ -138,10 +139,15 @@ def plan_pictures(
     for k in ks:
         path, digest = path_of(k), picture_digest(result, settings, [k])
         there = digest_of(path)
-        if there == "" and not overwrite:
+        if is_foreign(there) and not overwrite:
             raise InputError(FOREIGN.format(path=path))
         plan.append(Planned(k, path, digest, there == digest and not overwrite))
     return plan
+
+
+def is_foreign(there: str | None) -> bool:
+    """Say whether a file with this digest, from `digest_of`, is not one of these pictures; nor is that of a ledger."""
+    return there is not None and not re.fullmatch("[0-9a-f]{32}", there)
 
 
 def make_pictures(

@@ -21,6 +21,8 @@ MARGIN = 0.04
 AZIMUTH, ELEVATION = 32.0, 24.0
 # Pixels along the sides of a picture that is only thought of.
 SQUARE = 1000
+# Sizes of the domain that a camera may be away from it: it is a hundredth of a pixel there.
+FARTHEST = 1e5
 # Rounds in which the middle of the projected domain is brought to the middle of the picture.
 CENTRING_ROUNDS = 8
 
@@ -160,6 +162,9 @@ def _free_view(subject: Subject, camera: str, size: tuple[int, int]) -> View:
     what = f'--camera "{camera}" is not a camera: give {", ".join(CAMERAS)}, or six numbers x,y,z,x,y,z in metres'
     if len(numbers) != 6 or not np.isfinite(numbers).all():
         raise InputError(f"{what}, where it stands and what it looks at.")
+    low, high = np.array(subject.lower), np.array(subject.upper)
+    if np.abs(numbers.reshape(2, 3) - 0.5 * (low + high)).max() > FARTHEST * (high - low).max():
+        raise InputError(f"{what}: this one is too far from the domain for anything to be seen.")
     position, focus = numbers[:3], numbers[3:]
     back, up = position - focus, np.array(subject.up)
     if np.linalg.norm(back) <= 1e-9 * max(np.abs(numbers).max(), 1e-300):
