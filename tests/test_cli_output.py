@@ -1,13 +1,15 @@
 """What commands print: JSON on stdout, everything else on stderr."""
 
 import json
+import os
 import shutil
+import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from command import CONFIGS, SCENE, Outcome, run_here
+from command import CONFIGS, ROOT, SCENE, Outcome, run_here
 
 from mpmcli import __version__
 from mpmcli.output import open_result
@@ -179,3 +181,14 @@ def test_a_reader_may_leave_early(tmp_path):
     command = f'"{sys.executable}" -m mpmcli schema | head -c 1'
     done = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=Path(__file__).parent.parent)
     assert done.stdout == "{" and done.stderr == ""
+
+
+def test_json_that_cannot_be_written_is_told(run_python):
+    """On a full disk, to a closed stdout, and where stdout has no code for a letter."""
+    words = [sys.executable, "-m", "mpmcli", "schema"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, env=environment)
+    assert done.returncode == 1 and done.stderr.startswith("error: The JSON could not be written to stdout (No space")
+    done = run_python(["-m", "mpmcli", "schema"], environment={"PYTHONIOENCODING": "ascii"})
+    assert json.loads(done.stdout)["title"] == "Scene"

@@ -177,6 +177,7 @@ def test_bad_input_gets_one_sentence_and_nothing_is_written(run: Path, tmp_path:
     assert "is no size" in refused(run, "--size", "big")
     assert "would be no film" in refused(run, "--movie", tmp_path / "film.avi")
     assert "frames per second" in refused(run, "--movie", tmp_path / "film.mp4", "--fps", 0)
+    assert "name one with --movie" in refused(run, "--fps", 12)
     assert "two things" in refused(run, "--movie", tmp_path / "film.mp4", "--montage", "2x2")
     assert "for a film, give --movie" in refused(run, "-o", tmp_path / "x.mp4")
     assert "name a directory" in refused(run, "-o", tmp_path / "x.png", "--frame", "all")

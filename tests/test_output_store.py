@@ -369,6 +369,18 @@ def test_what_is_no_result_is_named(tmp_path):
         open_result(tmp_path / "good")
 
 
+def test_a_file_that_contradicts_itself_is_damaged(tmp_path):
+    fill(tmp_path / "run", [make_frame(0, 20, 3)])
+    with h5py.File(tmp_path / "run" / "particles.vtkhdf", "r+") as f:
+        f["mpmcli"].attrs["header"] = "{no JSON"
+    with pytest.raises(InputError, match="is damaged: its list of frames cannot be read"):
+        open_result(tmp_path / "run")
+    with h5py.File(tmp_path / "run" / "particles.vtkhdf", "r+") as f:
+        del f["VTKHDF/Steps"]
+    with pytest.raises(InputError, match="is damaged"):
+        open_result(tmp_path / "run")
+
+
 def test_frames_packed_under_a_reader_are_read_on(tmp_path):
     frames = [make_frame(k, 20, 3) for k in range(3)]
     store = fill(tmp_path, frames, finish=False)

@@ -127,10 +127,14 @@ def test_the_commands_make_what_the_readme_says(commands, checkout):
     assert summary["status"] == "finished" and summary["backend"]["precision"] == "f64"
     assert json.loads((checkout / "scene.schema.json").read_text(encoding="utf-8"))["title"] == "Scene"
     assert sorted(path.name for path in (checkout / "results" / "drop").iterdir()) == [
+        "ledger.png",
         "particles.vtkhdf",
+        "render",
         "run.json",
         "scene.toml",
     ]
+    assert {path.name for path in (checkout / "results" / "drop" / "render").iterdir()} >= {"dots_000025.png"}
+    assert all((checkout / "results" / name).stat().st_size > 1000 for name in ("drop.mp4", "drop.png"))
 
 
 def test_three_lines_of_h5py_read_a_result(commands, checkout, monkeypatch):

@@ -84,7 +84,7 @@ def test_grids_and_limits() -> None:
         with pytest.raises(InputError, match="lower and the upper limit"):
             parse_limits(text)
     # Differences that overflow, vanish or round to nothing.
-    for text in ("-1.7e308,1.7e308", "0,5e-324", "1,1.0000000000000002"):
+    for text in ("-1.7e308,1.7e308", "1,1.0000000000000002"):
         with pytest.raises(InputError, match="too wide or too narrow"):
             parse_limits(text)
     assert parse_limits("-1e-30,1e30") == (-1e-30, 1e30)

@@ -41,7 +41,7 @@ class ProgressBar:
         return self._task is not None
 
     def __enter__(self) -> "ProgressBar":
-        if not self._quiet and self._console.is_terminal:
+        if not self._quiet and self._console.is_terminal and not self._console.is_dumb_terminal:
             self._task = self._bar.add_task("", total=self._total)
             self._bar.start()
         return self

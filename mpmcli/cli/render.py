@@ -49,7 +49,7 @@ THEMES = ("light", "dark")
     "--theme", type=click.Choice(THEMES), default="light", show_default=True, help="Colours around the particles."
 )
 @click.option("--movie", type=click.Path(path_type=Path), metavar="FILE", help="Make a film: .mp4 or .gif.")
-@click.option("--fps", type=float, default=30.0, show_default=True, help="Frames of the film per second.")
+@click.option("--fps", type=float, help="Frames of the film per second, 30 by default.")
 @click.option("--montage", metavar="CxR", help="One picture of evenly spaced frames, in so many columns and rows.")
 @click.option(
     "--save-surface",
@@ -73,7 +73,7 @@ def command(
     camera: str,
     theme: str,
     movie: Path | None,
-    fps: float,
+    fps: float | None,
     montage: str | None,
     save_surface: Path | None,
     workers: int | None,

@@ -107,8 +107,7 @@ class _PackedResult(Result):
     kind = "packed"
 
     def __init__(self, path: Path) -> None:
-        with closing(open_vtkhdf(path)) as file:
-            super().__init__(path, read_index(file))
+        super().__init__(path, _index_of(path))
 
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
         return _read_arrays(self.path, names, int(self._index.offsets[k]), int(self.particle_counts[k]))
@@ -119,11 +118,7 @@ class _SegmentsResult(Result):
 
     def __init__(self, path: Path, segments: Sequence[Path]) -> None:
         self._segments = list(segments)
-        indices = []
-        for segment in segments:
-            with closing(open_vtkhdf(segment)) as file:
-                indices.append(read_index(file))
-        super().__init__(path, FrameIndex.joined(indices))
+        super().__init__(path, FrameIndex.joined([_index_of(segment) for segment in segments]))
 
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
         try:
@@ -215,9 +210,18 @@ def _open_directory(directory: Path) -> Result:
     raise InputError(f'{directory} holds no frame yet: its run is "{record["status"]}" and has written none.')
 
 
+def _index_of(path: Path) -> FrameIndex:
+    with closing(open_vtkhdf(path)) as file:
+        try:
+            return read_index(file)
+        # What h5py, numpy and JSON raise on a file whose content contradicts itself.
+        except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+            raise InputError(f"{path} is damaged: its list of frames cannot be read.") from error
+
+
 def _read_arrays(path: Path, names: Sequence[str], offset: int, count: int) -> dict[str, np.ndarray]:
     try:
         with closing(open_vtkhdf(path)) as file:
             return {name: read_array(file, name, offset, count) for name in names}
-    except (OSError, KeyError) as error:
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
         raise InputError(f"{path} is damaged: a frame that it lists cannot be read.") from error

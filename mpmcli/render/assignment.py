@@ -31,6 +31,7 @@ from mpmcli.render.view import CAMERAS
 
 # Where pictures go, beside the result.
 DIRECTORY = "render"
+USUAL_FPS = 30.0
 USUAL_SIZE, USUAL_MONTAGE_SIZE = "1280x720", "1280xauto"
 # Modes in which particles have the colours of a value.
 COLORED = ("dots", "surface")
@@ -50,10 +51,15 @@ class Request:
     camera: str = "iso"
     theme: str = "light"
     movie: Path | None = None
-    fps: float = 30.0
+    fps: float | None = None
     montage: str | None = None
     save_surface: Path | None = None
     overwrite: bool = False
+
+    @property
+    def rate(self) -> float:
+        """Frames of a film per second."""
+        return USUAL_FPS if self.fps is None else self.fps
 
 
 @dataclass(frozen=True)
@@ -201,7 +207,7 @@ def assign(result: Result, request: Request) -> Assignment:
     """
     _require_sense(request)
     if request.movie is not None:
-        check_film(request.movie, request.fps)
+        check_film(request.movie, request.rate)
         if film_digest(request.movie) == "" and not request.overwrite:
             raise InputError(FOREIGN.format(path=request.movie).replace("with -o", "with --movie"))
     grid = parse_grid(request.montage) if request.montage else (1, 1)
@@ -242,12 +248,14 @@ def assign(result: Result, request: Request) -> Assignment:
     for path in (plan[0].path, request.movie, surface):
         if path is not None:
             require_writable(path)
-    return Assignment(studio, ks, plan, request.movie, request.fps, request.save_surface, request.overwrite)
+    return Assignment(studio, ks, plan, request.movie, request.rate, request.save_surface, request.overwrite)
 
 
 def _require_sense(request: Request) -> None:
     if request.movie and request.montage:
         raise InputError("--movie and --montage are two things: ask for one after the other.")
+    if request.fps is not None and not request.movie:
+        raise InputError("--fps is the rate of a film: name one with --movie.")
     if request.save_surface and request.mode != "surface":
         raise InputError("--save-surface writes the surfaces of --mode surface: ask for that.")
     if request.mode == "surface" and request.color == "body":
