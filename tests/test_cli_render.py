@@ -15,8 +15,8 @@ from PIL import Image
 
 from mpmcli.output import Result, VtkSeriesStore, open_result
 from mpmcli.output.store import SEGMENTS
-from mpmcli.render.assignment import Request, assign
 from mpmcli.render.files.picture_file import settings_digest, write_picture
+from mpmcli.render.request import Request, assign
 
 pytestmark = pytest.mark.usefixtures("drawing")
 

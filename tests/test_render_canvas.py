@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mpmcli.output import Result
-from mpmcli.render.canvas import Canvas, cut, length_text, round_length, ticks_of, time_text
+from mpmcli.render.canvas import Canvas
 from mpmcli.render.color_by import color_by
 from mpmcli.render.coloring import Categories, Coloring
+from mpmcli.render.labels import cut, length_text, round_length, ticks_of, time_text
 from mpmcli.render.painter import open_studio
 from mpmcli.render.pictures import picture_digest
 from mpmcli.render.settings import Settings

@@ -88,7 +88,7 @@ def command(
     """
     from mpmcli.cli.progress_bar import ProgressBar
     from mpmcli.output import open_result
-    from mpmcli.render.assignment import Request, assign
+    from mpmcli.render.request import Request, assign
 
     # Without a home it tells at length where it keeps its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)

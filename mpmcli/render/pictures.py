@@ -10,10 +10,10 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.output.frame import Frame
 from mpmcli.output.result import Result, open_result
-from mpmcli.render.canvas import time_text
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.files.picture_file import digest_of, settings_digest, write_picture
 from mpmcli.render.frame_workers import render_frames
+from mpmcli.render.labels import time_text
 from mpmcli.render.painter import Painter, Studio, expected_times, open_studio
 from mpmcli.render.settings import Settings
 from mpmcli.render.window import choose_window
