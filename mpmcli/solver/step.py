@@ -14,7 +14,8 @@ from mpmcli.solver.extremes import (
     extremes_of,
     volume_growth,
     volume_ratio,
-    widen,
+    widen_motion,
+    widen_state,
 )
 from mpmcli.solver.flip import settle_before, unseen_velocity
 from mpmcli.solver.forces import Gravity
@@ -84,8 +85,7 @@ def build_step(
     threads = orders[0].threads
     pairs = tuple(zip(range(len(groups)), groups, orders, strict=True))
     fastest = ti.field(float, shape=())
-    # What is read back of each group: its rate of deformation, and all extremes where it hardens. A field each, as only
-    # a field without axes is reduced without an atomic operation per particle.
+    # What is read back of each group: its rate of deformation, and all extremes where it hardens.
     sharpest = tuple(ti.field(float, shape=()) for _ in groups)
     hardens = tuple(group.law.hardening > 0 for group in groups)
     farthest = tuple(
@@ -128,6 +128,8 @@ def build_step(
         for a in ti.static(range(d)):
             for c in ti.static(range(group.v.n)):
                 group.gradient[p][a, c] = gradient[a, c]
+        # Here, where C is at hand, it takes half the time that it would take at the end.
+        pace = deformation_rate(group, C)
         if ti.static(group.law.deformation == "F"):
             # F - I grows by dt C + dt C (F - I).
             old = group.departure[p]
@@ -154,7 +156,7 @@ def build_step(
             group.x[p][c] = ti.select(sound, inside[c], x[c])
         if not sound:
             ti.atomic_min(lost[g], p)
-        return deformation_rate(group, C)
+        return pace
 
     @ti.func
     def spread_one(g: ti.template(), group: ti.template(), p: int, kick: float, atomic: ti.template()):
@@ -229,11 +231,21 @@ def build_step(
                         node[d - 1] += 1
                 ti.atomic_max(fastest[None], speed_squared)
         for g, group, _order in ti.static(pairs):
-            for p in range(group.count):
-                ti.atomic_max(sharpest[g][None], advance(g, group, p, dt))
-                if ti.static(hardens[g]):
-                    own = ti.Vector([NOTHING] * ti.static(entries(group)))
-                    widen(group, own, p)
+            # Each thread keeps its own maxima and merges them once: with Taichi's own reduction, two threads took as
+            # long as one, as if they shared cache lines.
+            for q in range(CHUNK * threads):
+                if q % CHUNK == 0:
+                    t = q // CHUNK
+                    sharp = NOTHING
+                    own = ti.Vector([NOTHING] * ti.static(max(len(farthest[g]), 1)))
+                    for p in range(share_start(group.count, t, threads), share_start(group.count, t + 1, threads)):
+                        rate = advance(g, group, p, dt)
+                        sharp = ti.max(sharp, rate)
+                        if ti.static(hardens[g]):
+                            v, _ = group.motion(p)
+                            widen_motion(own, v, rate)
+                            widen_state(group, own, p)
+                    ti.atomic_max(sharpest[g][None], sharp)
                     for k in ti.static(range(len(farthest[g]))):
                         ti.atomic_max(farthest[g][k][None], own[k])
         result = found(0.0)
