@@ -260,3 +260,33 @@ def test_colours_of_a_surface_are_those_of_a_field_where_asked(run: Path, tmp_pa
         pictures.append(np.asarray(Image.open(said["pictures"][0])))
     assert (pictures[0] != pictures[1]).any()
     assert "a surface has no bodies" in refused(run, "--mode", "surface", "--color-by", "body")
+
+
+@pytest.mark.parametrize("mode", ["fluid", "density"])
+def test_every_mode_is_drawn_from_the_command_line(run: Path, tmp_path: Path, mode: str) -> None:
+    """In 2D here; water and jelly are both there, and move to the right."""
+    middles = []
+    for k in (0, FRAMES - 1):
+        picture = np.asarray(
+            Image.open(rendered(run, "--mode", mode, "-o", tmp_path / f"{k}.png", "--frame", k)["pictures"][0])
+        )
+        inside = picture[40:130, 70:215].astype(int)
+        drawn = np.abs(inside - 255).max(axis=2) > 40
+        assert drawn.mean() > 0.1
+        middles.append(np.nonzero(drawn)[1].mean())
+    assert middles[1] > middles[0] + 10
+
+
+def test_a_liquid_in_space_is_drawn_from_the_command_line(tmp_path: Path) -> None:
+    block = lattice((0.1, 0.1, 0.0), (0.4, 0.4, 0.3), 0.025)
+    result = write(tmp_path / "run", header((0.5, 0.5, 0.5), 0.05, [WATER]), [frame(0, block), frame(1, block[:0])])
+    full, empty = (
+        np.asarray(
+            Image.open(
+                rendered(result.path, "--mode", "fluid", "-o", tmp_path / f"{k}.png", "--frame", k)["pictures"][0]
+            )
+        )
+        for k in (0, 1)
+    )
+    bluer = full[:, :, 2].astype(int) - full[:, :, 0] > empty[:, :, 2].astype(int) - empty[:, :, 0] + 30
+    assert 0.03 < bluer.mean() < 0.6

@@ -1,9 +1,14 @@
 """An off-screen window that is kept for all frames of a film: one rendering gives the picture and its depth."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from mpmcli.render.theme import Theme
 from mpmcli.render.view import View
+
+if TYPE_CHECKING:
+    from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
 # Edges of the domain, as pairs of its corners; bit i of a corner's number is its side along axis i.
 EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
@@ -57,14 +62,7 @@ class Stage:
 
     def picture(self) -> np.ndarray:
         """Return the rows from the top, (h, w, 3) uint8, averaged over the samples of each pixel."""
-        from vtkmodules.util.numpy_support import vtk_to_numpy
-        from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
-
-        width, height = (length * self.samples for length in self.view.size)
-        array = vtkUnsignedCharArray()
-        self.plotter.render_window.GetPixelData(0, 0, width - 1, height - 1, 0, array, 0)
-        image = vtk_to_numpy(array).reshape(height, width, 3)[::-1]
-        return self._averaged(image) if self.samples > 1 else np.ascontiguousarray(image)
+        return averaged(window_pixels(self.plotter.render_window), self.samples)
 
     def depth(self) -> np.ndarray:
         """Return how far away what each sample shows is, (h, w) float32, m; inf where there is nothing."""
@@ -84,11 +82,25 @@ class Stage:
         """Give the window back."""
         self.plotter.close()
 
-    def _averaged(self, image: np.ndarray) -> np.ndarray:
-        width, height = self.view.size
-        s = self.samples
-        total = np.zeros((height, width, 3), np.uint16)
-        for i in range(s):
-            for j in range(s):
-                total += image[i::s, j::s]
-        return ((total + s * s // 2) // (s * s)).astype(np.uint8)
+
+def window_pixels(window: "vtkRenderWindow") -> np.ndarray:
+    """Return what a window shows, rows from the top, (h, w, 3) uint8."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
+
+    width, height = window.GetSize()
+    array = vtkUnsignedCharArray()
+    window.GetPixelData(0, 0, width - 1, height - 1, 0, array, 0)
+    return vtk_to_numpy(array).reshape(height, width, 3)[::-1]
+
+
+def averaged(image: np.ndarray, step: int) -> np.ndarray:
+    """Return the means over blocks of `step` by `step` pixels, (h, w, 3) uint8."""
+    if step == 1:
+        return np.ascontiguousarray(image)
+    height, width = (length // step for length in image.shape[:2])
+    total = np.zeros((height, width, 3), np.uint16)
+    for i in range(step):
+        for j in range(step):
+            total += image[i::step, j::step]
+    return ((total + step * step // 2) // (step * step)).astype(np.uint8)

@@ -10,7 +10,8 @@ import numpy as np
 
 from mpmcli.output.frame import Frame
 from mpmcli.render.depth_shading import depth_shaded
-from mpmcli.render.liquids.fluid_room import DIAMETER, SAMPLES, Room
+from mpmcli.render.dots import OVERLAP
+from mpmcli.render.liquids.fluid_room import SAMPLES, Room
 from mpmcli.render.liquids.fluid_shading import displayed, fluid_lights, linear, optics_of, shaded, transmitted
 from mpmcli.render.liquids.liquid_surface import Liquid, Surface, layers_of, scale_at, surface_of, window_of
 from mpmcli.render.liquids.pixel_rays import plane
@@ -108,7 +109,7 @@ class FluidPainter:
         shade = None
         if distance is not None:
             white = np.full((height, width, 3), 255, np.uint8)
-            shade = depth_shaded(white, depth, DIAMETER * distance, self._view, SAMPLES)[..., 0] / np.float32(255)
+            shade = depth_shaded(white, depth, OVERLAP * distance, self._view, SAMPLES)[..., 0] / np.float32(255)
         samples = []
         for i in range(SAMPLES):
             for j in range(SAMPLES):

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mpmcli.render.dots import OVERLAP, SMALLEST
 from mpmcli.render.liquids.fluid_shading import linear
 from mpmcli.render.stage import Stage
 from mpmcli.render.subject import Subject
 from mpmcli.render.surfaces.backdrop import Backdrop
-from mpmcli.render.surfaces.lighting import OPACITY
+from mpmcli.render.surfaces.lighting import occlusion_by
 from mpmcli.render.surfaces.material_groups import Group
-from mpmcli.render.surfaces.occlusion import occlusion_of
 from mpmcli.render.theme import Theme
 from mpmcli.render.view import View
 
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 # Samples along each axis of a pixel in what VTK draws.
 SAMPLES = 2
-# Diameter of the dots, in distances between particles: they overlap a little; and the smallest, pixels.
-DIAMETER, SMALLEST = 1.15, 1.5
 
 
 class Room:
@@ -58,13 +56,7 @@ class Room:
 
     def base(self, groups: list[Group]) -> np.ndarray:
         """Return the background (h, w, 3) in amounts of light, with the shadows that particles throw on the floor."""
-        occlusion = None
-        if groups:
-            position = np.concatenate([group.position for group in groups])
-            counts = [len(group.position) for group in groups]
-            volumes = np.repeat([group.distance**3 for group in groups], counts)
-            opacity = np.repeat([OPACITY.get(group.look.finish, 1.0) for group in groups], counts)
-            occlusion = occlusion_of(self._subject, position, volumes, opacity, self._lamp)
+        occlusion = occlusion_by(self._subject, groups, self._lamp)
         return linear(self._backdrop.image(occlusion) / np.float32(255))
 
     def _show(self, group: Group, colors: np.ndarray) -> None:
@@ -92,4 +84,4 @@ class Room:
         # Dots of one group have one size, that of those in the middle.
         distance = max(float(np.median(self._view.pixels(group.position)[:, 2])), self._view.near)
         scale = self._view.pixels_per_metre * (1.0 if self._view.parallel else self._view.distance / distance)
-        actor.prop.point_size = max(DIAMETER * group.distance * scale, SMALLEST) * SAMPLES
+        actor.prop.point_size = max(OVERLAP * group.distance * scale, SMALLEST) * SAMPLES

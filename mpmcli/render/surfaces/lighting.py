@@ -5,12 +5,15 @@ what is dull and is mirrored in what is glossy. What is clear shows the picture 
 dimmed by its thickness, after the law of Beer and Lambert, with Schlick's approximation of Fresnel's mirror.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from mpmcli.render.look import Finish, Look
 from mpmcli.render.subject import Subject
+from mpmcli.render.surfaces.material_groups import Group
+from mpmcli.render.surfaces.occlusion import Occlusion, occlusion_of
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.view import View
 
@@ -41,6 +44,16 @@ class Lights:
     sky: np.ndarray
     horizon: np.ndarray
     ground: np.ndarray
+
+
+def occlusion_by(subject: Subject, groups: Sequence[Group], lamp: np.ndarray) -> Occlusion | None:
+    """Return what the particles of some groups take of the light of a lamp in direction (3,), None without any."""
+    if not groups:
+        return None
+    counts = [len(group.position) for group in groups]
+    volumes = np.repeat([group.distance**3 for group in groups], counts)
+    opacity = np.repeat([OPACITY.get(group.look.finish, 1.0) for group in groups], counts)
+    return occlusion_of(subject, np.concatenate([group.position for group in groups]), volumes, opacity, lamp)
 
 
 def lights_of(subject: Subject, view: View, theme: Theme) -> Lights:

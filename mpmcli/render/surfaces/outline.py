@@ -1,11 +1,11 @@
 """Bodies in the plane: filled where particles cover it, with a soft light on their edges."""
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mpmcli.output.frame import Frame
+from mpmcli.render.coloring import Coloring
 from mpmcli.render.look import Look
 from mpmcli.render.subject import Subject
 from mpmcli.render.surfaces.coverage import SPREAD, Grid, cover_of, disk_nodes, gaussian, spread, with_images
@@ -13,9 +13,6 @@ from mpmcli.render.surfaces.material_groups import Group, groups_of
 from mpmcli.render.surfaces.tints import shades
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.view import View
-
-if TYPE_CHECKING:
-    from mpmcli.render.surfaces.surface import FieldColors
 
 # Steepness of the share of each of the bodies that meet in a pixel.
 SHARPNESS = 8
@@ -38,7 +35,7 @@ ROUGHNESS, CRUMB = 0.55, 0.75
 class OutlinePainter:
     """Draws a 2D run as filled bodies."""
 
-    def __init__(self, subject: Subject, view: View, theme: Theme, colors: "FieldColors | None" = None) -> None:
+    def __init__(self, subject: Subject, view: View, theme: Theme, colors: Coloring | None = None) -> None:
         """Find the pixels that show the domain; nothing is drawn yet."""
         self.subject, self.view, self.theme, self.colors = subject, view, theme, colors
         width, height = view.size
@@ -72,9 +69,6 @@ class OutlinePainter:
             drawn /= weight[..., None]
             picture += alpha[..., None] * (drawn - picture)
         return (255.0 * np.clip(picture, 0.0, 1.0) + 0.5).astype(np.uint8)[::-1]
-
-    def close(self) -> None:
-        """Do nothing: there is no window."""
 
     def _cover(self, group: Group) -> np.ndarray:
         """Return the share of each pixel's surroundings that a group covers, (h, w); its edge is where it is 1/2."""

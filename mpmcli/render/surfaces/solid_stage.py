@@ -1,24 +1,23 @@
 """The stage of 3D surfaces: one off-screen window, its meshes replaced with every frame."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mpmcli.output.frame import Frame
+from mpmcli.render.coloring import Coloring
+from mpmcli.render.stage import averaged, window_pixels
 from mpmcli.render.subject import Subject
 from mpmcli.render.surfaces import lighting
 from mpmcli.render.surfaces.backdrop import Backdrop
 from mpmcli.render.surfaces.grains import JITTER, grain_colors, new_grains, pose_grains
 from mpmcli.render.surfaces.material_groups import Group, groups_of
-from mpmcli.render.surfaces.occlusion import Occlusion, occlusion_of
+from mpmcli.render.surfaces.occlusion import Occlusion
 from mpmcli.render.surfaces.reconstruction import SMOOTHING_ROUNDS, Mesh, reconstruct
 from mpmcli.render.surfaces.thickness import thickness_at
 from mpmcli.render.surfaces.tints import painted, shades, tints_of
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.view import View
-
-if TYPE_CHECKING:
-    from mpmcli.render.surfaces.surface import FieldColors
 
 # Pixels of the window to one of the picture, along each axis, and the longest side of a window.
 FINER, LONGEST = 2, 8192
@@ -29,7 +28,7 @@ ROUNDS = {"crumbly": 2}
 class SolidStage:
     """Draws a 3D run as bodies in a lit room."""
 
-    def __init__(self, subject: Subject, view: View, theme: Theme, colors: "FieldColors | None" = None) -> None:
+    def __init__(self, subject: Subject, view: View, theme: Theme, colors: Coloring | None = None) -> None:
         """Open the window; nothing is drawn yet."""
         import pyvista as pv
 
@@ -51,7 +50,7 @@ class SolidStage:
     def draw(self, frame: Frame) -> np.ndarray:
         """Return the picture of a frame, (h, w, 3) uint8."""
         groups = groups_of(self.subject, frame)
-        occlusion = self._occlusion(groups)
+        occlusion = lighting.occlusion_by(self.subject, groups, self.lights.lamp)
         clear = []
         for actor in self.actors.values():
             actor.SetVisibility(False)
@@ -67,31 +66,12 @@ class SolidStage:
             _put(self.behind, self._window_pixels())
             for actor in clear:
                 actor.SetVisibility(True)
-        return _coarser(self._window_pixels(), self.finer)
-
-    def close(self) -> None:
-        """Close the window."""
-        self.plotter.close()
+        return averaged(self._window_pixels(), self.finer)
 
     def _window_pixels(self) -> np.ndarray:
-        import vtk
-        from vtkmodules.util.numpy_support import vtk_to_numpy
-
-        window = self.plotter.render_window
         self.view.place(self.plotter)
-        window.Render()
-        width, height = window.GetSize()
-        pixels = vtk.vtkUnsignedCharArray()
-        window.GetPixelData(0, 0, width - 1, height - 1, 0, pixels, 0)
-        return vtk_to_numpy(pixels).reshape(height, width, 3)[::-1]
-
-    def _occlusion(self, groups: list[Group]) -> Occlusion | None:
-        if not groups:
-            return None
-        position = np.concatenate([group.position for group in groups])
-        volumes = np.concatenate([np.full(len(g.position), g.distance**3) for g in groups])
-        opacity = np.concatenate([np.full(len(g.position), lighting.OPACITY.get(g.look.finish, 1.0)) for g in groups])
-        return occlusion_of(self.subject, position, volumes, opacity, self.lights.lamp)
+        self.plotter.render_window.Render()
+        return window_pixels(self.plotter.render_window)
 
     def _posed(self, group: Group, frame: Frame, occlusion: Occlusion | None) -> Any:
         """Return the actor of a group, with the mesh of this frame."""
@@ -199,12 +179,6 @@ class SolidStage:
             lighting=False,
         )
         walls.SetPickable(False)
-
-
-def _coarser(pixels: np.ndarray, step: int) -> np.ndarray:
-    """Return the means over blocks of `step` by `step` pixels (h, w, 3) uint8."""
-    total = sum(pixels[i::step, j::step].astype(np.uint16) for i in range(step) for j in range(step))
-    return ((total + step * step // 2) // (step * step)).astype(np.uint8)
 
 
 def _texture() -> Any:

@@ -1,29 +1,26 @@
 """Colours of a surface by a field of its particles."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mpmcli.output.frame import Frame
+from mpmcli.render.coloring import Coloring
 from mpmcli.render.surfaces.material_groups import Group
 from mpmcli.render.theme import rgb
-
-if TYPE_CHECKING:
-    from mpmcli.render.surfaces.surface import FieldColors
 
 # Colours in a table of a colour map.
 STEPS = 1024
 
 
-def tints_of(group: Group, colors: "FieldColors", frame: Frame) -> dict[str, np.ndarray]:
+def tints_of(group: Group, colors: Coloring, frame: Frame) -> dict[str, np.ndarray]:
     """Return what is carried over from particles to a surface: their values, and which of them are numbers."""
     values = np.asarray(colors.values(frame), dtype=np.float64)[group.rows]
     known = np.isfinite(values)
     return {"value": np.where(known, values, 0.0), "known": known.astype(np.float32)}
 
 
-def shades(values: np.ndarray, colors: "FieldColors") -> np.ndarray:
+def shades(values: np.ndarray, colors: Coloring) -> np.ndarray:
     """Return the colours (n, 3) float32, as the display shows them, of values (n,)."""
     from matplotlib import colormaps
 
@@ -36,7 +33,7 @@ def shades(values: np.ndarray, colors: "FieldColors") -> np.ndarray:
     return found
 
 
-def painted(attributes: Mapping[str, np.ndarray], colors: "FieldColors") -> np.ndarray:
+def painted(attributes: Mapping[str, np.ndarray], colors: Coloring) -> np.ndarray:
     """Return linear colours (v, 3) of vertices to which the values of `tints_of` have been carried over."""
     value, known = attributes["value"].astype(np.float64), attributes["known"].astype(np.float64)
     # The mean over those particles that have a number, where they are the most.
