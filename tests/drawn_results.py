@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from mpmcli.output import Frame, Result, SegmentStore, open_result
-from mpmcli.stability.ledger import LedgerRow
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output import Result, SegmentStore, open_result
 
 WATER = {"law": "fluid", "density": 1000.0, "viscosity": 0.001}
 JELLY = {"law": "neo_hookean", "density": 1020.0, "youngs_modulus": 5e4, "poissons_ratio": 0.45}

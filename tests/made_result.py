@@ -5,8 +5,9 @@ from unittest import mock
 
 import numpy as np
 
-from mpmcli.output import Frame, SegmentStore, VtkSeriesStore
-from mpmcli.stability.ledger import LedgerRow
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output import SegmentStore, VtkSeriesStore
 
 GRAVITY = 9.81
 MASS, STEP, PAUSE = 2.0, 0.002, 0.02

@@ -12,10 +12,11 @@ import h5py
 import numpy as np
 from command import run_here
 
-from mpmcli.output import Frame, SegmentStore, VtkSeriesStore, open_result
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output import SegmentStore, VtkSeriesStore, open_result
 from mpmcli.output.run_record import RECORD
 from mpmcli.output.store import PACKED
-from mpmcli.stability.ledger import LedgerRow
 
 FORMS = ("packed", "segments", "series")
 # A drop falls on the floor and splashes, and a jelly ball falls freely; it starts in no time.

@@ -5,9 +5,9 @@ import pytest
 
 from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_motion import MomentumCheck
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.scene_facts import SceneFacts, scene_facts
-from mpmcli.stability.ledger import LedgerRow
 
 SCENE = """\
 [domain]

@@ -16,8 +16,8 @@ from result_copies import FORMS, SCENE, StoredRun, real_run, stored_run
 
 from mpmcli.check.finding import Finding
 from mpmcli.check.result_check import ResultCheck, check_result
-from mpmcli.output import Frame
-from mpmcli.stability.ledger import LedgerRow
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 
 K = 6  # the frame that is broken
 

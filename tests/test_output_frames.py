@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.ledger_table import ledger_columns, ledger_csv, ledger_rows, parse_ledger_csv
-from mpmcli.stability.ledger import LedgerRow
 
 # Fields by name: shape per particle as a function of d.
 FIELDS = {

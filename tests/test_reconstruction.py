@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mpmcli.output import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.render.look import LOOKS
 from mpmcli.render.subject import Subject
 from mpmcli.render.surfaces.reconstruction import Mesh, reconstruct

@@ -8,7 +8,8 @@ import psutil
 import pytest
 from drawn_results import WATER, frame, header, lattice, write
 
-from mpmcli.output import Frame, Result
+from mpmcli.frames.frame import Frame
+from mpmcli.output import Result
 from mpmcli.render.color_by import color_by
 from mpmcli.render.dots import OVERLAP, DotsPainter, samples_of
 from mpmcli.render.hidden import hidden

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.render.liquids.fluid import FluidPainter
 from mpmcli.render.look import LOOKS
 from mpmcli.render.subject import Subject

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mpmcli.output import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.render.look import LOOKS
 from mpmcli.render.subject import Subject
 from mpmcli.render.surfaces.lighting import lights_of

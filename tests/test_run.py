@@ -9,12 +9,13 @@ import pytest
 from command import SCENE, run_here
 
 from mpmcli.errors import RunError
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
-from mpmcli.output import Frame, SegmentStore, open_result
+from mpmcli.output import SegmentStore, open_result
 from mpmcli.scene import load_scene
+from mpmcli.simulation.run import RunSettings, run_scene
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.run import RunSettings, run_scene
-from mpmcli.stability.ledger import LedgerRow
 
 
 @pytest.fixture(scope="module")
@@ -127,8 +128,8 @@ class FakeSolver:
 def run(tmp_path, monkeypatch):
     """Return `run(fault)`: the summary of a run whose solver raises it after two frames."""
     backend = Backend("cpu", 1, "f32", compile_cache=True)
-    monkeypatch.setattr("mpmcli.solver.run.start_backend", lambda *_, **__: backend)
-    monkeypatch.setattr("mpmcli.solver.run.Solver", FakeSolver)
+    monkeypatch.setattr("mpmcli.simulation.run.start_backend", lambda *_, **__: backend)
+    monkeypatch.setattr("mpmcli.simulation.run.Solver", FakeSolver)
     scene = tmp_path / "scene.toml"
     scene.write_text(SCENE, encoding="utf-8")
     loaded = load_scene(scene, laws=parameter_models())

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from solver_state import bodies_of, scene_of
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.solver import Solver
-from mpmcli.stability.ledger import LedgerRow
 
 H = 0.1
 FIELDS = [

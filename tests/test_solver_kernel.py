@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 
 from mpmcli.solver.grid import PAD
-from mpmcli.solver.kernel import SPLINES
+from mpmcli.solver.splines import SPLINES
 
 CELLS = 40
 SPACING = 0.025

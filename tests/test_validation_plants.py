@@ -64,7 +64,7 @@ PLANTS = (
     ),
     Plant(
         "middle weight of the kernel",
-        "solver/kernel.py",
+        "solver/splines.py",
         "0.75 - (distance - 1.0) ** 2",
         "0.7 - (distance - 1.0) ** 2",
         ("bar_fixed_fixed",),
@@ -136,14 +136,14 @@ PLANTS = (
     ),
     Plant(
         "J without the whole trace",
-        "solver/extremes.py",
+        "solver/state_bounds.py",
         "growth = dt * (C.trace() + dt * second_invariant(C))",
         "growth = dt * (C[0, 0] + dt * second_invariant(C))",
         ("dam_break",),
     ),
     Plant(
         "J without the second invariant",
-        "solver/extremes.py",
+        "solver/state_bounds.py",
         "growth = dt * (C.trace() + dt * second_invariant(C))",
         "growth = dt * C.trace()",
         ("elliptical_drop",),

@@ -4,9 +4,9 @@ import numpy as np
 
 from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_state import TOUCHED
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.scene_facts import SceneFacts
-from mpmcli.stability.ledger import LedgerRow
 
 # Relative, of numbers that are taken in single precision once more.
 SINGLE = 1e-5

@@ -8,12 +8,12 @@ import numpy as np
 
 from mpmcli.check.result_findings import FrameFindings
 from mpmcli.errors import InputError
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.result import Result, open_result
 from mpmcli.output.run_record import read_record
 from mpmcli.output.series import SERIES, SERIES_HEADER
 from mpmcli.output.store import PACKED, SEGMENTS, sealed_segments
-from mpmcli.stability.ledger import LedgerRow
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # What HDF5, numpy and the XML reader raise on a file whose content contradicts itself.

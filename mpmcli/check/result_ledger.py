@@ -8,8 +8,8 @@ import numpy as np
 from mpmcli.check.result_entries import Entry
 from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_state import BLOWN_UP, COHERENT_LAWS, CRUSHED, TOUCHED
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.scene_facts import SceneFacts
-from mpmcli.stability.ledger import LedgerRow
 from mpmcli.stability.limits import COURANT
 
 # Energy that comes from nowhere, relative to what was turned over so far. The scenes in configs stay below 2e-4, bodies

@@ -8,9 +8,9 @@ from mpmcli.check.deformation import deformation_rate
 from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_ledger import LOWER_SAFETY, MARGIN
 from mpmcli.check.result_state import TOUCHED, extent
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.scene_facts import SceneFacts
-from mpmcli.stability.ledger import LedgerRow
 from mpmcli.stability.limits import DEFORMATION
 
 # On a GPU the Courant number is an estimate between measurements, and what pushes may double the speed.

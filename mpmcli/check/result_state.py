@@ -3,7 +3,7 @@
 import numpy as np
 
 from mpmcli.check.result_findings import FrameFindings
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.output.scene_facts import SceneFacts
 
 # A J below the first is no state that a law is meant for; above the second, one that holds together would have torn.

@@ -68,7 +68,7 @@ def command(
     from mpmcli.errors import InputError
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
-    from mpmcli.solver.run import RunSettings, run_scene
+    from mpmcli.simulation.run import RunSettings, run_scene
 
     overrides += (f'solver.precision="{precision}"',) if precision else ()
     overrides += ("output.compress=true",) if compress else ()

@@ -7,8 +7,8 @@ from types import TracebackType
 import click
 
 from mpmcli.cli.progress_bar import ProgressBar
-from mpmcli.solver.run import RunSummary
-from mpmcli.stability.ledger import LedgerRow
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.simulation.run import RunSummary
 
 
 class SimulateProgress:

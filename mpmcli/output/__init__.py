@@ -4,14 +4,12 @@ Neither vtk nor meshio is imported until a series is written or read.
 """
 
 from mpmcli.output.directory import check_directory, prepare_directory
-from mpmcli.output.frame import Frame
 from mpmcli.output.result import Result, open_result
 from mpmcli.output.run_record import RunRecord, read_record
 from mpmcli.output.series import VtkSeriesStore
 from mpmcli.output.store import SegmentStore
 
 __all__ = [
-    "Frame",
     "Result",
     "RunRecord",
     "SegmentStore",

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.layout import FrameLayout
-from mpmcli.stability.ledger import LedgerRow
 
 
 @dataclass(frozen=True)

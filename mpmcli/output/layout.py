@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 
 POSITION = "Points"  # VTK's name; every other array keeps its own
 STANDARD = ("id", "body", "material", "velocity")

@@ -8,7 +8,7 @@ from dataclasses import fields
 import h5py
 import numpy as np
 
-from mpmcli.stability.ledger import LedgerRow
+from mpmcli.frames.ledger import LedgerRow
 
 COLUMNS = tuple(f.name for f in fields(LedgerRow))
 VECTORS = ("linear_momentum", "angular_momentum")

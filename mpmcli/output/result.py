@@ -11,7 +11,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mpmcli.errors import InputError
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.layout import POSITION, STANDARD, FrameLayout
 from mpmcli.output.ledger_table import FRAME_COLUMNS, parse_ledger_csv
@@ -19,7 +20,6 @@ from mpmcli.output.run_record import read_record
 from mpmcli.output.series import SERIES, SERIES_HEADER, SERIES_LEDGER, read_vtu
 from mpmcli.output.store import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.vtkhdf import FORMAT, open_vtkhdf, read_array, read_index
-from mpmcli.stability.ledger import LedgerRow
 
 Kind = Literal["packed", "segments", "series"]
 

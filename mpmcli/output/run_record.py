@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 from mpmcli import __version__
 from mpmcli.errors import RunError
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import write_text
-from mpmcli.stability.ledger import LedgerRow
 
 RECORD = "run.json"
 PROGRAM = "mpmcli"

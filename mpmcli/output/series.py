@@ -12,13 +12,13 @@ import numpy as np
 
 from mpmcli import __version__
 from mpmcli.errors import InputError, RunError
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import require_free_space, sealed, write_text
-from mpmcli.output.frame import Frame
 from mpmcli.output.layout import POSITION, FrameLayout
 from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_csv
 from mpmcli.output.store import frames_kept
 from mpmcli.output.vtkhdf import FORMAT, OVERHEAD_BYTES
-from mpmcli.stability.ledger import LedgerRow
 
 SERIES = "particles.pvd"
 SERIES_HEADER = "particles.json"

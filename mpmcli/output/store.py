@@ -5,12 +5,12 @@ from contextlib import suppress
 from pathlib import Path
 
 from mpmcli.errors import InputError, RunError
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import TEMPORARY_SUFFIX, require_free_space, sealed, sync_directory
-from mpmcli.output.frame import Frame
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.pack import pack_segments
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
-from mpmcli.stability.ledger import LedgerRow
 
 PACKED = "particles.vtkhdf"
 SEGMENTS = "segments"

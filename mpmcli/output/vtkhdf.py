@@ -18,10 +18,10 @@ import numpy as np
 
 from mpmcli import __version__
 from mpmcli.errors import InputError
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.layout import POSITION, FrameLayout
 from mpmcli.output.ledger_table import COLUMNS, ledger_columns, ledger_rows
-from mpmcli.stability.ledger import LedgerRow
 
 # A newer upper bound makes files that no VTK can open ("bad version number for layout message").
 LIBVER = ("v110", "v110")

@@ -5,12 +5,12 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from mpmcli.errors import InputError
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.ledger_table import TEXT
 from mpmcli.output.result import Result
 from mpmcli.output.scene_facts import SceneFacts, scene_facts
 from mpmcli.plain_text import one_line
-from mpmcli.stability.ledger import LedgerRow
 
 # Frames whose positions are read; more would not be seen in the figure.
 FRAMES_MAX = 200

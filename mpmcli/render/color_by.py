@@ -7,7 +7,7 @@ from typing import get_args
 import numpy as np
 
 from mpmcli.errors import InputError
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.output.result import Result
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.settings import LIMIT_MAX, LIMIT_MIN

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.render.theme import rgb_bytes
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.output.result import Result
 from mpmcli.output.scene_facts import SceneFacts, scene_facts
 from mpmcli.render.color_by import color_map

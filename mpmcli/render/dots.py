@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.depth_shading import depth_shaded
 from mpmcli.render.hidden import hidden

@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.output.result import Result
 from mpmcli.output.scene_facts import scene_facts
 from mpmcli.render.canvas import Canvas

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mpmcli.errors import InputError
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.output.result import Result, open_result
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.files.picture_file import digest_of, settings_digest, write_picture

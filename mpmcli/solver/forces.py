@@ -17,8 +17,8 @@ from mpmcli.scene.expression import INITIAL, POSITION, Number, Tree, names_in
 from mpmcli.scene.schema import Force
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.expression_kernels import Clock, node_of
-from mpmcli.solver.extremes import build_maxima
 from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.state_bounds import build_maxima
 
 # Half of the distance over which the slope of a force is taken, cells: a particle acts on nodes 1.5 cells away.
 REACH = 0.5

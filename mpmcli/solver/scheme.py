@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from mpmcli.scene.schema import SolverSettings
-from mpmcli.solver.kernel import SPLINES, CubicSpline, QuadraticSpline
+from mpmcli.solver.splines import SPLINES, CubicSpline, QuadraticSpline
 
 
 # Equal by identity: kernels are compiled for the object that they are given.

@@ -6,8 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
+from mpmcli.frames.frame import Frame
 from mpmcli.materials.tensors import determinant
-from mpmcli.output.frame import Frame
 from mpmcli.solver.observe import Observation
 from mpmcli.solver.particles import MASS, VOLUME, ParticleGroup
 

@@ -10,12 +10,13 @@ import taichi as ti
 from mpmcli.boundaries.walls import Walls
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.errors import InputError
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
-from mpmcli.output.frame import Frame
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError, cause_of, diagnose, first_unsound, rate_of_change
-from mpmcli.solver.drive import Drive
+from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.forces import needs_initial
 from mpmcli.solver.grid import DRIFT, PAD, Grid, node_width
 from mpmcli.solver.observe import build_observation
@@ -25,8 +26,7 @@ from mpmcli.solver.plan import members_of
 from mpmcli.solver.scheme import scheme_of
 from mpmcli.solver.snapshot import STRESSES, Snapshot, build_frame, measure, read_group
 from mpmcli.solver.step import NOT_LOST, build_step
-from mpmcli.solver.watch import Watch
-from mpmcli.stability.ledger import LedgerRow
+from mpmcli.solver.step_control import StepControl
 from mpmcli.stability.limits import Limit, force_limit, speed_limit
 from mpmcli.stability.scheme import affine_moment
 
@@ -113,7 +113,7 @@ class Solver:
         self._initial = None
         if "initial_position" in scene.output.fields:
             self._initial = np.concatenate([b.position if b.initial is None else b.initial for b in particles])
-        self._drive = Drive(scene, self.groups, backend)
+        self._drive = ExternalForces(scene, self.groups, backend)
         self.grid = Grid(scene.dimension, self.spacing, scene.domain.cells, width, scheme_of(scene.solver))
         kind = ZeroedWalls if scene.solver.walls == "zeroed" else Walls
         walls = kind(scene.domain.walls.faces(scene.dimension), PAD, self.grid.cells, self.grid.shape)
@@ -134,7 +134,7 @@ class Solver:
         self._observe = [build_observation(group) for group in self.groups]
         self._last_step = 0.0
         self._drift = math.inf
-        self._watch = Watch(scene, self.groups, backend)
+        self._watch = StepControl(scene, self.groups, backend)
         self._speed = self._watch.speed
         self._drive.measure(0.0, 0.0)
         # Once more, with the step that says how far ahead the next measurement is.

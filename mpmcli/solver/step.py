@@ -6,7 +6,12 @@ from dataclasses import dataclass
 import taichi as ti
 
 from mpmcli.boundaries.walls import REACH, Walls
-from mpmcli.solver.extremes import (
+from mpmcli.solver.flip import settle_before, unseen_velocity
+from mpmcli.solver.forces import Gravity
+from mpmcli.solver.grid import Grid
+from mpmcli.solver.ordering import CHUNK, TileOrder, share_start
+from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.state_bounds import (
     NOTHING,
     Extremes,
     deformation_rate,
@@ -17,11 +22,6 @@ from mpmcli.solver.extremes import (
     widen_motion,
     widen_state,
 )
-from mpmcli.solver.flip import settle_before, unseen_velocity
-from mpmcli.solver.forces import Gravity
-from mpmcli.solver.grid import Grid
-from mpmcli.solver.ordering import CHUNK, TileOrder, share_start
-from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.transfer import gather, scatter
 
 NOT_LOST = 2**31 - 1

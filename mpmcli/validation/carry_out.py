@@ -5,13 +5,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from mpmcli.errors import MpmcliError
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
-from mpmcli.output.frame import Frame
 from mpmcli.scene import Scene, parse_scene
 from mpmcli.solver.backend import Backend, start_backend
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.solver import Solver
-from mpmcli.stability.ledger import LedgerRow
 from mpmcli.validation.case import Case
 from mpmcli.validation.run_result import RunResult, failure, not_finite
 from mpmcli.validation.setting import Setting

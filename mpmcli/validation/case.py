@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene
-from mpmcli.stability.ledger import LedgerRow
 from mpmcli.validation.setting import Setting
 
 Level = Literal["coarse", "default", "fine"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.render.depth_shading import depth_shaded
 from mpmcli.render.dots import OVERLAP
 from mpmcli.render.liquids.fluid_room import SAMPLES, Room

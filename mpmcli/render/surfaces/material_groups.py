@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.render.look import Look
 from mpmcli.render.subject import Subject
 from mpmcli.render.surfaces.reconstruction import drawable

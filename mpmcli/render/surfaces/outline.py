@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.look import Look
 from mpmcli.render.subject import Subject

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpmcli.errors import InputError, RunError
+from mpmcli.frames.frame import Frame
 from mpmcli.output.durable import sealed, write_text
-from mpmcli.output.frame import Frame
 from mpmcli.output.result import Result, open_result
 from mpmcli.render.frame_workers import render_frames
 from mpmcli.render.subject import Subject, subject_of

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.stage import averaged, window_pixels
 from mpmcli.render.subject import Subject

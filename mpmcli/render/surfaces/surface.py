@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.subject import Subject
 from mpmcli.render.surfaces.outline import OutlinePainter

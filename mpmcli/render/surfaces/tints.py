@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.surfaces.material_groups import Group
 from mpmcli.render.theme import rgb

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
-from mpmcli.output.frame import Frame
 from mpmcli.scene import BodyParticles, Scene, parse_scene
 from mpmcli.solver.backend import start_backend, stop_backend
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.solver import Solver
-from mpmcli.stability.ledger import LedgerRow
 
 GRAVITY = 9.81
 

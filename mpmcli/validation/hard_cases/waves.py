@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpmcli.output.frame import Frame
+from mpmcli.frames.frame import Frame
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.solver import Solver
 from mpmcli.validation.hard_cases.case import HardCase, Outcome

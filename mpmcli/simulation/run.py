@@ -8,6 +8,7 @@ from typing import Literal
 
 from mpmcli import __version__
 from mpmcli.errors import MpmcliError, RunError
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, check_directory, prepare_directory
 from mpmcli.output.durable import write_text
 from mpmcli.scene import LoadedScene, scene_to_toml
@@ -15,7 +16,6 @@ from mpmcli.solver.backend import Arch, start_backend
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.plan import Plan, make_plan, require_room
 from mpmcli.solver.solver import Solver
-from mpmcli.stability.ledger import LedgerRow
 
 SCENE = "scene.toml"
 

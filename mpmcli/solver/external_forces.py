@@ -17,7 +17,7 @@ INSTANTS = 5
 MARGIN = 1.5
 
 
-class Drive:
+class ExternalForces:
     """Gravity and forces of a scene, and how strong they are.
 
     Attributes:

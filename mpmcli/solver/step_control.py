@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from mpmcli.scene import Scene
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.extremes import Extremes, build_extremes
 from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.state_bounds import Extremes, build_extremes
 from mpmcli.solver.step import SMALLEST_J, Pace
 from mpmcli.stability.limits import Limit, deformation_limit, mode_limit
 from mpmcli.stability.scheme import step_inertia
@@ -27,7 +27,7 @@ SLOW = 0.1
 EASING = 1.001
 
 
-class Watch:
+class StepControl:
     """What was last measured of each group of particles, and the bounds on the step that follow from it.
 
     Attributes:

@@ -1,0 +1,1 @@
+"""One run from a loaded scene to a stored result."""
