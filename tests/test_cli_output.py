@@ -189,6 +189,6 @@ def test_json_that_cannot_be_written_is_told(run_python):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with open("/dev/full", "w") as full:
         done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True, env=environment)
-    assert done.returncode == 1 and done.stderr.startswith("error: The JSON could not be written to stdout (No space")
+    assert done.returncode == 1 and done.stderr.startswith("error: The result could not be printed on stdout (No space")
     done = run_python(["-m", "mpmcli", "schema"], environment={"PYTHONIOENCODING": "ascii"})
     assert json.loads(done.stdout)["title"] == "Scene"

@@ -101,6 +101,14 @@ def test_kernels_are_kept_although_a_killed_process_left_its_lock(scene: Path) -
     assert len(list(lock.parent.glob("*.tic"))) > 3
 
 
+def buffered() -> dict[str, str]:
+    """Return the environment without PYTHONUNBUFFERED.
+
+    Buffered streams are flushed at exit, and Python changes the exit code to 120 where that fails.
+    """
+    return {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+
+
 @pytest.mark.parametrize("arguments", [[], ["--json"]])
 def test_a_reader_may_go_away(scene: Path, arguments: list[str]) -> None:
     """`mpmcli simulate ... 2>&1 | head -1`: the run goes on to its end."""
@@ -109,10 +117,22 @@ def test_a_reader_may_go_away(scene: Path, arguments: list[str]) -> None:
         [sys.executable, "-m", "mpmcli", "simulate", scene, "-o", scene.parent / "result", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
+        env=buffered(),
     ) as process:
         process.stdout.close()
         assert process.wait(timeout=120) == 0
     assert open_result(scene.parent / "result").record["status"] == "finished"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"), [(["--help"], 0), (["materials"], 0), (["schema"], 0), (["materials", "none"], 2)]
+)
+def test_a_closed_pipe_does_not_change_the_exit_code(arguments: list[str], status: int) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-m", "mpmcli", *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=buffered()
+    ) as process:
+        process.stdout.close()
+        assert process.wait(timeout=120) == status
 
 
 def test_threads_are_bounded(scene: Path) -> None:

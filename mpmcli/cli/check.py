@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mpmcli.cli.json_output import print_json
 from mpmcli.cli.options import json_option, plugin_option, set_option, threads_option
+from mpmcli.cli.streams import print_json
 
 if TYPE_CHECKING:
     from mpmcli.check.result_check import ResultCheck

@@ -2,8 +2,8 @@
 
 import click
 
-from mpmcli.cli.json_output import print_json
 from mpmcli.cli.options import json_option
+from mpmcli.cli.streams import print_json
 
 
 @click.command("doctor")

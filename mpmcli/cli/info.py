@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from mpmcli.cli.json_output import print_json
 from mpmcli.cli.options import json_option, plugin_option, set_option
+from mpmcli.cli.streams import print_json
 
 
 @click.command("info")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mpmcli.cli.json_output import print_json
 from mpmcli.cli.options import json_option, plugin_option
+from mpmcli.cli.streams import print_json
 
 if TYPE_CHECKING:
     from rich.console import Console

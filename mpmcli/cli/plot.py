@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from mpmcli.cli.json_output import print_json
 from mpmcli.cli.options import json_option, quiet_option
+from mpmcli.cli.streams import print_json
 
 DEFAULT = "ledger.png"
 # Begins what a picture of this command says of itself.

@@ -3,12 +3,14 @@
 import importlib
 import sys
 import traceback
+from contextlib import suppress
 from typing import Any, NoReturn
 
 import click
 
 from mpmcli import __version__
 from mpmcli.cli.interrupt import catch_interrupts, interrupt_came
+from mpmcli.cli.streams import flush_streams
 from mpmcli.errors import MpmcliError
 
 # Name of each command, the module that holds it, and its line in the help: so that help loads no module.
@@ -61,8 +63,8 @@ class LazyGroup(click.Group):
 def program(context: click.Context, debug: bool) -> None:
     """Turn a TOML scene into a reproducible particle dataset with the Material Point Method.
 
-    Text goes to stderr and JSON to stdout. Exit codes: 0 done; 1 done, with a finding; 2 bad input or
-    usage; 130 interrupted.
+    What a command was asked for goes to stdout; progress, warnings and errors go to stderr. Exit codes: 0 done;
+    1 done, with a finding; 2 bad input or usage; 130 interrupted.
     """
     context.obj = debug
     if context.invoked_subcommand is None:
@@ -72,7 +74,9 @@ def program(context: click.Context, debug: bool) -> None:
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line, `sys.argv` where no arguments are given, and exit with its code."""
-    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+    code = run(sys.argv[1:] if arguments is None else arguments)
+    flush_streams()
+    sys.exit(code)
 
 
 def run(arguments: list[str]) -> int:
@@ -85,23 +89,22 @@ def run(arguments: list[str]) -> int:
         result = program.main(arguments, prog_name="mpmcli", standalone_mode=False)
         return result if isinstance(result, int) else 0
     except click.ClickException as error:
-        click.echo(f"error: {_usage_sentence(error)}", err=True)
+        _print_error(f"error: {_usage_sentence(error)}")
         return 2
     except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted", err=True)
+        _print_error("interrupted")
         return INTERRUPTED
     except MpmcliError as error:
         if debug:
             traceback.print_exc()
-        click.echo(f"error: {error}", err=True)
+        _print_error(f"error: {error}")
         return error.exit_code
-    except BrokenPipeError:
-        # The reader of a pipe went away, which is its right.
-        sys.stderr.close()
+    except (BrokenPipeError, SystemExit):
+        # The reader of stdout or stderr has gone, as in `mpmcli materials | head -1`. click and rich exit then.
         return 0
     except Exception as error:
         if interrupt_came():
-            click.echo("interrupted", err=True)
+            _print_error("interrupted")
             return INTERRUPTED
         if debug:
             traceback.print_exc()
@@ -109,8 +112,14 @@ def run(arguments: list[str]) -> int:
         # On a bare machine a library of the system may be missing, which a package of ours loads.
         of_system = isinstance(error, ImportError) and not (error.name or "").startswith("mpmcli")
         whose = "mpmcli doctor says what is missing" if of_system else "a fault of mpmcli"
-        click.echo(f"error: {kind}: {error} ({whose}; --debug shows where)", err=True)
+        _print_error(f"error: {kind}: {error} ({whose}; --debug shows where)")
         return 1
+
+
+def _print_error(line: str) -> None:
+    """Print a line on stderr, where somebody still reads it."""
+    with suppress(OSError, ValueError):
+        click.echo(line, err=True)
 
 
 def _usage_sentence(error: click.ClickException) -> str:

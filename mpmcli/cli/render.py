@@ -6,8 +6,8 @@ from pathlib import Path
 import click
 
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
-from mpmcli.cli.json_output import print_json
 from mpmcli.cli.options import json_option, quiet_option
+from mpmcli.cli.streams import print_json
 
 MODES = ("dots", "surface", "fluid", "density")
 THEMES = ("light", "dark")

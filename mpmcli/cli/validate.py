@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import click
 
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
-from mpmcli.cli.json_output import print_json
 from mpmcli.cli.options import json_option, quiet_option
+from mpmcli.cli.streams import print_json
 
 if TYPE_CHECKING:
     from mpmcli.validation.case import Case, Level

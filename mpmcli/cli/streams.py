@@ -1,0 +1,67 @@
+"""What a command prints on stdout, and what becomes of the standard streams when a reader has gone."""
+
+import json
+import os
+import sys
+from typing import IO
+
+import click
+
+from mpmcli.errors import RunError
+from mpmcli.plain_json import finite_json
+
+
+def print_json(content: object) -> None:
+    """Print one JSON document on stdout; numbers that are not finite become null.
+
+    Raises:
+        RunError: stdout is closed, or cannot be written to, as on a full disk.
+    """
+    print_text(json.dumps(finite_json(content), indent=2, ensure_ascii=not _has_unicode(), allow_nan=False))
+
+
+def print_text(text: str) -> None:
+    """Print what a command was asked for on stdout, with a newline; a reader that has gone is no error.
+
+    Raises:
+        RunError: stdout is closed, or cannot be written to, as on a full disk.
+    """
+    try:
+        click.echo(text)
+        # click writes nothing, and raises nothing, where there is no stdout.
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _discard(sys.stdout)
+    except OSError as error:
+        _discard(sys.stdout)
+        raise RunError(f"The result could not be printed on stdout ({error.strerror}).") from error
+    except (AttributeError, ValueError) as error:
+        raise RunError("The result could not be printed, as stdout is closed.") from error
+
+
+def flush_streams() -> None:
+    """Flush stdout and stderr, and discard what cannot be written.
+
+    Python flushes both at exit, and changes the exit code to 120 where that fails.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, AttributeError, ValueError):
+            _discard(stream)
+
+
+def _has_unicode() -> bool:
+    """Return whether stdout encodes every character; JSON can escape those that it does not."""
+    return (getattr(sys.stdout, "encoding", None) or "").lower().replace("-", "") in ("utf8", "utf16", "utf32")
+
+
+def _discard(stream: IO[str] | None) -> None:
+    """Send what is buffered, and all that follows, to the null device."""
+    try:
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
+        stream.flush()
+    except (OSError, AttributeError, ValueError):
+        pass
