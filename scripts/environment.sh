@@ -1,5 +1,5 @@
 # Sourced by demo and test: makes .venv in this checkout, once, and installs the package into it.
-# Defines `prepare_environment EXTRA`, EXTRA being "" or the name of an extra of pyproject.toml.
+# Defines `require_libraries PACKAGE...` and `prepare_environment EXTRA`, EXTRA being "" or an extra of pyproject.toml.
 
 find_python() {
     local name
@@ -9,8 +9,52 @@ find_python() {
             return 0
         fi
     done
-    echo "mpmcli needs Python 3.11, 3.12 or 3.13, and none was found on the PATH: please install one." >&2
+    echo "mpmcli needs Python 3.11, 3.12 or 3.13, and none is on the PATH." >&2
     return 1
+}
+
+# Whether the system can load the shared library of a Debian package. Systems other than Linux bring theirs.
+has_library() {
+    local library
+    case $1 in
+        libx11-6) library=libX11.so.6 ;;
+        libvulkan1) library=libvulkan.so.1 ;;
+        libegl1) library=libEGL.so.1 ;;
+        *) package_installed "$1"; return ;;
+    esac
+    "$python" -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' "$library" 2>/dev/null
+}
+
+package_installed() {
+    ! command -v dpkg-query >/dev/null || dpkg-query -W -f='${Status}' "$1" 2>/dev/null | grep -q 'install ok installed'
+}
+
+install_packages() {
+    DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends "$@" </dev/null
+}
+
+# Looks for the system libraries of these Debian packages, before anything is downloaded. As root it installs what is
+# missing. Without libx11-6, which Taichi links, nothing runs; the others serve tests that are skipped without them.
+require_libraries() {
+    local python package log missing=()
+    [ "$(uname -s)" = Linux ] || return 0
+    python=$(find_python) || return 1
+    for package in "$@"; do
+        has_library "$package" || missing+=("$package")
+    done
+    [ ${#missing[@]} -eq 0 ] && return 0
+    if [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null; then
+        echo "Installing ${missing[*]} with apt-get." >&2
+        log=$(mktemp)
+        if { install_packages "${missing[@]}" || { apt-get update && install_packages "${missing[@]}"; }; } >"$log" 2>&1; then
+            rm -f "$log"
+            return 0
+        fi
+        echo "apt-get failed; its messages are in $log." >&2
+    fi
+    echo "System libraries are missing. On Debian and Ubuntu, install them with this line:" >&2
+    echo "    sudo apt-get update && sudo apt-get install -y --no-install-recommends ${missing[*]}" >&2
+    [ "${missing[0]}" != libx11-6 ] && echo "Tests that need them are skipped." >&2
 }
 
 make_venv() {
@@ -18,7 +62,7 @@ make_venv() {
     python=$(find_python) || return 1
     echo "Making .venv with $("$python" --version)." >&2
     if ! "$python" -m venv --clear .venv >&2; then
-        echo "Making .venv failed, see above (on Debian and Ubuntu the package python3-venv is needed)." >&2
+        echo "Making .venv failed, see above (Debian and Ubuntu need the package python3-venv)." >&2
         return 1
     fi
 }
@@ -37,7 +81,7 @@ prepare_environment() {
     [ "$(cat "$stamp_file" 2>/dev/null)" = "$stamp" ] && return 0
     # With the test extra installed, the package itself is installed too.
     [ -z "$extra" ] && [ "$(cat .venv/installed-test 2>/dev/null)" = "$stamp" ] && return 0
-    echo "Installing mpmcli and what it needs into .venv; this takes a minute or two the first time." >&2
+    echo "Installing mpmcli and its dependencies into .venv. The first time takes a minute or two." >&2
     if ! .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e "$target" >&2; then
         echo "Installing failed, see pip's message above; nothing outside .venv was changed." >&2
         return 1
