@@ -52,8 +52,8 @@ require_libraries() {
         fi
         echo "apt-get failed; its messages are in $log." >&2
     fi
-    echo "System libraries are missing. On Debian and Ubuntu, install them with this line:" >&2
-    echo "    sudo apt-get update && sudo apt-get install -y --no-install-recommends ${missing[*]}" >&2
+    echo "System libraries are missing. On Debian and Ubuntu, this line installs them (as root, or with sudo):" >&2
+    echo "    apt-get update && apt-get install -y --no-install-recommends ${missing[*]}" >&2
     [ "${missing[0]}" != libx11-6 ] && echo "Tests that need them are skipped." >&2
 }
 

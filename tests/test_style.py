@@ -5,12 +5,10 @@ import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from importlib.metadata import packages_distributions
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "mpmcli"
@@ -19,33 +17,19 @@ SOURCES = sorted([*MODULES, *(ROOT / "tests").rglob("*.py")])
 
 # Imports run downwards only, or within a level.
 LEVELS = {
-    "cli": 9,
-    "__main__": 9,
-    "dataset": 8,
-    "validation": 8,
-    "doctor": 8,
-    "plot": 8,
-    "render": 8,
-    "bench": 8,
-    "simulation": 7,
-    "check": 6,
-    "solver": 5,
-    "output": 4,
-    "stability": 3,
-    "boundaries": 3,
-    "materials": 3,
+    **dict.fromkeys(("cli", "__main__"), 8),
+    **dict.fromkeys(("dataset", "validation", "render", "plot", "bench", "doctor"), 7),
+    "simulation": 6,
+    "check": 5,
+    **dict.fromkeys(("solver", "output"), 4),
+    **dict.fromkeys(("boundaries", "materials", "stability"), 3),
     "frames": 2,
     "scene": 1,
-    "child_process": 0,
-    "cores": 0,
-    "errors": 0,
-    "plain_json": 0,
-    "plain_text": 0,
-    "__init__": 0,
+    **dict.fromkeys(("processes", "child_process", "cores", "errors", "plain_json", "plain_text", "__init__"), 0),
 }
 TAICHI_ROOMS = {"solver", "materials", "boundaries"}
-# These know frames and files, never the device state.
-WITHOUT_SOLVER = {"render", "plot", "output", "dataset"}
+# These know frames and files, never the device state; the solver knows no store.
+BARRED = {"solver": "output", "render": "solver", "plot": "solver", "output": "solver", "dataset": "solver"}
 HEAVY = {"taichi", "numpy", "h5py", "pydantic", "vtk", "vtkmodules", "pyvista", "meshio", "matplotlib", "PIL"}
 LINES_MAX = 400
 
@@ -60,14 +44,22 @@ def room_of(path: Path) -> str:
     return first.removesuffix(".py")
 
 
+def module_of(path: Path) -> str:
+    """Return the dotted name of a file of the package."""
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+MODULE_NAMES = {module_of(path) for path in MODULES}
+
+
 @cache
 def tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
 
 
 def imports(path: Path) -> Iterator[tuple[str, int]]:
-    """Yield (absolute dotted name, line) of everything a module imports, at any depth of its code."""
-    package = ("mpmcli", *path.relative_to(PACKAGE).parts[:-1])
+    """Yield (absolute dotted name, line) of everything a file imports, at any depth of its code."""
+    package = path.relative_to(ROOT).parts[:-1]
     for node in ast.walk(tree(path)):
         if isinstance(node, ast.Import):
             for alias in node.names:
@@ -87,6 +79,15 @@ def imported_rooms(path: Path) -> Iterator[tuple[str, int]]:
         # `from mpmcli import __version__` names an attribute of the package itself.
         is_room = len(parts) > 1 and ((PACKAGE / parts[1]).is_dir() or (PACKAGE / f"{parts[1]}.py").is_file())
         yield (parts[1] if is_room else "__init__"), line
+
+
+def imported_modules(path: Path) -> Iterator[str]:
+    """Yield the modules of the package that a module imports, at any depth of its code."""
+    for name, _ in imports(path):
+        for known in (name, name.rpartition(".")[0]):
+            if known in MODULE_NAMES:
+                yield known
+                break
 
 
 def calls(path: Path) -> Iterator[tuple[str, int]]:
@@ -111,48 +112,53 @@ def repository_files() -> list[Path]:
     return [path for path in paths if path.is_file()]
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_every_module_has_a_level(path: Path) -> None:
-    assert room_of(path) in LEVELS, f"{name_of(path)}: give its room a level in {Path(__file__).name}"
+def offenders(rule: Callable[[Path], Iterable[int]], paths: Iterable[Path] = MODULES) -> list[str]:
+    """Return "file:line" of every line that breaks a rule."""
+    return [f"{name_of(path)}:{line}" for path in paths for line in rule(path)]
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_imports_run_downwards(path: Path) -> None:
-    room = room_of(path)
-    for imported, line in imported_rooms(path):
-        assert LEVELS[imported] <= LEVELS[room], f"{name_of(path)}:{line}: {room} may not import {imported}"
-        upward = imported == "solver" and room in WITHOUT_SOLVER
-        assert not upward, f"{name_of(path)}:{line}: {room} knows frames and files, never the solver"
+def test_every_module_has_a_level() -> None:
+    unknown = [name_of(path) for path in MODULES if room_of(path) not in LEVELS]
+    assert not unknown, f"give their rooms a level in {Path(__file__).name}: {unknown}"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_taichi_is_imported_where_kernels_live_and_nowhere_else(path: Path) -> None:
-    lines = [line for name, line in imports(path) if name.split(".")[0] == "taichi"]
-    assert not lines or room_of(path) in TAICHI_ROOMS, f"{name_of(path)}:{lines[0]} imports taichi"
+def test_imports_run_downwards() -> None:
+    """Imports inside functions, and those for type checking, count too."""
+
+    def upward(path: Path) -> Iterator[int]:
+        room = room_of(path)
+        for imported, line in imported_rooms(path):
+            if LEVELS[imported] > LEVELS[room] or imported == BARRED.get(room):
+                yield line
+
+    assert not offenders(upward)
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_annotations_are_never_postponed(path: Path) -> None:
+def test_taichi_is_imported_where_kernels_live_and_nowhere_else() -> None:
+    def taichi(path: Path) -> Iterator[int]:
+        if room_of(path) not in TAICHI_ROOMS:
+            yield from (line for name, line in imports(path) if name.split(".")[0] == "taichi")
+
+    assert not offenders(taichi)
+
+
+def test_annotations_are_never_postponed() -> None:
     """Taichi reads annotations as objects: postponed ones are strings, and fail far from their cause."""
-    for node in ast.walk(tree(path)):
-        if isinstance(node, ast.ImportFrom) and node.module == "__future__":
-            assert "annotations" not in {alias.name for alias in node.names}, f"{name_of(path)}:{node.lineno}"
+
+    def postponed(path: Path) -> Iterator[int]:
+        yield from (line for name, line in imports(path) if name == "__future__.annotations")
+
+    assert not offenders(postponed, SOURCES)
 
 
 def test_taichi_starts_in_one_place() -> None:
     """A second ti.init kills every field of the first, so there is one call, in the backend."""
-    found = [
-        f"{name_of(path)}:{line}"
-        for path in MODULES
-        for name, line in calls(path)
-        if name in {"ti.init", "taichi.init"}
-    ]
+    found = offenders(lambda path: (line for name, line in calls(path) if name in {"ti.init", "taichi.init"}))
     assert len(found) == 1, found
     assert found[0].startswith("mpmcli/solver/backend.py:"), found
 
 
-@pytest.mark.parametrize("path", [p for p in MODULES if room_of(p) not in {"cli", "__main__"}], ids=name_of)
-def test_nothing_below_the_command_line_prints_or_exits(path: Path) -> None:
+def test_nothing_below_the_command_line_prints_or_exits() -> None:
     banned = {
         "print",
         "sys.exit",
@@ -163,25 +169,31 @@ def test_nothing_below_the_command_line_prints_or_exits(path: Path) -> None:
         "sys.stderr.write",
         "click.echo",
     }
-    # The worker is the main program of its own process; its answers on stdout are its protocol.
-    if path == PACKAGE / "bench" / "worker.py":
-        return
-    for name, line in calls(path):
-        assert name not in banned, f"{name_of(path)}:{line}: {name}() belongs in mpmcli/cli"
-    for node in ast.walk(tree(path)):
-        if isinstance(node, ast.Raise) and node.exc is not None:
-            assert "SystemExit" not in ast.unparse(node.exc), f"{name_of(path)}:{node.lineno}"
+
+    def speaks(path: Path) -> Iterator[int]:
+        # What runs as a process of its own answers on stdout.
+        if room_of(path) in {"cli", "__main__", "processes"} or path == PACKAGE / "bench" / "worker.py":
+            return
+        yield from (line for name, line in calls(path) if name in banned)
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.Raise) and node.exc is not None and "SystemExit" in ast.unparse(node.exc):
+                yield node.lineno
+
+    assert not offenders(speaks)
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_modules_stay_short(path: Path) -> None:
-    lines = len(path.read_text(encoding="utf-8").splitlines())
-    assert lines <= LINES_MAX, f"{name_of(path)} has {lines} lines: split it by what it does"
+def test_modules_stay_short() -> None:
+    long = [name_of(path) for path in MODULES if len(path.read_text(encoding="utf-8").splitlines()) > LINES_MAX]
+    assert not long, f"more than {LINES_MAX} lines; split them by what they do: {long}"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_modules_say_what_they_are(path: Path) -> None:
-    assert not path.read_text(encoding="utf-8").strip() or ast.get_docstring(tree(path)), name_of(path)
+def test_modules_say_what_they_are() -> None:
+    silent = [
+        name_of(path)
+        for path in MODULES
+        if path.read_text(encoding="utf-8").strip() and not ast.get_docstring(tree(path))
+    ]
+    assert not silent, f"without a docstring: {silent}"
 
 
 def test_every_imported_package_is_a_declared_dependency() -> None:
@@ -190,13 +202,15 @@ def test_every_imported_package_is_a_declared_dependency() -> None:
     # pydantic pins its core, and its documentation imports errors from there.
     declared = {name.lower().replace("_", "-") for name in declared} | {"pydantic-core"}
     distributions = packages_distributions()
-    for path in MODULES:
+
+    def undeclared(path: Path) -> Iterator[int]:
         for name, line in imports(path):
             package = name.split(".")[0]
-            if package == "mpmcli" or package in sys.stdlib_module_names:
-                continue
             owners = {owner.lower().replace("_", "-") for owner in distributions.get(package, [package])}
-            assert owners & declared, f"{name_of(path)}:{line}: {package} is not in pyproject.toml"
+            if package != "mpmcli" and package not in sys.stdlib_module_names and not owners & declared:
+                yield line
+
+    assert not offenders(undeclared)
 
 
 def test_no_file_names_a_package_registry() -> None:
