@@ -43,7 +43,7 @@ def fall(backend: Backend) -> dict:
         "speeds": [float(v) for v in (last.velocity[:, 1].min(), last.velocity[:, 1].max())],
         "courant": float(row.courant_max),
         "step_max": float(row.step_max),
-        "last": solver._last_step,
+        "last": solver.last_step,
     }
 
 

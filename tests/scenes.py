@@ -75,7 +75,7 @@ def restart(solver: Solver, sample: BodyParticles, end: float) -> None:
         values.fill(variable.at_rest)
     group.id.from_numpy(np.arange(group.count, dtype=np.int32))
     solver.scene = solver.scene.model_copy(update={"time": solver.scene.time.model_copy(update={"end": end})})
-    solver.time, solver.step_count, solver._last_step = 0.0, 0, 0.0
+    solver.time, solver.step_count, solver.last_step = 0.0, 0, 0.0
     # What only a new Solver sets: no particle is lost.
     solver._kernels.lost.fill(NOT_LOST)
     solver.state_was_replaced()
@@ -84,9 +84,9 @@ def restart(solver: Solver, sample: BodyParticles, end: float) -> None:
 
 def sums(solver: Solver) -> dict:
     """Return what the ledger sums at this moment, in float64."""
-    seen = [observe(solver._last_step, stress=False) for observe in solver._observe]
+    seen = [observe(solver.last_step, stress=False) for observe in solver._observe]
     gravity = np.array(solver.scene.domain.gravity)
-    return measure([read_group(group) for group in solver.groups], seen, gravity, solver.spacing, solver._last_step)
+    return measure([read_group(group) for group in solver.groups], seen, gravity, solver.spacing, solver.last_step)
 
 
 def total_energy(solver: Solver) -> float:

@@ -17,7 +17,7 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.plan import make_plan
 from mpmcli.solver.snapshot import read_group
 from mpmcli.solver.solver import Solver
-from mpmcli.stability.scheme import step_inertia
+from mpmcli.stability.transfer_factors import step_inertia
 
 H = 0.1
 

@@ -8,7 +8,7 @@ import pytest
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene
 from mpmcli.solver.solver import Solver
-from mpmcli.stability.scheme import loss_per_step
+from mpmcli.stability.transfer_factors import loss_per_step
 from mpmcli.validation.cases.bar import LENGTH, PERIODS, Bar
 from mpmcli.validation.setting import Setting
 

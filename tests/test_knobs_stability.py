@@ -9,7 +9,7 @@ from step_spectrum import Choice, Coupling, free, periodic, radius, step_matrix
 
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.stability.limits import mode_limit
-from mpmcli.stability.scheme import loss_per_step, step_inertia
+from mpmcli.stability.transfer_factors import loss_per_step, step_inertia
 from mpmcli.validation.blow_up import Trial
 from mpmcli.validation.blow_up_scenes import alone, block, liquid, solid
 

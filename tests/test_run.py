@@ -110,7 +110,7 @@ class FakeSolver:
 
     def __init__(self, *_: object, force: bool) -> None:
         self.particle_count, self.step_count = 1, 0
-        self.first_step_seconds = self.frame_seconds = self.watch_seconds = 0.0
+        self.first_step_seconds = self.frame_seconds = self.measure_seconds = 0.0
         self.laws = ("fluid",)
 
     def frames(self, stop):

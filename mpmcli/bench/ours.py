@@ -74,7 +74,7 @@ class Ours:
     @property
     def watch_seconds(self) -> float:
         """Wall time spent so far on measuring the state."""
-        return self._solver.watch_seconds
+        return self._solver.measure_seconds
 
     def step(self) -> None:
         """Advance by one step, as `frames` does: of the case's size, unless the limits ask for less."""
@@ -85,7 +85,7 @@ class Ours:
     def sync(self) -> None:
         """Wait until every step asked for is done; on the CPU each step has waited by itself."""
         if self._waits:
-            self._solver.watch(self._dt)
+            self._solver.measure_state(self._dt)
 
     def positions(self) -> np.ndarray:
         """Return where the particles are, (particles, dimension), m, in the order they started in."""

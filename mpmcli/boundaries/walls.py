@@ -86,7 +86,7 @@ class Walls:
             inside = rest == 0
             low = grid.box[0, axis]
             if inside and node[axis] >= low and node[axis] < low + grid.box[1, axis]:
-                value = self.pulled(grid.nodes[grid.first_node(node)], gravity_step)
+                value = self.pulled(grid.nodes[grid.linear_index(node)], gravity_step)
                 if ti.static(self.crossed[axis]):
                     # What other walls fold onto this node is pressed or pulled with it.
                     depth, mirror, upper_side = self.place(node)
@@ -138,9 +138,9 @@ class Walls:
         """
         total = ti.Vector.zero(float, grid.width)
         for images in range(ti.static(2**self.dimension)):
-            if self.mirrored(images, acts, depth):
+            if self.has_image(images, acts, depth):
                 value = self.pulled(grid.nodes[self.image(grid, node, mirror, images)], gravity_step)
-                total += self.flip(value, images, upper)
+                total += self.mirrored(value, images, upper)
         return total
 
     @ti.func
@@ -156,8 +156,8 @@ class Walls:
         """Return the momentum from before stress and forces of a node with those of its images behind the walls."""
         total = ti.Vector.zero(float, grid.width)
         for images in range(ti.static(2**self.dimension)):
-            if self.mirrored(images, acts, depth):
-                total += self.flip(grid.before[self.image(grid, node, mirror, images)], images, upper)
+            if self.has_image(images, acts, depth):
+                total += self.mirrored(grid.before[self.image(grid, node, mirror, images)], images, upper)
         return total
 
     @ti.func
@@ -214,8 +214,8 @@ class Walls:
                         if inward < 0:
                             velocity[a] = 0.0
                 for images in range(ti.static(2**d)):
-                    if self.mirrored(images, acts, depth):
-                        grid.nodes[self.image(grid, node, mirror, images)] = self.flip(velocity, images, upper)
+                    if self.has_image(images, acts, depth):
+                        grid.nodes[self.image(grid, node, mirror, images)] = self.mirrored(velocity, images, upper)
                 if ti.static(grid.scheme.keeps_before):
                     # As the mirror images have it, so that a wall that acts changes nothing but what stress does.
                     before = self.folded_before(grid, node, mirror, acts, depth, upper) / total[d]
@@ -223,12 +223,12 @@ class Walls:
                         if acts[a] == 1 and depth[a] == 0:
                             before = self.stop(before, a, upper[a])
                     for images in range(ti.static(2**d)):
-                        if self.mirrored(images, acts, depth):
-                            grid.before[self.image(grid, node, mirror, images)] = self.flip(before, images, upper)
+                        if self.has_image(images, acts, depth):
+                            grid.before[self.image(grid, node, mirror, images)] = self.mirrored(before, images, upper)
         return owned
 
     @ti.func
-    def mirrored(self, images: int, acts: ti.template(), depth: ti.template()):
+    def has_image(self, images: int, acts: ti.template(), depth: ti.template()):
         """Return whether the node has an image mirrored in exactly the axes of the bit set `images`."""
         exists = True
         for a in ti.static(range(self.dimension)):
@@ -242,7 +242,7 @@ class Walls:
         for a in ti.static(range(self.dimension)):
             if images >> a & 1 == 1:
                 place[a] = mirror[a]
-        return grid.first_node(place)
+        return grid.linear_index(place)
 
     @ti.func
     def face_is(self, word: ti.template(), axis: ti.template(), upper: int):
@@ -257,7 +257,7 @@ class Walls:
         return result
 
     @ti.func
-    def flip(self, value: ti.template(), images: int, upper: ti.template()):
+    def mirrored(self, value: ti.template(), images: int, upper: ti.template()):
         """Return momentum or velocity mirrored: the normal part always, the rest where the wall sticks."""
         result = value
         for a in ti.static(range(self.dimension)):

@@ -40,7 +40,7 @@ class ZeroedWalls:
         What nodes hold from before stress and forces is not stopped: FLIP's change is that by the wall, too.
         """
         d = ti.static(self.dimension)
-        index = grid.first_node(node)
+        index = grid.linear_index(node)
         value = grid.nodes[index]
         mass = value[d]
         if mass > 0:

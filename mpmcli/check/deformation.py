@@ -4,7 +4,7 @@ import numpy as np
 
 
 def deformation_rate(C: np.ndarray, *, keeps_J: bool) -> np.ndarray:
-    """Return what bounds the change of what particles store, (n,), 1/s; the solver has it in `solver.extremes`.
+    """Return what bounds the change of what particles store, (n,), 1/s; the solver has it in `solver.state_bounds`.
 
     For F the largest row sum of |C + C^T| / 2, as a rotation deforms nothing. For J, which grows by det(I + dt C) =
     1 + dt tr C + dt^2 m + ..., |tr C| + sqrt(-m) where m, the sum of the principal minors of order two, is negative.

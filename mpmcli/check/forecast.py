@@ -12,7 +12,7 @@ from mpmcli.scene import Scene, scene_to_toml
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.plan import Plan
 from mpmcli.solver.solver import POSITION_ERROR
-from mpmcli.stability.scheme import loss_per_step
+from mpmcli.stability.transfer_factors import loss_per_step
 
 # Bytes of a packed file beside its particles, measured on files of 51 to 151 frames in 2D and 3D: the headers of
 # its data sets, and per frame the tables of steps and ledger without momenta.

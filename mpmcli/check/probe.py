@@ -58,7 +58,7 @@ def probe_scene(loaded: LoadedScene, *, arch: Arch = "auto", threads: int | None
         warm = time.perf_counter()
         for _ in range(WARM_UP):
             _advance(solver)
-        solver.watch(0.0)
+        solver.measure_state(0.0)
         compiled += time.perf_counter() - warm
         since = time.perf_counter()
         while steps == 0 or (spent < seconds and solver.time < scene.time.end):
@@ -66,7 +66,7 @@ def probe_scene(loaded: LoadedScene, *, arch: Arch = "auto", threads: int | None
             steps += 1
             spent = time.perf_counter() - since
         # A GPU answers only here.
-        solver.watch(0.0)
+        solver.measure_state(0.0)
         spent = time.perf_counter() - since
     except UnstableRunError as error:
         failure = str(error)

@@ -14,7 +14,7 @@ from mpmcli.scene.bounds import body_points
 from mpmcli.scene.initial import initial_motion, moves_unevenly
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.stability.limits import FIX, WHY, deformation_limit, mode_limit, speed_limit
-from mpmcli.stability.scheme import step_inertia
+from mpmcli.stability.transfer_factors import step_inertia
 
 # In an impact a cell stops on one side while matter comes in on the other from two nodes: two speeds per cell.
 IMPACT_GRADIENT = 2.0

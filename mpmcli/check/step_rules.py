@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import wave_loss
-from mpmcli.stability.scheme import step_inertia
+from mpmcli.stability.transfer_factors import step_inertia
 
 # A step this much smaller than the stable one costs four times the time and loses four times the energy (H19).
 SMALL_STEP = 0.25

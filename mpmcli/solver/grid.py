@@ -9,7 +9,7 @@ import numpy as np
 import taichi as ti
 
 if TYPE_CHECKING:
-    from mpmcli.solver.scheme import Scheme
+    from mpmcli.solver.transfer_scheme import TransferScheme
 
 # Nodes beyond each wall: ghost nodes that the wall folds, and the reach of the kernel.
 PAD = 3
@@ -55,7 +55,9 @@ class Grid:
         box: (2, d) ints: first node in use and number of nodes in use, per axis.
     """
 
-    def __init__(self, dimension: int, spacing: float, cells: tuple[int, ...], width: int, scheme: "Scheme") -> None:
+    def __init__(
+        self, dimension: int, spacing: float, cells: tuple[int, ...], width: int, scheme: "TransferScheme"
+    ) -> None:
         self.dimension = dimension
         self.width = width
         self.spacing = spacing
@@ -93,7 +95,7 @@ class Grid:
             self.before[node] = ti.Vector.zero(float, self.width)
 
     @ti.func
-    def first_node(self, base: ti.template()):
+    def linear_index(self, base: ti.template()):
         """Return the linear index of the node at the integer coordinates `base`."""
         index = 0
         for a in ti.static(range(self.dimension)):

@@ -24,8 +24,9 @@ class ParticleGroup:
         x: position relative to the origin of the domain, (n) Vector(d), m.
         v: velocity, (n) Vector, m/s, as wide as a node of the grid; the first d entries count.
         gradient: of the velocity, (n) matrix of d rows as wide, 1/s: row a holds dv/dx_a, the transpose of C.
-        departure: what the deformation is beyond rest: J - 1, (n), or F - I, (n) matrix of d rows as wide as a node, as
-            the law says. A step adds strains of 1e-6 and less: to 1 they would be rounded off in single precision.
+        displacement_gradient: F - I, (n) matrix of d rows, each as wide as a node; None where the law keeps J.
+        J_minus_1: J - 1, (n); None where the law keeps F. Both are stored as the difference from rest: a step adds
+            strains of 1e-6 and less, which single precision would round off next to 1.
         internal: the law's internal variables, (n) each.
         id: (n) int, row of the particle in every frame.
         body: (n) int, place in `bodies`; None where the group has one body.
@@ -54,10 +55,9 @@ class ParticleGroup:
         self.x = ti.Vector.field(d, float, shape=n, layout=layout)
         self.v = ti.Vector.field(width, float, shape=n, layout=layout)
         self.gradient = ti.Matrix.field(d, width, float, shape=n, layout=layout)
-        if law.deformation == "F":
-            self.departure = ti.Matrix.field(d, width, float, shape=n, layout=layout)
-        else:
-            self.departure = ti.field(float, shape=n)
+        keeps_F = law.deformation == "F"
+        self.displacement_gradient = ti.Matrix.field(d, width, float, shape=n, layout=layout) if keeps_F else None
+        self.J_minus_1 = None if keeps_F else ti.field(float, shape=n)
         self.internal = tuple(ti.field(float, shape=n) for _ in law.internal)
         self.id = ti.field(int, shape=n)
         self.several = len(self.bodies) > 1
@@ -94,7 +94,8 @@ class ParticleGroup:
     def state(self) -> tuple[ti.Field, ...]:
         """Every real field that the sort must move."""
         initial = () if self.initial is None else (self.initial,)
-        return (self.x, self.v, self.gradient, self.departure, *self.internal, *initial)
+        deformation = self.J_minus_1 if self.displacement_gradient is None else self.displacement_gradient
+        return (self.x, self.v, self.gradient, deformation, *self.internal, *initial)
 
     @property
     def labels(self) -> tuple[ti.Field, ...]:
@@ -123,18 +124,18 @@ class ParticleGroup:
 
     def set_deformation(self, deformation: np.ndarray) -> None:
         """Set J, (n,), or F, (n, d, d), of all particles, in the solver's order."""
-        if deformation.ndim == 3:
-            departure = np.zeros((self.count, self.dimension, self.departure.m), self.real)
-            departure[:, :, : self.dimension] = deformation - np.eye(self.dimension)
+        if self.displacement_gradient is None:
+            self.J_minus_1.from_numpy((deformation - 1).astype(self.real))
         else:
-            departure = (deformation - 1).astype(self.real)
-        self.departure.from_numpy(departure)
+            values = np.zeros((self.count, self.dimension, self.displacement_gradient.m), self.real)
+            values[:, :, : self.dimension] = deformation - np.eye(self.dimension)
+            self.displacement_gradient.from_numpy(values)
 
     def deformation_to_numpy(self) -> np.ndarray:
         """Return J, (n,), or F, (n, d, d), in the solver's order."""
-        values = self.departure.to_numpy()
-        if values.ndim == 1:
-            return 1 + values
+        if self.displacement_gradient is None:
+            return 1 + self.J_minus_1.to_numpy()
+        values = self.displacement_gradient.to_numpy()
         return np.eye(self.dimension, dtype=self.real) + values[:, :, : self.dimension]
 
     @ti.func
@@ -144,10 +145,10 @@ class ParticleGroup:
             F = ti.Matrix.identity(float, self.dimension)
             for i in ti.static(range(self.dimension)):
                 for j in ti.static(range(self.dimension)):
-                    F[i, j] += self.departure[p][i, j]
+                    F[i, j] += self.displacement_gradient[p][i, j]
             return F
         else:
-            return 1.0 + self.departure[p]
+            return 1.0 + self.J_minus_1[p]
 
     @ti.func
     def inner(self, p: int):
@@ -165,9 +166,9 @@ class ParticleGroup:
         if ti.static(self.law.deformation == "F"):
             for i in ti.static(range(self.dimension)):
                 for j in ti.static(range(self.dimension)):
-                    self.departure[p][i, j] += change[i, j]
+                    self.displacement_gradient[p][i, j] += change[i, j]
         else:
-            self.departure[p] += change
+            self.J_minus_1[p] += change
         for i in ti.static(range(len(self.internal))):
             self.internal[i][p] = inner[i]
 

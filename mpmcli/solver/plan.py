@@ -16,7 +16,7 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import Grid, node_width, tile_edge
 from mpmcli.solver.ordering import TileOrder
-from mpmcli.solver.scheme import scheme_of
+from mpmcli.solver.transfer_scheme import scheme_of
 
 # Taichi addresses fields with 32-bit integers, and a particle has at most 3 x 4 numbers in one field.
 LARGEST_INDEX = 2**31 - 1

@@ -149,7 +149,7 @@ def measure(
     is second order in the step; with the positions as they are it would swing by v dt/2 times the force.
 
     Args:
-        moment: D / h^2, see `stability.scheme.affine_moment`.
+        moment: D / h^2, see `stability.transfer_factors.affine_moment`.
 
     Returns:
         The entries of a `LedgerRow` that belong to the state alone, by name, summed in float64.

@@ -23,12 +23,12 @@ from mpmcli.solver.observe import build_observation
 from mpmcli.solver.ordering import SortBuffers, TileOrder, build_sort
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.plan import members_of
-from mpmcli.solver.scheme import scheme_of
 from mpmcli.solver.snapshot import STRESSES, Snapshot, build_frame, measure, read_group
 from mpmcli.solver.step import NOT_LOST, build_step
 from mpmcli.solver.step_control import StepControl
+from mpmcli.solver.transfer_scheme import scheme_of
 from mpmcli.stability.limits import Limit, force_limit, speed_limit
-from mpmcli.stability.scheme import affine_moment
+from mpmcli.stability.transfer_factors import affine_moment
 
 # Largest rounding of a stored position, in cells.
 POSITION_ERROR = 1e-3
@@ -113,7 +113,7 @@ class Solver:
         self._initial = None
         if "initial_position" in scene.output.fields:
             self._initial = np.concatenate([b.position if b.initial is None else b.initial for b in particles])
-        self._drive = ExternalForces(scene, self.groups, backend)
+        self._external_forces = ExternalForces(scene, self.groups, backend)
         self.grid = Grid(scene.dimension, self.spacing, scene.domain.cells, width, scheme_of(scene.solver))
         kind = ZeroedWalls if scene.solver.walls == "zeroed" else Walls
         walls = kind(scene.domain.walls.faces(scene.dimension), PAD, self.grid.cells, self.grid.shape)
@@ -127,32 +127,36 @@ class Solver:
             walls,
             self.groups,
             orders,
-            self._drive.gravity,
+            self._external_forces.gravity,
             on_cpu=backend.on_cpu,
             drift=math.ceil(self._drift_allowed),
         )
         self._observe = [build_observation(group) for group in self.groups]
-        self._last_step = 0.0
+        self.last_step = 0.0
         self._drift = math.inf
-        self._watch = StepControl(scene, self.groups, backend)
-        self._speed = self._watch.speed
-        self._drive.measure(0.0, 0.0)
+        self._step_control = StepControl(scene, self.groups, backend)
+        self._speed = self._step_control.speed
+        self._external_forces.measure(0.0, 0.0)
         # Once more, with the step that says how far ahead the next measurement is.
-        self._drive.measure(0.0, self._watch.longest * self.stable_step()[0])
+        self._external_forces.measure(0.0, self._step_control.longest * self.stable_step()[0])
         self._first_stable_step = self.stable_step()[0]
 
     def limits(self) -> list[Limit]:
         """Return every bound on the next step: of the speed as it is, of the rest as last measured."""
-        return [*self._fast_limits(), *self._watch.limits()]
+        return [*self._fast_limits(), *self._step_control.limits()]
 
     def _fast_limits(self) -> list[Limit]:
-        speed = Limit(speed_limit(self.spacing, self._speed, self._drive.pull(self.time)), "speed", "")
-        return [speed, Limit(force_limit(self._drive.slope), "force", "")] if self._drive.pushes else [speed]
+        speed = Limit(speed_limit(self.spacing, self._speed, self._external_forces.pull(self.time)), "speed", "")
+        return (
+            [speed, Limit(force_limit(self._external_forces.slope), "force", "")]
+            if self._external_forces.pushes
+            else [speed]
+        )
 
     @property
     def nearest_limit(self) -> Limit:
         """The smallest bound on the next step."""
-        return min(self._watch.nearest, *self._fast_limits())
+        return min(self._step_control.nearest, *self._fast_limits())
 
     def stable_step(self) -> tuple[float, Limit]:
         """Return the step to take, safety included, and the bound that sets it."""
@@ -179,34 +183,34 @@ class Solver:
             self._drift = 0.0
         # Velocities live in the middle of steps: they move on from that of the last one to that of this one, at the
         # start by half a step. A kick longer than dt / safety^2 might be unstable: kick dt <= (dt / safety)^2.
-        kick = min(0.5 * (self._last_step + dt), dt / self.scene.time.safety**2)
-        pull = self._drive.pull(self.time)
-        self._drive.begin_step(self.time)
-        pace = self._kernels.step(dt, kick)
+        kick = min(0.5 * (self.last_step + dt), dt / self.scene.time.safety**2)
+        pull = self._external_forces.pull(self.time)
+        self._external_forces.begin_step(self.time)
+        result = self._kernels.step(dt, kick)
         self.time += dt
-        self._last_step = dt
+        self.last_step = dt
         self.step_count += 1
         if self.step_count == 1:
             self.first_step_seconds = time.perf_counter() - began
-        if pace is not None:
-            if not pace.speed >= 0:
+        if result is not None:
+            if not result.speed >= 0:
                 self._stop(dt)
-            self._speed = pace.speed
+            self._speed = result.speed
         else:
             # Not read back: what is known of it is what pulls from outside.
             self._speed += kick * pull
         self.courant = dt * self._speed / self.spacing
         # Whatever else pushes on a GPU is allowed to double the speed; `advance` flags what went further.
-        unseen = 2 * self.courant + UNSEEN if pace is None else 0.0
+        unseen = 2 * self.courant + UNSEEN if result is None else 0.0
         self._drift += max(self.courant, unseen)
-        due = self._watch.after_step(dt, self.courant, pace)
+        due = self._step_control.after_step(dt, self.courant, result)
         blind = unseen > 0 and self._drift + unseen >= self._drift_allowed
         if blind:
-            self.watch(dt)
+            self.measure_state(dt)
         elif due:
-            self.watch(dt, due)
+            self.measure_state(dt, due)
 
-    def watch(self, dt: float, due: Sequence[int] | None = None) -> None:
+    def measure_state(self, dt: float, due: Sequence[int] | None = None) -> None:
         """Measure the device's state, and the limits with it.
 
         Args:
@@ -219,23 +223,23 @@ class Solver:
         # On the CPU every step says so itself.
         if not self.backend.on_cpu and self._kernels.any_lost():
             self._stop(dt)
-        if not self._watch.measure(due):
+        if not self._step_control.measure(due):
             # Crushed or inverted by the last step: the next one would have refused to scatter it.
             self._stop(dt)
-        self._drive.measure(self.time, self._watch.longest * dt)
+        self._external_forces.measure(self.time, self._step_control.longest * dt)
         # Otherwise the fastest node of the last step bounds the speeds of all.
-        if self._watch.fresh:
-            self._speed = self._watch.speed
+        if self._step_control.fresh:
+            self._speed = self._step_control.speed
 
     @property
-    def watch_seconds(self) -> float:
+    def measure_seconds(self) -> float:
         """Wall time spent so far on measuring the state for the limits."""
-        return self._watch.seconds
+        return self._step_control.seconds
 
     def state_was_replaced(self) -> None:
         """Sort and measure particles whose state was set from outside, as tests and benchmarks do."""
         self._drift = math.inf
-        self.watch(self._last_step)
+        self.measure_state(self.last_step)
 
     def _stop(self, dt: float) -> None:
         for group, lost in zip(self.groups, self._kernels.lost.to_numpy(), strict=True):
@@ -303,7 +307,7 @@ class Solver:
                 if stop():
                     raise KeyboardInterrupt
             self.time = target
-            self.watch(dt)
+            self.measure_state(dt)
             yield self.frame(index, taken)
 
     def frame(self, index: int, taken: list[tuple[float, float, str]]) -> tuple[Frame, LedgerRow]:
@@ -311,7 +315,7 @@ class Solver:
         began = time.perf_counter()
         snapshots = [read_group(group) for group in self.groups]
         stress = any(name in STRESSES for name in self.scene.output.fields)
-        seen = [observe(self._last_step, stress=stress) for observe in self._observe]
+        seen = [observe(self.last_step, stress=stress) for observe in self._observe]
         frame = build_frame(
             snapshots,
             seen,
@@ -323,8 +327,8 @@ class Solver:
             self.time,
             self.step_count,
         )
-        gravity, moment = self._drive.gravity_at(self.time), affine_moment(self.scene.solver)
-        sums = measure(snapshots, seen, gravity, self.spacing, self._last_step, moment)
+        gravity, moment = self._external_forces.gravity_at(self.time), affine_moment(self.scene.solver)
+        sums = measure(snapshots, seen, gravity, self.spacing, self.last_step, moment)
         smallest = min(taken, default=(0.0, 0.0, ""))
         row = LedgerRow(
             time=self.time,

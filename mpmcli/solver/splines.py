@@ -3,7 +3,7 @@
 import taichi as ti
 
 from mpmcli.solver.grid import PAD
-from mpmcli.stability.scheme import INVERSE_MOMENT
+from mpmcli.stability.transfer_factors import INVERSE_MOMENT
 
 
 @ti.data_oriented

@@ -11,7 +11,7 @@ from mpmcli.solver.ordering import CHUNK, share_start
 from mpmcli.solver.particles import ParticleGroup
 
 # Of the smallest values the negative is kept, so that all are maxima.
-SPEED_SQUARED, GRADIENT, J_MAX, MINUS_J_MIN, STRETCH_SQUARED = range(5)
+SPEED_SQUARED, RATE, J_MAX, MINUS_J_MIN, STRETCH_SQUARED = range(5)
 ENTRIES = 5
 NOTHING = -1e30
 # Workers of a measurement on a GPU, each with every so-manieth particle.
@@ -19,17 +19,17 @@ GPU_WORKERS = 16384
 
 
 @dataclass(frozen=True)
-class Extremes:
-    """Extremes over all particles of one law.
+class StateBounds:
+    """Largest and smallest values over all particles of one law.
 
     Attributes:
         speed: largest speed, m/s.
-        gradient: bound on the rate of deformation, 1/s (see `deformation_rate`).
+        deformation_rate: bound on the rate of deformation, 1/s (see `deformation_rate`).
         bound: range of J, of stretches and of the internal variables.
     """
 
     speed: float
-    gradient: float
+    deformation_rate: float
     bound: StateBound
 
 
@@ -103,12 +103,12 @@ class Measurement:
     """Compiled measurements of a group.
 
     Attributes:
-        state: () -> extremes of everything.
+        state: () -> bounds of everything.
         internal: () -> (smallest, largest) value of each internal variable, by name: for laws that harden, whose
             stiffness follows these variables far more closely than anything else.
     """
 
-    state: Callable[[], Extremes]
+    state: Callable[[], StateBounds]
     internal: Callable[[], dict[str, tuple[float, float]]]
 
 
@@ -121,7 +121,7 @@ def entries(group: ParticleGroup) -> int:
 def widen_motion(own: ti.template(), v: ti.template(), rate: float):
     """Raise maxima to those of a particle that moves by v, m/s, and deforms at this rate, 1/s."""
     own[SPEED_SQUARED] = ti.max(own[SPEED_SQUARED], v.norm_sqr())
-    own[GRADIENT] = ti.max(own[GRADIENT], rate)
+    own[RATE] = ti.max(own[RATE], rate)
 
 
 @ti.func
@@ -149,18 +149,18 @@ def widen_internal(group: ti.template(), own: ti.template(), p: int, first: ti.t
         own[first + 2 * i + 1] = ti.max(own[first + 2 * i + 1], -value)
 
 
-def extremes_of(group: ParticleGroup, maxima: Sequence[float]) -> Extremes:
-    """Return the extremes that the maxima of all particles stand for."""
+def state_bounds_of(group: ParticleGroup, maxima: Sequence[float]) -> StateBounds:
+    """Return the bounds that the maxima of all particles stand for."""
     internal = _ranges(group, maxima[ENTRIES:])
     bound = StateBound(-maxima[MINUS_J_MIN], maxima[J_MAX], maxima[STRETCH_SQUARED], internal)
-    return Extremes(maxima[SPEED_SQUARED] ** 0.5, maxima[GRADIENT], bound)
+    return StateBounds(maxima[SPEED_SQUARED] ** 0.5, maxima[RATE], bound)
 
 
 def _ranges(group: ParticleGroup, maxima: Sequence[float]) -> dict[str, tuple[float, float]]:
     return {v.name: (-maxima[2 * i + 1], maxima[2 * i]) for i, v in enumerate(group.law.internal)}
 
 
-def build_extremes(group: ParticleGroup, backend: Backend) -> Measurement:
+def build_measurement(group: ParticleGroup, backend: Backend) -> Measurement:
     """Compile-ready measurements of a group."""
 
     @ti.func
@@ -175,7 +175,7 @@ def build_extremes(group: ParticleGroup, backend: Backend) -> Measurement:
 
     state = build_maxima(group.count, entries(group), widen_all, backend)
     internal = build_maxima(group.count, 2 * len(group.internal), widen_inner, backend)
-    return Measurement(lambda: extremes_of(group, state()), lambda: _ranges(group, internal()))
+    return Measurement(lambda: state_bounds_of(group, state()), lambda: _ranges(group, internal()))
 
 
 def build_maxima(count: int, size: int, widen: Callable, backend: Backend) -> Callable[[], list[float]]:
@@ -184,7 +184,7 @@ def build_maxima(count: int, size: int, widen: Callable, backend: Backend) -> Ca
         return list
     vector = ti.types.vector(size, float)
     found = ti.field(float, shape=size)
-    # Each worker keeps its own extremes and merges them once: an atomic per particle costs more than the rest.
+    # Each worker keeps its own maxima and merges them once: an atomic per particle costs more than the rest.
     workers = CHUNK * backend.threads if backend.on_cpu else GPU_WORKERS
     on_cpu = backend.on_cpu
 

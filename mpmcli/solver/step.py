@@ -13,10 +13,10 @@ from mpmcli.solver.ordering import CHUNK, TileOrder, share_start
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.state_bounds import (
     NOTHING,
-    Extremes,
+    StateBounds,
     deformation_rate,
     entries,
-    extremes_of,
+    state_bounds_of,
     volume_growth,
     volume_ratio,
     widen_motion,
@@ -30,18 +30,18 @@ SMALLEST_J = 1e-6
 
 
 @dataclass(frozen=True)
-class Pace:
+class StepResult:
     """How fast the state changed in a step.
 
     Attributes:
         speed: largest speed of a node, m/s, which no particle exceeds; -1 where a particle was lost.
-        gradients: of each group, the largest rate of deformation, 1/s (see `deformation_rate`).
-        extremes: of each group that hardens, the extremes of its state; None of the others, which change less.
+        deformation_rates: of each group, the largest rate of deformation, 1/s (see `deformation_rate`).
+        state_bounds: of each group that hardens, the bounds of its state; None of the others, which change less.
     """
 
     speed: float
-    gradients: list[float]
-    extremes: list[Extremes | None]
+    deformation_rates: list[float]
+    state_bounds: list[StateBounds | None]
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class StepKernels:
         any_lost: () -> whether there is one.
     """
 
-    step: Callable[[float, float], Pace | None]
+    step: Callable[[float, float], StepResult | None]
     find_box: Callable[[], None]
     lost: ti.Field
     any_lost: Callable[[], bool]
@@ -85,7 +85,7 @@ def build_step(
     threads = orders[0].threads
     pairs = tuple(zip(range(len(groups)), groups, orders, strict=True))
     fastest = ti.field(float, shape=())
-    # What is read back of each group: its rate of deformation, and all extremes where it hardens.
+    # What is read back of each group: its rate of deformation, and all bounds where it hardens.
     sharpest = tuple(ti.field(float, shape=()) for _ in groups)
     hardens = tuple(group.law.hardening > 0 for group in groups)
     farthest = tuple(
@@ -129,10 +129,10 @@ def build_step(
             for c in ti.static(range(group.v.n)):
                 group.gradient[p][a, c] = gradient[a, c]
         # Here, where C is at hand, it takes half the time that it would take at the end.
-        pace = deformation_rate(group, C)
+        rate_now = deformation_rate(group, C)
         if ti.static(group.law.deformation == "F"):
             # F - I grows by dt C + dt C (F - I).
-            old = group.departure[p]
+            old = group.displacement_gradient[p]
             new = old
             for i in ti.static(range(d)):
                 for k in ti.static(range(d)):
@@ -140,10 +140,10 @@ def build_step(
                     new[i, k] += rate
                     for j in ti.static(range(old.m)):
                         new[i, j] += rate * old[k, j]
-            group.departure[p] = new
+            group.displacement_gradient[p] = new
         else:
             growth = volume_growth(C, dt)
-            group.departure[p] += growth + growth * group.departure[p]
+            group.J_minus_1[p] += growth + growth * group.J_minus_1[p]
         # Written so that a NaN is not sound; then the position stays, and no later step writes outside the grid.
         sound = beyond <= 0.5 * h
         if ti.static(not on_cpu):
@@ -156,7 +156,7 @@ def build_step(
             group.x[p][c] = ti.select(sound, inside[c], x[c])
         if not sound:
             ti.atomic_min(lost[g], p)
-        return pace
+        return rate_now
 
     @ti.func
     def spread_one(g: ti.template(), group: ti.template(), p: int, kick: float, atomic: ti.template()):
@@ -187,14 +187,14 @@ def build_step(
         return speed_squared
 
     @ti.kernel
-    def spread(part: int, kick: float):
+    def p2g(part: int, kick: float):
         """Scatter some colours, after clearing the grid for the first ones."""
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
                 t = q // CHUNK
                 rows = grid.row_count() if part == 0 else 0
                 for row in range(share_start(rows, t, threads), share_start(rows, t + 1, threads)):
-                    first = grid.first_node(grid.row_start(row))
+                    first = grid.linear_index(grid.row_start(row))
                     for k in range(grid.box[1, d - 1]):
                         grid.clear(first + k)
         for g, group, order in ti.static(pairs):
@@ -209,8 +209,8 @@ def build_step(
                                 spread_one(g, group, p, kick, False)
 
     @ti.kernel
-    def collect(dt: float, kick: float) -> found:
-        """Update the grid, gather, and return the numbers of a `Pace`."""
+    def update_and_g2p(dt: float, kick: float) -> found:
+        """Update the grid, gather, and return the numbers of a `StepResult`."""
         fastest[None] = 0.0
         for k in ti.static(range(len(read_back))):
             read_back[k][None] = NOTHING
@@ -225,7 +225,7 @@ def build_step(
                 speed_squared = 0.0
                 for row in range(share_start(rows, t, threads), share_start(rows, t + 1, threads)):
                     node = grid.row_start(row)
-                    first = grid.first_node(node)
+                    first = grid.linear_index(node)
                     for k in range(grid.box[1, d - 1]):
                         speed_squared = ti.max(speed_squared, update_node(node, first + k, gravity_step))
                         node[d - 1] += 1
@@ -257,21 +257,21 @@ def build_step(
                 result[0] = -1.0
         return result
 
-    def step_cpu(dt: float, kick: float) -> Pace:
+    def step_cpu(dt: float, kick: float) -> StepResult:
         for part in range(orders[0].colours // together):
-            spread(part, kick)
-        speed, *values = collect(dt, kick).to_list()
-        extremes, first = [], len(groups)
+            p2g(part, kick)
+        speed, *values = update_and_g2p(dt, kick).to_list()
+        bounds, first = [], len(groups)
         for group, fields in zip(groups, farthest, strict=True):
             own = values[first : first + len(fields)]
-            extremes.append(extremes_of(group, own) if own else None)
+            bounds.append(state_bounds_of(group, own) if own else None)
             first += len(fields)
-        return Pace(speed, values[: len(groups)], extremes)
+        return StepResult(speed, values[: len(groups)], bounds)
 
     @ti.kernel
     def step_gpu(dt: float, kick: float):
         for q in range(grid.box_nodes()):
-            grid.clear(grid.first_node(grid.box_node(q)))
+            grid.clear(grid.linear_index(grid.box_node(q)))
         for g, group, _order in ti.static(pairs):
             for p in range(group.count):
                 spread_one(g, group, p, kick, True)
@@ -280,7 +280,7 @@ def build_step(
                 walls.find_contact(grid, q, gravity.in_step(kick))
         for q in range(grid.box_nodes()):
             node = grid.box_node(q)
-            update_node(node, grid.first_node(node), gravity.in_step(kick))
+            update_node(node, grid.linear_index(node), gravity.in_step(kick))
         for g, group, _order in ti.static(pairs):
             for p in range(group.count):
                 advance(g, group, p, dt)

@@ -8,10 +8,10 @@ from dataclasses import replace
 from mpmcli.scene import Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.particles import ParticleGroup
-from mpmcli.solver.state_bounds import Extremes, build_extremes
-from mpmcli.solver.step import SMALLEST_J, Pace
+from mpmcli.solver.state_bounds import StateBounds, build_measurement
+from mpmcli.solver.step import SMALLEST_J, StepResult
 from mpmcli.stability.limits import Limit, deformation_limit, mode_limit
-from mpmcli.stability.scheme import step_inertia
+from mpmcli.stability.transfer_factors import step_inertia
 
 # The state is measured, and the limits with it, once in so many steps at least. It is earlier where a stiffness may
 # have grown since by more than this share of what time.safety leaves: nearly all, as every step tells how fast it
@@ -41,11 +41,11 @@ class StepControl:
         self._names = tuple(body.name for body in scene.bodies)
         self._spacing = scene.domain.spacing
         self._inertia = step_inertia(scene.solver)
-        self._measure = [build_extremes(group, backend) for group in groups]
-        self._extremes = [measure.state() for measure in self._measure]
+        self._measure = [build_measurement(group, backend) for group in groups]
+        self._bounds = [measure.state() for measure in self._measure]
         # Per group: its rate of deformation after the last step as far as known, and since its last measurement steps
         # and growth of the logarithm of its stiffness: by deformation, and by hardening, which is measured by itself.
-        self._gradients = [extremes.gradient for extremes in self._extremes]
+        self._rates = [bounds.deformation_rate for bounds in self._bounds]
         self._unwatched = [0] * len(groups)
         self._change = [0.0] * len(groups)
         self._hardened = [0.0] * len(groups)
@@ -54,14 +54,14 @@ class StepControl:
         # A step of safety times the limit is stable until the stiffness has grown to safety^-2 of what it was.
         self._growth_allowed = -2 * share * math.log(scene.time.safety)
         self.seconds = 0.0
-        self._limits = [self._limits_of(g, extremes) for g, extremes in enumerate(self._extremes)]
+        self._limits = [self._limits_of(g, bounds) for g, bounds in enumerate(self._bounds)]
         self._eased = math.inf
         self._take_limits()
 
     @property
     def speed(self) -> float:
         """Largest speed as last measured, m/s."""
-        return max(extremes.speed for extremes in self._extremes)
+        return max(bounds.speed for bounds in self._bounds)
 
     @property
     def fresh(self) -> bool:
@@ -75,8 +75,8 @@ class StepControl:
     def limits_now(self) -> list[Limit]:
         """Return every bound by the state as it is, without keeping it."""
         states = [measure.state() for measure in self._measure]
-        limits = [limit for g, extremes in enumerate(states) for limit in self._limits_of(g, extremes)]
-        return [*limits, _deformation_limit(extremes.gradient for extremes in states)]
+        limits = [limit for g, bounds in enumerate(states) for limit in self._limits_of(g, bounds)]
+        return [*limits, _deformation_limit(bounds.deformation_rate for bounds in states)]
 
     @property
     def nearest(self) -> Limit:
@@ -84,7 +84,7 @@ class StepControl:
         limit = min(self._stiffness_limit, self._deformation_limit)
         return limit._replace(value=min(limit.value, self._eased))
 
-    def after_step(self, dt: float, courant: float, pace: Pace | None) -> list[int]:
+    def after_step(self, dt: float, courant: float, result: StepResult | None) -> list[int]:
         """Count a step and return the groups to measure now.
 
         What the step itself read back is taken in at once.
@@ -92,19 +92,19 @@ class StepControl:
         Args:
             dt: the step, s.
             courant: cells that the fastest particle moved.
-            pace: what changed in it, None where that was not read back.
+            result: what it read back, None where that was not read back.
         """
         began = time.perf_counter()
         self._eased = min(EASING * self._eased, self._stiffness_limit.value, self._deformation_limit.value)
-        if pace is not None:
-            self._gradients[:] = pace.gradients
-            self._deformation_limit = _deformation_limit(self._gradients)
+        if result is not None:
+            self._rates[:] = result.deformation_rates
+            self._deformation_limit = _deformation_limit(self._rates)
         due = []
         for g, group in enumerate(self._groups):
             self._unwatched[g] += 1
-            strain = dt * self._gradients[g]
+            strain = dt * self._rates[g]
             sensitivity = group.law.sensitivity
-            if pace is None:
+            if result is None:
                 # What moves through a fifth of a cell may meet something that deforms it by about as much. Where
                 # stiffness does not grow with it, only the deformation itself bounds the step, and slow steps deform
                 # little.
@@ -118,10 +118,10 @@ class StepControl:
             if self._unwatched[g] >= self.longest:
                 due.append(g)
             elif grown or self._hardened[g] >= self._growth_allowed:
-                known = None if pace is None else pace.extremes[g]
+                known = None if result is None else result.state_bounds[g]
                 if known is not None and _sound(known):
                     self._take(g, known)
-                elif pace is None and not grown and 2 * pending <= self._growth_allowed:
+                elif result is None and not grown and 2 * pending <= self._growth_allowed:
                     self._measure_hardening(g, pending)
                 else:
                     due.append(g)
@@ -133,36 +133,36 @@ class StepControl:
         began = time.perf_counter()
         sound = True
         for g in range(len(self._groups)) if due is None else due:
-            extremes = self._measure[g].state()
-            sound = sound and _sound(extremes)
+            bounds = self._measure[g].state()
+            sound = sound and _sound(bounds)
             if sound:
-                self._take(g, extremes)
+                self._take(g, bounds)
                 self._unwatched[g] = 0
         self.seconds += time.perf_counter() - began
         return sound
 
-    def _take(self, g: int, extremes: Extremes) -> None:
-        """Keep the extremes of a group as they are now, and the bounds that follow from them."""
-        self._extremes[g] = extremes
-        self._gradients[g] = extremes.gradient
+    def _take(self, g: int, bounds: StateBounds) -> None:
+        """Keep the state's bounds of a group, and the limits that follow from them."""
+        self._bounds[g] = bounds
+        self._rates[g] = bounds.deformation_rate
         self._change[g] = self._hardened[g] = 0.0
-        self._limits[g] = self._limits_of(g, extremes)
+        self._limits[g] = self._limits_of(g, bounds)
         self._take_limits()
 
     def _measure_hardening(self, g: int, pending: float) -> None:
         """Measure the internal variables of a group alone; `pending` is what they do not know of yet."""
-        extremes = self._extremes[g]
-        self._extremes[g] = replace(extremes, bound=replace(extremes.bound, internal=self._measure[g].internal()))
+        bounds = self._bounds[g]
+        self._bounds[g] = replace(bounds, bound=replace(bounds.bound, internal=self._measure[g].internal()))
         self._hardened[g] = pending
-        self._limits[g] = self._limits_of(g, self._extremes[g])
+        self._limits[g] = self._limits_of(g, self._bounds[g])
         self._take_limits()
 
-    def _limits_of(self, g: int, extremes: Extremes) -> list[Limit]:
-        """Return the bounds that the stiffness of the g-th group sets within such extremes."""
+    def _limits_of(self, g: int, bounds: StateBounds) -> list[Limit]:
+        """Return the limits that the stiffness of the g-th group sets within these bounds of its state."""
         group = self._groups[g]
         bounds = []
         for place, parameters in zip(group.bodies, group.law.members, strict=True):
-            for mode in group.law.modes(parameters, extremes.bound):
+            for mode in group.law.modes(parameters, bounds.bound):
                 value, cause = mode_limit(
                     self._spacing, parameters.density, mode.stiffness, mode.viscosity, self._inertia
                 )
@@ -172,13 +172,13 @@ class StepControl:
     def _take_limits(self) -> None:
         """Keep the smallest of the bounds that were measured, those of stiffness apart from those of deformation."""
         self._stiffness_limit = min(limit for limits in self._limits for limit in limits)
-        self._deformation_limit = _deformation_limit(self._gradients)
+        self._deformation_limit = _deformation_limit(self._rates)
 
 
-def _sound(extremes: Extremes) -> bool:
+def _sound(bounds: StateBounds) -> bool:
     """Return whether no particle is crushed, inverted or NaN."""
-    return extremes.bound.volume_ratio_min > SMALLEST_J
+    return bounds.bound.volume_ratio_min > SMALLEST_J
 
 
-def _deformation_limit(gradients: Iterable[float]) -> Limit:
-    return Limit(deformation_limit(max(gradients)), "deformation", "")
+def _deformation_limit(rates: Iterable[float]) -> Limit:
+    return Limit(deformation_limit(max(rates)), "deformation", "")

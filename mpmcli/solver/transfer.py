@@ -51,7 +51,7 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float, atom
                 change[a, c] = -stress_scale * stress[c, a]
             middle[c] -= change[a, c] * (distance[a] - 1.0)
     middle[d] = mass
-    spread(grid.nodes, grid, grid.first_node(base), w, middle, change, atomic)
+    add_linear(grid.nodes, grid, grid.linear_index(base), w, middle, change, atomic)
     if ti.static(grid.scheme.keeps_before):
         # Last, and with a copy: before it, Taichi 1.7.4 loses what a force with branches adds to v and C.
         own_v, own_C = group.motion(p)
@@ -78,11 +78,11 @@ def scatter_before(
         for a in ti.static(range(d)):
             change[a, c] = (mass * ti.static(grid.spacing)) * C[c, a]
             middle[c] -= change[a, c] * (distance[a] - 1.0)
-    spread(grid.before, grid, grid.first_node(base), w, middle, change, atomic)
+    add_linear(grid.before, grid, grid.linear_index(base), w, middle, change, atomic)
 
 
 @ti.func
-def spread(
+def add_linear(
     field: ti.template(),
     grid: ti.template(),
     first: int,
@@ -141,7 +141,7 @@ def gather(x: ti.template(), grid: ti.template(), field: ti.template()):
     d = ti.static(grid.dimension)
     base, distance = grid.scheme.spline.stencil(x, ti.static(1 / grid.spacing))
     w = grid.scheme.spline.weights(distance)
-    first = grid.first_node(base)
+    first = grid.linear_index(base)
     velocity = ti.Vector.zero(float, grid.width)
     moment = ti.Matrix.zero(float, d, grid.width)
     for o, line_node in ti.static(grid.lines):

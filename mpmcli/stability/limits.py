@@ -2,7 +2,7 @@
 
 For MLS-MPM and leapfrog. The wave bound is exact for an isolated particle, which is the least stable
 configuration: particles that share nodes allow 1.0 to 1.4 times more with APIC and quadratic B-splines. With the other
-knobs of [solver] that is so too: `scheme.step_inertia` has their factor.
+knobs of [solver] that is so too: `transfer_factors.step_inertia` has their factor.
 """
 
 import math
@@ -70,7 +70,7 @@ def mode_limit(
         spacing: h, m.
         density: kg/m^3, at rest.
         stiffness, viscosity: Pa and Pa s, see `Mode`.
-        inertia: factor of density h^2 by the scheme, see `scheme.step_inertia`.
+        inertia: factor of density h^2 by the scheme, see `transfer_factors.step_inertia`.
 
     Returns:
         The step, and "wave" or "viscosity", whichever term is the larger one at that step.

@@ -13,7 +13,7 @@ from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.solver import Solver
 from mpmcli.solver.step import NOT_LOST
 from mpmcli.stability.limits import Limit
-from mpmcli.stability.scheme import INVERSE_MOMENT
+from mpmcli.stability.transfer_factors import INVERSE_MOMENT
 from mpmcli.validation.blow_up_scenes import SPACING, BlowUpScene
 
 # Size of the perturbation, in cells per predicted step: growth is seen long before anything is nonlinear.

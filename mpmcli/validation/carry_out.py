@@ -67,7 +67,7 @@ class TimedSolver(Solver):
 
     def __init__(self, scene: Scene, backend: Backend) -> None:
         super().__init__(scene, backend)
-        self._watched = self.watch_seconds
+        self._watched = self.measure_seconds
         self._drawing = self._elsewhere = 0.0
 
     def timed_frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
@@ -109,7 +109,7 @@ class TimedSolver(Solver):
         return {
             "steps": self.step_count,
             "seconds": max(self._drawing - self._elsewhere, 0.0),
-            "watch_seconds": self.watch_seconds - self._watched,
+            "watch_seconds": self.measure_seconds - self._watched,
             "compile_seconds": self.first_step_seconds,
             "frame_seconds": self.frame_seconds,
         }

@@ -8,7 +8,7 @@ from mpmcli.solver.splines import SPLINES, CubicSpline, QuadraticSpline
 
 # Equal by identity: kernels are compiled for the object that they are given.
 @dataclass(frozen=True, eq=False)
-class Scheme:
+class TransferScheme:
     """Constants of the kernels.
 
     Attributes:
@@ -32,6 +32,6 @@ class Scheme:
         return self.spline.nodes == 3 and not self.keeps_before
 
 
-def scheme_of(settings: SolverSettings) -> Scheme:
+def scheme_of(settings: SolverSettings) -> TransferScheme:
     """Return the scheme that a scene asks for."""
-    return Scheme(SPLINES[settings.kernel], settings.transfer != "pic", settings.flip or 0.0)
+    return TransferScheme(SPLINES[settings.kernel], settings.transfer != "pic", settings.flip or 0.0)
