@@ -160,14 +160,14 @@ class StepControl:
     def _limits_of(self, g: int, bounds: StateBounds) -> list[Limit]:
         """Return the limits that the stiffness of the g-th group sets within these bounds of its state."""
         group = self._groups[g]
-        bounds = []
+        limits = []
         for place, parameters in zip(group.bodies, group.law.members, strict=True):
             for mode in group.law.modes(parameters, bounds.bound):
                 value, cause = mode_limit(
                     self._spacing, parameters.density, mode.stiffness, mode.viscosity, self._inertia
                 )
-                bounds.append(Limit(value, cause, self._names[place]))
-        return bounds
+                limits.append(Limit(value, cause, self._names[place]))
+        return limits
 
     def _take_limits(self) -> None:
         """Keep the smallest of the bounds that were measured, those of stiffness apart from those of deformation."""
