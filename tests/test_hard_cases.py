@@ -4,9 +4,8 @@ from collections.abc import Callable
 
 import pytest
 from conftest import ROOT
-
-from mpmcli.validation.hard_cases.case import HardCase, carry_out
-from mpmcli.validation.hard_cases.registry import hard_cases
+from hard_cases.case import HardCase, carry_out
+from hard_cases.catalogue import hard_cases
 
 CASES = hard_cases()
 # What is missed, with the figure; a case that begins to pass must leave this list.

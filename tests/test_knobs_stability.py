@@ -5,13 +5,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from blow_up.scenes import alone, block, liquid, solid
+from blow_up.trial import Trial
 from step_spectrum import Choice, Coupling, free, periodic, radius, step_matrix
 
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.stability.limits import mode_limit
 from mpmcli.stability.transfer_factors import loss_per_step, step_inertia
-from mpmcli.validation.blow_up import Trial
-from mpmcli.validation.blow_up_scenes import alone, block, liquid, solid
 
 KNOBS = [
     {"kernel": kernel, **transfer}

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from mpmcli.validation.blow_up import GROWTH, Measured, Run, Trial
-from mpmcli.validation.blow_up_report import HEAD, bulk_median, flaws, table_rows
-from mpmcli.validation.blow_up_resonance import measured_blow_ups, recursion_blow_ups, windows
-from mpmcli.validation.blow_up_scenes import alone, cluster, liquid, study_scenes
+from blow_up.report import HEAD, bulk_median, flaws, table_rows
+from blow_up.resonance import measured_blow_ups, recursion_blow_ups, windows
+from blow_up.scenes import alone, cluster, liquid, study_scenes
+from blow_up.trial import GROWTH, Measured, Run, Trial
 
 ROOT = Path(__file__).resolve().parent.parent
 LAWS = {"fluid", "viscoplastic", "neo_hookean", "fixed_corotated", "von_mises", "snow", "sand"}

@@ -1,9 +1,9 @@
-"""All hard cases, in the order of the catalogue (verification: 11)."""
+"""All hard cases, in the order of the catalogue."""
 
 import re
 
-from mpmcli.validation.hard_cases import contact, failure, impact, lone, plastic, precision, resting, tension, waves
-from mpmcli.validation.hard_cases.case import HardCase
+from hard_cases import contact, failure, impact, lone, plastic, precision, resting, tension, waves
+from hard_cases.case import HardCase
 
 MODULES = (contact, failure, impact, lone, plastic, precision, resting, tension, waves)
 

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from blow_up.scenes import alone, liquid
+from blow_up.trial import Trial
 from mpmcli.solver.backend import Backend
-from mpmcli.validation.blow_up import Trial
-from mpmcli.validation.blow_up_scenes import alone, liquid
 
 # Steps over the bound at rest that are tried, and steps of one trial.
 RATIOS = np.round(np.arange(0.4, 1.1, 0.01), 2)

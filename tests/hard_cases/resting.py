@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from hard_cases.case import HardCase, Outcome
+from hard_cases.running import GRAVITY, block, look, scene, sound, start
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.solver import Solver
-from mpmcli.validation.hard_cases.case import HardCase, Outcome
-from mpmcli.validation.hard_cases.setting import GRAVITY, block, look, scene, sound, start
 
 DENSITY = 1000.0
 

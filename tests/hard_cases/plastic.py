@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from hard_cases.case import HardCase, Outcome
+from hard_cases.running import GRAVITY, block, look, run, scene, sound, start
 from mpmcli.scene import sample_bodies
-from mpmcli.validation.hard_cases.case import HardCase, Outcome
-from mpmcli.validation.hard_cases.setting import GRAVITY, block, look, run, scene, sound, start
 
 H, SIDE = 0.1, 0.8
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 5e5, "friction_angle": 30.0}

@@ -7,11 +7,11 @@ from multiprocessing import get_context
 
 import numpy as np
 
+from hard_cases.case import HardCase, Outcome
+from hard_cases.running import GRAVITY, block, look, run, scene, sound, start
 from mpmcli.errors import InputError
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.diagnosis import NOT_FINITE, UnstableRunError
-from mpmcli.validation.hard_cases.case import HardCase, Outcome
-from mpmcli.validation.hard_cases.setting import GRAVITY, block, look, run, scene, sound, start
 
 H = 0.1
 BULK, DENSITY = 1e5, 1000.0

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from hard_cases.case import HardCase, Outcome
+from hard_cases.running import block, look, scene, sound, start
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.solver import Solver
-from mpmcli.validation.hard_cases.case import HardCase, Outcome
-from mpmcli.validation.hard_cases.setting import block, look, scene, sound, start
 
 # The bar of verification 1.1: fixed at x = 0, free at x = L unless its end is fixed too.
 L, YOUNG, DENSITY = 25.0, 100.0, 1.0

@@ -27,7 +27,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class HardCase:
-    """One row of the catalogue (verification: 11).
+    """One row of the catalogue.
 
     Attributes:
         name: its name there, "H1" to "H24"; title: in a few words.

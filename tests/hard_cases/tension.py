@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from hard_cases.case import HardCase, Outcome
+from hard_cases.running import block, growth, look, nearest, run, scene, start
 from mpmcli.scene import BodyParticles, sample_bodies
 from mpmcli.solver.solver import Solver
-from mpmcli.validation.hard_cases.case import HardCase, Outcome
-from mpmcli.validation.hard_cases.setting import block, growth, look, nearest, run, scene, start
 
 H, DENSITY = 0.1, 1000.0
 YOUNG, NU = 1e6, 0.3

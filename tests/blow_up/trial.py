@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from blow_up.scenes import SPACING, BlowUpScene
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import BodyParticles, Scene, parse_scene
 from mpmcli.solver.backend import Backend
@@ -14,7 +15,6 @@ from mpmcli.solver.solver import Solver
 from mpmcli.solver.step import NOT_LOST
 from mpmcli.stability.limits import Limit
 from mpmcli.stability.transfer_factors import INVERSE_MOMENT
-from mpmcli.validation.blow_up_scenes import SPACING, BlowUpScene
 
 # Size of the perturbation, in cells per predicted step: growth is seen long before anything is nonlinear.
 AMPLITUDE = 1e-7

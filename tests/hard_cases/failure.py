@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from hard_cases.case import HardCase, Outcome
+from hard_cases.running import block, scene, start
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError
 from mpmcli.solver.particles import ParticleGroup
-from mpmcli.validation.hard_cases.case import HardCase, Outcome
-from mpmcli.validation.hard_cases.setting import block, scene, start
 
 H = 0.1
 PARTICLE = 7

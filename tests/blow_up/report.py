@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from statistics import median
 
-from mpmcli.validation.blow_up import Measured
+from blow_up.trial import Measured
 
 # Growth between the fifth and the last tenth of the long run that is none.
 NO_GROWTH = 2.0

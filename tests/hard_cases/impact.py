@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from hard_cases.case import HardCase, Outcome
+from hard_cases.running import GRAVITY, block, growth, look, run, scene, start
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.validation.hard_cases.case import HardCase, Outcome
-from mpmcli.validation.hard_cases.setting import GRAVITY, block, growth, look, run, scene, start
 
 H, SIDE, DENSITY = 0.1, 0.8, 1000.0
 YOUNG, NU = 1e6, 0.3

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from hard_cases.case import HardCase, Outcome
+from hard_cases.running import GRAVITY, block, growth, run, scene, start
 from mpmcli.scene import sample_bodies
-from mpmcli.validation.hard_cases.case import HardCase, Outcome
-from mpmcli.validation.hard_cases.setting import GRAVITY, block, growth, run, scene, start
 
 
 def density_ratio() -> Outcome:

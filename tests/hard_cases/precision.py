@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from hard_cases.case import HardCase, Outcome
+from hard_cases.running import GRAVITY, block, look, scene, sound, start
 from mpmcli.errors import InputError
 from mpmcli.scene import sample_bodies
-from mpmcli.validation.hard_cases.case import HardCase, Outcome
-from mpmcli.validation.hard_cases.setting import GRAVITY, block, look, scene, sound, start
 
 H, DENSITY = 0.1, 1000.0
 YOUNG, NU = 1e6, 0.3

@@ -1,0 +1,1 @@
+"""The steps at which scenes blow up, found by bisection, beside the steps that the solver predicts."""
