@@ -9,7 +9,6 @@ from solver_state import scene_of
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.snapshot import measure, read_group
 from mpmcli.solver.solver import Solver
-from mpmcli.solver.step import NOT_LOST
 
 GRAVITY = 9.81
 
@@ -76,8 +75,6 @@ def restart(solver: Solver, sample: BodyParticles, end: float) -> None:
     group.id.from_numpy(np.arange(group.count, dtype=np.int32))
     solver.scene = solver.scene.model_copy(update={"time": solver.scene.time.model_copy(update={"end": end})})
     solver.time, solver.step_count, solver.last_step = 0.0, 0, 0.0
-    # What only a new Solver sets: no particle is lost.
-    solver._kernels.lost.fill(NOT_LOST)
     solver.state_was_replaced()
     solver._first_stable_step = solver.stable_step()[0]
 

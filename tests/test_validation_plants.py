@@ -71,7 +71,7 @@ PLANTS = (
     ),
     Plant(
         "gradient transposed",
-        "solver/step.py",
+        "solver/particle_update.py",
         "C[c, a] = gradient[a, c]",
         "C[c, a] = gradient[c, a]",
         ("homogeneous",),
@@ -92,7 +92,7 @@ PLANTS = (
     ),
     Plant(
         "walls that zero their nodes",
-        "boundaries/walls.py",
+        "boundaries/mirror_images.py",
         "result[c] = -result[c]",
         "result[c] = 0.0",
         ("bar_fixed_fixed",),
@@ -100,7 +100,7 @@ PLANTS = (
     ),
     Plant(
         "mirror images that are not mirrored",
-        "boundaries/walls.py",
+        "boundaries/mirror_images.py",
         "result[c] = -result[c]",
         "result[c] = result[c]",
         ("bar_fixed_fixed",),
@@ -122,14 +122,14 @@ PLANTS = (
     ),
     Plant(
         "deformation by half a step",
-        "solver/step.py",
+        "solver/particle_update.py",
         "rate = dt * C[i, k]",
         "rate = 0.5 * dt * C[i, k]",
         ("bar_fixed_fixed",),
     ),
     Plant(
         "motion by half a step",
-        "solver/step.py",
+        "solver/particle_update.py",
         "moved = x[c] + dt * v[c]",
         "moved = x[c] + 0.5 * dt * v[c]",
         ("dam_break",),

@@ -1,7 +1,6 @@
 """The walls of the domain in the usual way: velocities of nodes on and behind them are set to zero.
 
-It is first-order accurate, where the folded walls of `boundaries.walls` are second-order (verification: 0.1), and there
-to be compared with.
+First-order accurate, where folded walls are second-order; kept for comparison (docs/theory.md, 3.3).
 """
 
 from collections.abc import Sequence
@@ -11,50 +10,28 @@ import taichi as ti
 
 @ti.data_oriented
 class ZeroedWalls:
-    """All faces of the domain, as `walls.Walls`: slip and separate stop the normal velocity, stick all of it.
+    """All faces of the domain, as a boundary that acts on nodes: slip and separate stop the normal velocity, stick all.
 
-    A separating face stops only what moves into it. None of them has to know first what presses on it.
+    A separating face stops only what moves into it. Nothing is mirrored. What nodes hold from before stress and forces
+    is not stopped: FLIP's change of velocity contains the wall's.
     """
 
-    separating = ()
-
-    def __init__(self, faces: Sequence[tuple[str, str]], first: int, cells: Sequence[int], shape: Sequence[int]):
+    def __init__(self, faces: Sequence[tuple[str, str]], first: int, cells: Sequence[int]):
         self.dimension = len(faces)
         self.faces = tuple(tuple(pair) for pair in faces)
         self.first = first
         self.last = tuple(first + n for n in cells)
-        self.shape = tuple(shape)
 
     @ti.func
-    def near(self, node: ti.template()):
-        """Return whether the node is on or behind any wall."""
-        stopped = False
+    def constrain(self, node: ti.template(), velocity: ti.template()):
+        """Return the velocity of a node after the walls."""
+        result = velocity
         for a in ti.static(range(self.dimension)):
-            stopped = stopped or node[a] <= self.first or node[a] >= self.last[a]
-        return stopped
-
-    @ti.func
-    def update(self, grid: ti.template(), node: ti.template(), gravity_step: ti.template()):
-        """Turn momentum into velocity, with gravity and the walls, at a node that is near one; return True: it did.
-
-        What nodes hold from before stress and forces is not stopped: FLIP's change is that by the wall, too.
-        """
-        d = ti.static(self.dimension)
-        index = grid.linear_index(node)
-        value = grid.nodes[index]
-        mass = value[d]
-        if mass > 0:
-            for a in ti.static(range(d)):
-                value[a] = value[a] / mass + gravity_step[a]
-            for a in ti.static(range(d)):
-                if node[a] <= self.first:
-                    value = self.stopped(value, a, 0)
-                if node[a] >= self.last[a]:
-                    value = self.stopped(value, a, 1)
-            grid.nodes[index] = value
-            if ti.static(grid.scheme.keeps_before):
-                grid.before[index] = grid.before[index] / mass
-        return True
+            if node[a] <= self.first:
+                result = self.stopped(result, a, 0)
+            if node[a] >= self.last[a]:
+                result = self.stopped(result, a, 1)
+        return result
 
     @ti.func
     def stopped(self, velocity: ti.template(), axis: ti.template(), side: ti.template()):

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpmcli.errors import RunError
+from mpmcli.solver.particle_update import SMALLEST_J
 from mpmcli.solver.snapshot import Snapshot
-from mpmcli.solver.step import SMALLEST_J
 from mpmcli.stability.limits import Limit
 
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import taichi as ti
 
+from mpmcli.boundaries.mirror_images import MirrorImages
 from mpmcli.boundaries.walls import Walls
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.errors import InputError
@@ -15,17 +16,21 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.backend import Backend
+from mpmcli.solver.box import build_box_search
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError, cause_of, diagnose, first_unsound, rate_of_change
 from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.forces import needs_initial
 from mpmcli.solver.grid import DRIFT, PAD, Grid, node_width
+from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.observe import build_observation
 from mpmcli.solver.ordering import SortBuffers, TileOrder, build_sort
+from mpmcli.solver.particle_update import NOT_LOST, ParticleUpdate
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.snapshot import STRESSES, Snapshot, build_frame, measure, read_group
-from mpmcli.solver.step import NOT_LOST, build_step
 from mpmcli.solver.step_control import StepControl
+from mpmcli.solver.step_cpu import build_cpu_step
+from mpmcli.solver.step_gpu import build_gpu_step
 from mpmcli.solver.transfer_scheme import scheme_of
 from mpmcli.stability.limits import Limit, force_limit, speed_limit
 from mpmcli.stability.transfer_factors import affine_moment
@@ -115,22 +120,26 @@ class Solver:
             self._initial = np.concatenate([b.position if b.initial is None else b.initial for b in particles])
         self._external_forces = ExternalForces(scene, self.groups, backend)
         self.grid = Grid(scene.dimension, self.spacing, scene.domain.cells, width, scheme_of(scene.solver))
-        kind = ZeroedWalls if scene.solver.walls == "zeroed" else Walls
-        walls = kind(scene.domain.walls.faces(scene.dimension), PAD, self.grid.cells, self.grid.shape)
+        faces = scene.domain.walls.faces(scene.dimension)
+        if scene.solver.walls == "zeroed":
+            images, walls = None, ZeroedWalls(faces, PAD, self.grid.cells)
+        else:
+            walls = Walls(faces, PAD, self.grid.cells, self.grid.shape)
+            images = MirrorImages(walls)
+        nodes = NodeUpdate(self.grid, images, [walls])
+        self._particle_update = ParticleUpdate(self.grid, len(self.groups), watches_box=not backend.on_cpu)
         buffers = SortBuffers(self.groups)
         orders = [TileOrder(g, self.grid, buffers, backend.threads, backend.on_cpu) for g in self.groups]
         self._sorts = [build_sort(order) for order in orders]
         # Without atomics a particle may drift only as far as its tile's colour allows.
         self._drift_allowed = DRIFT if backend.on_cpu else float(self.grid.tile)
-        self._kernels = build_step(
-            self.grid,
-            walls,
-            self.groups,
-            orders,
-            self._external_forces.gravity,
-            on_cpu=backend.on_cpu,
-            drift=math.ceil(self._drift_allowed),
-        )
+        self._find_box = build_box_search(self.grid, orders, math.ceil(self._drift_allowed))
+        parts = (self.grid, nodes, self._particle_update, self.groups)
+        gravity = self._external_forces.gravity
+        if backend.on_cpu:
+            self._advance = build_cpu_step(*parts, orders, gravity)
+        else:
+            self._advance = build_gpu_step(*parts, gravity)
         self._observe = [build_observation(group) for group in self.groups]
         self.last_step = 0.0
         self._drift = math.inf
@@ -179,14 +188,14 @@ class Solver:
         if self._drift >= self._drift_allowed:
             for sort in self._sorts:
                 sort()
-            self._kernels.find_box()
+            self._find_box()
             self._drift = 0.0
         # Velocities live in the middle of steps: they move on from that of the last one to that of this one, at the
         # start by half a step. A kick longer than dt / safety^2 might be unstable: kick dt <= (dt / safety)^2.
         kick = min(0.5 * (self.last_step + dt), dt / self.scene.time.safety**2)
         pull = self._external_forces.pull(self.time)
         self._external_forces.begin_step(self.time)
-        result = self._kernels.step(dt, kick)
+        result = self._advance(dt, kick)
         self.time += dt
         self.last_step = dt
         self.step_count += 1
@@ -221,7 +230,7 @@ class Solver:
             UnstableRunError: a particle is lost.
         """
         # On the CPU every step says so itself.
-        if not self.backend.on_cpu and self._kernels.any_lost():
+        if not self.backend.on_cpu and self._particle_update.any_lost():
             self._stop(dt)
         if not self._step_control.measure(due):
             # Crushed or inverted by the last step: the next one would have refused to scatter it.
@@ -237,12 +246,13 @@ class Solver:
         return self._step_control.seconds
 
     def state_was_replaced(self) -> None:
-        """Sort and measure particles whose state was set from outside, as tests and benchmarks do."""
+        """Sort and measure particles whose state was set from outside; none of them counts as lost."""
+        self._particle_update.lost.fill(NOT_LOST)
         self._drift = math.inf
         self.measure_state(self.last_step)
 
     def _stop(self, dt: float) -> None:
-        for group, lost in zip(self.groups, self._kernels.lost.to_numpy(), strict=True):
+        for group, lost in zip(self.groups, self._particle_update.lost.to_numpy(), strict=True):
             snapshot = read_group(group)
             p = int(lost) if lost != NOT_LOST else first_unsound(snapshot)
             if p is not None:

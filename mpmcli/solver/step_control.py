@@ -7,9 +7,10 @@ from dataclasses import replace
 
 from mpmcli.scene import Scene
 from mpmcli.solver.backend import Backend
+from mpmcli.solver.particle_update import SMALLEST_J
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.state_bounds import StateBounds, build_measurement
-from mpmcli.solver.step import SMALLEST_J, StepResult
+from mpmcli.solver.step_cpu import StepResult
 from mpmcli.stability.limits import Limit, deformation_limit, mode_limit
 from mpmcli.stability.transfer_factors import step_inertia
 

@@ -12,7 +12,6 @@ from mpmcli.scene import BodyParticles, Scene, parse_scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.solver import Solver
-from mpmcli.solver.step import NOT_LOST
 from mpmcli.stability.limits import Limit
 from mpmcli.stability.transfer_factors import INVERSE_MOMENT
 
@@ -105,8 +104,6 @@ class Trial:
         for variable, values in zip(group.law.internal, group.internal, strict=True):
             values.fill(scene.internal.get(variable.name, variable.at_rest))
         group.id.from_numpy(np.arange(n, dtype=np.int32))
-        # What only a new Solver sets: no particle is lost. Its kernels would be compiled once more.
-        self.solver._kernels.lost.fill(NOT_LOST)
         self.solver.state_was_replaced()
 
     def kinetic_energy(self) -> float:

@@ -1,0 +1,179 @@
+"""Folds what particles scatter beyond the walls onto mirror images, and gives those the mirrored velocity back.
+
+What lies beyond a wall belongs to the mirror images of the nodes inside. It is added to them, mirrored, before momentum
+becomes velocity; afterwards the nodes beyond receive the mirrored velocity. The wall is then second-order accurate,
+where setting node velocities to zero makes it first-order (docs/theory.md, 3.1).
+"""
+
+import taichi as ti
+
+from mpmcli.boundaries.walls import REACH, Walls
+
+
+@ti.data_oriented
+class MirrorImages:
+    """The mirror images of nodes behind walls.
+
+    A node has an image for every set of axes along which a wall acts on it and it lies inside that wall. Sets are bits:
+    bit a stands for a mirror across the wall of axis a; 0 is the node itself.
+
+    Attributes:
+        walls: the mirrors.
+        needs_contact: whether `find_contact` has to run before nodes are updated.
+        crossed: per axis, whether walls along other axes always act on its faces.
+    """
+
+    def __init__(self, walls: Walls) -> None:
+        self.walls = walls
+        self.dimension = walls.dimension
+        self.needs_contact = len(walls.separating) > 0
+        self.crossed = tuple(
+            any(word != "separate" for b in walls.lateral[a] for word in walls.faces[b]) for a in range(self.dimension)
+        )
+
+    @ti.func
+    def near(self, node: ti.template()):
+        """Return whether the node may have images or be one."""
+        return self.walls.near(node)
+
+    @ti.func
+    def fold(self, grid: ti.template(), field: ti.template(), node: ti.template(), gravity_step: ti.template()):
+        """Return the momentum and mass of a node near a wall together with its images, gravity's pull included.
+
+        A node on a wall that acts is its own image, and what the wall stops cancels. At an image, whose share the node
+        inside takes, the result is zero.
+
+        Args:
+            field: of the nodes: momentum and mass, or momentum alone, which gravity does not pull.
+            gravity_step: change of velocity by gravity in this step, m/s.
+        """
+        depth, mirror, upper = self.walls.place(node)
+        acts = self.walls.acting(node, depth, mirror, upper)
+        owned = True
+        for a in ti.static(range(self.dimension)):
+            if acts[a] == 1 and depth[a] < 0:
+                owned = False
+        total = ti.Vector.zero(float, grid.width)
+        if owned:
+            total = self.image_sum(grid, field, node, mirror, acts, depth, upper, gravity_step)
+            for a in ti.static(range(self.dimension)):
+                if acts[a] == 1 and depth[a] == 0:
+                    total = self.walls.stopped(total, a, upper[a])
+        return total
+
+    @ti.func
+    def unfold(self, grid: ti.template(), field: ti.template(), node: ti.template(), value: ti.template()):
+        """Write a velocity to a node near a wall, and mirrored to its images."""
+        depth, mirror, upper = self.walls.place(node)
+        acts = self.walls.acting(node, depth, mirror, upper)
+        for images in range(ti.static(2**self.dimension)):
+            if self.has_image(images, acts, depth):
+                field[self.image(grid, node, mirror, images)] = self.mirrored(value, images, upper)
+
+    @ti.func
+    def image_sum(
+        self,
+        grid: ti.template(),
+        field: ti.template(),
+        node: ti.template(),
+        mirror: ti.template(),
+        acts: ti.template(),
+        depth: ti.template(),
+        upper: ti.template(),
+        gravity_step: ti.template(),
+    ):
+        """Return the sum over a node and its images, each mirrored, after a step of gravity.
+
+        Gravity acts before the fold, so that it pulls mirror images the mirrored way, as everything else does with
+        them: after it, matter on a floor would weigh more than its stress can balance, and be squeezed for ever.
+        """
+        total = ti.Vector.zero(float, grid.width)
+        for images in range(ti.static(2**self.dimension)):
+            if self.has_image(images, acts, depth):
+                value = pulled(field[self.image(grid, node, mirror, images)], self.dimension, gravity_step)
+                total += self.mirrored(value, images, upper)
+        return total
+
+    @ti.func
+    def has_image(self, images: int, acts: ti.template(), depth: ti.template()):
+        """Return whether the node has an image mirrored in exactly the axes of the bit set `images`."""
+        exists = True
+        for a in ti.static(range(self.dimension)):
+            exists = exists and (images >> a & 1 == 0 or (acts[a] == 1 and depth[a] >= 1))
+        return exists
+
+    @ti.func
+    def image(self, grid: ti.template(), node: ti.template(), mirror: ti.template(), images: int):
+        """Return the linear index of that image."""
+        place = node
+        for a in ti.static(range(self.dimension)):
+            if images >> a & 1 == 1:
+                place[a] = mirror[a]
+        return grid.linear_index(place)
+
+    @ti.func
+    def mirrored(self, value: ti.template(), images: int, upper: ti.template()):
+        """Return momentum or velocity mirrored: the normal part always, the rest where the wall sticks."""
+        result = value
+        for a in ti.static(range(self.dimension)):
+            if images >> a & 1 == 1:
+                holds = self.walls.face_is("stick", a, upper[a])
+                for c in ti.static(range(self.dimension)):
+                    if ti.static(c == a):
+                        result[c] = -result[c]
+                    elif holds:
+                        result[c] = -result[c]
+        return result
+
+    @ti.func
+    def plane_nodes(self, grid: ti.template()):
+        """Return the number of nodes in use of the largest plane that a separating face lies in."""
+        most = 0
+        for f in ti.static(range(len(self.walls.separating))):
+            count = 1
+            for b in ti.static(self.walls.lateral[self.walls.separating[f][0]]):
+                count *= grid.box[1, b]
+            most = ti.max(most, count)
+        return most
+
+    @ti.func
+    def find_contact(self, grid: ti.template(), q: int, gravity_step: ti.template()):
+        """For the q-th node in use of the plane of every separating face, note whether it is pressed.
+
+        A wall that lets go only pushes: it acts where the momentum of the node on the wall, with this step's forces in
+        it, points into the wall.
+        """
+        for f in ti.static(range(len(self.walls.separating))):
+            axis = ti.static(self.walls.separating[f][0])
+            upper = ti.static(self.walls.separating[f][1])
+            node = ti.Vector.zero(int, self.dimension)
+            node[axis] = self.walls.last[axis] if ti.static(upper) else self.walls.first
+            rest = q
+            for b in ti.static(self.walls.lateral[axis]):
+                node[b] = grid.box[0, b] + rest % grid.box[1, b]
+                rest = rest // grid.box[1, b]
+            inside = rest == 0
+            low = grid.box[0, axis]
+            if inside and node[axis] >= low and node[axis] < low + grid.box[1, axis]:
+                value = pulled(grid.nodes[grid.linear_index(node)], self.dimension, gravity_step)
+                if ti.static(self.crossed[axis]):
+                    # What other walls fold onto this node is pressed or pulled with it.
+                    depth, mirror, upper_side = self.walls.place(node)
+                    acts = ti.Vector.zero(int, self.dimension)
+                    for b in ti.static(self.walls.lateral[axis]):
+                        separates = self.walls.face_is("separate", b, upper_side[b])
+                        acts[b] = ti.cast(depth[b] <= REACH and not separates, int)
+                    value = self.image_sum(grid, grid.nodes, node, mirror, acts, depth, upper_side, gravity_step)
+                outward = value[axis]
+                if ti.static(not upper):
+                    outward = -outward
+                self.walls.contact[f, self.walls.plane_index(node, axis)] = ti.cast(outward >= 0, int)
+
+
+@ti.func
+def pulled(value: ti.template(), dimension: ti.template(), gravity_step: ti.template()):
+    """Return momentum and mass after a step of gravity: p + m g dt."""
+    result = value
+    for a in ti.static(range(dimension)):
+        result[a] += value[dimension] * gravity_step[a]
+    return result

@@ -1,0 +1,53 @@
+"""Finds the box of nodes that a step uses, from the tiles that hold particles."""
+
+from collections.abc import Callable, Sequence
+
+import taichi as ti
+
+from mpmcli.boundaries.walls import REACH
+from mpmcli.solver.grid import PAD, Grid
+from mpmcli.solver.ordering import TileOrder
+
+
+def build_box_search(grid: Grid, orders: Sequence[TileOrder], drift: int) -> Callable[[], None]:
+    """Compile-ready search, to be called after a sort: it sets `grid.box`.
+
+    Args:
+        drift: cells that a particle may move away from the tile that it was sorted into.
+    """
+    d = grid.dimension
+    orders = tuple(orders)
+    first_wall = PAD
+    last_wall = tuple(PAD + n for n in grid.cells)
+    # Nodes from the first to the last of a stencil.
+    reach = grid.scheme.spline.nodes - 1
+    tile_low = ti.field(int, shape=d)
+    tile_high = ti.field(int, shape=d)
+
+    @ti.kernel
+    def find_box():
+        for a in ti.static(range(d)):
+            tile_low[a] = 2**30
+            tile_high[a] = -1
+        for order in ti.static(orders):
+            for tile in range(order.tiles):
+                if order.start[tile + 1] > order.start[tile]:
+                    rest = tile
+                    for b in ti.static(range(d)):
+                        a = ti.static(d - 1 - b)
+                        ti.atomic_min(tile_low[a], rest % ti.static(grid.tiles[a]))
+                        ti.atomic_max(tile_high[a], rest % ti.static(grid.tiles[a]))
+                        rest = rest // ti.static(grid.tiles[a])
+        for a in ti.static(range(d)):
+            # A stencil starts up to `drift` cells outside its tile and ends `reach` nodes further up.
+            first = grid.tile * tile_low[a] - drift
+            last = grid.tile * tile_high[a] + grid.tile - 1 + drift + reach
+            # A box that comes near a wall holds the images beyond it too: they are read and written.
+            if first <= first_wall + REACH:
+                first = first_wall - REACH
+            if last >= last_wall[a] - REACH:
+                last = last_wall[a] + REACH
+            grid.box[0, a] = first
+            grid.box[1, a] = last - first + 1
+
+    return find_box

@@ -1,0 +1,111 @@
+"""What a step does at the nodes of the grid between P2G and G2P: fold, velocity, constrain, unfold."""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import taichi as ti
+
+from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.solver.grid import Grid
+
+
+class Boundary(Protocol):
+    """What acts on the velocity of nodes: the walls, and whatever else stands in the way of the material."""
+
+    def constrain(self, node: object, velocity: object) -> object:
+        """Return the velocity of a node after the boundary; a ti.func.
+
+        Args:
+            node: its integer coordinates; velocity: m/s, as wide as a node, the mass in entry d.
+        """
+
+
+@ti.data_oriented
+class NodeUpdate:
+    """Turns momentum into velocity at every node.
+
+    Attributes:
+        images: mirror images behind walls, None where walls do not mirror.
+        boundaries: what constrains the velocity, in turn.
+    """
+
+    def __init__(self, grid: Grid, images: MirrorImages | None, boundaries: Sequence[Boundary]) -> None:
+        self.grid = grid
+        self.dimension = grid.dimension
+        self.images = images
+        self.mirrors = images is not None
+        self.needs_contact = images is not None and images.needs_contact
+        self.boundaries = tuple(boundaries)
+
+    @ti.func
+    def update(self, node: ti.template(), index: int, gravity_step: ti.template()):
+        """Update a node and its images; return the square of its velocity, 0 at an image and where there is no mass.
+
+        Gravity, gravity_step (m/s), acts on the momentum of every image near a wall and on the velocity elsewhere,
+        which is the same up to round-off.
+        """
+        d = ti.static(self.dimension)
+        value = self.grid.nodes[index]
+        pull = gravity_step
+        mirrored = False
+        speed_squared = 0.0
+
+        # Fold.
+        if ti.static(self.mirrors):
+            mirrored = self.images.near(node)
+            if mirrored:
+                total = self.images.fold(self.grid, self.grid.nodes, node, gravity_step)
+                # Entry by entry here and below: Taichi loses vectors that are assigned as a whole in static blocks.
+                for c in ti.static(range(self.grid.width)):
+                    value[c] = total[c]
+                for a in ti.static(range(d)):
+                    pull[a] = 0.0
+
+        if value[d] > 0:
+            # Velocity.
+            velocity = value
+            for a in ti.static(range(d)):
+                velocity[a] = value[a] / value[d] + pull[a]
+
+            # Constrain.
+            for boundary in ti.static(self.boundaries):
+                constrained = boundary.constrain(node, velocity)
+                for c in ti.static(range(d)):
+                    velocity[c] = constrained[c]
+
+            # Unfold.
+            self.write(self.grid.nodes, node, index, mirrored, velocity)
+            if ti.static(self.grid.scheme.keeps_before):
+                self.update_before(node, index, mirrored, value[d])
+            for a in ti.static(range(d)):
+                speed_squared += velocity[a] ** 2
+        return speed_squared
+
+    @ti.func
+    def update_before(self, node: ti.template(), index: int, mirrored: bool, mass: float):
+        """Turn the momentum from before stress and forces into velocity: fold and unfold, without any boundary.
+
+        Mirror images have it too, so that a wall that acts changes nothing but what stress does.
+        """
+        before = self.grid.before[index]
+        if ti.static(self.mirrors):
+            if mirrored:
+                total = self.images.fold(
+                    self.grid, self.grid.before, node, ti.Vector.zero(float, ti.static(self.dimension))
+                )
+                for c in ti.static(range(self.grid.width)):
+                    before[c] = total[c]
+        for a in ti.static(range(self.dimension)):
+            before[a] /= mass
+        self.write(self.grid.before, node, index, mirrored, before)
+
+    @ti.func
+    def write(self, field: ti.template(), node: ti.template(), index: int, mirrored: bool, value: ti.template()):
+        """Write the velocity of a node, and of its images."""
+        if ti.static(self.mirrors):
+            if mirrored:
+                self.images.unfold(self.grid, field, node, value)
+            else:
+                field[index] = value
+        else:
+            field[index] = value

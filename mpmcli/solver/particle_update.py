@@ -1,0 +1,123 @@
+"""What a step does with one particle: scatter it to the nodes, and move it with them."""
+
+import taichi as ti
+
+from mpmcli.solver.grid import Grid
+from mpmcli.solver.state_bounds import deformation_rate, volume_growth, volume_ratio
+from mpmcli.solver.transfer import gather, scatter
+
+NOT_LOST = 2**31 - 1
+# A particle crushed to less than this fraction of its volume is lost: near zero J is round-off, not physics.
+SMALLEST_J = 1e-6
+
+
+@ti.data_oriented
+class ParticleUpdate:
+    """Both halves of a step of a particle.
+
+    Attributes:
+        extent: size of the domain, m.
+        watches_box: whether a particle whose stencil has left the nodes in use is lost: on a GPU, where speeds are not
+            read back at every step.
+        lost: per group, the first particle (in solver order) that left the domain, was inverted or is not finite, or
+            NOT_LOST.
+    """
+
+    def __init__(self, grid: Grid, group_count: int, *, watches_box: bool) -> None:
+        self.grid = grid
+        self.dimension = grid.dimension
+        self.extent = tuple(n * grid.spacing for n in grid.cells)
+        self.watches_box = watches_box
+        self.lost = ti.field(int, shape=group_count)
+        self.lost.fill(NOT_LOST)
+
+    def any_lost(self) -> bool:
+        """Return whether any particle is lost."""
+        return bool((self.lost.to_numpy() != NOT_LOST).any())
+
+    @ti.func
+    def scatter(self, g: ti.template(), group: ti.template(), p: int, kick: float, atomic: ti.template()):
+        """Scatter one particle, unless it is crushed or inverted: its stress would spread NaN over the grid."""
+        if volume_ratio(group, group.stored(p)) > SMALLEST_J:
+            scatter(group, self.grid, p, kick, atomic)
+        else:
+            ti.atomic_min(self.lost[g], p)
+
+    @ti.func
+    def advance(self, g: ti.template(), group: ti.template(), p: int, dt: float):
+        """Gather and move one particle, x += dt v and F <- (I + dt C) F or J *= det(I + dt C).
+
+        Returns:
+            Its rate of deformation, 1/s (see `deformation_rate`).
+        """
+        d = ti.static(self.dimension)
+
+        # Gather.
+        x = group.x[p]
+        v, gradient = gather(x, self.grid, self.grid.nodes)
+        C = ti.Matrix.zero(float, d, d)
+        inside = x
+        beyond = 0.0
+        for c in ti.static(range(d)):
+            for a in ti.static(range(d)):
+                C[c, a] = gradient[a, c]
+            moved = x[c] + dt * v[c]
+            inside[c] = ti.select(moved > 0.0, moved, 0.0)
+            inside[c] = ti.select(inside[c] < self.extent[c], inside[c], self.extent[c])
+            beyond += ti.abs(moved - inside[c])
+        if ti.static(self.grid.scheme.keeps_before):
+            kept = self.unseen_velocity(group, p, x)
+            for c in ti.static(range(d)):
+                v[c] += kept[c]
+
+        # Motion.
+        for c in ti.static(range(group.v.n)):
+            group.v[p][c] = v[c]
+        for a in ti.static(range(d)):
+            for c in ti.static(range(group.v.n)):
+                group.gradient[p][a, c] = gradient[a, c]
+
+        # Deformation. The rate here, where C is at hand, takes half the time that it would take at the end.
+        deforming = deformation_rate(group, C)
+        if ti.static(group.law.deformation == "F"):
+            # F - I grows by dt C + dt C (F - I).
+            old = group.displacement_gradient[p]
+            new = old
+            for i in ti.static(range(d)):
+                for k in ti.static(range(d)):
+                    rate = dt * C[i, k]
+                    new[i, k] += rate
+                    for j in ti.static(range(old.m)):
+                        new[i, j] += rate * old[k, j]
+            group.displacement_gradient[p] = new
+        else:
+            growth = volume_growth(C, dt)
+            group.J_minus_1[p] += growth + growth * group.J_minus_1[p]
+
+        # Position. Written so that a NaN is not sound; then it stays, and no later step writes outside the grid.
+        sound = beyond <= ti.static(0.5 * self.grid.spacing)
+        if ti.static(self.watches_box):
+            base, _ = self.grid.scheme.spline.stencil(inside, ti.static(1 / self.grid.spacing))
+            for a in ti.static(range(d)):
+                low = self.grid.box[0, a]
+                reach = ti.static(self.grid.scheme.spline.nodes - 1)
+                sound = sound and base[a] >= low and base[a] + reach < low + self.grid.box[1, a]
+        for c in ti.static(range(d)):
+            group.x[p][c] = ti.select(sound, inside[c], x[c])
+        if not sound:
+            ti.atomic_min(self.lost[g], p)
+        return deforming
+
+    @ti.func
+    def unseen_velocity(self, group: ti.template(), p: int, x: ti.template()):
+        """Return the share that particle p, at x, keeps of the velocity of its own that the nodes do not see.
+
+        AFLIP adds it to APIC's velocity: v <- sum w v_i + flip (v - sum w v_i^before) (Fei et al. 2021;
+        docs/theory.md, 2.3). C, positions and deformations follow the nodes. As positions do, and not the particle's
+        own velocity, angular momentum is kept to first order in the step only.
+        """
+        before, _ = gather(x, self.grid, self.grid.before)
+        kept = ti.Vector.zero(float, self.dimension)
+        for c in ti.static(range(self.dimension)):
+            kept[c] = self.grid.scheme.flip * (group.v[p][c] - before[c])
+        return kept

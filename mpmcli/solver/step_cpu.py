@@ -1,0 +1,159 @@
+"""The step on the CPU: P2G colour by colour without atomics, then nodes and G2P in one kernel.
+
+Every loop over shares runs `threads` times CHUNK iterations, of which one in CHUNK works: Taichi gives a thread at
+least CHUNK iterations.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import taichi as ti
+
+from mpmcli.solver.forces import Gravity
+from mpmcli.solver.grid import Grid
+from mpmcli.solver.nodes import NodeUpdate
+from mpmcli.solver.ordering import CHUNK, TileOrder, share_start
+from mpmcli.solver.particle_update import NOT_LOST, ParticleUpdate
+from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.state_bounds import NOTHING, StateBounds, entries, state_bounds_of, widen_motion, widen_state
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """What a step reads back.
+
+    Attributes:
+        speed: largest speed of a node, m/s, which no particle exceeds; -1 where a particle was lost.
+        deformation_rates: of each group, the largest rate of deformation, 1/s (see `deformation_rate`).
+        state_bounds: of each group that hardens, the bounds of its state; None of the others, which change less.
+    """
+
+    speed: float
+    deformation_rates: list[float]
+    state_bounds: list[StateBounds | None]
+
+
+def build_cpu_step(
+    grid: Grid,
+    nodes: NodeUpdate,
+    particles: ParticleUpdate,
+    groups: Sequence[ParticleGroup],
+    orders: Sequence[TileOrder],
+    gravity: Gravity,
+) -> Callable[[float, float], StepResult]:
+    """Build the kernels of a step (dt, kick) for these groups and nothing else."""
+    d = grid.dimension
+    threads = orders[0].threads
+    pairs = tuple(zip(range(len(groups)), groups, orders, strict=True))
+    # Colours written out in one kernel: four would double the compile time of 3D scenes, two that of what scatters
+    # more than is usual.
+    together = 2 if grid.scheme.plain else 1
+    # What is read back: the largest speed, and of each group its rate of deformation and all maxima where it hardens.
+    largest_speed_squared = ti.field(float, shape=())
+    largest_rate = tuple(ti.field(float, shape=()) for _ in groups)
+    hardens = tuple(group.law.hardening > 0 for group in groups)
+    maxima = tuple(
+        tuple(ti.field(float, shape=()) for _ in range(entries(group) * hardened))
+        for group, hardened in zip(groups, hardens, strict=True)
+    )
+    read_back = (*largest_rate, *(field for fields in maxima for field in fields))
+    numbers = ti.types.vector(1 + len(read_back), float)
+
+    @ti.func
+    def clear_rows(t: int, count: int):
+        """Clear the share of thread t of `count` rows of nodes."""
+        for row in range(share_start(count, t, threads), share_start(count, t + 1, threads)):
+            first = grid.linear_index(grid.row_start(row))
+            for k in range(grid.box[1, d - 1]):
+                grid.clear(first + k)
+
+    @ti.func
+    def scatter_pencils(g: ti.template(), group: ti.template(), order: ti.template(), colour: int, t: int, kick: float):
+        """Scatter the particles in the pencils of a colour that thread t takes."""
+        for r in range(order.work[colour, t], order.work[colour, t + 1]):
+            first = order.pencil_start(colour, r)
+            for p in range(order.start[first], order.start[first + order.pencil]):
+                particles.scatter(g, group, p, kick, False)
+
+    @ti.func
+    def update_rows(t: int, gravity_step: ti.template()):
+        """Update the nodes in the rows of thread t; return the square of the largest velocity."""
+        rows = grid.row_count()
+        speed_squared = 0.0
+        for row in range(share_start(rows, t, threads), share_start(rows, t + 1, threads)):
+            node = grid.row_start(row)
+            first = grid.linear_index(node)
+            for k in range(grid.box[1, d - 1]):
+                speed_squared = ti.max(speed_squared, nodes.update(node, first + k, gravity_step))
+                node[d - 1] += 1
+        return speed_squared
+
+    @ti.func
+    def advance_share(g: ti.template(), group: ti.template(), t: int, dt: float):
+        """Move the particles of thread t.
+
+        Each thread keeps its own maxima and merges them once: with Taichi's own reduction, two threads took as long as
+        one, as if they shared cache lines.
+        """
+        sharpest = NOTHING
+        own = ti.Vector([NOTHING] * ti.static(max(len(maxima[g]), 1)))
+        for p in range(share_start(group.count, t, threads), share_start(group.count, t + 1, threads)):
+            rate = particles.advance(g, group, p, dt)
+            sharpest = ti.max(sharpest, rate)
+            if ti.static(hardens[g]):
+                v, _ = group.motion(p)
+                widen_motion(own, v, rate)
+                widen_state(group, own, p)
+        ti.atomic_max(largest_rate[g][None], sharpest)
+        for k in ti.static(range(len(maxima[g]))):
+            ti.atomic_max(maxima[g][k][None], own[k])
+
+    @ti.kernel
+    def p2g(part: int, kick: float):
+        """Scatter some colours, after clearing the grid for the first ones."""
+        for q in range(CHUNK * threads):
+            if q % CHUNK == 0:
+                clear_rows(q // CHUNK, grid.row_count() if part == 0 else 0)
+        for g, group, order in ti.static(pairs):
+            for parity in ti.static(range(together)):
+                for q in range(CHUNK * threads):
+                    if q % CHUNK == 0:
+                        scatter_pencils(g, group, order, parity + together * part, q // CHUNK, kick)
+
+    @ti.kernel
+    def update_and_g2p(dt: float, kick: float) -> numbers:
+        """Update the grid, gather, and return the numbers of a `StepResult`."""
+        largest_speed_squared[None] = 0.0
+        for k in ti.static(range(len(read_back))):
+            read_back[k][None] = NOTHING
+        if ti.static(nodes.needs_contact):
+            for q in range(nodes.images.plane_nodes(grid)):
+                nodes.images.find_contact(grid, q, gravity.in_step(kick))
+        for q in range(CHUNK * threads):
+            if q % CHUNK == 0:
+                ti.atomic_max(largest_speed_squared[None], update_rows(q // CHUNK, gravity.in_step(kick)))
+        for g, group, _order in ti.static(pairs):
+            for q in range(CHUNK * threads):
+                if q % CHUNK == 0:
+                    advance_share(g, group, q // CHUNK, dt)
+        result = numbers(0.0)
+        result[0] = ti.sqrt(largest_speed_squared[None])
+        for k in ti.static(range(len(read_back))):
+            result[1 + k] = read_back[k][None]
+        for g in ti.static(range(len(groups))):
+            if particles.lost[g] != NOT_LOST:
+                result[0] = -1.0
+        return result
+
+    def step(dt: float, kick: float) -> StepResult:
+        for part in range(orders[0].colours // together):
+            p2g(part, kick)
+        speed, *values = update_and_g2p(dt, kick).to_list()
+        bounds, first = [], len(groups)
+        for group, fields in zip(groups, maxima, strict=True):
+            own = values[first : first + len(fields)]
+            bounds.append(state_bounds_of(group, own) if own else None)
+            first += len(fields)
+        return StepResult(speed, values[: len(groups)], bounds)
+
+    return step

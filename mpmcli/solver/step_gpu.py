@@ -1,0 +1,37 @@
+"""The step on a GPU: one kernel, whose scatter adds atomically, and which reads nothing back."""
+
+from collections.abc import Callable, Sequence
+
+import taichi as ti
+
+from mpmcli.solver.forces import Gravity
+from mpmcli.solver.grid import Grid
+from mpmcli.solver.nodes import NodeUpdate
+from mpmcli.solver.particle_update import ParticleUpdate
+from mpmcli.solver.particles import ParticleGroup
+
+
+def build_gpu_step(
+    grid: Grid, nodes: NodeUpdate, particles: ParticleUpdate, groups: Sequence[ParticleGroup], gravity: Gravity
+) -> Callable[[float, float], None]:
+    """Build the kernel of a step (dt, kick) for these groups and nothing else."""
+    numbered = tuple(enumerate(groups))
+
+    @ti.kernel
+    def step(dt: float, kick: float):
+        for q in range(grid.box_nodes()):
+            grid.clear(grid.linear_index(grid.box_node(q)))
+        for g, group in ti.static(numbered):
+            for p in range(group.count):
+                particles.scatter(g, group, p, kick, True)
+        if ti.static(nodes.needs_contact):
+            for q in range(nodes.images.plane_nodes(grid)):
+                nodes.images.find_contact(grid, q, gravity.in_step(kick))
+        for q in range(grid.box_nodes()):
+            node = grid.box_node(q)
+            nodes.update(node, grid.linear_index(node), gravity.in_step(kick))
+        for g, group in ti.static(numbered):
+            for p in range(group.count):
+                particles.advance(g, group, p, dt)
+
+    return step
