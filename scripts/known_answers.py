@@ -4,7 +4,6 @@ Each takes an opened result and returns one phrase for the table of README.md.
 """
 
 import math
-import tomllib
 
 import numpy as np
 
@@ -20,7 +19,7 @@ def dam_break_2d(result: Result) -> str:
     """Compare the front Z(T) with the experiment, as it is and shifted by the largest delay that a gate may cause."""
     gravity, width = 9.81, 1.0
     # A particle stands for h/2 of the row along the floor.
-    front = np.array([frame.position[:, 0].max() for frame in result.frames([])]) + result.header["spacing"] / 4
+    front = np.array([frame.position[:, 0].max() for frame in result.frames([])]) + result.header.spacing / 4
     T = math.sqrt(N_SQUARED * gravity / width) * result.times
     larger = measured("front")[0]
     as_it_is, shifted = (100 * mean_error(larger, T, front / width, shift) for shift in (0.0, GATE))
@@ -34,7 +33,7 @@ def dam_break_3d(result: Result) -> str:
     """Say when the front has come within half a cell of the far wall, in units of sqrt(H / g)."""
     gravity, height = 9.81, 0.3
     front = np.array([frame.position[:, 0].max() for frame in result.frames([])])
-    wall = result.header["origin"][0] + result.header["size"][0] - result.header["spacing"] / 2
+    wall = result.header.upper[0] - result.header.spacing / 2
     k = int(np.argmax(front >= wall))
     time = np.interp(wall, front[k - 1 : k + 1], result.times[k - 1 : k + 1])
     return f"front at the far wall at t √(g/H) = {time * math.sqrt(gravity / height):.2f}; experiments 2.4 to 2.6"
@@ -55,10 +54,10 @@ def elliptical_drop_2d(result: Result) -> str:
 
 def falling(result: Result) -> str:
     """Compare the fall of the centre of mass with g t^2 / 2, at the last frame before any cell touches the floor."""
-    gravity, reach = 9.81, 2 * result.header["spacing"]
+    gravity, reach = 9.81, 2 * result.header.spacing
     heights = []
     for frame in result.frames([]):
-        if frame.position[:, -1].min() - result.header["origin"][-1] < reach:
+        if frame.position[:, -1].min() - result.header.origin[-1] < reach:
             break
         heights.append(frame.position[:, -1].mean(dtype=np.float64))
     time = float(result.times[len(heights) - 1])
@@ -77,7 +76,7 @@ def rubber_bounce_2d(result: Result) -> str:
 
 def snowball_wall(result: Result) -> str:
     """Compare the flight with v t + g t^2 / 2 up to the wall, and say how much of the snow ends on the wall."""
-    spacing, wall = result.header["spacing"], result.header["origin"][0] + result.header["size"][0]
+    spacing, wall = result.header.spacing, result.header.upper[0]
     first = result.frame(0, [])
     start, velocity = (array.mean(axis=0, dtype=np.float64) for array in (first.position, first.velocity))
     k = 0
@@ -111,7 +110,7 @@ def sand_column_3d(result: Result) -> str:
 def heap(result: Result, axis: np.ndarray, length: float) -> tuple[float, float]:
     """Return how far a heap has run out of a column of half width `length`, 99 % of it, and its height, in lengths."""
     position = result.frame(result.frame_count - 1, []).position
-    reach = result.header["spacing"] / 4
+    reach = result.header.spacing / 4
     distance = np.linalg.norm(position[:, :-1] - axis, axis=1)
     return (float(np.quantile(distance, 0.99)) + reach) / length - 1, (float(position[:, -1].max()) + reach) / length
 
@@ -119,7 +118,7 @@ def heap(result: Result, axis: np.ndarray, length: float) -> tuple[float, float]
 def lava_slope_2d(result: Result) -> str:
     """Compare the thickness of the middle third of the layer with yield_stress / (density g sin(slope))."""
     lava = material(result)
-    downhill = abs(tomllib.loads(result.header["scene"])["domain"]["gravity"][0])
+    downhill = abs(result.header.gravity[0])
     position = result.frame(result.frame_count - 1, []).position[:, 0]
     low, high = position.min(), position.max()
     third = (high - low) / 3
@@ -136,8 +135,8 @@ def mud_slump_2d(result: Result) -> str:
     """Compare the half width of the heap with that of the parabola h^2 = 2 yield_stress (L - |x|) / (density g)."""
     mud = material(result)
     position = result.frame(result.frame_count - 1, []).position
-    half_width = (np.ptp(position[:, 0]) + result.header["spacing"] / 2) / 2
-    height = position[:, 1].max() + result.header["spacing"] / 4
+    half_width = (np.ptp(position[:, 0]) + result.header.spacing / 2) / 2
+    height = position[:, 1].max() + result.header.spacing / 4
     length = mud["yield_stress"] / (mud["density"] * 9.81)
     area = result.ledger[0].mass / mud["density"]
     known = (0.75 * area / math.sqrt(2 * length)) ** (2 / 3)
@@ -161,7 +160,7 @@ def metal_impact_2d(result: Result) -> str:
     Both take one flow stress: here the mean over the plastic strain of the whole rod, times 2/sqrt(3) in plane strain.
     """
     metal, speed = material(result), 200.0
-    reach = result.header["spacing"] / 2
+    reach = result.header.spacing / 2
     first, last = (np.ptp(result.frame(k, []).position[:, 1]) + reach for k in (0, result.frame_count - 1))
     strain = result.frame(result.frame_count - 1).fields["plastic_strain"].astype(np.float64)
     flow_stress = 2 / math.sqrt(3) * plastic_work(metal, strain).sum() / strain.sum()
@@ -195,10 +194,10 @@ def plastic_share(result: Result) -> str:
     """Say how much of the energy that went is plastic work."""
     frame = result.frame(result.frame_count - 1)
     strain = frame.fields["plastic_strain"].astype(np.float64)
-    bodies = tomllib.loads(result.header["scene"])["bodies"]
+    bodies = result.header.bodies
     # All bodies have one density and as many particles per cell, so that every particle has the same volume.
-    volume = result.ledger[0].mass / bodies[0]["material"]["density"] / len(strain)
-    work = sum(volume * plastic_work(body["material"], strain[frame.body == k]).sum() for k, body in enumerate(bodies))
+    volume = result.ledger[0].mass / bodies[0].density / len(strain)
+    work = sum(volume * plastic_work(body.material, strain[frame.body == k]).sum() for k, body in enumerate(bodies))
     went = result.ledger[0].energy - result.ledger[-1].energy
     return f"{100 * work / went:.1f} % of the energy that went is plastic work"
 
@@ -210,7 +209,7 @@ def plastic_work(metal: dict, strain: np.ndarray) -> np.ndarray:
 
 def material(result: Result) -> dict:
     """Return the parameters of the first body, every default and knob filled in."""
-    return tomllib.loads(result.header["scene"])["bodies"][0]["material"]
+    return result.header.bodies[0].material
 
 
 def stirred_tank_2d(result: Result) -> str:

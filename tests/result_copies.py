@@ -16,7 +16,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import SegmentStore, VtkSeriesStore, open_result
 from mpmcli.output.run_record import RECORD
-from mpmcli.output.store import PACKED
+from mpmcli.output.segments import PACKED
 
 FORMS = ("packed", "segments", "series")
 # A drop falls on the floor and splashes, and a jelly ball falls freely; it starts in no time.
@@ -134,4 +134,4 @@ def stored_run(directory: Path, *overrides: str) -> StoredRun:
     assert outcome.status == 0, outcome.stderr
     result = open_result(directory / "result")
     record = (directory / "result" / RECORD).read_text(encoding="utf-8")
-    return StoredRun(directory / "result", tuple(result.frames()), tuple(result.ledger), result.header, record)
+    return StoredRun(directory / "result", tuple(result.frames()), tuple(result.ledger), result.header.stored, record)

@@ -19,6 +19,7 @@ from mpmcli.output.layout import FrameLayout
 from mpmcli.scene import scene_to_toml
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError
 from mpmcli.solver.ordering import entry_count
+from mpmcli.solver.plan import make_plan
 from mpmcli.solver.solver import Solver
 
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e7, "friction_angle": 30.0}
@@ -76,7 +77,7 @@ def test_a_run_takes_what_was_forecast(backend_of: Callable, tmp_path: Path, cas
     """Memory of all fields, packed file and .vtu series within 5 % (the issue asks for 10), steps to within 2."""
     scene = CASES[case]()
     backend = backend_of(scene.scene.solver.precision)
-    checked = check_scene(scene, threads=backend.threads)
+    checked = check_scene(scene, plan=make_plan(scene.scene, backend))
     forecast = checked.forecast
     before = fields()
     solver = Solver(scene.scene, backend)
@@ -177,5 +178,5 @@ def test_the_command_probes_and_writes_nothing(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(Solver, "step", broken)
     outcome = run_here("check", path, "--threads", "2")
     assert outcome.status == 1
-    assert "error: The run broke down within 0 steps of the probe: the run became unstable" in outcome.stderr
-    assert "not ok: 1 error" in outcome.stderr
+    assert "error: The run broke down within 0 steps of the probe: the run became unstable" in outcome.stdout
+    assert "not ok: 1 error" in outcome.stdout

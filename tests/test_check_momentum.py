@@ -7,7 +7,7 @@ from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_motion import MomentumCheck
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.scene_facts import SceneFacts, scene_facts
+from mpmcli.output.header import RunHeader
 
 SCENE = """\
 [domain]
@@ -19,9 +19,9 @@ transfer = "{transfer}"
 """
 
 
-def facts_of(transfer: str) -> SceneFacts:
+def header_of(transfer: str) -> RunHeader:
     header = {"dimension": 2, "spacing": 0.05, "origin": [0.0, 0.0], "size": [2.0, 1.0]}
-    return scene_facts({**header, "scene": SCENE.format(transfer=transfer)})
+    return RunHeader.read({**header, "scene": SCENE.format(transfer=transfer)})
 
 
 def row(index: int, spin: float) -> LedgerRow:
@@ -41,7 +41,7 @@ def test_spin_that_is_lost_is_a_fault_of_apic_alone(transfer: str, found: bool) 
     label = np.zeros(2, dtype=np.int32)
     lost = 0.05 * np.sqrt(0.2) * np.hypot(2.0, 1.0)
     findings = FrameFindings()
-    check = MomentumCheck(facts_of(transfer), findings, row(0, 1.0))
+    check = MomentumCheck(header_of(transfer), findings, row(0, 1.0))
     for k in range(2):
         check.check(k, Frame(k, 0.1 * k, k, position, velocity, label, label, {}), row(k, 1.0 - k * lost))
     assert check.frames == 1

@@ -15,8 +15,8 @@ from mpmcli.check import result_check
 from mpmcli.check.result_check import check_result
 from mpmcli.errors import InputError
 from mpmcli.output.run_record import RECORD
+from mpmcli.output.segments import PACKED, SEGMENTS, segment_name
 from mpmcli.output.series import SERIES, SERIES_HEADER, SERIES_LEDGER, series_frame_name
-from mpmcli.output.store import PACKED, SEGMENTS, segment_name
 
 K = 6
 

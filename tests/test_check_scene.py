@@ -202,12 +202,12 @@ def test_the_json_has_what_is_promised(tmp_path) -> None:
 
 
 def test_the_table_names_what_binds(tmp_path, monkeypatch) -> None:
-    """Text goes to stderr, and nothing is written."""
+    """Text goes to stdout, and nothing is written."""
     monkeypatch.chdir(tmp_path)
     outcome = run_here("check", CONFIGS / "snowball_wall_2d.toml", "--no-probe")
-    assert (outcome.status, outcome.stdout) == (0, "")
+    assert (outcome.status, outcome.stderr) == (0, "")
     for words in ("binds throughout", "binds at the start", "passes of a step", "on the device", "ok: nothing found"):
-        assert words in outcome.stderr
+        assert words in outcome.stdout
     assert list(tmp_path.iterdir()) == []
 
 

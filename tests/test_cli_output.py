@@ -1,4 +1,4 @@
-"""What commands print: JSON on stdout, everything else on stderr."""
+"""What commands print: what was asked for on stdout, everything else on stderr."""
 
 import json
 import os
@@ -52,14 +52,8 @@ def test_json_is_all_there_is_on_stdout(results):
     lines = outcome.stderr.splitlines()
     assert lines[0] == summary["notes"][0]
     assert lines[1].startswith("256 particles on ")
-    # A slow machine has time for lines of progress in between.
-    assert [line.split(":")[0] for line in lines[2:] if "/5 frames: t = " not in line] == [
-        "finished",
-        "seconds",
-        "energy",
-        "volume ratio J at the end",
-        "result",
-    ]
+    # A slow machine has time for lines of progress.
+    assert all("/5 frames: t = " in line for line in lines[2:])
 
 
 def test_quiet_says_nothing(results):
@@ -82,8 +76,8 @@ def test_info_says_what_a_result_holds(run, path, kind):
     expected |= {"fields": ["velocity", "density", "pressure"], "bodies": ["drop"], "time_s": [0.0, 0.05]}
     assert {key: facts[key] for key in expected} == expected
     outcome = run("info", path)
-    assert outcome.status == 0 and outcome.stdout == ""
-    told = dict(line.split("  ", 1) for line in outcome.stderr.splitlines())
+    assert outcome.status == 0 and outcome.stderr == ""
+    told = dict(line.split("  ", 1) for line in outcome.stdout.splitlines())
     assert told["frames"].strip() == "5"
     assert "failure" not in told
 
@@ -93,7 +87,7 @@ def test_info_reads_a_run_that_goes_on(run, tmp_path):
     from mpmcli.output import RunRecord, SegmentStore
 
     result = open_result(Path("packed"))
-    store, record = SegmentStore(tmp_path, result.header), RunRecord(tmp_path, frames_expected=5)
+    store, record = SegmentStore(tmp_path, result.header.stored), RunRecord(tmp_path, frames_expected=5)
     for k in range(2):
         store.write(result.frame(k), result.ledger[k])
         record.observe(result.ledger[k])
@@ -108,7 +102,7 @@ def test_info_of_a_scene_says_what_it_takes(run):
     facts = json.loads(run("info", "scene.toml", "--set", "time.frames=9", "--json").stdout)
     expected = {"dimension": 2, "cells": [16, 16], "particles": 256, "frames": 10, "bodies": ["drop: fluid, box"]}
     assert {key: facts[key] for key in expected} == expected
-    assert "bytes per particle" in run("info", "scene.toml").stderr
+    assert "bytes per particle" in run("info", "scene.toml").stdout
 
 
 def test_json_has_no_infinity(run, tmp_path):
@@ -118,7 +112,7 @@ def test_json_has_no_infinity(run, tmp_path):
     from mpmcli.output import SegmentStore
 
     result = open_result(Path("packed"))
-    store = SegmentStore(tmp_path, result.header)
+    store = SegmentStore(tmp_path, result.header.stored)
     store.write(result.frame(0), replace(result.ledger[0], elastic=float("inf")))
     outcome = run("info", tmp_path, "--json")
     assert json.loads(outcome.stdout, parse_constant=pytest.fail)["energy_J"] == [None, None]

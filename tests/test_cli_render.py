@@ -14,7 +14,7 @@ from drawn_results import JELLY, WATER, frame, header, lattice, write
 from PIL import Image
 
 from mpmcli.output import Result, VtkSeriesStore, open_result
-from mpmcli.output.store import SEGMENTS
+from mpmcli.output.segments import SEGMENTS
 from mpmcli.render.files.picture_file import settings_digest, write_picture
 from mpmcli.render.request import Request, assign
 
@@ -225,7 +225,7 @@ def test_without_a_window_the_setting_at_fault_is_named(run: Path, run_python: C
 
 def test_series_are_drawn_too(tmp_path: Path, run: Path) -> None:
     source = open_result(run)
-    store = VtkSeriesStore(tmp_path / "series", source.header)
+    store = VtkSeriesStore(tmp_path / "series", source.header.stored)
     for k, entry in enumerate(source.frames()):
         store.write(entry, source.ledger[k])
     series = store.finish()

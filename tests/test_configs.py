@@ -87,7 +87,7 @@ def test_a_config_runs(path, tmp_path):
     )
     assert (outcome.status, outcome.stdout, outcome.stderr) == (0, "", "")
     result = open_result(tmp_path / "result")
-    assert result.dimension == scene.dimension and result.header["title"] == scene.title
+    assert result.dimension == scene.dimension and result.header.title == scene.title
     assert result.times.tolist() == [0.0, end / 2, end]
     stored = {"velocity", *result.field_names}
     assert stored == {"velocity", *scene.output.fields}

@@ -4,11 +4,11 @@ import h5py
 import numpy as np
 import pytest
 from test_output_frames import FIELDS, make_frame
-from test_output_store import fill
+from test_output_segments import fill
 
 from mpmcli.errors import InputError
 from mpmcli.output import open_result
-from mpmcli.output.store import sealed_segments
+from mpmcli.output.segments import sealed_segments
 
 
 def test_fields_can_be_left_out(tmp_path):

@@ -47,7 +47,7 @@ def test_round_trip(counts, d, dtype, fields, compress):
         assert store.finish() == Path(place) / "particles.pvd"
         for path in (place, store.finish()):
             result = open_result(path)
-            assert (result.kind, result.dimension, result.header) == ("series", d, HEADER)
+            assert (result.kind, result.dimension, result.header.stored) == ("series", d, HEADER)
             assert result.times.tolist() == [frame.time for frame in frames]
             assert result.particle_counts.tolist() == counts
             assert result.ledger == [make_row(k, d) for k in range(len(counts))]

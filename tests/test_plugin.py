@@ -134,7 +134,7 @@ def test_simulate_runs_the_law():
     from mpmcli.output import open_result
 
     result = open_result(Path("result"))
-    assert result.header["materials"] == ["log_fluid"]
+    assert [law.name for law in result.header.laws] == ["log_fluid"]
     first, last = result.frame(0), result.frame(4)
     assert (first.position != last.position).any()
     # Nothing dissipates but the transfers: energy is not made, to rounding in f32.

@@ -153,7 +153,7 @@ def test_three_lines_of_h5py_read_a_result(commands, checkout, monkeypatch):
             assert not position[k, :, 2].any()
         stored = set(names["file"]["VTKHDF/PointData"])
         assert stored == {"id", "body", "material", "velocity", "density", "pressure"}
-        assert names["file"]["mpmcli"].attrs["scene"] == result.header["scene"]
+        assert names["file"]["mpmcli"].attrs["scene"] == result.header.stored["scene"]
         np.testing.assert_array_equal(names["file"]["VTKHDF/Steps/Values"][:], result.times)
     finally:
         names["file"].close()

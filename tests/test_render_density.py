@@ -7,7 +7,6 @@ import pytest
 from drawn_results import WATER, frame, header, lattice, write
 
 from mpmcli.output import Result
-from mpmcli.output.scene_facts import scene_facts
 from mpmcli.render.density import DensityPainter, Slice, density_colors, grid_density, slice_of
 from mpmcli.render.subject import subject_of
 from mpmcli.render.theme import THEMES, rgb_bytes
@@ -35,7 +34,7 @@ def test_all_mass_is_on_the_grid(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     places = rng.random((500, 2)) * (1.0, 0.5)
     result = write(tmp_path / "run", header((1.0, 0.5), H, [WATER]), [frame(0, places)])
-    density = grid_density(result.frame(0), scene_facts(result.header), Slice((0, 1)))
+    density = grid_density(result.frame(0), result.header, Slice((0, 1)))
     assert density.shape == (21, 11)
     # 1000 kg/m^3 over the whole domain; single precision of masses and places.
     assert (density * weights(density)).sum() * H**2 == pytest.approx(1000.0 * 1.0 * 0.5, rel=1e-6)
@@ -43,7 +42,7 @@ def test_all_mass_is_on_the_grid(tmp_path: Path) -> None:
 
 def test_a_block_has_its_density_up_to_the_walls(tmp_path: Path) -> None:
     result = filled(tmp_path, (1.0, 0.5))
-    density = grid_density(result.frame(0), scene_facts(result.header), Slice((0, 1)))
+    density = grid_density(result.frame(0), result.header, Slice((0, 1)))
     # All mass in half of the room; quadratic B-splines sum to one on a lattice of two particles per cell.
     np.testing.assert_allclose(density[:8], 2000.0, rtol=1e-5)
     np.testing.assert_allclose(density[13:], 0.0)
@@ -55,7 +54,7 @@ def test_a_slice_has_the_density_of_its_place(tmp_path: Path, camera: str, acros
     result = filled(tmp_path, (0.6, 0.4, 0.5))
     plane = slice_of(subject_of(result), camera)
     assert plane.across == across
-    density = grid_density(result.frame(0), scene_facts(result.header), plane)
+    density = grid_density(result.frame(0), result.header, plane)
     # The slice from the side lies on the edge of the block, where half of the kernel is.
     expected = 1000.0 if camera == "side" else 2000.0
     np.testing.assert_allclose(density[:4], expected, rtol=1e-5)
@@ -68,7 +67,7 @@ def test_the_image_shows_the_block_where_it_is(tmp_path: Path) -> None:
     plane = slice_of(subject, "iso")
     colors = density_colors(result, plane, LIGHT)
     assert colors.limits == (0.0, pytest.approx(2000.0, rel=1e-4))
-    painter = DensityPainter(scene_facts(result.header), subject, view, LIGHT, plane, colors)
+    painter = DensityPainter(result.header, subject, view, LIGHT, plane, colors)
     picture = painter.draw(result.frame(0))
     left, right, outside = view.pixels(np.array([[0.2, 0.25, 0.0], [0.8, 0.25, 0.0], [1.02, 0.25, 0.0]]))[:, :2].astype(
         int

@@ -14,7 +14,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import SegmentStore, open_result
 from mpmcli.scene import load_scene
-from mpmcli.simulation.run import RunSettings, run_scene
+from mpmcli.simulation.simulate import RunSettings, simulate
 from mpmcli.solver.backend import Backend
 
 
@@ -128,15 +128,15 @@ class FakeSolver:
 def run(tmp_path, monkeypatch):
     """Return `run(fault)`: the summary of a run whose solver raises it after two frames."""
     backend = Backend("cpu", 1, "f32", compile_cache=True)
-    monkeypatch.setattr("mpmcli.simulation.run.start_backend", lambda *_, **__: backend)
-    monkeypatch.setattr("mpmcli.simulation.run.Solver", FakeSolver)
+    monkeypatch.setattr("mpmcli.simulation.simulate.start_backend", lambda *_, **__: backend)
+    monkeypatch.setattr("mpmcli.simulation.simulate.Solver", FakeSolver)
     scene = tmp_path / "scene.toml"
     scene.write_text(SCENE, encoding="utf-8")
     loaded = load_scene(scene, laws=parameter_models())
 
-    def run(fault: BaseException | None, watch=lambda row, summary: None):
+    def run(fault: BaseException | None, on_frame=lambda row, summary: None):
         monkeypatch.setattr(FakeSolver, "fault", fault)
-        return run_scene(loaded, RunSettings(tmp_path / "result"), watch)
+        return simulate(loaded, RunSettings(tmp_path / "result"), on_frame=on_frame)
 
     return run
 
@@ -193,7 +193,7 @@ def test_a_run_that_cannot_be_packed_says_so(run, tmp_path, monkeypatch):
     assert status_on_disk(tmp_path / "result") == "failed"
 
 
-def test_the_watch_sees_every_frame(run):
+def test_every_frame_is_reported(run):
     seen = []
     run(None, lambda row, summary: seen.append((row.time, summary.frames, summary.status)))
     assert seen == [(0.0, 1, "running"), (1.0, 2, "running"), (2.0, 3, "running")]

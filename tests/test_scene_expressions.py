@@ -172,7 +172,7 @@ def test_scenes_without_expressions_plan_as_before(tmp_path):
 
 
 def test_the_check_of_a_scene_takes_expressions(tmp_path):
-    check = check_scene(loaded(tmp_path), threads=2)
+    check = check_scene(loaded(tmp_path))
     assert check.passes() and check.forecast.steps > 0
     gradient = next(limit for limit in check.limits if limit.name == "deformation" and limit.state == "rest")
     assert gradient.value == pytest.approx(0.5 / (0.1 * np.pi), rel=1e-3)

@@ -65,7 +65,7 @@ def test_the_scene_of_a_case_runs_as_it_is(tmp_path: Path) -> None:
     ran = run_here("simulate", tmp_path / "bar.toml", "-o", tmp_path / "result", "--quiet", "--set", "time.frames=2")
     assert (ran.status, ran.stderr) == (0, "")
     result = open_result(tmp_path / "result")
-    assert result.times[-1] == 25.0 and result.header["precision"] == "f64"
+    assert result.times[-1] == 25.0 and result.header.precision == "f64"
     assert result.particle_counts[0] == 7 * 5 * 4
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from mpmcli.scene import LoadedScene
 from mpmcli.solver.backend import Arch, Backend, start_backend
 from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.plan import make_plan, require_room
+from mpmcli.solver.plan import Plan, make_plan, require_room
 from mpmcli.solver.solver import Solver
 
 # Steps that are not counted: the first compiles, and the caches of the processor fill.
@@ -36,16 +36,22 @@ class Probe:
     failure: str = ""
 
 
-def probe_scene(loaded: LoadedScene, *, arch: Arch = "auto", threads: int | None = None, seconds: float = 2.0) -> Probe:
+def probe_scene(
+    loaded: LoadedScene, *, arch: Arch = "auto", threads: int | None = None, seconds: float = 2.0
+) -> tuple[Probe, Plan]:
     """Run the scene for some seconds of stepping; it starts Taichi in this process and writes nothing.
 
+    Returns:
+        What it cost, and the plan of a run on the backend that came.
+
     Raises:
-        InputError: the backend cannot be had, or the scene does not fit into memory.
+        InputError: the backend is not available, or the scene does not fit into memory.
     """
     scene = loaded.scene
     began = time.perf_counter()
     backend = start_backend(arch, threads, scene.solver.precision)
-    require_room(make_plan(scene, backend))
+    plan = make_plan(scene, backend)
+    require_room(plan)
     solver = Solver(scene, backend)
     start = time.perf_counter() - began
     solver.frame(0, [])
@@ -70,7 +76,7 @@ def probe_scene(loaded: LoadedScene, *, arch: Arch = "auto", threads: int | None
         spent = time.perf_counter() - since
     except UnstableRunError as error:
         failure = str(error)
-    return Probe(backend, start, compiled, spent / steps if steps else None, frame, steps, failure)
+    return Probe(backend, start, compiled, spent / steps if steps else None, frame, steps, failure), plan
 
 
 def _advance(solver: Solver) -> None:

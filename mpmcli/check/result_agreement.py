@@ -6,7 +6,7 @@ from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_state import TOUCHED
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.scene_facts import SceneFacts
+from mpmcli.output.header import RunHeader
 
 # Relative, of numbers that are taken in single precision once more.
 SINGLE = 1e-5
@@ -21,8 +21,8 @@ class AgreementCheck:
         largest: largest relative difference found.
     """
 
-    def __init__(self, facts: SceneFacts, findings: FrameFindings) -> None:
-        self._facts = facts
+    def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
+        self._header = header
         self._findings = findings
         self._masses: np.ndarray | None = None
         self._body: np.ndarray | None = None
@@ -71,16 +71,16 @@ class AgreementCheck:
         self, number: int, frame: Frame, row: LedgerRow, m: np.ndarray, momentum: np.ndarray, precision: float
     ) -> None:
         """The ledger takes it half a step back, and the last step lies between the smallest and the largest."""
-        facts = self._facts
-        if facts.gravity is None or facts.origin is None or not facts.gravity.any():
+        header = self._header
+        if header.gravity is None or header.origin is None or not header.gravity.any():
             return
         # Positions that were moved by an origin were rounded once more.
-        rounding = 0.0 if not facts.origin.any() else float(np.finfo(frame.position.dtype).eps) * facts.farthest
-        weight = float(m.sum()) * float(np.linalg.norm(facts.gravity))
-        tolerance = weight * (rounding + precision * float(np.linalg.norm(facts.upper - facts.origin)))
-        moments = [np.einsum("i,i->", m, x - x0) for x, x0 in zip(frame.position.T, facts.origin, strict=True)]
-        power = 0.5 * float(momentum @ facts.gravity)
-        found = -float(moments @ facts.gravity) + np.array([row.step_min, row.step_max]) * power
+        rounding = 0.0 if not header.origin.any() else float(np.finfo(frame.position.dtype).eps) * header.farthest
+        weight = float(m.sum()) * float(np.linalg.norm(header.gravity))
+        tolerance = weight * (rounding + precision * float(np.linalg.norm(header.upper - header.origin)))
+        moments = [np.einsum("i,i->", m, x - x0) for x, x0 in zip(frame.position.T, header.origin, strict=True)]
+        power = 0.5 * float(momentum @ header.gravity)
+        found = -float(moments @ header.gravity) + np.array([row.step_min, row.step_max]) * power
         nearest = float(np.clip(row.potential, found.min(), found.max()))
         self._compare(number, "potential", nearest, row.potential, tolerance)
 
@@ -88,7 +88,7 @@ class AgreementCheck:
         if "mass" in frame.fields:
             return frame.fields["mass"].astype(np.float64)
         if self._body is None or not np.array_equal(self._body, frame.body):
-            self._body, self._masses = frame.body, self._facts.masses(frame.body)
+            self._body, self._masses = frame.body, self._header.masses(frame.body)
         return self._masses
 
     def _compare(self, number: int, name: str, found: float, told: float, tolerance: float) -> None:

@@ -15,8 +15,8 @@ from mpmcli.check.result_motion import MomentumCheck, MotionCheck
 from mpmcli.check.result_order import check_order, frames_expected
 from mpmcli.check.result_state import StateCheck
 from mpmcli.errors import InputError
-from mpmcli.output.scene_facts import SceneFacts, scene_facts
-from mpmcli.output.store import PACKED
+from mpmcli.output.header import RunHeader
+from mpmcli.output.segments import PACKED
 from mpmcli.plain_json import finite_json
 
 Verdict = Literal["stable", "suspect", "unstable"]
@@ -124,11 +124,11 @@ def check_result(path: Path) -> ResultCheck:
     """
     findings = FrameFindings()
     opened = open_entries(path, findings)
-    facts = scene_facts(opened.header)
-    check_order(opened, facts, findings)
-    figures = check_ledger(opened.entries, facts, findings)
+    header = opened.header
+    check_order(opened, header, findings)
+    figures = check_ledger(opened.entries, header, findings)
     if opened.entries:
-        figures |= _check_frames(opened, facts, findings)
+        figures |= _check_frames(opened, header, findings)
     if opened.kind == "segments" and (opened.path / PACKED).exists():
         # The run has come to its end meanwhile, and has packed the frames.
         return check_result(opened.path)
@@ -143,17 +143,17 @@ def check_result(path: Path) -> ResultCheck:
         first_bad_frame=first_bad,
         limit="" if first_bad is None else _limit_at(opened, first_bad),
         frames=len(opened.entries) - len(findings.frames_of("unreadable") & {e.number for e in opened.entries}),
-        frames_expected=frames_expected(opened, facts),
+        frames_expected=frames_expected(opened, header),
         particles=opened.entries[0].count if opened.entries else 0,
         figures=figures,
     )
 
 
-def _check_frames(opened: OpenedResult, facts: SceneFacts, findings: FrameFindings) -> dict[str, float | None]:
+def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindings) -> dict[str, float | None]:
     """Read every frame once, and check it against itself, the one before it, and the ledger."""
-    state, motion = StateCheck(facts, findings), MotionCheck(facts, findings)
-    agreement = AgreementCheck(facts, findings)
-    momentum = MomentumCheck(facts, findings, opened.entries[0].row)
+    state, motion = StateCheck(header, findings), MotionCheck(header, findings)
+    agreement = AgreementCheck(header, findings)
+    momentum = MomentumCheck(header, findings, opened.entries[0].row)
     size = 0
     before: tuple[int, int] | None = None
     for entry in opened.entries:

@@ -10,10 +10,11 @@ from mpmcli.check.result_findings import FrameFindings
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.header import RunHeader
 from mpmcli.output.result import Result, open_result
 from mpmcli.output.run_record import read_record
+from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_HEADER
-from mpmcli.output.store import PACKED, SEGMENTS, sealed_segments
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # What HDF5, numpy and the XML reader raise on a file whose content contradicts itself.
@@ -66,14 +67,14 @@ class OpenedResult:
 
     Attributes:
         kind: "packed", "segments", "series", or "none" where nothing can be read.
-        header: facts about the run, {} where nothing can be read.
+        header: facts about the run.
         record: content of run.json, None where there is none.
         entries: the frames in the order of the files.
     """
 
     path: Path
     kind: str
-    header: dict[str, Any]
+    header: RunHeader
     record: dict[str, Any] | None
     entries: list[Entry]
 
@@ -102,7 +103,7 @@ def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
             raise
         directory = path if path.is_dir() else path.parent
         findings.add("error", "unreadable", 0, f"No frame can be read: {_first_line(error).rstrip('.')}", RUN_AGAIN)
-        return OpenedResult(path, "none", {}, read_record(directory), [])
+        return OpenedResult(path, "none", RunHeader.read({}), read_record(directory), [])
     listed = min(len(result.ledger), len(result.numbers), len(result.particle_counts))
     if listed < result.frame_count:
         what = f"The ledger has {listed} rows for {result.frame_count} frames"
@@ -121,7 +122,7 @@ def _open_segments(directory: Path, findings: FrameFindings) -> OpenedResult:
         except DAMAGE as error:
             what = f"The segment of frame {number} cannot be read ({_first_line(error).rstrip('.')})"
             findings.add("error", "unreadable", number, what, RUN_AGAIN)
-    header = entries[0].result.header if entries else {}
+    header = entries[0].result.header if entries else RunHeader.read({})
     return OpenedResult(directory, "segments", header, read_record(directory), entries)
 
 

@@ -7,9 +7,9 @@ import numpy as np
 
 from mpmcli.check.result_entries import Entry
 from mpmcli.check.result_findings import FrameFindings
-from mpmcli.check.result_state import BLOWN_UP, COHERENT_LAWS, CRUSHED, TOUCHED
+from mpmcli.check.result_state import BLOWN_UP, CRUSHED, TOUCHED
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.scene_facts import SceneFacts
+from mpmcli.output.header import RunHeader
 from mpmcli.stability.limits import COURANT
 
 # Energy that comes from nowhere, relative to what was turned over so far. The scenes in configs stay below 2e-4, bodies
@@ -29,7 +29,7 @@ LEFT_BEHIND = 2.0
 LOWER_SAFETY = "Lower time.safety, or refine the domain."
 
 
-def check_ledger(entries: Sequence[Entry], facts: SceneFacts, findings: FrameFindings) -> dict[str, float | None]:
+def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFindings) -> dict[str, float | None]:
     """Check all rows.
 
     Returns:
@@ -48,12 +48,12 @@ def check_ledger(entries: Sequence[Entry], facts: SceneFacts, findings: FrameFin
         return {}
     figures: dict[str, float | None] = {}
     figures["mass_change"] = _mass(rows, findings)
-    figures["energy_growth"], figures["energy_lost"] = _energy(rows, facts, findings)
+    figures["energy_growth"], figures["energy_lost"] = _energy(rows, header, findings)
     figures["courant_max"] = _courant(rows, findings)
     figures["speed_max"] = max(row.speed_max for _, row in rows)
     figures["volume_ratio_min"] = min(row.volume_ratio_min for _, row in rows)
     figures["volume_ratio_max"] = max(row.volume_ratio_max for _, row in rows)
-    _volume(rows, facts, findings)
+    _volume(rows, header, findings)
     figures |= _steps(rows, findings)
     return figures
 
@@ -80,14 +80,14 @@ def _mass(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> float:
 
 
 def _energy(
-    rows: list[tuple[int, LedgerRow]], facts: SceneFacts, findings: FrameFindings
+    rows: list[tuple[int, LedgerRow]], header: RunHeader, findings: FrameFindings
 ) -> tuple[float | None, float | None]:
     """Find growth of the total energy above its lowest value so far, and what is lost by the end.
 
     Both are relative to the energy turned over: the largest kinetic energy so far and the ranges of potential and
     elastic energy, since the zero of a potential is arbitrary. Nothing is known of either where the scene is driven.
     """
-    if facts.driven:
+    if header.driven:
         what = "Forces or a gravity of time do work, so that neither energy nor momentum can be held against a balance"
         findings.add("note", "driven", None, what, "Nothing needs to be done.")
         return None, None
@@ -120,8 +120,8 @@ def _courant(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> floa
     return max(row.courant_max for _, row in rows)
 
 
-def _volume(rows: list[tuple[int, LedgerRow]], facts: SceneFacts, findings: FrameFindings) -> None:
-    coherent = bool(facts.laws) and all(law in COHERENT_LAWS for law in facts.laws)
+def _volume(rows: list[tuple[int, LedgerRow]], header: RunHeader, findings: FrameFindings) -> None:
+    coherent = bool(header.laws) and all(law.coherent for law in header.laws)
     for number, row in rows:
         low, high = row.volume_ratio_min, row.volume_ratio_max
         fix = "Make the material stiffer, the domain finer, or time.safety lower."

@@ -10,7 +10,7 @@ from mpmcli.check.result_ledger import LOWER_SAFETY, MARGIN
 from mpmcli.check.result_state import TOUCHED, extent
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.scene_facts import SceneFacts
+from mpmcli.output.header import RunHeader
 from mpmcli.stability.limits import DEFORMATION
 
 # On a GPU the Courant number is an estimate between measurements, and what pushes may double the speed.
@@ -36,8 +36,8 @@ class MotionCheck:
         deformation: largest deformation in a step, by the velocity gradients where they are stored, else None.
     """
 
-    def __init__(self, facts: SceneFacts, findings: FrameFindings) -> None:
-        self._facts = facts
+    def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
+        self._header = header
         self._findings = findings
         self._before: _Moment | None = None
         self.largest_ratio = 0.0
@@ -60,7 +60,7 @@ class MotionCheck:
         moved = frame.position - before.frame.position
         squares = np.einsum("ij,ij->i", moved, moved)
         squares = np.where(np.isfinite(squares), squares, 0.0) if sound is not None else squares
-        allowed = reach(self._facts, row, frame.position.dtype)
+        allowed = reach(self._header, row, frame.position.dtype)
         p = int(np.argmax(squares))
         farthest = float(np.sqrt(float(squares[p])))
         if farthest == 0.0:
@@ -70,7 +70,7 @@ class MotionCheck:
         ratio = farthest / allowed if allowed > 0 else (np.inf if farthest > 0 else 0.0)
         self.largest_ratio = max(self.largest_ratio, ratio)
         if ratio > 1:
-            body = self._facts.body_name(int(frame.body[p]))
+            body = self._header.body_name(int(frame.body[p]))
             what = (
                 f'Up to frame {number} particle {p} of body "{body}" moved by {farthest:.4g} m since the one before, '
                 f"where {row.steps} steps at a Courant number of {row.courant_max:.3g} reach {allowed:.4g} m"
@@ -88,15 +88,16 @@ class MotionCheck:
         n, d = frame.position.shape
         C = frame.fields["affine"].reshape(n, d, d)
         rate = deformation_rate(C, keeps_J=False)
-        if "fluid" in self._facts.laws:
-            fluid = frame.material == self._facts.laws.index("fluid")
-            rate[fluid] = deformation_rate(C[fluid], keeps_J=True)
+        for label, law in enumerate(self._header.laws):
+            if law.deformation == "J":
+                of_law = frame.material == label
+                rate[of_law] = deformation_rate(C[of_law], keeps_J=True)
         p = int(np.argmax(rate))
         deformation = float(rate[p]) * row.step_max
         self.deformation = max(self.deformation or 0.0, deformation)
         if deformation > DEFORMATION * MARGIN:
             severity = "error" if deformation > 1 else "warning"
-            body = self._facts.body_name(int(frame.body[p]))
+            body = self._header.body_name(int(frame.body[p]))
             what = (
                 f'In frame {number} particle {p} of body "{body}" deforms by {deformation:.3g} in a step, '
                 f"{DEFORMATION:g} is safe"
@@ -106,7 +107,7 @@ class MotionCheck:
     def _repeated(self, number: int, frame: Frame, before: Frame, row: LedgerRow) -> None:
         """A frame that repeats the one before it, though something moves, bit for bit."""
         speed = float(np.abs(frame.velocity).max())
-        far = speed * (row.time - before.time) > 1e3 * self._facts.place_error(frame.position.dtype)
+        far = speed * (row.time - before.time) > 1e3 * self._header.place_error(frame.position.dtype)
         if far and np.array_equal(frame.velocity, before.velocity):
             what = f"Frame {number} repeats frame {number - 1}, though something moves at {speed:.4g} m/s"
             self._findings.add("error", "repeated-frame", number, what, TOUCHED, value=speed)
@@ -117,7 +118,7 @@ class MotionCheck:
         With one change of velocity on the way x1 - x0 differs from t (v0 + v1)/2 by at most t |v1 - v0|/2. Bodies that
         bounce to and fro between two frames differ by more, but all of their particles do.
         """
-        h = self._facts.spacing
+        h = self._header.spacing
         if h is None:
             return
         own = (frame.position - before.position) - 0.5 * time * (before.velocity + frame.velocity)
@@ -135,7 +136,7 @@ class MotionCheck:
             apart = float(np.linalg.norm(own[p] - np.median(own[near], axis=0)))
             apart -= 0.5 * time * float(np.linalg.norm(change[p] - np.median(change[near], axis=0)))
             if apart > threshold:
-                body = self._facts.body_name(int(frame.body[p]))
+                body = self._header.body_name(int(frame.body[p]))
                 what = (
                     f'Up to frame {number} particle {p} of body "{body}" moved since the one before by '
                     f"{apart / h:.3g} cells more than its velocities and its neighbours account for"
@@ -144,17 +145,17 @@ class MotionCheck:
                 return
 
 
-def reach(facts: SceneFacts, row: LedgerRow, stored: np.dtype) -> float | None:
+def reach(header: RunHeader, row: LedgerRow, stored: np.dtype) -> float | None:
     """Return how far a particle can have moved since the frame before, m: steps times Courant number times h.
 
     Each step rounds the position, and so does the file, whose type of positions is given. None where the ledger or
     the header does not tell.
     """
-    if facts.spacing is None or not np.isfinite(row.courant_max):
+    if header.spacing is None or not np.isfinite(row.courant_max):
         return None
-    factor = GPU_FACTOR if facts.on_gpu else 1.0
-    rounding = row.steps * facts.step_error + 2 * facts.place_error(stored)
-    return factor * row.steps * row.courant_max * facts.spacing * (1 + 1e-3) + rounding
+    factor = GPU_FACTOR if header.on_gpu else 1.0
+    rounding = row.steps * header.step_error + 2 * header.place_error(stored)
+    return factor * row.steps * row.courant_max * header.spacing * (1 + 1e-3) + rounding
 
 
 class MomentumCheck:
@@ -173,36 +174,36 @@ class MomentumCheck:
     # A particle acts on nodes up to 1.5 cells away, and the first plane of nodes of a wall is the wall itself.
     MARGIN = 2.0
 
-    def __init__(self, facts: SceneFacts, findings: FrameFindings, first: LedgerRow) -> None:
-        self._facts = facts
+    def __init__(self, header: RunHeader, findings: FrameFindings, first: LedgerRow) -> None:
+        self._header = header
         self._findings = findings
         self._first = first
         self._steps = 0
         self._kinetic = 0.0
-        self._free = np.ones(facts.dimension, bool)
+        self._free = np.ones(header.dimension, bool)
         self._distance: np.ndarray | None = None
         self.drift: float | None = None
         self.frames = 0
 
     def check(self, number: int, frame: Frame, row: LedgerRow) -> None:
         """Check the row of a frame; every frame must come, in order."""
-        facts = self._facts
-        known = facts.origin is not None and facts.gravity is not None and facts.sticking is not None
-        if not known or facts.driven or not self._free.any() or len(frame.position) == 0:
+        header = self._header
+        known = header.origin is not None and header.gravity is not None and header.sticking is not None
+        if not known or header.driven or not self._free.any() or len(frame.position) == 0:
             return
         self._kinetic = max(self._kinetic, row.kinetic)
         self._steps += row.steps
-        allowed = reach(facts, row, frame.position.dtype)
+        allowed = reach(header, row, frame.position.dtype)
         if number > 0:
-            near = self.MARGIN * facts.spacing
+            near = self.MARGIN * header.spacing
             gone = self._distance is None or allowed is None
-            touching = np.ones(facts.dimension, bool) if gone else ~(self._distance > near + allowed)
+            touching = np.ones(header.dimension, bool) if gone else ~(self._distance > near + allowed)
             self._free &= ~touching
             # A wall that sticks acts along itself, too.
-            if (touching & np.array(facts.sticking)).any():
+            if (touching & np.array(header.sticking)).any():
                 self._free[:] = False
         lowest, highest = extent(frame.position)
-        self._distance = np.minimum(lowest - facts.origin, facts.upper - highest)
+        self._distance = np.minimum(lowest - header.origin, header.upper - highest)
         if number > 0 and self._free.any():
             self._compare(number, row)
 
@@ -211,23 +212,23 @@ class MomentumCheck:
         self._free[:] = False
 
     def _compare(self, number: int, row: LedgerRow) -> None:
-        facts, first = self._facts, self._first
+        header, first = self._header, self._first
         scale = float(np.sqrt(2 * row.mass * self._kinetic))
         middle = row.time - (row.step_min + row.step_max) / 4
-        expected = np.array(first.linear_momentum) + row.mass * facts.gravity * (middle - first.time)
-        unknown = row.mass * np.abs(facts.gravity) * (row.step_max - row.step_min) / 4
+        expected = np.array(first.linear_momentum) + row.mass * header.gravity * (middle - first.time)
+        unknown = row.mass * np.abs(header.gravity) * (row.step_max - row.step_min) / 4
         difference = (np.abs(np.array(row.linear_momentum) - expected) - unknown)[self._free].max()
         angular = 0.0
-        if facts.spin_kept and not facts.gravity.any() and self._free.all():
+        if header.keeps_spin and not header.gravity.any() and self._free.all():
             turned = np.abs(np.array(row.angular_momentum) - np.array(first.angular_momentum)).max()
-            angular = float(turned) / float(np.linalg.norm(facts.upper - facts.origin))
+            angular = float(turned) / float(np.linalg.norm(header.upper - header.origin))
         if scale == 0 or not np.isfinite(scale):
             return
         drift = float(max(difference, angular, 0.0)) / scale
         self.frames += 1
         self.drift = max(self.drift or 0.0, drift)
         # Rounding may go the same way in every step.
-        if drift > 1e-3 + self._steps * facts.epsilon:
+        if drift > 1e-3 + self._steps * header.epsilon:
             what = (
                 f"By frame {number} momentum has drifted by {drift:.3g} of what moves, though no wall was near and "
                 "nothing but gravity acted"

@@ -4,23 +4,23 @@ from collections.abc import Sequence
 
 from mpmcli.check.result_entries import RUN_AGAIN, Entry, OpenedResult
 from mpmcli.check.result_findings import FrameFindings
-from mpmcli.output.scene_facts import SceneFacts
+from mpmcli.output.header import RunHeader
 
 # Relative to the length of the run; frames land on their times exactly.
 TIME_ERROR = 1e-9
 
 
-def frames_expected(opened: OpenedResult, facts: SceneFacts) -> int | None:
+def frames_expected(opened: OpenedResult, header: RunHeader) -> int | None:
     """Return how many frames the whole run has, None where nothing says so."""
-    return (opened.record or {}).get("frames_expected") or facts.frames
+    return (opened.record or {}).get("frames_expected") or header.frames
 
 
-def check_order(opened: OpenedResult, facts: SceneFacts, findings: FrameFindings) -> None:
+def check_order(opened: OpenedResult, header: RunHeader, findings: FrameFindings) -> None:
     """Check the numbers of the frames, their times, and that those of a finished run are all there."""
     entries = opened.entries
     _numbers(entries, findings)
-    _times(entries, facts, findings)
-    expected = frames_expected(opened, facts)
+    _times(entries, header, findings)
+    expected = frames_expected(opened, header)
     status = (opened.record or {}).get("status")
     numbers = {entry.number for entry in entries} | {entry.said for entry in entries}
     if expected is not None and entries and max(numbers) >= expected:
@@ -61,18 +61,18 @@ def _numbers(entries: Sequence[Entry], findings: FrameFindings) -> None:
         highest = max(highest, entry.said)
 
 
-def _times(entries: Sequence[Entry], facts: SceneFacts, findings: FrameFindings) -> None:
+def _times(entries: Sequence[Entry], header: RunHeader, findings: FrameFindings) -> None:
     before = None
     for entry in entries:
-        allowed = TIME_ERROR * max(abs(entry.time), facts.end or 0.0)
+        allowed = TIME_ERROR * max(abs(entry.time), header.end or 0.0)
         if not abs(entry.time - entry.row.time) <= allowed:
             what = f"Frame {entry.number} is listed at {entry.time:.6g} s and its ledger row at {entry.row.time:.6g} s"
             findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time, kind="ledger")
         elif before is not None and not entry.time > before.time:
             what = f"Frame {entry.number}, at {entry.time:.6g} s, is not later than the one before it"
             findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time, kind="order")
-        elif facts.end is not None and facts.frames is not None:
-            planned = facts.end * entry.number / (facts.frames - 1)
+        elif header.end is not None and header.frames is not None:
+            planned = header.end * entry.number / (header.frames - 1)
             if not abs(entry.time - planned) <= allowed:
                 what = f"Frame {entry.number} is at {entry.time:.6g} s, where the scene has it at {planned:.6g} s"
                 findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time, kind="scene")

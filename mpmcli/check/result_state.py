@@ -4,12 +4,10 @@ import numpy as np
 
 from mpmcli.check.result_findings import FrameFindings
 from mpmcli.frames.frame import Frame
-from mpmcli.output.scene_facts import SceneFacts
+from mpmcli.output.header import RunHeader
 
 # A J below the first is no state that a law is meant for; above the second, one that holds together would have torn.
 CRUSHED, BLOWN_UP = 0.1, 10.0
-# Sand and snow open without resistance, and of other laws nothing is known.
-COHERENT_LAWS = ("fluid", "fixed_corotated", "neo_hookean", "von_mises", "viscoplastic")
 LOOK = "Look at this particle, and lower time.safety or refine the domain where it is."
 TOUCHED = "The file was changed after the run; copy it again or run the scene again."
 
@@ -17,8 +15,8 @@ TOUCHED = "The file was changed after the run; copy it again or run the scene ag
 class StateCheck:
     """Checks frames one after the other; what does not change is held against the first one."""
 
-    def __init__(self, facts: SceneFacts, findings: FrameFindings) -> None:
-        self._facts = facts
+    def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
+        self._header = header
         self._findings = findings
         self._first: Frame | None = None
 
@@ -52,7 +50,7 @@ class StateCheck:
         """Return J of each particle as stored, or from the density; None where neither is."""
         if "volume_ratio" in frame.fields:
             return frame.fields["volume_ratio"]
-        densities = np.array(self._facts.densities)
+        densities = np.array(self._header.densities)
         if "density" not in frame.fields or not len(densities) or not _within(frame.body, len(densities)):
             return None
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -78,16 +76,16 @@ class StateCheck:
         return sound
 
     def _inside(self, number: int, frame: Frame) -> None:
-        facts = self._facts
-        if facts.origin is None or len(frame.position) == 0:
+        header = self._header
+        if header.origin is None or len(frame.position) == 0:
             return
-        tolerance = 4 * facts.place_error(frame.position.dtype)
-        low, high = facts.origin - tolerance, facts.upper + tolerance
+        tolerance = 4 * header.place_error(frame.position.dtype)
+        low, high = header.origin - tolerance, header.upper + tolerance
         # A NaN fails both comparisons, and is passed over below: it has its own finding.
         lowest, highest = extent(frame.position)
         if (lowest >= low).all() and (highest <= high).all():
             return
-        beyond = np.fmax(facts.origin - frame.position, frame.position - facts.upper).max(1)
+        beyond = np.fmax(header.origin - frame.position, frame.position - header.upper).max(1)
         beyond = np.where(np.isfinite(beyond), beyond, -np.inf)
         if not beyond.max() > tolerance:
             return
@@ -114,8 +112,8 @@ class StateCheck:
                 )
                 self._findings.add("error", "label", number, what, TOUCHED, value=len(changed), kind=name)
         for name, found, known in (
-            ("body", frame.body, self._facts.bodies),
-            ("material", frame.material, self._facts.laws),
+            ("body", frame.body, self._header.bodies),
+            ("material", frame.material, self._header.laws),
         ):
             if known and not _within(found, len(known)):
                 what = f"In frame {number} a particle has {name} {found.max()}, where there are {len(known)}"
@@ -131,8 +129,8 @@ class StateCheck:
         order = np.lexsort((*frame.velocity.T, *frame.position.T))
         same = (frame.position[order[1:]] == frame.position[order[:-1]]).all(1)
         same &= (frame.velocity[order[1:]] == frame.velocity[order[:-1]]).all(1)
-        if self._facts.origin is not None:
-            inside = (frame.position > self._facts.origin) & (frame.position < self._facts.upper)
+        if self._header.origin is not None:
+            inside = (frame.position > self._header.origin) & (frame.position < self._header.upper)
             same &= inside.all(1)[order[1:]]
         if same.any():
             at = int(np.flatnonzero(same)[0])
@@ -153,7 +151,7 @@ class StateCheck:
                     f'In frame {number} particle {p} of body "{body}" weighs {mass[p]:.6g} kg instead of {was:.6g} kg'
                 )
                 self._findings.add("error", "mass", number, what, TOUCHED, float(mass[p]), body, kind="particle")
-        densities = np.array(self._facts.densities)
+        densities = np.array(self._header.densities)
         both = {"density", "volume_ratio"} <= frame.fields.keys()
         if both and len(densities) and _within(frame.body, len(densities)):
             product = frame.fields["density"].astype(np.float64) * frame.fields["volume_ratio"]
@@ -184,13 +182,13 @@ class StateCheck:
 
     def _holds_together(self, frame: Frame) -> np.ndarray:
         """Say of each particle whether its law resists to being pulled apart."""
-        coherent = [law in COHERENT_LAWS for law in self._facts.laws]
+        coherent = [law.coherent for law in self._header.laws]
         if not _within(frame.material, len(coherent)):
             return np.zeros(len(frame.material), bool)
         return np.array(coherent)[frame.material]
 
     def _body(self, frame: Frame, p: int) -> str:
-        return self._facts.body_name(int(frame.body[p]))
+        return self._header.body_name(int(frame.body[p]))
 
 
 def extent(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

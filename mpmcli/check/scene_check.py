@@ -74,22 +74,19 @@ class SceneCheck:
 
 
 def check_scene(
-    loaded: LoadedScene, *, threads: int | None = None, probe: Probe | None = None, directory: Path = Path()
+    loaded: LoadedScene, *, plan: Plan | None = None, probe: Probe | None = None, directory: Path = Path()
 ) -> SceneCheck:
     """Check a scene; Taichi is not started and nothing is written.
 
     Args:
-        threads: CPU threads of the run, all of them where None; the plan depends on them a little.
-        probe: what a moment of the run cost, for the forecast of time; its backend is that of the plan, too.
+        plan: of the run, or of the probe; that of a run on all cores of the CPU where None.
+        probe: what a moment of the run cost, for the forecast of time.
         directory: where results would go, for the room on its disk.
     """
     scene = loaded.scene
     facts = SceneFacts(scene)
-    if probe is None:
-        backend = Backend("cpu", threads or available_cores(), scene.solver.precision, compile_cache=True)
-    else:
-        backend = probe.backend
-    plan = make_plan(scene, backend)
+    if plan is None:
+        plan = make_plan(scene, Backend("cpu", available_cores(), scene.solver.precision, compile_cache=True))
     forecast = forecast_of(facts, plan, probe)
     findings = [
         *step_findings(facts),

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from mpmcli.cli.options import json_option, plugin_option, set_option, threads_option
-from mpmcli.cli.streams import print_json
+from mpmcli.cli.streams import print_json, print_text
 
 if TYPE_CHECKING:
     from mpmcli.check.result_check import ResultCheck
@@ -44,7 +44,7 @@ def command(
     if as_json:
         print_json({**check.as_dict(), "ok": check.passes(strict=strict)})
     else:
-        click.echo(check.text(), err=True)
+        print_text(check.text())
     return 0 if check.passes(strict=strict) else 1
 
 
@@ -53,14 +53,19 @@ def _of_scene(
 ) -> "SceneCheck":
     from mpmcli.check.probe import probe_scene
     from mpmcli.check.scene_check import check_scene
+    from mpmcli.cores import available_cores
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
+    from mpmcli.solver.backend import Backend
+    from mpmcli.solver.plan import make_plan
 
     loaded = load_scene(path, overrides, laws=load_plugins(plugins))
-    check = check_scene(loaded, threads=threads)
-    # What cannot run is not tried.
+    backend = Backend("cpu", threads or available_cores(), loaded.scene.solver.precision, compile_cache=True)
+    check = check_scene(loaded, plan=make_plan(loaded.scene, backend))
+    # A scene that does not fit into memory is not run.
     if probing and not any(finding.rule == "memory" for finding in check.findings):
-        check = check_scene(loaded, probe=probe_scene(loaded, threads=threads))
+        probe, plan = probe_scene(loaded, threads=threads)
+        check = check_scene(loaded, plan=plan, probe=probe)
     return check
 
 

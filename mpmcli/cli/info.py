@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from mpmcli.cli.options import json_option, plugin_option, set_option
-from mpmcli.cli.streams import print_json
+from mpmcli.cli.streams import print_json, print_text
 
 
 @click.command("info")
@@ -27,10 +27,9 @@ def command(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], a
     if as_json:
         print_json(facts)
         return
-    told = {name: value for name, value in facts.items() if value not in (None, "", [], {})}
-    width = max(len(name) for name in told)
-    for name, value in told.items():
-        click.echo(f"{name.replace('_', ' '):<{width}}  {_plain(value)}", err=True)
+    known = {name: value for name, value in facts.items() if value not in (None, "", [], {})}
+    width = max(len(name) for name in known)
+    print_text("\n".join(f"{name.replace('_', ' '):<{width}}  {_plain(value)}" for name, value in known.items()))
 
 
 def _of_scene(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...]) -> dict:
@@ -68,7 +67,7 @@ def _of_result(path: Path) -> dict:
     record = result.record or {}
     last = result.ledger[-1]
     return {
-        "title": result.header.get("title", ""),
+        "title": result.header.title,
         "kind": result.kind,
         "status": record.get("status", "unknown"),
         "frames": result.frame_count,
@@ -76,11 +75,11 @@ def _of_result(path: Path) -> dict:
         "time_s": [float(result.times[0]), float(result.times[-1])],
         "particles": int(result.particle_counts[-1]),
         "dimension": result.dimension,
-        "bodies": result.header.get("bodies", []),
-        "materials": result.header.get("materials", []),
+        "bodies": list(result.header.body_names),
+        "materials": [law.name for law in result.header.laws],
         "fields": ["velocity", *result.field_names],
-        "precision": result.header.get("precision"),
-        "backend": result.header.get("backend"),
+        "precision": result.header.precision,
+        "backend": dict(result.header.backend) or None,
         "steps": record.get("steps"),
         "step_s": [
             min((row.step_min for row in result.ledger[1:]), default=0.0),
@@ -95,7 +94,7 @@ def _of_result(path: Path) -> dict:
         ],
         "timings_s": record.get("timings", {}),
         "failure": (record.get("failure") or {}).get("message"),
-        "version": result.header.get("version"),
+        "version": result.header.version,
     }
 
 

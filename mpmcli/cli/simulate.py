@@ -1,14 +1,13 @@
 """`mpmcli simulate`."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import click
 
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
 from mpmcli.cli.options import json_option, plugin_option, quiet_option, set_option, threads_option
-from mpmcli.cli.streams import print_json
+from mpmcli.cli.streams import print_json, print_text
 
 
 @click.command("simulate")
@@ -62,28 +61,16 @@ def command(
     as_json: bool,
 ) -> int:
     """Run SCENE, a TOML file, and store its particles for ParaView, h5py and learners."""
-    from mpmcli.check.finding import passes
-    from mpmcli.check.scene_check import check_scene
     from mpmcli.cli.simulate_progress import SimulateProgress
-    from mpmcli.errors import InputError
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
-    from mpmcli.simulation.run import RunSettings, run_scene
+    from mpmcli.simulation.simulate import RunSettings, simulate
 
     overrides += (f'solver.precision="{precision}"',) if precision else ()
     overrides += ("output.compress=true",) if compress else ()
     loaded = load_scene(scene, overrides, laws=load_plugins(plugins))
-    directory = output or Path("results") / scene.stem
-    findings = check_scene(loaded, threads=threads, directory=directory).findings
-    if not (force or passes(findings)):
-        errors = [f"{loaded.source}: {f.what} {f.fix}" for f in findings if f.severity == "error"]
-        # Nothing makes room that is not there.
-        hint = [] if any(finding.rule == "memory" for finding in findings) else ["--force runs it all the same."]
-        raise InputError("\n".join(errors + hint))
-    grave = tuple(finding.line for finding in findings if finding.severity != "note")
-    loaded = replace(loaded, notes=(*loaded.notes, *grave))
     settings = RunSettings(
-        directory=directory,
+        directory=output or Path("results") / scene.stem,
         arch=arch,
         threads=threads,
         form=form,
@@ -92,11 +79,11 @@ def command(
         command=["mpmcli", *sys.argv[1:]],
     )
     progress = SimulateProgress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
-    progress.notes(loaded.notes)
-
     with progress, interrupts_wait():
-        summary = run_scene(loaded, settings, progress.advance, interrupt_came)
+        summary = simulate(loaded, settings, progress.start, progress.advance, interrupt_came)
     progress.close(summary)
     if as_json:
         print_json(summary.as_dict())
+    elif not quiet:
+        print_text(summary.text())
     return {"finished": 0, "interrupted": 130}.get(summary.status, 1)

@@ -28,6 +28,7 @@ class FixedCorotated(Law):
     name = "fixed_corotated"
     parameters = FixedCorotatedParameters
     deformation = "F"
+    coherent = True
 
     def constants(self, parameters: FixedCorotatedParameters) -> tuple[float, ...]:
         return (parameters.shear_modulus, parameters.lame_lambda)

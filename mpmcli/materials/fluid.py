@@ -130,6 +130,7 @@ class Fluid(Law):
     name = "fluid"
     parameters = FluidParameters
     deformation = "J"
+    coherent = True
 
     def __init__(self, members: tuple[FluidParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)

@@ -55,6 +55,7 @@ class Law(ABC):
         parameters: the pydantic model of its parameters, which also lists its internal variables.
         deformation: what a particle stores, "J" (the volume ratio) or "F" (the deformation gradient).
         projects: whether `respond` may change the state.
+        coherent: whether the material resists being pulled apart, so that `check` reports a J far above 1.
         sensitivity: growth of the logarithm of the largest stiffness per strain that is stored: how closely the state
             is watched; 0 where none is stiffer than rest.
         hardening: the same growth by way of the internal variables, which are watched by themselves: 0 without any.
@@ -67,6 +68,7 @@ class Law(ABC):
     parameters: ClassVar[type[MaterialParameters]]
     deformation: ClassVar[Literal["J", "F"]]
     projects: bool = False
+    coherent: ClassVar[bool] = False
     sensitivity: float = 1.0
     hardening: float = 0.0
 

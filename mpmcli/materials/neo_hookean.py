@@ -22,6 +22,7 @@ class NeoHookean(Law):
     name = "neo_hookean"
     parameters = NeoHookeanParameters
     deformation = "F"
+    coherent = True
 
     def constants(self, parameters: NeoHookeanParameters) -> tuple[float, ...]:
         return (parameters.shear_modulus, parameters.lame_lambda)

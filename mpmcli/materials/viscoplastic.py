@@ -89,6 +89,7 @@ class Viscoplastic(Law):
     parameters = ViscoplasticParameters
     deformation = "F"
     projects = True
+    coherent = True
 
     def __init__(self, members: tuple[ViscoplasticParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)

@@ -73,6 +73,7 @@ class VonMises(HenckyLaw):
     name = "von_mises"
     parameters = VonMisesParameters
     projects = True
+    coherent = True
 
     def constants(self, parameters: VonMisesParameters) -> tuple[float, ...]:
         return (

@@ -6,8 +6,8 @@ Neither vtk nor meshio is imported until a series is written or read.
 from mpmcli.output.directory import check_directory, prepare_directory
 from mpmcli.output.result import Result, open_result
 from mpmcli.output.run_record import RunRecord, read_record
+from mpmcli.output.segments import SegmentStore
 from mpmcli.output.series import VtkSeriesStore
-from mpmcli.output.store import SegmentStore
 
 __all__ = [
     "Result",

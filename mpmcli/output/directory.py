@@ -6,8 +6,8 @@ from pathlib import Path
 from mpmcli.errors import InputError
 from mpmcli.output.durable import TEMPORARY_SUFFIX
 from mpmcli.output.run_record import RECORD, read_record
+from mpmcli.output.segments import PACKED, remove_segments, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_FRAME, SERIES_HEADER, SERIES_LEDGER
-from mpmcli.output.store import PACKED, remove_segments, sealed_segments
 
 SCENE = "scene.toml"
 NAMES = (PACKED, SCENE, SERIES, SERIES_HEADER, SERIES_LEDGER, RECORD)

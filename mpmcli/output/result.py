@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,11 +14,12 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import POSITION, STANDARD, FrameLayout
 from mpmcli.output.ledger_table import FRAME_COLUMNS, parse_ledger_csv
 from mpmcli.output.run_record import read_record
+from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_HEADER, SERIES_LEDGER, read_vtu
-from mpmcli.output.store import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.vtkhdf import FORMAT, open_vtkhdf, read_array, read_index
 
 Kind = Literal["packed", "segments", "series"]
@@ -36,7 +37,7 @@ class Result(ABC):
         numbers: (T,) frame numbers.
         particle_counts: (T,) particles of each frame.
         ledger: T rows.
-        header: facts about the run, among them "scene", the TOML text.
+        header: facts about the run.
         dimension: 2 or 3.
         field_names: the fields each Frame has beside position, velocity, body and material.
         record: content of run.json, None where there is none.
@@ -51,7 +52,7 @@ class Result(ABC):
         self.numbers = index.frames
         self.particle_counts = index.counts
         self.ledger: list[LedgerRow] = index.ledger
-        self.header: dict[str, Any] = index.header
+        self.header = RunHeader.read(index.header)
         self.dimension = index.layout.dimension
         names = [name for name in index.layout.arrays if name not in (POSITION, *STANDARD)]
         self.field_names: tuple[str, ...] = tuple(names)

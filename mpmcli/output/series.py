@@ -6,18 +6,19 @@ Every ParaView and VTK reads it, at the price of more and larger files; VTKHDF i
 import json
 import re
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from mpmcli import __version__
-from mpmcli.errors import InputError, RunError
+from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.durable import require_free_space, sealed, write_text
+from mpmcli.output.durable import sealed, write_text
 from mpmcli.output.layout import POSITION, FrameLayout
 from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_csv
-from mpmcli.output.store import frames_kept
+from mpmcli.output.store import Store
 from mpmcli.output.vtkhdf import FORMAT, OVERHEAD_BYTES
 
 SERIES = "particles.pvd"
@@ -31,70 +32,39 @@ def series_frame_name(index: int) -> str:
     return f"particles_{index:06d}.vtu"
 
 
-class VtkSeriesStore:
-    """The same interface as `SegmentStore`, for `--format vtk`.
+class VtkSeriesStore(Store):
+    """The store of `--format vtk`.
 
     After each frame `directory` holds its .vtu file, ledger.csv and particles.pvd, each replaced in one
-    step, so that ParaView can open the series while the run goes on. particles.json holds the header.
-
-    Args:
-        directory: the output directory, made by `prepare_directory`.
-        header: facts about the run that JSON can hold.
-        compress: zlib in the .vtu files.
+    step, so that ParaView can open the series while the run goes on. particles.json holds the header. `compress` is
+    zlib in the .vtu files.
     """
 
-    def __init__(self, directory: Path, header: dict, *, compress: bool = False) -> None:
-        self._directory = Path(directory)
-        self._header = header
-        self._compress = compress
-        self._layout: FrameLayout | None = None
+    def __init__(self, directory: Path, header: dict[str, Any], *, compress: bool = False) -> None:
+        super().__init__(directory, header, compress=compress)
         self._times: list[float] = []
         self._frames: dict[str, list[int]] = {name: [] for name in FRAME_COLUMNS}
         self._rows: list[LedgerRow] = []
-        self._count = 0
-
-    @property
-    def frames_written(self) -> int:
-        """Number of frames that a crash can no longer harm."""
-        return self._count
-
-    def write(self, frame: Frame, row: LedgerRow) -> None:
-        """Write the next frame; it is durable and listed in the .pvd when this returns.
-
-        Raises:
-            RunError: the disk is full or refuses; all frames before this one are kept.
-            InputError: the directory holds an earlier result.
-            ValueError: the frame is out of order or has other arrays than the first one.
-        """
-        if frame.index != self._count:
-            raise ValueError(f"frame {frame.index} was given where frame {self._count} comes next")
-        if self._layout is None:
-            self._layout = FrameLayout.of(frame)
-            if (self._directory / SERIES).exists():
-                raise InputError(f"{self._directory} holds an earlier result: give another directory, or --overwrite.")
-            self._directory.mkdir(parents=True, exist_ok=True)
-        purpose, kept = f"frame {frame.index}", frames_kept(self._count)
-        # Base64 makes 4 bytes of 3; each particle is a cell of its own: number, offset and type.
-        size = len(frame.position) * (self._layout.bytes_per_particle + 24) * 4 // 3 + OVERHEAD_BYTES
-        require_free_space(self._directory, size, purpose, kept)
-        try:
-            with sealed(self._directory / series_frame_name(frame.index)) as temporary:
-                _write_vtu(temporary, dict(self._layout.stored(frame)), compress=self._compress)
-            self._write_tables(frame, row)
-        except OSError as error:
-            reason = getattr(error, "strerror", None) or error
-            place = self._directory
-            raise RunError(f"{purpose} could not be written to {place} ({reason}); {kept}.") from error
-        self._count += 1
 
     def finish(self) -> Path | None:
-        """Give the .pvd, which is complete after every frame; None when no frame was written."""
-        return self._directory / SERIES if self._count else None
+        """Return the .pvd, which is complete after every frame; None where no frame was written."""
+        return self._directory / SERIES if self.frames_written else None
 
-    def _write_tables(self, frame: Frame, row: LedgerRow) -> None:
+    def _holds_result(self) -> bool:
+        return (self._directory / SERIES).exists()
+
+    def _start(self) -> None:
+        self._directory.mkdir(parents=True, exist_ok=True)
+
+    def _size(self, layout: FrameLayout, count: int) -> int:
+        # Base64 makes 4 bytes of 3; each particle is a cell of its own: number, offset and type.
+        return count * (layout.bytes_per_particle + 24) * 4 // 3 + OVERHEAD_BYTES
+
+    def _write(self, layout: FrameLayout, frame: Frame, row: LedgerRow, size: int) -> None:
+        with sealed(self._directory / series_frame_name(frame.index)) as temporary:
+            _write_vtu(temporary, dict(layout.stored(frame)), compress=self._compress)
         if frame.index == 0:
-            facts = {"format": FORMAT, "version": __version__, "header": self._header}
-            facts["layout"] = FrameLayout.of(frame).to_dict()
+            facts = {"format": FORMAT, "version": __version__, "header": self._header, "layout": layout.to_dict()}
             write_text(self._directory / SERIES_HEADER, json.dumps(facts, indent=1) + "\n")
         self._times.append(float(frame.time))
         self._rows.append(row)

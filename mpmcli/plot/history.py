@@ -7,9 +7,9 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.header import RunHeader
 from mpmcli.output.ledger_table import TEXT
 from mpmcli.output.result import Result
-from mpmcli.output.scene_facts import SceneFacts, scene_facts
 from mpmcli.plain_text import one_line
 
 # Frames whose positions are read; more would not be seen in the figure.
@@ -42,7 +42,7 @@ class History:
 
     Attributes:
         title: of the scene.
-        facts: what is known of the scene; particles: in the last frame; kind, status: of the result.
+        header: facts about the run; particles: in the last frame; kind, status: of the result.
         columns: (T,) float64 per column of the ledger, momenta (T, components); NaN where it is not finite.
         limits: T names of the bound on the step, "" at the initial state.
         reach: see `Reach`.
@@ -50,7 +50,7 @@ class History:
     """
 
     title: str
-    facts: SceneFacts
+    header: RunHeader
     particles: int
     status: str
     columns: dict[str, np.ndarray]
@@ -78,20 +78,19 @@ def read_history(result: Result) -> History:
         values = np.array([getattr(row, name) for row in rows], dtype=np.float64)
         columns[name] = np.where(np.isfinite(values), values, np.nan)
         broken.append(~np.isfinite(values).reshape(len(rows), -1).all(1))
-    facts = scene_facts(result.header)
     record = result.record or {}
     notes = _gaps(np.flatnonzero(np.any(broken, 0)), result.numbers)
     chosen = np.unique(np.linspace(0, result.frame_count - 1, FRAMES_MAX).round().astype(int))
     if len(chosen) < result.frame_count:
         notes.append(f"The reach of the particles is read from {len(chosen)} of {result.frame_count} frames.")
     return History(
-        title=one_line(str(result.header.get("title", ""))) or result.path.stem,
-        facts=facts,
+        title=one_line(result.header.title) or result.path.stem,
+        header=result.header,
         particles=int(result.particle_counts[-1]),
         status=str(record.get("status", "")),
         columns=columns,
         limits=tuple(row.limit for row in rows),
-        reach=_reach(result, chosen, facts),
+        reach=_reach(result, chosen),
         notes=tuple(notes),
     )
 
@@ -105,12 +104,13 @@ def _gaps(rows: np.ndarray, numbers: np.ndarray) -> list[str]:
     return [f"The ledger holds numbers that are not finite in {frames} {named}{more}; they are gaps in the figure."]
 
 
-def _reach(result: Result, chosen: np.ndarray, facts: SceneFacts) -> Reach:
-    apart = 1 < len(facts.bodies) <= BODIES_MAX
-    labels = range(len(facts.bodies)) if apart else [None]
+def _reach(result: Result, chosen: np.ndarray) -> Reach:
+    bodies = result.header.body_names
+    apart = 1 < len(bodies) <= BODIES_MAX
+    labels = range(len(bodies)) if apart else [None]
     found = [[_extent(frame, label) for label in labels] for frame in (result.frame(int(k), ()) for k in chosen)]
     both = np.array(found).reshape(len(chosen), len(labels), 2, result.dimension)
-    names = facts.bodies if apart else (facts.bodies[0] if len(facts.bodies) == 1 else "all bodies",)
+    names = bodies if apart else (bodies[0] if len(bodies) == 1 else "all bodies",)
     names = tuple(one_line(name) for name in names)
     return Reach(result.times[chosen], names, both[:, :, 0], both[:, :, 1])
 

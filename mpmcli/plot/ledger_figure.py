@@ -35,7 +35,7 @@ def ledger_picture(history: History, size: tuple[int, int], theme: ThemeName) ->
 
 def draw_ledger(figure: "Figure", history: History, theme: ThemeName) -> list[str]:
     """Draw a run into an empty figure and return the titles of its panels, in the order of its axes."""
-    d = history.facts.dimension
+    d = history.header.dimension
     # Each row for itself, as they differ in their number of panels.
     rows = figure.add_gridspec(3, 1)
     places = [cell for row, count in enumerate((4, 4, d)) for cell in rows[row].subgridspec(1, count)]
@@ -65,7 +65,7 @@ def _first(values: np.ndarray) -> int:
 
 def _units(history: History) -> tuple[str, str, str]:
     """Return the units of energy, momentum and angular momentum: in the plane they are per metre of depth."""
-    return ("J/m", "N s/m", "N s") if history.facts.dimension == 2 else ("J", "N s", "N m s")
+    return ("J/m", "N s/m", "N s") if history.header.dimension == 2 else ("J", "N s", "N m s")
 
 
 def _energy(parts: Panel, change: Panel, history: History) -> None:
@@ -80,7 +80,7 @@ def _energy(parts: Panel, change: Panel, history: History) -> None:
     ):
         parts.line(values, name, k)
     largest = float(np.nanmax(total)) if np.isfinite(total).any() else 0.0
-    work = ", while forces do work" if history.facts.driven else ""
+    work = ", while forces do work" if history.header.driven else ""
     change.title("Change of total energy", f"(E - E₀) / largest E{work}")
     if largest > 0:
         change.line((total - total[_first(total)]) / largest, "", None)
@@ -89,20 +89,20 @@ def _energy(parts: Panel, change: Panel, history: History) -> None:
 
 def _momentum(panel: Panel, history: History) -> None:
     """Draw what gravity does not explain of the momentum: 0 but for rounding until something else acts."""
-    facts, columns = history.facts, history.columns
+    header, columns = history.header, history.columns
     momentum = columns["linear_momentum"]
     start = _first(momentum)
     values = momentum - momentum[start]
     unit = _units(history)[1]
-    if facts.gravity is None:
+    if header.gravity is None:
         panel.title("Momentum (gravity is not constant)", f"P - P₀, {unit}")
     else:
-        what = "walls and forces" if facts.driven else "walls"
+        what = "walls and forces" if header.driven else "walls"
         panel.title(f"Impulse of the {what}", f"P - P₀ - M g t, {unit}")
         # Velocities are those of the middle of the last step.
         middle = history.times - (columns["step_min"] + columns["step_max"]) / 4
-        values = values - columns["mass"][:, None] * facts.gravity * (middle - middle[start])[:, None]
-    for axis in range(facts.dimension):
+        values = values - columns["mass"][:, None] * header.gravity * (middle - middle[start])[:, None]
+    for axis in range(header.dimension):
         panel.line(values[:, axis], AXES[axis], axis)
     panel.level(0.0)
 
@@ -152,10 +152,10 @@ def _speed(panel: Panel, history: History) -> None:
 
 
 def _reach(panel: Panel, history: History, axis: int) -> None:
-    facts, reach = history.facts, history.reach
+    header, reach = history.header, history.reach
     panel.title(f"Reach along {AXES[axis]}", "lowest to highest particle, m")
     for k, name in enumerate(reach.names):
         panel.band(reach.lowest[:, k, axis], reach.highest[:, k, axis], name, k, times=reach.times)
-    if facts.origin is not None and facts.upper is not None:
-        panel.level(float(facts.origin[axis]), "walls")
-        panel.level(float(facts.upper[axis]))
+    if header.origin is not None and header.upper is not None:
+        panel.level(float(header.origin[axis]), "walls")
+        panel.level(float(header.upper[axis]))

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpmcli.frames.frame import Frame
+from mpmcli.output.header import RunHeader
 from mpmcli.output.result import Result
-from mpmcli.output.scene_facts import SceneFacts, scene_facts
 from mpmcli.render.color_by import color_map
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.subject import Subject
@@ -47,20 +47,20 @@ def slice_of(subject: Subject, camera: str) -> Slice:
     return Slice(across, normal, 0.5 * (subject.lower[normal] + subject.upper[normal]))
 
 
-def grid_density(frame: Frame, facts: SceneFacts, plane: Slice) -> np.ndarray:
+def grid_density(frame: Frame, header: RunHeader, plane: Slice) -> np.ndarray:
     """Return the mass of the grid nodes of a plane over their volume, by quadratic B-splines, walls mirrored.
 
     Returns:
         (a, b) float64 along the axes of the plane, nodes on both walls included, kg/m^3: a 2D scene is a metre deep.
     """
-    h, d = facts.spacing, facts.dimension
-    cells = np.rint((facts.upper - facts.origin) / h).astype(int)
-    masses = facts.masses(frame.body)
-    place = (np.asarray(frame.position, dtype=np.float64) - facts.origin) / h
+    h, d = header.spacing, header.dimension
+    cells = np.rint((header.upper - header.origin) / h).astype(int)
+    masses = header.masses(frame.body)
+    place = (np.asarray(frame.position, dtype=np.float64) - header.origin) / h
     kept = np.isfinite(place).all(axis=1) & (place >= 0).all(axis=1) & (place <= cells).all(axis=1)
     weight = np.ones(len(place)) if masses is None else masses / h**d
     if plane.normal is not None:
-        through = (plane.place - facts.origin[plane.normal]) / h
+        through = (plane.place - header.origin[plane.normal]) / h
         kept &= np.abs(place[:, plane.normal] - through) < 1.5
         # Between nodes there is no grid, but the kernel is defined there as well.
         weight = weight * _kernel(place[:, plane.normal] - through)
@@ -100,10 +100,10 @@ def density_colors(
 ) -> Coloring:
     """Return what the colours of a density mean; by default nearly no node of any frame exceeds the upper limit."""
     if limits is None:
-        facts, found = scene_facts(result.header), [0.0]
+        header, found = result.header, [0.0]
         count = min(LOOKED_AT, result.frame_count)
         for k in np.unique(np.linspace(0, result.frame_count - 1, count).round().astype(int)):
-            density = grid_density(result.frame(int(k), ()), facts, plane)
+            density = grid_density(result.frame(int(k), ()), header, plane)
             if (density > 0).any():
                 found.append(float(np.quantile(density[density > 0], 1.0 - OUTSIDE)))
         limits = 0.0, max(found) or 1.0
@@ -120,9 +120,9 @@ class DensityPainter:
     fields: tuple[str, ...] = ()
 
     def __init__(
-        self, facts: SceneFacts, subject: Subject, view: View, theme: Theme, plane: Slice, colors: Coloring
+        self, header: RunHeader, subject: Subject, view: View, theme: Theme, plane: Slice, colors: Coloring
     ) -> None:
-        self._facts, self._plane, self._colors = facts, plane, colors
+        self._header, self._plane, self._colors = header, plane, colors
         self._size, self._ground = view.size, np.array(rgb_bytes(theme.ground), dtype=np.float64)
         low, high = np.array(subject.lower), np.array(subject.upper)
         corners = np.tile(0.5 * (low + high), (2, 1))
@@ -132,7 +132,7 @@ class DensityPainter:
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return (h, w, 3) uint8."""
-        density = grid_density(frame, self._facts, self._plane)
+        density = grid_density(frame, self._header, self._plane)
         width, height = self._size
         (left, bottom), (right, top) = self._box
         u = (np.arange(width) + 0.5 - left) / (right - left) * (density.shape[0] - 1)

@@ -43,21 +43,23 @@ LOOKS = {
 }
 # Laws without a preset, in the order in which they come.
 OTHERS = ("#0f9d8a", "#c2569b", "#7d8a2e", "#4e6fb8", "#b0563c")
-# Laws that share their parameters: what they look like hangs on these.
-ELASTIC = ("fixed_corotated", "hencky", "neo_hookean")
 # Two values of a parameter this far apart, as a ratio, differ as much as it can matter.
 FAR = 1e6
 
 
 def look_of(law: str, parameters: dict[str, Any], others: int = 0) -> Look:
-    """Return the look of a law with these parameters: that of the preset of its kind that they are nearest to.
+    """Return the look of the nearest preset: among those of the law and of laws with the same parameters.
 
     Args:
         parameters: those of the effective scene.
         others: how many laws without a preset came before.
     """
-    kind = ELASTIC if law in ELASTIC else (law,)
-    known = {name: preset for name, preset in PRESETS.items() if preset.law in kind and name in LOOKS}
+    names = parameters.keys() - {"law"}
+    known = {
+        name: preset
+        for name, preset in PRESETS.items()
+        if name in LOOKS and (preset.law == law or preset.parameters.keys() == names)
+    }
     if not known:
         color = OTHERS[others % len(OTHERS)]
         return Look(law, color, color, "matte")

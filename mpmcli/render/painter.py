@@ -7,7 +7,6 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.output.result import Result
-from mpmcli.output.scene_facts import scene_facts
 from mpmcli.render.canvas import Canvas
 from mpmcli.render.color_by import color_by
 from mpmcli.render.coloring import Categories, Coloring
@@ -62,7 +61,7 @@ class Studio:
         if settings.mode == "density":
             assert isinstance(self.colors, Coloring)
             plane = slice_of(subject, settings.camera)
-            return DensityPainter(scene_facts(self.result.header), subject, view, theme, plane, self.colors)
+            return DensityPainter(self.result.header, subject, view, theme, plane, self.colors)
         if settings.mode == "fluid" and subject.dimension == 3:
             from mpmcli.render.liquids.fluid import FluidPainter
 
@@ -123,11 +122,11 @@ def expected_times(result: Result) -> tuple[float, ...]:
 
     Otherwise milliseconds would become seconds while a film of a run under way is drawn.
     """
-    facts = scene_facts(result.header)
-    if facts.end is not None and facts.frames is not None and facts.frames > 1:
-        step = facts.end / (facts.frames - 1)
+    header = result.header
+    if header.end is not None and header.frames is not None and header.frames > 1:
+        step = header.end / (header.frames - 1)
         if np.allclose(result.times, result.numbers * step, rtol=1e-3, atol=1e-3 * step):
-            return 0.0, step, min(2 * step, facts.end), facts.end
+            return 0.0, step, min(2 * step, header.end), header.end
     return tuple(result.times.tolist())
 
 

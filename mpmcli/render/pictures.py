@@ -119,7 +119,7 @@ def picture_digest(result: Result, settings: Settings, ks: Sequence[int]) -> str
     labels = [time_text(float(result.times[k]), times) for k in ks]
     frames = [[int(result.numbers[k]), int(result.particle_counts[k]), repr(result.ledger[k])] for k in ks]
     return settings_digest(
-        {**asdict(settings), "scene": result.header.get("scene", ""), "frames": frames, "labels": labels}
+        {**asdict(settings), "scene": result.header.stored.get("scene", ""), "frames": frames, "labels": labels}
     )
 
 

@@ -1,19 +1,16 @@
 """What a picture needs to know of a run: its domain, its bodies and their materials."""
 
-import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from mpmcli.errors import InputError
+from mpmcli.output.header import BodyHeader
 from mpmcli.output.result import Result
 from mpmcli.plain_text import one_line
 from mpmcli.render.look import OTHERS, Look, look_of
-
-# Particles to a cell where the scene does not say, in 2D and 3D.
-USUAL_PER_CELL = {2: 4, 3: 8}
 
 
 @dataclass(frozen=True)
@@ -55,57 +52,42 @@ def subject_of(result: Result) -> Subject:
         InputError: it does not say what the domain is.
     """
     header, d = result.header, result.dimension
-    scene = _parsed(header.get("scene", ""))
-    domain, tables = scene.get("domain", {}), scene.get("bodies", [])
-    try:
-        spacing = float(header.get("spacing") or domain["spacing"])
-        lower = np.array(header.get("origin") or domain.get("origin") or [0.0] * d, dtype=np.float64)
-        upper = lower + np.array(header.get("size") or domain["size"], dtype=np.float64)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{result.path} does not say what its domain is, so that no picture can be framed.") from error
-    bodies = tuple(one_line(str(name)) for name in header.get("bodies", ())) or ("all",)
-    tables = tables if len(tables) == len(bodies) else [{} for _ in bodies]
-    looks, material_of = _materials(bodies, [table.get("material", {}) for table in tables])
+    if header.origin is None or not header.spacing:
+        raise InputError(f"{result.path} does not say what its domain is, so that no picture can be framed.")
+    bodies = header.bodies or (BodyHeader("all", {}, None, 2**d),)
+    names = tuple(one_line(body.name) for body in bodies)
+    looks, material_of = _materials(names, [body.material for body in bodies])
     flat = [0.0] * (3 - d)
     return Subject(
-        title=one_line(str(header.get("title") or "")),
+        title=one_line(header.title),
         dimension=d,
-        lower=(*lower.tolist(), *flat),
-        upper=(*upper.tolist(), *flat),
-        spacing=spacing,
-        up=_up(domain.get("gravity"), d),
-        bodies=bodies,
+        lower=(*header.origin.tolist(), *flat),
+        upper=(*header.upper.tolist(), *flat),
+        spacing=header.spacing,
+        up=_up(header.steady_gravity, d),
+        bodies=names,
         looks=looks,
         material_of=material_of,
-        distances=tuple(spacing / table.get("particles_per_cell", USUAL_PER_CELL[d]) ** (1 / d) for table in tables),
-        densities=tuple(float(table.get("material", {}).get("density", 1000.0)) for table in tables),
+        distances=tuple(header.spacing / body.particles_per_cell ** (1 / d) for body in bodies),
+        densities=tuple(body.density or 1000.0 for body in bodies),
         fields=result.field_names,
     )
 
 
-def _parsed(text: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
-        return {}
-
-
-def _up(gravity: object, d: int) -> tuple[float, ...]:
-    """Return the axis against gravity; the last one where there is none, or where it turns with time."""
+def _up(gravity: np.ndarray | None, d: int) -> tuple[float, ...]:
+    """Return the axis against gravity; in 2D, and where there is none, the last one."""
     up = np.zeros(3)
-    up[d - 1] = 1.0
-    if isinstance(gravity, list) and len(gravity) == d and d == 3:
-        known = np.array([entry if isinstance(entry, int | float) else 0.0 for entry in gravity])
-        axis = int(np.argmax(np.abs(known)))
-        if known[axis] != 0.0:
-            up = np.zeros(3)
-            up[axis] = -np.sign(known[axis])
+    if d == 3 and gravity is not None and gravity.any():
+        axis = int(np.argmax(np.abs(gravity)))
+        up[axis] = -np.sign(gravity[axis])
+    else:
+        up[d - 1] = 1.0
     return tuple(up.tolist())
 
 
-def _materials(bodies: Sequence[str], tables: Sequence[dict[str, Any]]) -> tuple[tuple[Look, ...], tuple[int, ...]]:
+def _materials(bodies: Sequence[str], tables: Sequence[Mapping[str, Any]]) -> tuple[tuple[Look, ...], tuple[int, ...]]:
     """Find the materials that differ, and which each body has."""
-    kinds: list[dict[str, Any]] = []
+    kinds: list[Mapping[str, Any]] = []
     firsts: list[str] = []
     looks: list[Look] = []
     material_of = []

@@ -23,7 +23,7 @@ from mpmcli.errors import InputError, RunError
 from mpmcli.output import SegmentStore, open_result, prepare_directory
 from mpmcli.output import pack as pack_module
 from mpmcli.output.layout import FrameLayout
-from mpmcli.output.store import sealed_segments
+from mpmcli.output.segments import sealed_segments
 
 HEADER = {
     "dimension": 2,
@@ -100,7 +100,7 @@ def test_round_trip(counts, d, dtype, fields, compress):
             assert result.times.tolist() == [frame.time for frame in frames]
             assert result.particle_counts.tolist() == counts
             assert result.ledger == [make_row(k, d) for k in range(len(counts))]
-            assert result.header == HEADER and set(result.field_names) == fields
+            assert result.header.stored == HEADER and set(result.field_names) == fields
             for read, frame in zip(result.frames(), frames, strict=True):
                 assert_same_frame(read, frame)
             if kind == "segments":
@@ -158,7 +158,7 @@ def test_a_long_scene_fits(tmp_path):
     store = SegmentStore(tmp_path, {"scene": "#" * 300_000})
     store.write(make_frame(0, 3, 2), make_row(0, 2))
     store.finish()
-    assert open_result(tmp_path).header == {"scene": "#" * 300_000}
+    assert open_result(tmp_path).header.stored == {"scene": "#" * 300_000}
 
 
 def test_compression_saves_what_is_constant(tmp_path):

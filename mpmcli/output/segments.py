@@ -1,0 +1,105 @@
+"""The store of a run: every frame a sealed file at once, one packed VTKHDF file at the end."""
+
+import re
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from mpmcli.errors import RunError
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.durable import TEMPORARY_SUFFIX, sealed, sync_directory
+from mpmcli.output.layout import FrameLayout
+from mpmcli.output.pack import pack_segments
+from mpmcli.output.store import Store
+from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
+
+PACKED = "particles.vtkhdf"
+SEGMENTS = "segments"
+SEGMENT_NAME = re.compile(r"frame_\d{6,}\.vtkhdf")
+
+
+def segment_name(index: int) -> str:
+    """File name of the sealed frame with this number."""
+    return f"frame_{index:06d}.vtkhdf"
+
+
+def sealed_segments(directory: Path) -> list[Path]:
+    """Sealed frames of a run that was not packed, in order; unfinished files are not among them."""
+    folder = directory / SEGMENTS
+    if not folder.is_dir():
+        return []
+    found = [path for path in folder.iterdir() if SEGMENT_NAME.fullmatch(path.name)]
+    return sorted(found, key=lambda path: int(path.stem.split("_")[1]))
+
+
+class SegmentStore(Store):
+    """Frames in `directory`/segments while running, in `directory`/particles.vtkhdf after `finish`.
+
+    Each segment is a complete VTKHDF file that ParaView can open while the run goes on. Segments are
+    not compressed, so that writing does not hold up the run; `compress` (gzip-1 with shuffle) applies to the packed
+    file.
+    """
+
+    def __init__(self, directory: Path, header: dict[str, Any], *, compress: bool = False) -> None:
+        super().__init__(directory, header, compress=compress)
+        self.place = self._directory / SEGMENTS
+
+    def finish(self) -> Path | None:
+        """Pack the sealed frames, verify the packed file, and remove the segments.
+
+        Returns:
+            The packed file; None when no frame was written.
+
+        Raises:
+            RunError: the disk cannot hold the packed file or it does not read back; the segments stay.
+        """
+        segments = sealed_segments(self._directory)
+        # An interrupt may fall between the seal and the count; a sealed frame is never left behind.
+        if len(segments) < self.frames_written:
+            raise RunError(
+                f"{self._directory / SEGMENTS} holds {len(segments)} of the {self.frames_written} frames written: "
+                "some were removed during the run; the others are kept."
+            )
+        if not segments:
+            return None
+        packed = self._directory / PACKED
+        pack_segments(segments, packed, compress=self._compress)
+        # The result is complete; a segment that somebody holds open may stay beside it.
+        with suppress(OSError):
+            remove_segments(self._directory)
+        return packed
+
+    def _holds_result(self) -> bool:
+        return (self._directory / PACKED).exists() or bool(sealed_segments(self._directory))
+
+    def _start(self) -> None:
+        try:
+            self.place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RunError(f"{self.place} could not be made ({error.strerror}); no frame was written.") from error
+        sync_directory(self._directory)
+
+    def _size(self, layout: FrameLayout, count: int) -> int:
+        return file_size(layout, [count])
+
+    def _write(self, layout: FrameLayout, frame: Frame, row: LedgerRow, size: int) -> None:
+        with (
+            sealed(self.place / segment_name(frame.index), size) as temporary,
+            VtkhdfWriter(temporary, layout, [len(frame.position)]) as writer,
+        ):
+            for name, array in layout.stored(frame):
+                writer.write_array(0, name, array)
+            writer.finish([frame.time], [frame.index], [frame.step], [row], self._header)
+
+
+def remove_segments(directory: Path) -> None:
+    """Remove sealed and unfinished segments, and their folder unless something else lies in it."""
+    folder = directory / SEGMENTS
+    if not folder.is_dir():
+        return
+    for path in folder.iterdir():
+        if SEGMENT_NAME.fullmatch(path.name.removesuffix(TEMPORARY_SUFFIX)):
+            path.unlink(missing_ok=True)
+    with suppress(OSError):
+        folder.rmdir()

@@ -1,0 +1,193 @@
+"""One run from a loaded scene to a stored result: check, refuse or go on, run, store."""
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from mpmcli.check.finding import Finding, passes
+from mpmcli.check.scene_check import check_scene
+from mpmcli.errors import InputError, MpmcliError, RunError
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.materials.registry import laws
+from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, check_directory, prepare_directory
+from mpmcli.output.durable import write_text
+from mpmcli.output.header import RunHeader
+from mpmcli.output.segments import Store
+from mpmcli.scene import LoadedScene, Scene, scene_to_toml
+from mpmcli.simulation.stopwatch import Stopwatch
+from mpmcli.simulation.summary import RunSummary
+from mpmcli.solver.backend import Arch, start_backend
+from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.plan import make_plan, require_room
+from mpmcli.solver.solver import Solver
+
+SCENE = "scene.toml"
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """How a scene is run and stored, beside what it says itself.
+
+    Attributes:
+        directory: where the result goes.
+        arch: backend to use; threads: CPU threads, all of them where None.
+        form: "vtkhdf" for one packed file, "vtk" for a .vtu series.
+        overwrite: whether an earlier result in the directory may be replaced.
+        force: whether to run although the check finds errors, and to take time.step above the stable step too.
+        compile_cache: whether compiled kernels are kept for the next start.
+        command: the command line, for the record.
+    """
+
+    directory: Path
+    arch: Arch = "auto"
+    threads: int | None = None
+    form: Literal["vtkhdf", "vtk"] = "vtkhdf"
+    overwrite: bool = False
+    force: bool = False
+    compile_cache: bool = True
+    command: Sequence[str] = ()
+
+
+def simulate(
+    loaded: LoadedScene,
+    settings: RunSettings,
+    on_start: Callable[[RunSummary], None] = lambda summary: None,
+    on_frame: Callable[[LedgerRow, RunSummary], None] = lambda row, summary: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> RunSummary:
+    """Check a scene, run it to its end or to where it stops, and store it.
+
+    Everything that can be refused is refused before anything is written. A run that becomes unstable, is
+    interrupted (`stop`, or KeyboardInterrupt) or cannot write keeps its sealed frames; its summary says so.
+
+    Args:
+        on_start: called before the first step, with the notes and warnings of the check in the summary.
+        on_frame: called after each stored frame with its ledger row and the summary so far.
+        stop: called after every step and every stored frame; returns whether to interrupt the run.
+
+    Raises:
+        InputError: the check finds errors, or the scene, the backend or the directory cannot be used; nothing was
+            written.
+    """
+    began = time.perf_counter()
+    scene = loaded.scene
+    check_directory(settings.directory, settings.overwrite)
+    backend = start_backend(
+        settings.arch, settings.threads, scene.solver.precision, compile_cache=settings.compile_cache
+    )
+    plan = make_plan(scene, backend)
+    findings = check_scene(loaded, plan=plan, directory=settings.directory).findings
+    if not (settings.force or passes(findings)):
+        raise InputError(_refusal(loaded.source, findings))
+    require_room(plan)
+    solver = Solver(scene, backend, force=settings.force)
+    # Last, since it removes an earlier result.
+    prepare_directory(settings.directory, settings.overwrite)
+
+    notes = (*loaded.notes, *(finding.line for finding in findings if finding.severity != "note"))
+    facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
+    summary = RunSummary(settings.directory, solver.particle_count, scene.time.frames + 1, facts, notes, plan)
+    on_start(summary)
+    record = _new_record(scene, settings, summary)
+    text = scene_to_toml(scene)
+    try:
+        write_text(settings.directory / SCENE, text)
+    except OSError as error:
+        raise RunError(f"{settings.directory / SCENE} could not be written ({error.strerror or error}).") from error
+    record.write()
+    header = RunHeader.of(scene, text, [laws()[name] for name in solver.laws], summary.backend)
+    kind = VtkSeriesStore if settings.form == "vtk" else SegmentStore
+    store = kind(settings.directory, header.stored, compress=scene.output.compress)
+
+    clock = Stopwatch(summary.timings, began)
+    failure: dict = {}
+    try:
+        _run(solver, store, record, summary, clock, on_frame, stop)
+        summary.status = "finished"
+    except KeyboardInterrupt:
+        summary.status, summary.message = "interrupted", "the run was interrupted"
+    except UnstableRunError as error:
+        summary.status, summary.message = "unstable", str(error)
+        failure = vars(error.diagnosis)
+    except MpmcliError as error:
+        summary.status, summary.message = "failed", str(error)
+    finally:
+        if summary.status == "running":
+            # An error of ours: the record must not claim that the run goes on.
+            record.close("failed", "an internal error ended the run")
+    summary.steps = solver.step_count
+    clock.book(solver.first_step_seconds, "compile_s")
+    with clock.adding("output_s"):
+        _finish(store, summary)
+    clock.stop()
+    record.timings = summary.timings
+    record.close(summary.status, summary.message, **failure)
+    return summary
+
+
+def _run(
+    solver: Solver,
+    store: Store,
+    record: RunRecord,
+    summary: RunSummary,
+    clock: Stopwatch,
+    on_frame: Callable[[LedgerRow, RunSummary], None],
+    stop: Callable[[], bool],
+) -> None:
+    """Compute and store frame after frame, and keep the record and the summary up to date."""
+    frames = solver.frames(stop)
+    while True:
+        with clock.adding("solve_s"):
+            frame, row = next(frames, (None, None))
+        if frame is None:
+            return
+        with clock.adding("output_s"):
+            store.write(frame, row)
+            record.observe(row)
+            summary.frames, summary.steps = store.frames_written, solver.step_count
+            summary.first, summary.last = summary.first or row, row
+            clock.book(solver.first_step_seconds, "compile_s")
+            clock.book(solver.frame_seconds, "output_s")
+            summary.timings["watch_s"] = solver.measure_seconds
+            record.timings = summary.timings
+            record.write()
+        on_frame(row, summary)
+        if stop():
+            raise KeyboardInterrupt
+
+
+def _finish(store: Store, summary: RunSummary) -> None:
+    """Pack what was stored; until then, the result is the directory with its sealed frames."""
+    summary.path = summary.directory
+    try:
+        summary.path = store.finish()
+    except KeyboardInterrupt:
+        summary.status, summary.message = "interrupted", "the run was interrupted while its frames were packed"
+    except RunError as error:
+        if summary.status == "finished":
+            summary.status = "failed"
+        summary.message = f"{summary.message} {error}".strip()
+
+
+def _new_record(scene: Scene, settings: RunSettings, summary: RunSummary) -> RunRecord:
+    return RunRecord(
+        settings.directory,
+        command=settings.command,
+        backend=summary.backend,
+        seeds={body.name: body.seed for body in scene.bodies if body.sampling == "jittered"},
+        frames_expected=summary.frames_expected,
+        particles=summary.particles,
+        notes=summary.notes,
+    )
+
+
+def _refusal(source: str, findings: Iterable[Finding]) -> str:
+    """Return the message of a scene that the check refuses, a line for each error."""
+    errors = [finding for finding in findings if finding.severity == "error"]
+    lines = [f"{source}: {finding.what} {finding.fix}" for finding in errors]
+    # A run that does not fit into memory cannot be forced.
+    if not any(finding.rule == "memory" for finding in errors):
+        lines.append("--force runs it all the same.")
+    return "\n".join(lines)
