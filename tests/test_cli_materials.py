@@ -17,8 +17,8 @@ def facts(*arguments: str) -> dict:
 
 def text(*arguments: str) -> str:
     outcome = run_here("materials", *arguments)
-    assert outcome.status == 0 and outcome.stdout == ""
-    return outcome.stderr
+    assert outcome.status == 0 and outcome.stderr == ""
+    return outcome.stdout
 
 
 def test_everything_is_listed():

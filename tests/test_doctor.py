@@ -51,8 +51,8 @@ def test_the_report_in_json_has_one_check_for_each_examination(trials):
 def test_the_report_as_text_has_one_line_for_each_examination(trials):
     trials({"vtk": CRASH})
     done = run_here("doctor")
-    lines = done.stderr.splitlines()
-    assert (done.status, done.stdout) == (1, "")
+    lines = done.stdout.splitlines()
+    assert (done.status, done.stderr) == (1, "")
     assert len(lines) == len(EXAMINATIONS) + 2
     for line, each in zip(lines, EXAMINATIONS, strict=False):
         status, rest = line.split(maxsplit=1)

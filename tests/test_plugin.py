@@ -109,7 +109,7 @@ def test_materials_shows_the_law():
         "description": "Speed of sound c, m/s.",
     }
     assert [knob["name"] for knob in law["knobs"]] == ["swiftness"]
-    assert "log_fluid" in run_here("materials", "--plugin", "law.py").stderr
+    assert "log_fluid" in run_here("materials", "--plugin", "law.py").stdout
     assert not list(Path.cwd().rglob("*.pyc"))
 
 

@@ -54,7 +54,9 @@ class BodyFacts:
         modes = self.law.modes(self.body.material, StateBound())
         # A mode has twice the viscosity.
         viscosity = max(mode.viscosity for mode in modes) / self.body.material.density
-        return viscosity * (math.pi / self.thickness) ** 2
+        k = math.pi / self.thickness
+        # Products overflow to infinity, where powers raise an error.
+        return viscosity * k * k if viscosity else 0.0
 
     @property
     def flows(self) -> bool:

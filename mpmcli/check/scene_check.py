@@ -15,9 +15,13 @@ from mpmcli.check.scene_table import scene_text
 from mpmcli.check.shape_rules import shape_findings
 from mpmcli.check.step_rules import step_findings
 from mpmcli.cores import available_cores
+from mpmcli.errors import InputError
 from mpmcli.scene import LoadedScene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.plan import Plan, make_plan
+
+# Steps that no run will ever take; the counts of a forecast are exact below 2^53.
+MOST_STEPS = 1e15
 
 
 @dataclass(frozen=True)
@@ -82,9 +86,17 @@ def check_scene(
         plan: of the run, or of the probe; that of a run on all cores of the CPU where None.
         probe: what a moment of the run cost, for the forecast of time.
         directory: where results would go, for the room on its disk.
+
+    Raises:
+        InputError: no step is stable, as where gravity is infinite at some time.
     """
     scene = loaded.scene
     facts = SceneFacts(scene)
+    if not scene.time.end <= MOST_STEPS * facts.taken(facts.step):
+        raise InputError(
+            f"{loaded.source}: no run is possible: with speeds up to {facts.bounds.speed:.3g} m/s and accelerations up "
+            f"to {facts.bounds.gravity:.3g} m/s^2 the largest stable step is {facts.step:.3g} s. {facts.binding.why}"
+        )
     if plan is None:
         plan = make_plan(scene, Backend("cpu", available_cores(), scene.solver.precision, compile_cache=True))
     forecast = forecast_of(facts, plan, probe)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import click
 
 from mpmcli.cli.options import json_option, threads_option
-from mpmcli.cli.streams import print_json
+from mpmcli.cli.streams import print_json, print_text
 
 if TYPE_CHECKING:
     from mpmcli.bench.cases import BenchCase
@@ -68,7 +68,8 @@ def command(
 
         cases = [case for case in chosen(CASES) if not quick or case.particles <= QUICK_PARTICLES]
         report = run_bench(cases, threads or os.cpu_count() or 1, seconds, progress, blocks=blocks)
-    click.echo(report.table(), err=True)
     if as_json:
         print_json(report.as_dict())
+    else:
+        print_text(report.table())
     return 0

@@ -3,7 +3,7 @@
 import click
 
 from mpmcli.cli.options import json_option
-from mpmcli.cli.streams import print_json
+from mpmcli.cli.streams import print_json, print_text
 
 
 @click.command("doctor")
@@ -23,7 +23,7 @@ def command(as_json: bool) -> int:
         found.append((name, finding))
         if not as_json:
             remedy = f"; {finding.remedy}" if finding.remedy else ""
-            click.echo(f"{finding.status:<11}  {name:<{width}}  {finding.detail}{remedy}", err=True)
+            print_text(f"{finding.status:<11}  {name:<{width}}  {finding.detail}{remedy}")
     faults = [name for name, finding in found if finding.is_fault]
     if as_json:
         checks = [
@@ -32,7 +32,7 @@ def command(as_json: bool) -> int:
         ]
         print_json({"ok": not faults, "checks": checks})
     elif faults:
-        click.echo(f"\nnot everything that mpmcli needs works: {', '.join(faults)}", err=True)
+        print_text(f"\nnot everything that mpmcli needs works: {', '.join(faults)}")
     else:
-        click.echo("\neverything that mpmcli needs works", err=True)
+        print_text("\neverything that mpmcli needs works")
     return 1 if faults else 0

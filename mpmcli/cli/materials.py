@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from mpmcli.cli.options import json_option, plugin_option
-from mpmcli.cli.streams import print_json
+from mpmcli.cli.streams import print_json, print_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -67,15 +67,15 @@ def _summary(law: type) -> str:
 def _print(facts: dict[str, list[dict[str, Any]]], in_full: bool) -> None:
     from rich.console import Console
 
-    console = Console(stderr=True, highlight=False)
+    console = Console(highlight=False)
     if not console.is_terminal:
         console.width = WIDTH
     if facts["presets"] and not in_full:
-        _say(console, 'Presets: material = "honey", or { preset = "honey", thickness = 0.7, density = 1400 }')
+        _show(console, 'Presets: material = "honey", or { preset = "honey", thickness = 0.7, density = 1400 }')
         _say_table(
             console, ["preset", "law", "what it shows"], [[p["name"], p["law"], p["shows"]] for p in facts["presets"]]
         )
-        _say(console, "\nLaws: material = { law = ..., with these parameters, or a knob in place of one }")
+        _show(console, "\nLaws: material = { law = ..., with these parameters, or a knob in place of one }")
     for law in facts["laws"]:
         _say_law(console, law)
     for preset in facts["presets"] if in_full else []:
@@ -83,7 +83,7 @@ def _print(facts: dict[str, list[dict[str, Any]]], in_full: bool) -> None:
 
 
 def _say_law(console: "Console", law: dict[str, Any]) -> None:
-    _say(console, f"\n{law['name']}: {law['summary']}")
+    _show(console, f"\n{law['name']}: {law['summary']}")
     rows = [
         [p["name"], p["unit"], p["range"], "needed" if p["default"] is None else _plain(p["default"]), p["description"]]
         for p in law["parameters"]
@@ -92,11 +92,11 @@ def _say_law(console: "Console", law: dict[str, Any]) -> None:
     _say_table(console, ["parameter", "unit", "range", "default", "meaning"], rows)
     for field in law["fields"]:
         where = "" if len(field["dimensions"]) == 2 else f" ({field['dimensions'][0]}D only)"
-        _say(console, f"output field {field['name']}{where}: {field['description']}")
+        _show(console, f"output field {field['name']}{where}: {field['description']}")
 
 
 def _say_preset(console: "Console", preset: dict[str, Any]) -> None:
-    _say(console, f"\npreset {preset['name']}, of the law {preset['law']}: {preset['shows']}")
+    _show(console, f"\npreset {preset['name']}, of the law {preset['law']}: {preset['shows']}")
     rows = [[v["name"], _plain(v["value"]), v["unit"], v["source"]] for v in preset["values"]]
     _say_table(console, ["parameter", "value", "unit", "source"], rows)
     knobs = [
@@ -117,10 +117,6 @@ def _plain(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else written(value)
 
 
-def _say(console: "Console", text: str) -> None:
-    _show(console, text)
-
-
 def _say_table(console: "Console", head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print columns, of which the last one wraps."""
     from rich.table import Table
@@ -139,4 +135,4 @@ def _show(console: "Console", content: object) -> None:
     with console.capture() as captured:
         console.print(content, markup=False)
     # Tables are padded to the full width.
-    click.echo("\n".join(line.rstrip() for line in captured.get().split("\n")), nl=False, err=True)
+    print_text("\n".join(line.rstrip() for line in captured.get().removesuffix("\n").split("\n")))

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from mpmcli.cli.options import json_option, quiet_option
-from mpmcli.cli.streams import print_json
+from mpmcli.cli.streams import print_json, print_text
 
 DEFAULT = "ledger.png"
 # Begins what a picture of this command says of itself.
@@ -61,11 +61,11 @@ def command(
             click.echo(note, err=True)
     picture, panels = ledger_picture(history, width_height, theme)  # type: ignore[arg-type]
     write_picture(path, picture, MARK + settings_digest({"theme": theme, "size": width_height}))
-    if not quiet:
-        click.echo(f"picture: {path}", err=True)
     if as_json:
         facts = {"path": str(path), "size": width_height, "theme": theme, "frames": opened.frame_count}
         print_json({**facts, "panels": panels, "notes": history.notes})
+    elif not quiet:
+        print_text(f"picture: {path}")
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -7,7 +7,7 @@ import click
 
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
 from mpmcli.cli.options import json_option, quiet_option
-from mpmcli.cli.streams import print_json
+from mpmcli.cli.streams import print_json, print_text
 
 MODES = ("dots", "surface", "fluid", "density")
 THEMES = ("light", "dark")
@@ -100,11 +100,11 @@ def command(
         done = assignment.carry_out(workers, watch=bar.show, stop=interrupt_came)
     for warning in done.warnings:
         click.echo(f"warning: {warning}", err=True)
-    if not quiet:
-        kept = len(done.pictures) - done.made
-        there = f", {kept} {'was' if kept == 1 else 'were'} there already" if kept else ""
-        bar.say(f"{done.made} picture{'s' if done.made != 1 else ''} made{there}")
-        bar.say(f"film: {done.film}" if done.film else f"pictures: {done.place}", whole=True)
     if as_json:
         print_json(done.as_dict())
+    elif not quiet:
+        kept = len(done.pictures) - done.made
+        there = f", {kept} {'was' if kept == 1 else 'were'} there already" if kept else ""
+        print_text(f"{done.made} picture{'s' if done.made != 1 else ''} made{there}")
+        print_text(f"film: {done.film}" if done.film else f"pictures: {done.place}")
     return 0

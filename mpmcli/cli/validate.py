@@ -8,7 +8,7 @@ import click
 
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
 from mpmcli.cli.options import json_option, quiet_option
-from mpmcli.cli.streams import print_json
+from mpmcli.cli.streams import print_json, print_text
 
 if TYPE_CHECKING:
     from mpmcli.validation.case import Case, Level
@@ -128,7 +128,7 @@ def _list(cases: Sequence["Case"], level: "Level", as_json: bool) -> int:
     rows = [
         (f["case"], f["title"], ", ".join(map(str, f["resolutions"])), str(f["runs"]), f["resolution"]) for f in facts
     ]
-    click.echo(text_table(head, rows, left={0, 1, 2, 4}), err=True)
+    print_text(text_table(head, rows, left={0, 1, 2, 4}))
     return 0
 
 
@@ -144,7 +144,7 @@ def _write_scene(cases: Sequence["Case"], names: Sequence[str], level: "Level", 
     if len(cases) > 1:
         others = ", ".join(other.name for other in cases[1:])
         click.echo(f"this is the scene of {case.name}; others are those of {others}", err=True)
-    click.echo(scene_to_toml(scene_of(case, resolution or min(case.levels[level]), Setting())), nl=False)
+    print_text(scene_to_toml(scene_of(case, resolution or min(case.levels[level]), Setting())).rstrip("\n"))
     return 0
 
 
@@ -188,7 +188,10 @@ def _run(
         raise
     if output is not None:
         write_report(report, output)
-    progress.close(report, output)
     if as_json:
         print_json(report.as_dict())
+    elif not quiet:
+        print_text(report.table())
+        if output is not None:
+            print_text(f"report: {output / 'report.html'}")
     return 0 if report.passed else 1

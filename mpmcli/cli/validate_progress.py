@@ -1,13 +1,11 @@
 """Progress of a validation for people: a line per run where there is no terminal."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from types import TracebackType
 
 from mpmcli.cli.progress_bar import ProgressBar
 from mpmcli.validation.case import Case
 from mpmcli.validation.matrix import Run, label_of
-from mpmcli.validation.report import Report
 from mpmcli.validation.run_result import RunResult
 
 
@@ -56,9 +54,3 @@ class ValidateProgress:
         if self._bar.drawn and not result.finished:
             self._bar.say(f"{what}: {outcome}")
         self._bar.show(done, what, f": {outcome}")
-
-    def close(self, report: Report, directory: Path | None) -> None:
-        """Print the table of a report, and where the report is."""
-        self._bar.say(report.table(), whole=True)
-        if directory is not None:
-            self._bar.say(f"report: {directory / 'report.html'}", whole=True)

@@ -31,6 +31,8 @@ def loss_per_step(settings: SolverSettings, kh: float) -> float:
     With PIC (D / h^2) (k h)^2: half of what a free transfer takes, as only one half of a wave's energy is in the
     velocities. AFLIP loses what APIC does of the share that is not FLIP's.
     """
+    # Products overflow to infinity, where powers raise an error.
+    square = kh * kh
     if settings.transfer == "pic":
-        return kh**2 / INVERSE_MOMENT[settings.kernel]
-    return (1 - (settings.flip or 0.0)) * APIC_LOSS[settings.kernel] * kh**4
+        return square / INVERSE_MOMENT[settings.kernel]
+    return (1 - (settings.flip or 0.0)) * APIC_LOSS[settings.kernel] * square * square
