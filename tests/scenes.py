@@ -74,9 +74,7 @@ def restart(solver: Solver, sample: BodyParticles, end: float) -> None:
         values.fill(variable.at_rest)
     group.id.from_numpy(np.arange(group.count, dtype=np.int32))
     solver.scene = solver.scene.model_copy(update={"time": solver.scene.time.model_copy(update={"end": end})})
-    solver.time, solver.step_count, solver.last_step = 0.0, 0, 0.0
-    solver.state_was_replaced()
-    solver._first_stable_step = solver.stable_step()[0]
+    solver.restart()
 
 
 def sums(solver: Solver) -> dict:

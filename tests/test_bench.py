@@ -95,7 +95,7 @@ from mpmcli.bench.cases import BenchCase
 from mpmcli.bench.{module} import {name}
 side = {name}({case!r}, threads=1, precision="f64", arch="cpu")
 if "{module}" == "ours":
-    side._solver.last_step = {case.step}
+    side._solver.state.last_step = {case.step}
 for _ in range({steps}):
     side.step()
 side.sync()

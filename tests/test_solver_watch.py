@@ -74,11 +74,11 @@ def test_no_step_exceeds_the_limit_of_its_moment(law: str, backend_of: Callable,
         }
     body = block("block", material, [0.65, 0.05], [0.95, 0.25], velocity=[wave_speed / 5, 0.0])
     solver = Solver(scene([32, 16], 1 / 32, [body], end=1.0), backend_of("f32", 1))
-    largest, at_start = 0.0, min(solver._step_control.limits_now()).value
+    largest, at_start = 0.0, min(solver.state.step_control.limits_now()).value
     smallest = at_start
     while solver.time < 0.06:
         dt, _ = solver.stable_step()
-        limit = min(solver._step_control.limits_now()).value
+        limit = min(solver.state.step_control.limits_now()).value
         largest, smallest = max(largest, dt / limit), min(smallest, limit)
         solver.step(dt)
     record_property("step over limit", largest)

@@ -168,7 +168,7 @@ def test_the_digest_is_of_the_code_that_a_run_depends_on(monkeypatch: pytest.Mon
     code_digest.__wrapped__(case_files(BAR))
     names = {str(path.relative_to(fingerprint.PACKAGE)) for path in read}
     assert {
-        "solver/step.py",
+        "solver/step_cpu.py",
         "materials/sand.py",
         "scene/sampling.py",
         "validation/carry_out.py",

@@ -151,7 +151,7 @@ PLANTS = (
     Plant(
         "a first kick of a whole step",
         "solver/solver.py",
-        "kick = min(0.5 * (self.last_step + dt),",
+        "kick = min(0.5 * (state.last_step + dt),",
         "kick = min(dt,",
         ("column_dynamic", "mms_2d_neo_hookean"),
     ),

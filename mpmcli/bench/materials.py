@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from mpmcli.bench.cases import BenchCase
 from mpmcli.bench.ours import Ours
 from mpmcli.errors import RunError
@@ -121,18 +119,15 @@ class Column(Ours):
             raise RunError(f"There is no law {min(unknown)}.")
         data = scene_of(names, case, precision)
         super().__init__(data, case.step, threads=threads, precision=precision, arch=arch)
-        self._kept: list[list[np.ndarray]] = []
+        self._kept = self._solver.state.save()
 
     def keep(self) -> None:
-        """Remember the state of all particles."""
-        self._kept = [[field.to_numpy() for field in (*g.state, *g.labels)] for g in self._solver.groups]
+        """Remember the state of the run."""
+        self._kept = self._solver.state.save()
 
     def rewind(self) -> None:
-        """Return to the state that was kept, and take the one step that sorts the particles again."""
-        for group, arrays in zip(self._solver.groups, self._kept, strict=True):
-            for field, values in zip((*group.state, *group.labels), arrays, strict=True):
-                field.from_numpy(values)
-        self._solver.state_was_replaced()
+        """Return to the state that was kept, and take one step that is not measured."""
+        self._solver.state.load(self._kept)
         self.step()
         self.sync()
 

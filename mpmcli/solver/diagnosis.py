@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpmcli.errors import RunError
+from mpmcli.scene import Scene
 from mpmcli.solver.particle_update import SMALLEST_J
 from mpmcli.solver.snapshot import Snapshot
 from mpmcli.stability.limits import Limit
@@ -103,8 +104,7 @@ def diagnose(
     snapshot: Snapshot,
     p: int,
     cause: str,
-    names: tuple[str, ...],
-    origin: np.ndarray,
+    scene: Scene,
     step: int,
     time: float,
     step_size: float,
@@ -118,8 +118,8 @@ def diagnose(
         step,
         time,
         int(snapshot.id[p]),
-        names[int(snapshot.body[p])],
-        tuple((snapshot.x[p].astype(np.float64) + origin).tolist()),
+        scene.bodies[int(snapshot.body[p])].name,
+        tuple((snapshot.x[p].astype(np.float64) + scene.domain.origin).tolist()),
         cause,
         limit.name,
         step_size,

@@ -46,6 +46,14 @@ class ExternalForces:
         """Whether there are forces beside gravity."""
         return bool(self._measures)
 
+    def save(self) -> dict[str, float]:
+        """Return what was last measured, as plain numbers."""
+        return {"push": self._push, "slope": self.slope}
+
+    def load(self, saved: dict[str, float]) -> None:
+        """Take what `save` returned."""
+        self._push, self.slope = saved["push"], saved["slope"]
+
     def begin_step(self, time: float) -> None:
         """Let gravity and forces be those of a time, s."""
         if self._timed:

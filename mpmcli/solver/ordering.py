@@ -6,6 +6,7 @@ counting sort, so the order, and with it every floating-point sum, is the same f
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import taichi as ti
 
@@ -119,8 +120,21 @@ class TileOrder:
         return tile * self.pencil
 
 
-def build_sort(order: TileOrder) -> Callable[[], None]:
-    """Compile-ready kernels of one group's sort: call the result to sort."""
+@dataclass(frozen=True)
+class Sort:
+    """The sort of one group.
+
+    Attributes:
+        run: sort the particles, and share the work.
+        share_work: set `TileOrder.work` from `TileOrder.start`; needed by itself where the latter was loaded.
+    """
+
+    run: Callable[[], None]
+    share_work: Callable[[], None]
+
+
+def build_sort(order: TileOrder) -> Sort:
+    """Compile-ready kernels of one group's sort."""
     group, buffers = order.group, order.buffers
     key, source = buffers.key, buffers.order
     n, threads, tiles = group.count, order.threads, order.tiles
@@ -250,4 +264,4 @@ def build_sort(order: TileOrder) -> Callable[[], None]:
             place_atomic()
             move()
 
-    return sort
+    return Sort(sort, share_work)

@@ -90,6 +90,13 @@ class ParticleGroup:
             place = [np.full(len(b.position), i) for i, b in enumerate(particles)]
             self.body.from_numpy(np.concatenate(place).astype(np.int32))
 
+    def fields(self) -> dict[str, ti.Field]:
+        """Return every field of the particles that changes during a run or is sorted, by name."""
+        names = ["position", "velocity", "velocity_gradient", "deformation", *(v.name for v in self.law.internal)]
+        initial = ["initial_position"] * self.keeps_initial
+        labels = ["id", "body"][: len(self.labels)]
+        return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
+
     @property
     def state(self) -> tuple[ti.Field, ...]:
         """Every real field that the sort must move."""

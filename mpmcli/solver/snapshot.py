@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.tensors import determinant
 from mpmcli.solver.observe import Observation
 from mpmcli.solver.particles import MASS, VOLUME, ParticleGroup
@@ -184,3 +185,17 @@ def measure(
         "volume_ratio_min": float(min(j.min() for j in J)),
         "volume_ratio_max": float(max(j.max() for j in J)),
     }
+
+
+def ledger_row(sums: dict, time: float, taken: Sequence[tuple[float, float, str]]) -> LedgerRow:
+    """Return the row of a frame: what `measure` returned, and the steps (size, Courant number, limit) taken to it."""
+    smallest = min(taken, default=(0.0, 0.0, ""))
+    return LedgerRow(
+        time=time,
+        steps=len(taken),
+        step_min=smallest[0],
+        step_max=max(taken, default=(0.0,))[0],
+        limit=smallest[2],
+        courant_max=max((courant for _, courant, _ in taken), default=0.0),
+        **sums,
+    )

@@ -3,8 +3,9 @@
 import math
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 
+from mpmcli.materials.law import StateBound
 from mpmcli.scene import Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.particle_update import SMALLEST_J
@@ -57,6 +58,33 @@ class StepControl:
         self.seconds = 0.0
         self._limits = [self._limits_of(g, bounds) for g, bounds in enumerate(self._bounds)]
         self._eased = math.inf
+        self._take_limits()
+
+    def begin(self) -> None:
+        """Let the first step of a run be as large as the bounds allow."""
+        self._eased = math.inf
+
+    def save(self) -> dict[str, object]:
+        """Return what was measured and counted of each group, as plain numbers, lists and dictionaries."""
+        return {
+            "bounds": [asdict(bounds) for bounds in self._bounds],
+            "rates": list(self._rates),
+            "unwatched": list(self._unwatched),
+            "change": list(self._change),
+            "hardened": list(self._hardened),
+            "eased": self._eased,
+        }
+
+    def load(self, saved: dict) -> None:
+        """Take what `save` returned."""
+        for g, bounds in enumerate(saved["bounds"]):
+            internal = {name: tuple(pair) for name, pair in bounds["bound"]["internal"].items()}
+            bound = StateBound(**bounds["bound"] | {"internal": internal})
+            self._bounds[g] = StateBounds(**bounds | {"bound": bound})
+            self._limits[g] = self._limits_of(g, self._bounds[g])
+        self._rates, self._unwatched = list(saved["rates"]), list(saved["unwatched"])
+        self._change, self._hardened = list(saved["change"]), list(saved["hardened"])
+        self._eased = saved["eased"]
         self._take_limits()
 
     @property

@@ -1,0 +1,57 @@
+"""Puts the particles of a scene on the device, one group for each law."""
+
+import numpy as np
+import taichi as ti
+
+from mpmcli.errors import InputError
+from mpmcli.materials.registry import laws
+from mpmcli.scene import BodyParticles, Scene
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.forces import needs_initial
+from mpmcli.solver.grid import node_width
+from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.plan import members_of
+
+
+def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles]) -> list[ParticleGroup]:
+    """Return a group for each law of a scene, in the order of their names.
+
+    Args:
+        particles: one entry per body.
+
+    Raises:
+        InputError: a particle is not in the domain.
+    """
+    origin, upper = np.array(scene.domain.origin), np.array(scene.domain.upper)
+    for sample in particles:
+        _require_inside(sample, origin, upper)
+    first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
+    layout = ti.Layout.AOS if backend.on_cpu else ti.Layout.SOA
+    groups = []
+    for name in sorted({body.material.law for body in scene.bodies}):
+        members = members_of(scene, name)
+        groups.append(
+            ParticleGroup(
+                laws()[name]([scene.bodies[i].material for i in members], scene.dimension),
+                members,
+                [particles[i] for i in members],
+                [int(first_ids[i]) for i in members],
+                origin,
+                node_width(scene.dimension, on_cpu=True) if backend.on_cpu else scene.dimension,
+                layout,
+                keeps_initial=needs_initial(scene, members),
+            )
+        )
+    return groups
+
+
+def _require_inside(sample: BodyParticles, lower: np.ndarray, upper: np.ndarray) -> None:
+    """Refuse particles beyond the domain, or nowhere: the sort would count them in a tile that does not exist."""
+    inside = ((sample.position >= lower) & (sample.position <= upper)).all(axis=1)
+    if not inside.all():
+        p = int(np.argmin(inside))
+        place, low, high = (", ".join(f"{x:.6g}" for x in point) for point in (sample.position[p], lower, upper))
+        raise InputError(
+            f'particle {p} of body "{sample.name}" lies at ({place}) m, outside the domain from ({low}) to ({high}) m; '
+            "every particle must begin inside it."
+        )

@@ -1,0 +1,66 @@
+"""Everything that is compiled for a scene: the sort, the box of nodes in use, and the step."""
+
+import math
+from collections.abc import Sequence
+
+from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.walls import Walls
+from mpmcli.boundaries.zeroed_walls import ZeroedWalls
+from mpmcli.scene import Scene
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.box import build_box_search
+from mpmcli.solver.forces import Gravity
+from mpmcli.solver.grid import DRIFT, PAD, Grid, node_width
+from mpmcli.solver.nodes import NodeUpdate
+from mpmcli.solver.ordering import SortBuffers, TileOrder, build_sort
+from mpmcli.solver.particle_update import ParticleUpdate
+from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.step_cpu import build_cpu_step
+from mpmcli.solver.step_gpu import build_gpu_step
+from mpmcli.solver.transfer_scheme import scheme_of
+
+
+class Kernels:
+    """The kernels of a scene, and the grid and the tables that they work on.
+
+    Attributes:
+        grid: the nodes.
+        orders: the tile order of each group.
+        particles: which also knows the particles that were lost.
+        drift_allowed: cells that a particle may move until particles are sorted again: without atomics only as far as
+            its tile's colour allows.
+        step: (dt, kick) -> what it read back, a `StepResult`; None on a GPU. Positions move on by dt, s, velocities by
+            kick, s: from the middle of the last step to the middle of this one (docs/theory.md, 7.1).
+    """
+
+    def __init__(self, scene: Scene, backend: Backend, groups: Sequence[ParticleGroup], gravity: Gravity) -> None:
+        width = node_width(scene.dimension, on_cpu=backend.on_cpu)
+        self.grid = Grid(scene.dimension, scene.domain.spacing, scene.domain.cells, width, scheme_of(scene.solver))
+        faces = scene.domain.walls.faces(scene.dimension)
+        if scene.solver.walls == "zeroed":
+            images, walls = None, ZeroedWalls(faces, PAD, self.grid.cells)
+        else:
+            walls = Walls(faces, PAD, self.grid.cells, self.grid.shape)
+            images = MirrorImages(walls)
+        nodes = NodeUpdate(self.grid, images, [walls])
+        self.particles = ParticleUpdate(self.grid, len(groups), watches_box=not backend.on_cpu)
+        buffers = SortBuffers(groups)
+        self.orders = [TileOrder(g, self.grid, buffers, backend.threads, backend.on_cpu) for g in groups]
+        self._sorts = [build_sort(order) for order in self.orders]
+        self.drift_allowed = DRIFT if backend.on_cpu else float(self.grid.tile)
+        self._find_box = build_box_search(self.grid, self.orders, math.ceil(self.drift_allowed))
+        if backend.on_cpu:
+            self.step = build_cpu_step(self.grid, nodes, self.particles, groups, self.orders, gravity)
+        else:
+            self.step = build_gpu_step(self.grid, nodes, self.particles, groups, gravity)
+
+    def sort(self) -> None:
+        """Sort the particles of every group by tile, and find the nodes in use."""
+        for sort in self._sorts:
+            sort.run()
+        self._find_box()
+
+    def share_work(self) -> None:
+        """Share the work of a sort among threads anew, after its tables were loaded."""
+        for sort in self._sorts:
+            sort.share_work()

@@ -1,0 +1,110 @@
+"""The complete state of a run: everything that its next step depends on, saved and loaded as one."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import taichi as ti
+
+from mpmcli.errors import InputError
+from mpmcli.solver.external_forces import ExternalForces
+from mpmcli.solver.kernels import Kernels
+from mpmcli.solver.particle_update import NOT_LOST
+from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.step_control import StepControl
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """A state on the host, as a file can hold it.
+
+    Attributes:
+        numbers: plain numbers, lists and dictionaries of them, by name; infinity occurs.
+        arrays: of the particles in the order of the device, the tables of the sort and the box of the grid, by name.
+    """
+
+    numbers: dict[str, object]
+    arrays: dict[str, np.ndarray]
+
+
+class State:
+    """The state of a run on its device.
+
+    On the CPU a run that is saved, loaded and continued, on any number of threads, gives the bytes of one that was not.
+
+    Attributes:
+        time: s, in double precision; step_count: steps taken; last_step: size of the last one, s, 0 before the first.
+        speed: bound on the speed of every particle, m/s; courant: cells that the fastest one moved in the last step.
+        drift: cells that a particle may have moved since particles were sorted; infinite before the first sort.
+        first_stable_step: s, at the start of the run.
+        step_control, external_forces: what is known of the bounds on the next step.
+    """
+
+    NUMBERS = ("time", "step_count", "last_step", "speed", "courant", "drift", "first_stable_step")
+
+    def __init__(
+        self,
+        groups: Sequence[ParticleGroup],
+        kernels: Kernels,
+        step_control: StepControl,
+        external_forces: ExternalForces,
+    ) -> None:
+        self._groups = groups
+        self._kernels = kernels
+        self.step_control = step_control
+        self.external_forces = external_forces
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a run with the particles that are on the device."""
+        self.time = 0.0
+        self.step_count = 0
+        self.last_step = 0.0
+        self.speed = self.step_control.speed
+        self.courant = 0.0
+        self.drift = math.inf
+        self.first_stable_step = 0.0
+        self.step_control.begin()
+        self._kernels.particles.lost.fill(NOT_LOST)
+
+    def save(self) -> SavedState:
+        """Copy the state to the host."""
+        numbers = {name: getattr(self, name) for name in self.NUMBERS}
+        numbers["step_control"] = self.step_control.save()
+        numbers["external_forces"] = self.external_forces.save()
+        return SavedState(numbers, {name: field.to_numpy() for name, field in self._fields().items()})
+
+    def load(self, saved: SavedState) -> None:
+        """Replace the state by one that was saved, of a solver of the same scene.
+
+        Raises:
+            InputError: the saved state has other fields or other numbers of particles or nodes.
+        """
+        fields = self._fields()
+        shapes = {name: _shape(field) for name, field in fields.items()}
+        if shapes != {name: array.shape for name, array in saved.arrays.items()}:
+            raise InputError("the saved state belongs to another scene or to another kind of backend.")
+        for name, field in fields.items():
+            field.from_numpy(saved.arrays[name])
+        for name in self.NUMBERS:
+            setattr(self, name, saved.numbers[name])
+        self.step_control.load(saved.numbers["step_control"])
+        self.external_forces.load(saved.numbers["external_forces"])
+        self._kernels.particles.lost.fill(NOT_LOST)
+        self._kernels.share_work()
+
+    def _fields(self) -> dict[str, ti.Field]:
+        """Return every field of the device that outlives a step, by name."""
+        fields = {"grid.box": self._kernels.grid.box}
+        for group, order in zip(self._groups, self._kernels.orders, strict=True):
+            fields |= {f"{group.law.name}.{name}": field for name, field in group.fields().items()}
+            fields[f"{group.law.name}.tile_start"] = order.start
+        return fields
+
+
+def _shape(field: ti.Field) -> tuple[int, ...]:
+    """Return the shape of a field as a numpy array."""
+    if isinstance(field, ti.lang.matrix.MatrixField):
+        return (*field.shape, field.n) if field.m == 1 else (*field.shape, field.n, field.m)
+    return tuple(field.shape)

@@ -1,0 +1,112 @@
+"""Saves and loads runs of small scenes, in its own process: `python state_run.py THREADS` prints JSON."""
+
+import json
+import sys
+
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import Scene, parse_scene
+from mpmcli.solver.backend import start_backend
+from mpmcli.solver.solver import Solver
+from mpmcli.solver.state import SavedState
+
+BEFORE, AFTER = 30, 50
+SOFT = {"density": 1000.0, "youngs_modulus": 2e5, "poissons_ratio": 0.3}
+MATERIALS = {
+    "fluid": {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4, "viscosity": 0.5},
+    "viscoplastic": {
+        "law": "viscoplastic",
+        "density": 1000.0,
+        "bulk_modulus": 2e5,
+        "shear_modulus": 5e4,
+        "yield_stress": 20.0,
+        "consistency": 2.0,
+    },
+    "neo_hookean": {"law": "neo_hookean", **SOFT},
+    "fixed_corotated": {"law": "fixed_corotated", **SOFT},
+    "snow": {"law": "snow", "density": 400.0, "youngs_modulus": 1.4e5, "poissons_ratio": 0.2},
+    "sand": {"law": "sand", "density": 1600.0, "youngs_modulus": 3e5, "poissons_ratio": 0.3, "friction_angle": 30.0},
+    "von_mises": {"law": "von_mises", **SOFT, "yield_stress": 500.0},
+}
+# Of the name of each scene: the materials of its bodies, its dimension, and further tables.
+SCENES = {name: ((name,), 2, {}) for name in MATERIALS} | {
+    "3D, two laws": (("fluid", "snow"), 3, {}),
+    "several bodies, FLIP": (("sand", "sand", "fluid"), 2, {"solver": {"transfer": "aflip", "flip": 0.9}}),
+    "forces": (("fluid", "neo_hookean"), 2, {"forces": [{"acceleration": ["3*sin(20*t) - 5*x", "2*X"]}]}),
+}
+NAMES = tuple(SCENES)
+# Scenes that are loaded into another solver, too, whose kernels are compiled anew.
+TWICE = ("snow", "several bodies, FLIP", "forces")
+
+
+def laws_in(name: str) -> set[str]:
+    """Return the laws of a scene."""
+    return {MATERIALS[material]["law"] for material in SCENES[name][0]}
+
+
+def scene_named(name: str) -> Scene:
+    """Return blocks that fall side by side onto a floor, fast enough to meet it within the run."""
+    materials, d, more = SCENES[name]
+    width = 0.8 / len(materials)
+    bodies = [
+        {
+            "name": f"body {k}",
+            "material": MATERIALS[material],
+            "shape": {
+                "box": {
+                    "min": [0.1 + width * k, 0.02, 0.3][:d],
+                    "max": [0.1 + width * (k + 0.8), 0.4, 0.6][:d],
+                }
+            },
+            "velocity": [1.0, -2.0, 0.5][:d],
+        }
+        for k, material in enumerate(materials)
+    ]
+    data = {
+        "domain": {"size": [1.0] * d, "cells": [20 if d == 2 else 12] * d, "gravity": [0.0, -9.81, 0.0][:d]},
+        "time": {"end": 1.0, "frames": 1},
+        "bodies": bodies,
+        **more,
+    }
+    return parse_scene(data, laws=parameter_models(), source=name).scene
+
+
+def advance(solver: Solver, steps: int) -> None:
+    """Take some steps, each as long as the solver allows."""
+    for _ in range(steps):
+        solver.step(solver.stable_step()[0])
+
+
+def through_json(saved: SavedState) -> SavedState:
+    """Return the state with its numbers written and read as JSON."""
+    return SavedState(json.loads(json.dumps(saved.numbers)), saved.arrays)
+
+
+def differences(expected: SavedState, found: SavedState) -> list[str]:
+    """Return the names of what two states differ in."""
+    arrays = [name for name, array in expected.arrays.items() if array.tobytes() != found.arrays[name].tobytes()]
+    # JSON makes lists of tuples.
+    pair = through_json(expected).numbers, through_json(found).numbers
+    return arrays + [name for name in pair[0] if pair[0][name] != pair[1][name]]
+
+
+def outcome(name: str, threads: int) -> dict[str, list[str]]:
+    """Return what a run that was loaded has otherwise than one that went on."""
+    backend = start_backend("cpu", threads)
+    solver = Solver(scene_named(name), backend)
+    advance(solver, BEFORE)
+    start = solver.state.save()
+    advance(solver, AFTER)
+    expected = solver.state.save()
+    solver.state.load(start)
+    advance(solver, AFTER)
+    found = {"same solver": differences(expected, solver.state.save())}
+    if name in TWICE:
+        other = Solver(scene_named(name), backend)
+        other.state.load(through_json(start))
+        advance(other, AFTER)
+        found["other solver"] = differences(expected, other.state.save())
+    return found
+
+
+if __name__ == "__main__":
+    print(json.dumps({name: outcome(name, int(sys.argv[1])) for name in NAMES}))

@@ -1,0 +1,53 @@
+"""The saved state of a run is complete: what is loaded goes on to the same bytes, for every law."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import state_run
+
+from mpmcli.errors import InputError
+from mpmcli.materials.registry import laws
+from mpmcli.solver.solver import Solver
+
+RUN = Path(state_run.__file__)
+
+
+@pytest.fixture(scope="module", params=[pytest.param(1, marks=pytest.mark.slow), 3])
+def outcomes(request: pytest.FixtureRequest) -> dict:
+    """Run every scene with some threads in a process of its own, and return what differed, by scene."""
+    done = subprocess.run(
+        [sys.executable, str(RUN), str(request.param)], capture_output=True, text=True, timeout=600, check=True
+    )
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("name", state_run.NAMES)
+def test_a_loaded_run_has_the_bytes_of_one_that_went_on(outcomes: dict, name: str) -> None:
+    """Save, 50 steps, load, 50 steps; and the same in another solver of the scene, by a route through JSON."""
+    found = outcomes[name]
+    assert found["same solver"] == []
+    assert found.get("other solver", []) == []
+    assert ("other solver" in found) == (name in state_run.TWICE)
+
+
+def test_there_is_a_scene_for_every_law() -> None:
+    """Every law of the registry is in one of the scenes."""
+    assert {law for name in state_run.NAMES for law in state_run.laws_in(name)} == set(laws())
+
+
+def test_a_state_of_another_scene_is_refused(backend_of) -> None:
+    backend = backend_of("f32")
+    saved = Solver(state_run.scene_named("fluid"), backend).state.save()
+    with pytest.raises(InputError, match="belongs to another scene"):
+        Solver(state_run.scene_named("sand"), backend).state.load(saved)
+
+
+def test_the_numbers_are_plain(backend_of) -> None:
+    """JSON can hold the numbers, and the arrays are numpy's."""
+    saved = Solver(state_run.scene_named("snow"), backend_of("f32")).state.save()
+    assert json.loads(json.dumps(saved.numbers)) == json.loads(json.dumps(saved.numbers))
+    assert all(isinstance(array, np.ndarray) for array in saved.arrays.values())
