@@ -1,11 +1,16 @@
 """`--plugin law.py`: a law in a file of its own is shown, completed by editors, and run; a scene alone runs no code."""
 
 import json
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from command import run_here
+from conftest import ROOT
 
 from mpmcli.materials.registry import laws, load_plugins
 
@@ -238,3 +243,27 @@ def test_a_result_needs_no_plugin():
     assert refused("info", "result", "--plugin", "law.py") == (
         "--plugin is for scenes, and result is none; leave it out."
     )
+
+
+def test_a_law_is_one_file_of_the_package(tmp_path: Path) -> None:
+    """A file put beside the laws of mpmcli is listed, completed by editors, checked, run, and its result checked."""
+    shutil.copytree(ROOT / "mpmcli", tmp_path / "mpmcli", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "mpmcli" / "materials" / "log_fluid.py").write_text(LAW, encoding="utf-8")
+
+    def said(*words: str) -> dict:
+        done = subprocess.run(
+            [sys.executable, "-m", "mpmcli", *words],
+            capture_output=True,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        )
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    (law,) = said("materials", "log_fluid", "--json")["laws"]
+    assert [knob["name"] for knob in law["knobs"]] == ["swiftness"]
+    assert "LogFluidParameters" in said("schema")["$defs"]
+    assert said("check", "scene.toml", "--no-probe", "--json")["ok"]
+    summary = said("simulate", "scene.toml", "-o", "result", "--json")
+    assert (summary["status"], summary["frames"]) == ("finished", 5)
+    assert said("check", "result", "--json")["verdict"] == "stable"

@@ -10,6 +10,9 @@ from mpmcli.materials.law import Law, Mode, StateBound
 from mpmcli.materials.polar import polar_rotation
 from mpmcli.materials.tensors import volume_strain
 
+# Places in the vector of constants.
+MU, LAMBDA = range(2)
+
 
 class FixedCorotatedParameters(ElasticParameters):
     """Parameters of the fixed corotated solid."""
@@ -44,14 +47,14 @@ class FixedCorotated(Law):
         # F^T = S R^T, so that R F^T is symmetric but for rounding.
         stretched = (F - polar_rotation(F)) @ F.transpose()
         J = F.determinant()
-        pressure_part = constants[1] * (J - 1.0) * J
-        tau = constants[0] * (stretched + stretched.transpose()) + pressure_part * ti.Matrix.identity(float, F.n)
+        pressure_part = constants[LAMBDA] * (J - 1.0) * J
+        tau = constants[MU] * (stretched + stretched.transpose()) + pressure_part * ti.Matrix.identity(float, F.n)
         # Out of plane F is 1 and R is 1.
         return tau, pressure_part, deformation, internal
 
     @ti.func
     def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
-        return corotated_energy(deformation, constants[0], constants[1])
+        return corotated_energy(deformation, constants[MU], constants[LAMBDA])
 
 
 @ti.func

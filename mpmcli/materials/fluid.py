@@ -11,6 +11,9 @@ from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import MaterialParameters, SceneBounds
 from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
 
+# Places in the vector of constants.
+BULK_MODULUS, EXPONENT, VISCOSITY, SECOND_VISCOSITY, LARGEST_J = range(5)
+
 # The speed that "auto" assumes where nothing in the scene moves or falls, m/s.
 QUIET_SPEED = 1.0
 # The pressure of a nonlinear equation of state grows no further below this J: the largest power stays a number of
@@ -178,19 +181,21 @@ class Fluid(Law):
     ):
         J = deformation
         if ti.static(self.projects):
-            J = ti.min(J, constants[4])
+            J = ti.min(J, constants[LARGEST_J])
         # -J p, which is K (J - 1) for g = 1.
-        spherical = constants[0] * (J - 1.0)
+        spherical = constants[BULK_MODULUS] * (J - 1.0)
         if ti.static(not self.linear):
             crushed = J
             if J < CRUSHED:
                 crushed = CRUSHED
-            spherical = constants[0] * crushed * (1.0 - crushed ** (-constants[1])) / constants[1]
+            spherical = (
+                constants[BULK_MODULUS] * crushed * (1.0 - crushed ** (-constants[EXPONENT])) / constants[EXPONENT]
+            )
         if ti.static(self.viscous):
-            spherical += constants[3] * C.trace()
+            spherical += constants[SECOND_VISCOSITY] * C.trace()
         tau = spherical * ti.Matrix.identity(float, C.n)
         if ti.static(self.viscous):
-            tau += constants[2] * (C + C.transpose())
+            tau += constants[VISCOSITY] * (C + C.transpose())
         return tau, spherical, J, internal
 
     @ti.func
@@ -199,14 +204,14 @@ class Fluid(Law):
         J = deformation
         result = volume_energy(J)
         if ti.static(not self.linear):
-            g = constants[1]
+            g = constants[EXPONENT]
             if g > 1.0:
                 if J < CRUSHED:
                     J = CRUSHED
                 # J^(1-g) - 1, as the exponential of a small number.
                 power = exponential_strain((1.0 - g) * ti.log(J))
                 result = (J - 1.0 + power / (g - 1.0)) / g
-        return constants[0] * result
+        return constants[BULK_MODULUS] * result
 
 
 @ti.func

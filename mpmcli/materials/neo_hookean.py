@@ -8,6 +8,9 @@ from mpmcli.materials.elasticity import ElasticParameters
 from mpmcli.materials.law import Law, Mode, StateBound
 from mpmcli.materials.tensors import log_ratio, volume_strain
 
+# Places in the vector of constants.
+MU, LAMBDA = range(2)
+
 
 class NeoHookeanParameters(ElasticParameters):
     """Parameters of the neo-Hookean solid."""
@@ -44,8 +47,8 @@ class NeoHookean(Law):
     ):
         identity = ti.Matrix.identity(float, C.n)
         left_cauchy_green = deformation @ deformation.transpose()
-        pressure_part = constants[1] * ti.log(deformation.determinant())
-        tau = constants[0] * (left_cauchy_green - identity) + pressure_part * identity
+        pressure_part = constants[LAMBDA] * ti.log(deformation.determinant())
+        tau = constants[MU] * (left_cauchy_green - identity) + pressure_part * identity
         # Out of plane F is 1, so that b - I vanishes there.
         return tau, pressure_part, deformation, internal
 
@@ -55,7 +58,7 @@ class NeoHookean(Law):
         H = deformation - ti.Matrix.identity(float, deformation.n)
         log_volume = log_ratio(volume_strain(H))
         stretch = H.trace() + 0.5 * (H * H).sum()
-        return constants[0] * (stretch - log_volume) + 0.5 * constants[1] * log_volume**2
+        return constants[MU] * (stretch - log_volume) + 0.5 * constants[LAMBDA] * log_volume**2
 
 
 LAW = NeoHookean

@@ -24,6 +24,9 @@ from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import Internal, SceneBounds
 from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, flaw, scene_dimension
 
+# Places in the vector of constants.
+MU, LAMBDA, TIP, SLOPE, CORRECTION = range(5)
+
 # Dense sand, 24 to 96 MPa (US Army Corps of Engineers, EM 1110-1-1904, Settlement analysis, 1990).
 REAL_MODULUS = 5e7
 # ln J beyond which grains are scattered, and open no further: a lone one would, without end, and owe the way back.
@@ -144,21 +147,21 @@ class Sand(HenckyLaw):
         closed = 0.0
         if ti.static(self.closes):
             if volume < 0.0:
-                closed = ti.min(constants[4] * v[0], -volume)
-        kept = ti.min(volume + closed, constants[2])
+                closed = ti.min(constants[CORRECTION] * v[0], -volume)
+        kept = ti.min(volume + closed, constants[TIP])
         shear = ti.sqrt(deviator.dot(deviator))
-        strength = constants[3] * (constants[2] - kept)
+        strength = constants[SLOPE] * (constants[TIP] - kept)
         if kept != volume or shear > strength or s.min() < STRETCH_MIN:
             if shear > strength:
                 deviator *= strength / shear
             e = deviator + kept / ti.static(float(self.dimension))
             F = stretch_tensor(Q, e)
-            v[0] = ti.min(v[0] + ti.max(volume - constants[2], 0.0) - closed, SCATTERED)
-        spherical = constants[1] * kept
-        tau = from_principal(Q, 2.0 * constants[0] * e + spherical)
+            v[0] = ti.min(v[0] + ti.max(volume - constants[TIP], 0.0) - closed, SCATTERED)
+        spherical = constants[LAMBDA] * kept
+        tau = from_principal(Q, 2.0 * constants[MU] * e + spherical)
         tau_zz = 0.0
         if ti.static(self.dimension == 2):
-            tau_zz = spherical + constants[0] * kept
+            tau_zz = spherical + constants[MU] * kept
         return tau, tau_zz, F, v
 
     @ti.func
@@ -166,7 +169,7 @@ class Sand(HenckyLaw):
         """mu |e|^2 + lambda/2 (tr e)^2."""
         _Q, s = principal_stretches(deformation)
         e = hencky_strains(s)
-        return constants[0] * e.dot(e) + 0.5 * constants[1] * e.sum() ** 2
+        return constants[MU] * e.dot(e) + 0.5 * constants[LAMBDA] * e.sum() ** 2
 
 
 LAW = Sand

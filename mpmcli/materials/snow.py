@@ -17,6 +17,9 @@ from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import Internal, SceneBounds
 from mpmcli.scene.quantity import Positive
 
+# Places in the vector of constants.
+MU, LAMBDA, SMALLEST_STRETCH, LARGEST_STRETCH, HARDENING, SMALLEST_PLASTIC_J, LARGEST_PLASTIC_J = range(7)
+
 # Without much hardening nothing else bounds the plastic volume ratio.
 PACKED_MOST, LOOSE_MOST = 0.1, 10.0
 
@@ -177,29 +180,33 @@ class Snow(Law):
         flows = 0
         for i in ti.static(range(F.n)):
             before = s[i]
-            if before < constants[2] - slack:
-                s[i] = constants[2]
+            if before < constants[SMALLEST_STRETCH] - slack:
+                s[i] = constants[SMALLEST_STRETCH]
                 flows = 1
-            if before > constants[3] + slack:
-                s[i] = constants[3]
+            if before > constants[LARGEST_STRETCH] + slack:
+                s[i] = constants[LARGEST_STRETCH]
                 flows = 1
             lost *= before / s[i]
         if flows == 1:
             F = from_principal(Q, s)
-            variables[0] = ti.max(ti.min(variables[0] * lost, constants[6]), constants[5])
-        hardness = ti.exp(constants[4] * (1.0 - variables[0]))
+            variables[0] = ti.max(
+                ti.min(variables[0] * lost, constants[LARGEST_PLASTIC_J]), constants[SMALLEST_PLASTIC_J]
+            )
+        hardness = ti.exp(constants[HARDENING] * (1.0 - variables[0]))
         J = s[0]
         for i in ti.static(range(1, F.n)):
             J *= s[i]
-        pressure_part = hardness * constants[1] * (J - 1.0) * J
-        tau = from_principal(Q, 2.0 * hardness * constants[0] * (s - 1.0) * s + pressure_part)
+        pressure_part = hardness * constants[LAMBDA] * (J - 1.0) * J
+        tau = from_principal(Q, 2.0 * hardness * constants[MU] * (s - 1.0) * s + pressure_part)
         # Out of plane F is 1.
         return tau, pressure_part, F, variables
 
     @ti.func
     def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
         """h (mu sum (s_i - 1)^2 + lambda/2 (J_E - 1)^2)."""
-        return ti.exp(constants[4] * (1.0 - internal[0])) * corotated_energy(deformation, constants[0], constants[1])
+        return ti.exp(constants[HARDENING] * (1.0 - internal[0])) * corotated_energy(
+            deformation, constants[MU], constants[LAMBDA]
+        )
 
 
 LAW = Snow

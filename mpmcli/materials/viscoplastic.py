@@ -12,6 +12,9 @@ from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import SceneBounds
 from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
 
+# Places in the vector of constants.
+BULK_MODULUS, SHEAR_MODULUS, YIELD_STRESS, CONSISTENCY, FLOW_INDEX, LARGEST_J = range(6)
+
 # The elastic shear strain at yield that shear_modulus = "auto" allows.
 YIELD_STRAIN = 0.05
 # The opening, as ln J, that leaves a torn particle 1/e of its shear stress.
@@ -133,9 +136,11 @@ class Viscoplastic(Law):
             mean = 1.0
             dev = ti.Matrix.zero(float, F.n, F.n)
             F = size * ti.Matrix.identity(float, F.n)
-        share = self.remaining(constants[1] * ti.sqrt(0.5 * (dev * dev).sum()), constants[1] * mean * dt, constants)
+        share = self.remaining(
+            constants[SHEAR_MODULUS] * ti.sqrt(0.5 * (dev * dev).sum()), constants[SHEAR_MODULUS] * mean * dt, constants
+        )
         if ti.static(self.tears):
-            largest = constants[5]
+            largest = constants[LARGEST_J]
             if largest < J:
                 # What rounding opens must not add up.
                 opened = ti.static(1.0 + 8.0 * rounding())
@@ -146,8 +151,8 @@ class Viscoplastic(Law):
         if share < 1.0:
             dev *= share
             F = triangular_factor(dev, isochoric_mean(dev, mean), J, size)
-        pressure_part = constants[0] * (J - 1.0)
-        tau = pressure_part * ti.Matrix.identity(float, F.n) + constants[1] * dev
+        pressure_part = constants[BULK_MODULUS] * (J - 1.0)
+        tau = pressure_part * ti.Matrix.identity(float, F.n) + constants[SHEAR_MODULUS] * dev
         return tau, pressure_part, F, internal
 
     @ti.func
@@ -157,22 +162,22 @@ class Viscoplastic(Law):
         x solves x = over - G dt (x/consistency)^(1/n) with over = q - yield_stress, where for G stands G mean(b),
         the modulus at finite strain (Simo and Hughes 1998, box 9.1); modulus_time is its product with dt, Pa s.
         """
-        over = q - constants[2]
+        over = q - constants[YIELD_STRESS]
         share = 1.0
         if over > 0.0:
             rest = 0.0
             if ti.static(self.bingham):
-                rest = over / (1.0 + modulus_time / constants[3])
+                rest = over / (1.0 + modulus_time / constants[CONSISTENCY])
             else:
                 # As w + D w^n = 1, of the part w = 1 - x / over that relaxes, D = consistency (over / G dt)^n / over.
-                n = constants[4]
-                D = ti.min(constants[3] * (over / modulus_time) ** n / over, 1e30)
+                n = constants[FLOW_INDEX]
+                D = ti.min(constants[CONSISTENCY] * (over / modulus_time) ** n / over, 1e30)
                 if n > 1.0:
                     rest = over * D * convex_root(1.0, D, n) ** n
                 else:
                     # With v = w^n: D v + v^(1/n) = 1.
                     rest = over * D * convex_root(D, 1.0, 1.0 / n)
-            share = (constants[2] + ti.min(rest, over)) / q
+            share = (constants[YIELD_STRESS] + ti.min(rest, over)) / q
         return share
 
     @ti.func
@@ -184,7 +189,7 @@ class Viscoplastic(Law):
         excess = 0.5 * (dev * dev).sum() / (mean + 1.0)
         if ti.static(deformation.n == 3):
             excess = (0.5 * (dev * dev).sum() * mean - dev.determinant()) / (mean * mean + mean + 1.0)
-        return constants[0] * volume_energy(J) + 0.5 * deformation.n * constants[1] * excess
+        return constants[BULK_MODULUS] * volume_energy(J) + 0.5 * deformation.n * constants[SHEAR_MODULUS] * excess
 
 
 @ti.func

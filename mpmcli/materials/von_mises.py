@@ -22,6 +22,9 @@ from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import Internal, SceneBounds
 from mpmcli.scene.quantity import LARGEST, NotNegative, Positive
 
+# Places in the vector of constants.
+MU, LAMBDA, YIELD_STRESS, HARDENING_MODULUS = range(4)
+
 
 class VonMisesParameters(HenckyParameters):
     """Parameters of the elastic-plastic solid."""
@@ -103,17 +106,17 @@ class VonMises(HenckyLaw):
     ):
         F = deformation
         variables = internal
-        mu = constants[0]
+        mu = constants[MU]
         Q, s = principal_stretches(deformation)
         e = self.strains(s, internal)
         volume = e.sum()
         deviator = e - volume / 3.0
         # sqrt(3/2) |dev tau|
         stress = ti.static(math.sqrt(6.0)) * mu * ti.sqrt(deviator.dot(deviator))
-        excess = stress - (constants[2] + constants[3] * variables[0])
+        excess = stress - (constants[YIELD_STRESS] + constants[HARDENING_MODULUS] * variables[0])
         if excess > 0.0 or s.min() < STRETCH_MIN:
             if excess > 0.0:
-                flow = excess / (3.0 * mu + constants[3])
+                flow = excess / (3.0 * mu + constants[HARDENING_MODULUS])
                 variables[0] += flow
                 e = volume / 3.0 + (1.0 - 3.0 * mu * flow / stress) * deviator
             if ti.static(self.dimension == 2):
@@ -121,7 +124,7 @@ class VonMises(HenckyLaw):
                 F = stretch_tensor(Q, ti.Vector([e[0], e[1]]))
             else:
                 F = stretch_tensor(Q, e)
-        principal = 2.0 * mu * e + constants[1] * volume
+        principal = 2.0 * mu * e + constants[LAMBDA] * volume
         tau = ti.Matrix.zero(float, F.n, F.n)
         tau_zz = 0.0
         if ti.static(self.dimension == 2):
@@ -136,7 +139,7 @@ class VonMises(HenckyLaw):
         """mu |e|^2 + lambda/2 (tr e)^2, of all three strains."""
         _Q, s = principal_stretches(deformation)
         e = self.strains(s, internal)
-        return constants[0] * e.dot(e) + 0.5 * constants[1] * e.sum() ** 2
+        return constants[MU] * e.dot(e) + 0.5 * constants[LAMBDA] * e.sum() ** 2
 
 
 LAW = VonMises
