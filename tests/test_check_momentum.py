@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mpmcli.check.result_findings import FrameFindings
+from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_motion import MomentumCheck
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow

@@ -122,9 +122,6 @@ def _density(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _stiffness(body: BodyFacts) -> tuple[str, float]:
-    """Return the parameter that makes a body stiff, and its value, Pa."""
-    for name in ("bulk_modulus", "youngs_modulus"):
-        value = getattr(body.body.material, name, None)
-        if isinstance(value, int | float):
-            return name, float(value)
-    return "its stiffness", body.stiffness
+    """Return the name of the parameter that sets the stiffness of a body, and its value, Pa."""
+    found = body.law.first_set(body.body.material, body.law.stiffness_parameters)
+    return found or ("its stiffness", body.stiffness)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mpmcli.check.result_findings import FrameFindings
+from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_state import TOUCHED
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow

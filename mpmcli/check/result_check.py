@@ -6,10 +6,9 @@ from typing import Literal
 
 import numpy as np
 
-from mpmcli.check.finding import Finding, passes
+from mpmcli.check.finding import Finding, FrameFindings, passes
 from mpmcli.check.result_agreement import AgreementCheck
 from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, arrays_of, open_entries
-from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_ledger import check_ledger
 from mpmcli.check.result_motion import MomentumCheck, MotionCheck
 from mpmcli.check.result_order import check_order, frames_expected

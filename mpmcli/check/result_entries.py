@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli.check.result_findings import FrameFindings
+from mpmcli.check.finding import FrameFindings
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow

@@ -5,8 +5,8 @@ from dataclasses import fields
 
 import numpy as np
 
+from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_entries import Entry
-from mpmcli.check.result_findings import FrameFindings
 from mpmcli.check.result_state import BLOWN_UP, CRUSHED, TOUCHED
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.header import RunHeader

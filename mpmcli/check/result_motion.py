@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpmcli.check.deformation import deformation_rate
-from mpmcli.check.result_findings import FrameFindings
+from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_ledger import LOWER_SAFETY, MARGIN
 from mpmcli.check.result_state import TOUCHED, extent
 from mpmcli.frames.frame import Frame

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
+from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_entries import RUN_AGAIN, Entry, OpenedResult
-from mpmcli.check.result_findings import FrameFindings
 from mpmcli.output.header import RunHeader
 
 # Relative to the length of the run; frames land on their times exactly.

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mpmcli.check.result_findings import FrameFindings
+from mpmcli.check.finding import FrameFindings
 from mpmcli.frames.frame import Frame
 from mpmcli.output.header import RunHeader
 

@@ -21,9 +21,6 @@ IMPACT_GRADIENT = 2.0
 # A wave that meets a free surface throws matter off at twice its speed, and jets out of a corner are about as fast:
 # 1.6 to 2.5 times the speed of the fall in seven scenes of eight, 3 times in one where bodies splash each other.
 JET = 2.0
-# Parameters that set how stiff a material is, and how viscous, the first that it has.
-STIFFNESSES = ("bulk_modulus", "youngs_modulus", "shear_modulus")
-VISCOSITIES = ("viscosity", "consistency", "bulk_viscosity")
 
 
 @dataclass(frozen=True)
@@ -96,13 +93,13 @@ def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene:
                 f"its stiffness of {stiffness:.4g} Pa and density of {material.density:.4g} kg/m^3 make "
                 f"{math.sqrt(stiffness / material.density):.4g} m/s, and a cell is {spacing:.4g} m wide"
             )
-            cure = f"a quarter of {_parameter(body, STIFFNESSES, 'the stiffness')} or cells twice as wide"
+            cure = f"a quarter of {_parameter(body, law.stiffness_parameters, 'the stiffness')} or cells twice as wide"
         else:
             numbers = (
                 f"its viscosity of {viscosity / 2:.4g} Pa s over a density of {material.density:.4g} kg/m^3 is "
                 f"{viscosity / 2 / material.density:.4g} m^2/s, and a cell is {spacing:.4g} m wide"
             )
-            cure = f"half of {_parameter(body, VISCOSITIES, 'the viscosity')}, or cells 1.4 times as wide,"
+            cure = f"half of {_parameter(body, law.viscosity_parameters, 'the viscosity')}, or cells 1.4 times as wide,"
         yield SceneLimit(
             value,
             name,
@@ -185,11 +182,8 @@ def _initial_rate(body: Body, dimension: int) -> float:
 
 def _parameter(body: Body, names: tuple[str, ...], otherwise: str) -> str:
     """Return the first of some parameters that a body has, with its value."""
-    for name in names:
-        value = getattr(body.material, name, 0)
-        if isinstance(value, int | float) and value > 0:
-            return f"{name} = {value:.4g}"
-    return otherwise
+    found = Law.first_set(body.material, names)
+    return f"{found[0]} = {found[1]:.4g}" if found else otherwise
 
 
 def _state_text(bound: StateBound) -> str:

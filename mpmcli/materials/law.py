@@ -55,6 +55,8 @@ class Law(ABC):
         parameters: the pydantic model of its parameters, which also lists its internal variables.
         deformation: what a particle stores, "J" (the volume ratio) or "F" (the deformation gradient).
         projects: whether `respond` may change the state.
+        stiffness_parameters, viscosity_parameters: names of the parameters that set the stiffness and the viscosity;
+            messages name the first that is a positive number. A law that calls them otherwise lists its own.
         coherent: whether the material resists being pulled apart, so that `check` reports a J far above 1.
         sensitivity: growth of the logarithm of the largest stiffness per strain that is stored: how closely the state
             is watched; 0 where none is stiffer than rest.
@@ -69,6 +71,8 @@ class Law(ABC):
     deformation: ClassVar[Literal["J", "F"]]
     projects: bool = False
     coherent: ClassVar[bool] = False
+    stiffness_parameters: ClassVar[tuple[str, ...]] = ("bulk_modulus", "youngs_modulus", "shear_modulus")
+    viscosity_parameters: ClassVar[tuple[str, ...]] = ("viscosity", "consistency", "bulk_viscosity")
     sensitivity: float = 1.0
     hardening: float = 0.0
 
@@ -87,6 +91,12 @@ class Law(ABC):
     @abstractmethod
     def constants(self, parameters: MaterialParameters) -> tuple[float, ...]:
         """Return the numbers that `respond` and `energy` read, in their order; one at least."""
+
+    @staticmethod
+    def first_set(parameters: MaterialParameters, names: Sequence[str]) -> tuple[str, float] | None:
+        """Return the first of `names` that is a positive number among the parameters, with its value, or None."""
+        values = ((name, getattr(parameters, name, None)) for name in names)
+        return next(((name, value) for name, value in values if isinstance(value, int | float) and value > 0), None)
 
     @abstractmethod
     def modes(self, parameters: MaterialParameters, bound: StateBound) -> list[Mode]:
