@@ -1,8 +1,8 @@
 """One MLS-MPM step in plain numpy, one particle and one node at a time, from the published formulas.
 
 It shares no code with the solver: Hu et al. (2018) for the scatter with A = m C - kick V0 tau / D, D = h^2/4 or h^2/3,
-Jiang et al. (2015) for the gather, Fei et al. (2021) for AFLIP, and the fold of ghost nodes at a wall (verification:
-1.4).
+Jiang et al. (2015) for the gather, Fei et al. (2021) for AFLIP, and the fold of ghost nodes at a wall
+(docs/theory.md, 3.1).
 """
 
 from collections.abc import Callable, Sequence

@@ -25,7 +25,7 @@ class BodyState:
         return self.mass @ self.v
 
     def angular_momentum(self, h: float) -> np.ndarray:
-        """sum m x cross v + m (h^2/4) axl(C), with axl_k = C_ji - C_ij (verification: 9)."""
+        """sum m x cross v + m (h^2/4) axl(C), with axl_k = C_ji - C_ij (docs/theory.md, 9.2)."""
         d = self.x.shape[1]
         found = []
         for i, j in [(0, 1)] if d == 2 else [(1, 2), (2, 0), (0, 1)]:

@@ -50,7 +50,7 @@ def test_aflip_loses_less_than_a_tenth_of_what_apic_does(measured: Callable) -> 
 
 
 def test_zeroed_walls_are_first_order(measured: Callable) -> None:
-    """Two fixed ends: an error of 0.36 h/L at least (verification: 1.2), halved with h; folded ones fall by four."""
+    """Two fixed ends: an error of 0.36 h/L at least (docs/theory.md, 3.3), halved with h; folded ones fall by four."""
     coarse, fine = (measured(n, walls="zeroed")[0]["period error"] for n in (13, 26))
     assert 0.9 < np.log2(coarse / fine) < 1.2
     assert fine > 0.36 / 26

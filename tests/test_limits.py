@@ -1,4 +1,4 @@
-"""The stable time step: predicted to a few per cent, for a particle alone and in deformed states (verification: 10)."""
+"""The stable time step: predicted to a few per cent, for one particle and in deformed states (docs/theory.md, 6)."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What one step, and ten thousand, conserve away from walls (verification: 9)."""
+"""What one step, and ten thousand, conserve away from walls (docs/theory.md, 9)."""
 
 from collections.abc import Callable
 from dataclasses import replace

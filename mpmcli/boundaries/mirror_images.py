@@ -84,8 +84,8 @@ class MirrorImages:
     ):
         """Return the sum over a node and its images, each mirrored, after a step of gravity.
 
-        Gravity acts before the fold, so that it pulls mirror images the mirrored way, as everything else does with
-        them: after it, matter on a floor would weigh more than its stress can balance, and be squeezed for ever.
+        Gravity acts before the fold and is mirrored with the momentum. After the fold, the weight of the material on a
+        floor would exceed what its stress balances.
         """
         total = ti.Vector.zero(float, grid.width)
         for images in range(ti.static(2**self.dimension)):

@@ -1,7 +1,7 @@
 """The walls of the domain: slip, stick and separate.
 
-A wall lies on a plane of nodes. `Walls` knows where the walls are, which of them act on a node, and what they do to its
-velocity; what particles scatter beyond them is folded back by `mirror_images` (docs/theory.md, 3).
+A wall lies on a plane of nodes. `Walls` holds where the walls are, which of them act on a node, and what they do to its
+velocity. What particles scatter beyond them is folded back by `mirror_images` (docs/theory.md, 3).
 """
 
 import math

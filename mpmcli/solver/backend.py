@@ -1,4 +1,4 @@
-"""Starts Taichi, once per process, on the backend that was asked for, and says which one came."""
+"""Starts Taichi, once per process, on the requested backend, and returns the one that started."""
 
 import contextlib
 import io
@@ -18,9 +18,9 @@ from mpmcli.errors import InputError
 Arch = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
 ARCHES: tuple[str, ...] = ("auto", "cpu", "cuda", "vulkan", "metal")
 
-# That many threads may be asked for anywhere; more than twice the cores gains nothing.
+# Threads that are accepted on any machine; beyond that, twice the number of cores.
 FEW_THREADS = 64
-# Seconds after which the lock on the compiled kernels belongs to a process that is gone; it is held for a moment.
+# Age, s, at which a lock on the compiled kernels counts as left behind by a killed process.
 LONGEST_LOCK = 60.0
 
 _started: "Backend | None" = None
@@ -31,7 +31,7 @@ class Backend:
     """The backend that runs the kernels.
 
     Attributes:
-        arch: "cpu", "cuda", "vulkan" or "metal": the one that really came.
+        arch: "cpu", "cuda", "vulkan" or "metal": the one that started.
         threads: CPU threads that kernels use (1 on a GPU).
         precision: "f32" or "f64", the type of every particle and node value.
         compile_cache: whether compiled kernels are kept for the next start.
@@ -51,10 +51,10 @@ class Backend:
 def start_backend(
     arch: Arch = "auto", threads: int | None = None, precision: str = "f32", *, compile_cache: bool = True
 ) -> Backend:
-    """Start Taichi and return the backend that came; a second call must ask for the same.
+    """Start Taichi and return the backend; a second call must request the same.
 
-    "auto" takes CUDA where a driver and a device are, Metal on a Mac, and otherwise the CPU:
-    Vulkan is taken only by name, since software Vulkan would pass for a GPU.
+    "auto" takes CUDA where a driver and a device are present, Metal on a Mac, and otherwise the CPU. Vulkan is taken
+    only by name, since software Vulkan counts as a device.
 
     Raises:
         InputError: the backend is not there, cannot do this precision, or another one is running.
@@ -93,9 +93,9 @@ def stop_backend() -> None:
 
 
 def _settle_cache() -> None:
-    """Give Taichi a cache that it can write: it crashes at its end where it has none.
+    """Set a writable cache directory; Taichi crashes at exit where it has none.
 
-    A process that is killed while it writes leaves its lock behind, and no later one would keep a kernel again.
+    A process that is killed while it writes leaves its lock behind, and later ones could not store kernels.
     """
     os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
@@ -120,7 +120,7 @@ def _best(precision: str) -> str:
 def _has(arch: str) -> bool:
     if arch == "cpu":
         return True
-    # Taichi loads CUDA wherever the driver's library is, and then dies without a device.
+    # Taichi loads CUDA wherever the driver's library is present, and ends the process without a device.
     if arch == "cuda" and not (os.path.exists("/dev/nvidia0") or os.path.exists("/dev/dxg")):
         return False
     return bool(ti.lang.misc.is_arch_supported(getattr(ti, arch)))
@@ -130,7 +130,7 @@ def _initialise(backend: Backend) -> None:
     if not _has(backend.arch):
         raise InputError(f"--arch {backend.arch} needs a device that this machine does not have; use --arch cpu.")
     arch = getattr(ti, backend.arch)
-    # Taichi lets this variable override what it is asked for, and announces its start on standard output.
+    # This variable would override `arch`. Taichi prints a line to standard output when it starts.
     os.environ.pop("TI_ARCH", None)
     _settle_cache()
     with contextlib.redirect_stdout(io.StringIO()):

@@ -1,4 +1,4 @@
-"""Says what went wrong with a run that cannot go on: which particle, where, and which limit was nearest."""
+"""Describes why a run stopped: which particle, where, what happened to it, and which limit was nearest."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ class Diagnosis:
 
     Attributes:
         step: number of the step after which it was seen; time: s.
-        particle: row of the particle in every frame; body: its name; position: last one inside the domain, m.
+        particle: row of the particle in every frame; body: name of its body; position: last one inside the domain, m.
         cause: what happened to it; suggestion: what may help.
         limit: name of the bound on the step that was nearest; step_size: of that step, s.
     """
@@ -50,7 +50,7 @@ class UnstableRunError(RunError):
         self.diagnosis = diagnosis
 
 
-# What can happen to a particle, and what may help.
+# Causes, and what may help.
 NOT_FINITE = "has a state that is not finite"
 INVERTED = "was turned inside out"
 CRUSHED = "was crushed to nothing"
@@ -84,7 +84,7 @@ def rate_of_change(snapshot: Snapshot, spacing: float) -> np.ndarray:
 
 
 def cause_of(snapshot: Snapshot, p: int, dt: float, size: tuple[float, ...]) -> str:
-    """Say what happened to particle p (in solver order) in a step of dt (s) in a domain of this size, m."""
+    """Return what happened to particle p (in solver order) in a step of dt (s) in a domain of this size, m."""
     values = (snapshot.x[p], snapshot.v[p], snapshot.C[p], snapshot.deformation[p])
     if not all(np.isfinite(value).all() for value in values):
         return NOT_FINITE

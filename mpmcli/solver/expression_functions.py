@@ -1,6 +1,6 @@
 """The operators and functions of expressions as kernels compute them, by the names of `scene.functions`.
 
-Truth is the integer 1, and 0 is not. Each agrees with numpy's to rounding; none returns more than once, as Taichi asks.
+Truth is the integer 1, and 0 is not. Each agrees with numpy's to rounding; each has one return, as Taichi requires.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""How hard a scene is driven from outside, for the bounds on the step: by gravity and forces, now and soon."""
+"""Gravity and external forces of a scene, and bounds on them for the step (docs/theory.md, 6.5)."""
 
 import math
 from collections.abc import Sequence
@@ -11,14 +11,14 @@ from mpmcli.solver.expression_kernels import Clock
 from mpmcli.solver.forces import Gravity, GroupForce, build_push, forces_on
 from mpmcli.solver.particles import ParticleGroup
 
-# Forces are measured with the state, for the steps up to the next measurement: at so many instants of that time where
-# they depend on time, and with a margin for what the particles meet on their way.
+# Forces are measured with the state, for the steps up to the next measurement: at INSTANTS times where they depend on
+# time. MARGIN allows for the motion of the particles in between.
 INSTANTS = 5
 MARGIN = 1.5
 
 
 class ExternalForces:
-    """Gravity and forces of a scene, and how strong they are.
+    """Gravity and forces of a scene, and bounds on them.
 
     Attributes:
         gravity: for the kernels.
@@ -26,7 +26,7 @@ class ExternalForces:
     """
 
     def __init__(self, scene: Scene, groups: Sequence[ParticleGroup], backend: Backend) -> None:
-        """Give each group its forces, before kernels are built."""
+        """Assign forces to groups; call it before kernels are built."""
         self._domain = scene.domain
         clock = Clock()
         self.gravity = Gravity(scene, clock)
@@ -55,7 +55,7 @@ class ExternalForces:
         self._push, self.slope = saved["push"], saved["slope"]
 
     def begin_step(self, time: float) -> None:
-        """Let gravity and forces be those of a time, s."""
+        """Set gravity and forces to those of a time, s."""
         if self._timed:
             self._set_time(time)
 

@@ -1,7 +1,7 @@
-"""What acts on matter from outside: gravity, which may depend on time, and forces that are expressions.
+"""Gravity, which may depend on time, and external forces, which are expressions.
 
-Leapfrog takes both at the start of a step: at t_n and x_n they move the velocity on from the middle of the last step to
-that of this one, which moves to x_(n+1).
+Leapfrog evaluates both at the start of a step, at t_n and x_n: they advance the velocity from the middle of the last
+step to that of this one, which moves particles to x_(n+1) (docs/theory.md, 7.1).
 Gravity acts on the nodes; a force acts on its particles, before their momentum is scattered.
 """
 
@@ -20,11 +20,11 @@ from mpmcli.solver.expression_kernels import Clock, node_of
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.state_bounds import build_maxima
 
-# Half of the distance over which the slope of a force is taken, cells: a particle acts on nodes 1.5 cells away.
+# Half of the distance of the differences for the slope of a force, cells.
 REACH = 0.5
-# A slope beyond this, or none at all where a force is not defined next to a particle, counts as none.
+# A slope beyond this counts as zero, as does NaN where a force is undefined next to a particle.
 STEEPEST = 1e30
-# Taichi inlines a tree by calling itself, some 20 times for each level.
+# Taichi inlines a tree recursively, about 20 calls deep for each level.
 RECURSION = 4000
 
 
@@ -40,14 +40,14 @@ def forces_on(scene: Scene, members: Sequence[int]) -> tuple[Force, ...]:
 
 
 def needs_initial(scene: Scene, members: Sequence[int]) -> bool:
-    """Say whether any force on these bodies depends on where a particle was at the start."""
+    """Return whether any force on these bodies depends on the initial position."""
     trees = [tree_of(entry) for force in forces_on(scene, members) for entry in force.acceleration]
     return any(names_in(tree) & set(INITIAL) for tree in trees)
 
 
 @ti.data_oriented
 class Gravity:
-    """The same at all times, and then a constant of the kernels, or read from the clock."""
+    """Gravity: a constant of the kernels where it is steady, otherwise a value of the clock."""
 
     def __init__(self, scene: Scene, clock: Clock) -> None:
         self.dimension = scene.dimension
@@ -58,7 +58,7 @@ class Gravity:
 
     @ti.func
     def in_step(self, kick: float):
-        """Return what gravity adds to a velocity in `kick` seconds."""
+        """Return the change of velocity by gravity in `kick` seconds, m/s."""
         result = ti.Vector.zero(float, self.dimension)
         for a in ti.static(range(self.dimension)):
             if ti.static(self.steady):
@@ -83,8 +83,8 @@ class GroupForce:
     Attributes:
         terms: the forces.
         moves: whether any of them depends on the position.
-        spreads: whether their slope is that of the force over the body: none depends on the initial position, whose own
-            slope is that of the motion so far and not known.
+        spreads: whether their slope is known: no force depends on the initial position, whose own slope is that of the
+            motion so far.
     """
 
     def __init__(self, scene: Scene, group: ParticleGroup, clock: Clock) -> None:

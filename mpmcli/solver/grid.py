@@ -19,7 +19,7 @@ DRIFT = 0.98
 
 
 def tile_edge(stencil: int) -> int:
-    """Return the edge of a tile, cells, for a spline that reaches so many nodes per axis.
+    """Return the edge of a tile, cells, for a spline whose stencil has this many nodes per axis.
 
     Same-coloured tiles write disjoint nodes as long as no particle has drifted more than one cell: two edges of t cells
     apart, they write t + 1 + 1 nodes and the rest of the last stencil, which leaves t > stencil.
@@ -42,7 +42,7 @@ class Grid:
         dimension: 2 or 3.
         spacing: h, m.
         cells: cells of the domain per axis.
-        scheme: how particles and nodes speak to each other.
+        scheme: constants of the transfers.
         tile: edge of a tile, cells.
         shape: nodes per axis, margins included, a multiple of `tile`.
         tiles: tiles per axis.
@@ -79,17 +79,17 @@ class Grid:
 
     @staticmethod
     def tile_counts(cells: Sequence[int], stencil: int) -> tuple[int, ...]:
-        """Return the tiles per axis of a grid over so many cells, for a spline that reaches so many nodes per axis."""
+        """Return the tiles per axis of a grid over these cells, for a stencil of this many nodes per axis."""
         return tuple(-(-(n + 1 + 2 * PAD) // tile_edge(stencil)) for n in cells)
 
     @staticmethod
     def nodes_needed(cells: Sequence[int], stencil: int) -> int:
-        """Return the number of nodes of such a grid."""
+        """Return the number of nodes of that grid."""
         return math.prod(tile_edge(stencil) * n for n in Grid.tile_counts(cells, stencil))
 
     @ti.func
     def clear(self, node: int):
-        """Forget what a node holds."""
+        """Set a node to zero."""
         self.nodes[node] = ti.Vector.zero(float, self.width)
         if ti.static(self.scheme.keeps_before):
             self.before[node] = ti.Vector.zero(float, self.width)

@@ -26,7 +26,7 @@ class Kernels:
     Attributes:
         grid: the nodes.
         orders: the tile order of each group.
-        particles: which also knows the particles that were lost.
+        particles: the update of particles, with the record of lost ones.
         drift_allowed: cells that a particle may move until particles are sorted again: without atomics only as far as
             its tile's colour allows.
         step: (dt, kick) -> what it read back, a `StepResult`; None on a GPU. Positions move on by dt, s, velocities by

@@ -1,4 +1,4 @@
-"""Asks the laws what a frame shows: stress, energy, and the state after plastic flow, as the next step will see it."""
+"""Evaluates the laws for a frame: stress, energy, and the state after plastic flow, as the next step uses it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,10 +14,10 @@ ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
 @dataclass(frozen=True)
 class Observation:
-    """What one law says of its n particles, in the solver's order.
+    """What one law gives for its n particles, in the solver's order.
 
     Attributes:
-        tau: Kirchhoff stress, (n, 3, 3), Pa per volume at rest; None where it was not asked for.
+        tau: Kirchhoff stress, (n, 3, 3), Pa; None where it was not requested.
         energy: stored energy per volume at rest, (n,), J/m^3, half a step earlier: where the velocities are.
         deformation: J, (n,), or F, (n, d, d), after plastic flow.
         internal: internal variables after plastic flow, (n,) each, by name.
@@ -32,7 +32,7 @@ class Observation:
 def build_observation(group: ParticleGroup) -> Callable[..., Observation]:
     """Compile-ready observation of a group: call the result with the last step (s), and `stress=False` to do without.
 
-    The device's state stays as it is: plastic flow is booked by the next step.
+    The device's state does not change: the next step applies plastic flow.
     """
     d, law = group.dimension, group.law
     kept = [e for e, (i, j) in enumerate(ENTRIES) if d == 3 or {i, j} <= {0, 1} or i == j == 2]

@@ -2,7 +2,8 @@
 
 On the CPU the tiles also make the scatter safe without atomics: tiles form pencils along the last axis,
 pencils are coloured along the others, and pencils of one colour write disjoint nodes. The sort is a stable
-counting sort, so the order, and with it every floating-point sum, is the same for any number of threads.
+counting sort, so the order, and with it every floating-point sum, is the same for any number of threads
+(docs/theory.md, 8).
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +22,7 @@ SPAN = 256
 
 @ti.func
 def share_start(count: int, t: int, threads: int):
-    """Return where the t-th of about equal shares of `count` things begins; count * t would overflow."""
+    """Return where the t-th of nearly equal shares of `count` items begins; count * t would overflow."""
     return count // threads * t + ti.min(t, count % threads)
 
 
@@ -54,7 +55,7 @@ class TileOrder:
 
     Attributes:
         start: (tiles + 1) int, first particle of each tile.
-        work: (colours, threads + 1) int, pencils of a colour that each thread takes.
+        work: (colours, threads + 1) int, first pencil of a colour of each thread.
     """
 
     def __init__(self, group: ParticleGroup, grid: Grid, buffers: SortBuffers, threads: int, on_cpu: bool):

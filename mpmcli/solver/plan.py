@@ -1,4 +1,4 @@
-"""What a scene will take, known before anything is allocated."""
+"""Memory and passes that a scene needs, known before anything is allocated."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ MEMORY_SHARE = 0.8
 
 @dataclass(frozen=True)
 class LawPlan:
-    """What the particles of one law take.
+    """Memory of the particles of one law.
 
     Attributes:
         law: its name.
@@ -49,9 +49,9 @@ class Plan:
         nodes: number of grid nodes.
         scratch_bytes: per particle, of the sort buffers.
         bytes_per_node: of the grid.
-        grid_bytes: of all nodes, the tables of the sort, and the contact that separating walls keep.
+        grid_bytes: of all nodes, the tables of the sort, and the contact flags of separating walls.
         host_bytes: of the arrays of one frame and of the initial state.
-        passes: the loops of a step in their order; those over particles name the law that they are compiled for.
+        passes: the loops of a step in order; loops over particles name their law.
     """
 
     laws: tuple[LawPlan, ...]
@@ -127,7 +127,7 @@ def members_of(scene: Scene, law: str) -> list[int]:
 
 
 def make_plan(scene: Scene, backend: Backend) -> Plan:
-    """Return what a scene needs."""
+    """Return the plan of a scene."""
     dimension = scene.dimension
     cells = scene.domain.cells
     real = 8 if backend.precision == "f64" else 4
@@ -164,7 +164,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
 
 
 def _separating_axes(scene: Scene) -> list[int]:
-    """Return the axis of every face that lets go and has to find out when; one whose nodes are set to zero has not."""
+    """Return the axis of every face that needs contact flags: separating ones, unless walls are zeroed."""
     if scene.solver.walls == "zeroed":
         return []
     faces = scene.domain.walls.faces(scene.dimension)
@@ -180,7 +180,7 @@ def _contact_bytes(scene: Scene, nodes: int) -> int:
 
 
 def require_room(plan: Plan) -> None:
-    """Refuse a plan that cannot be carried out.
+    """Refuse a plan that does not fit this machine.
 
     Raises:
         InputError: it takes more memory than this machine has free, or more than 32-bit indices reach.

@@ -24,9 +24,9 @@ from mpmcli.stability.transfer_factors import affine_moment
 
 # Largest rounding of a stored position, in cells.
 POSITION_ERROR = 1e-3
-# Cells that a particle of a GPU run may move in a step beyond what was expected.
+# Cells that a particle of a GPU run may move in a step beyond the estimate.
 UNSEEN = 0.05
-# A stable step this much smaller than the first one will not recover: the run stops instead of crawling on.
+# Ratio of the stable step to the first one at which a run stops: steps that small do not recover.
 COLLAPSE = 1e-4
 
 
@@ -155,8 +155,8 @@ class Solver:
         if state.drift >= self._kernels.drift_allowed:
             self._kernels.sort()
             state.drift = 0.0
-        # Velocities live in the middle of steps: they move on from that of the last one to that of this one, at the
-        # start by half a step. A kick longer than dt / safety^2 might be unstable: kick dt <= (dt / safety)^2.
+        # Velocities belong to the middle of steps. They advance from the middle of the last step to that of this one,
+        # at the start by half a step. A kick beyond dt / safety^2 might be unstable: kick dt <= (dt / safety)^2.
         kick = min(0.5 * (state.last_step + dt), dt / self.scene.time.safety**2)
         pull = state.external_forces.pull(state.time)
         state.external_forces.begin_step(state.time)
@@ -171,10 +171,10 @@ class Solver:
                 self._stop(dt)
             state.speed = result.speed
         else:
-            # Not read back: what is known of it is what pulls from outside.
+            # Not read back: bounded by what gravity and forces add.
             state.speed += kick * pull
         state.courant = dt * state.speed / self.spacing
-        # Whatever else pushes on a GPU is allowed to double the speed; `advance` flags what went further.
+        # On a GPU stress may double the speed; `ParticleUpdate.advance` flags particles that went further.
         unseen = 2 * state.courant + UNSEEN if result is None else 0.0
         state.drift += max(state.courant, unseen)
         due = state.step_control.after_step(dt, state.courant, result)
@@ -197,7 +197,7 @@ class Solver:
         if not self.backend.on_cpu and self._kernels.particles.any_lost():
             self._stop(dt)
         if not self.state.step_control.measure(due):
-            # Crushed or inverted by the last step: the next one would have refused to scatter it.
+            # A particle was crushed or inverted by the last step; the next one would not scatter it.
             self._stop(dt)
         self.state.external_forces.measure(self.time, self.state.step_control.longest * dt)
         # Otherwise the fastest node of the last step bounds the speeds of all.
@@ -225,11 +225,11 @@ class Solver:
         raise AssertionError("a step reported a lost particle and kept no trace of it")
 
     def _stop_collapsed(self, step: float) -> None:
-        """Name the particle that forces the smallest step: the fastest to move or to deform."""
+        """Stop at the particle that requires the smallest step: the one that moves or deforms fastest."""
         snapshots = [read_group(group) for group in self.groups]
-        haste = [rate_of_change(snapshot, self.spacing) for snapshot in snapshots]
-        worst = max(range(len(snapshots)), key=lambda g: haste[g].max())
-        p = int(haste[worst].argmax())
+        rates = [rate_of_change(snapshot, self.spacing) for snapshot in snapshots]
+        worst = max(range(len(snapshots)), key=lambda g: rates[g].max())
+        p = int(rates[worst].argmax())
         cause = f"allows a step of only {step:.3g} s, where the run began with {self.state.first_stable_step:.3g} s"
         raise UnstableRunError(self._diagnose(snapshots[worst], p, cause, step))
 
@@ -245,11 +245,11 @@ class Solver:
         The time left to the next frame is split into equal steps, so that frames land on their times.
 
         Args:
-            stop: asked after each step whether to end there.
+            stop: called after each step; True ends the run there.
 
         Raises:
             UnstableRunError: see `step`.
-            KeyboardInterrupt: `stop` said so.
+            KeyboardInterrupt: `stop` returned True.
         """
         count = self.scene.time.frames
         yield self.frame(0, [])

@@ -1,4 +1,4 @@
-"""The B-splines that carry everything between particles and nodes."""
+"""The B-splines of the transfers between particles and nodes (docs/theory.md, 2.1)."""
 
 import taichi as ti
 
@@ -8,7 +8,7 @@ from mpmcli.stability.transfer_factors import INVERSE_MOMENT
 
 @ti.data_oriented
 class QuadraticSpline:
-    """The quadratic B-spline, which reaches the three nodes nearest to a point.
+    """The quadratic B-spline, whose stencil is the three nodes nearest to a point.
 
     Attributes:
         nodes: of a stencil, per axis.
@@ -37,7 +37,7 @@ class QuadraticSpline:
 
 @ti.data_oriented
 class CubicSpline:
-    """The cubic B-spline, which reaches the two nodes on either side of a point; see QuadraticSpline."""
+    """The cubic B-spline, whose stencil is the two nodes on either side of a point; see QuadraticSpline."""
 
     nodes = 4
     inverse_moment = INVERSE_MOMENT["cubic"]

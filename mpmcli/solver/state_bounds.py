@@ -1,4 +1,4 @@
-"""Measures how far the particles of each law have gone: what the limits of the next steps depend on."""
+"""Measures extreme values over the particles of each law, on which the limits of the next steps depend."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,11 +10,11 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.ordering import CHUNK, share_start
 from mpmcli.solver.particles import ParticleGroup
 
-# Of the smallest values the negative is kept, so that all are maxima.
+# Minima are stored as maxima of the negative.
 SPEED_SQUARED, RATE, J_MAX, MINUS_J_MIN, STRETCH_SQUARED = range(5)
 ENTRIES = 5
 NOTHING = -1e30
-# Workers of a measurement on a GPU, each with every so-manieth particle.
+# Workers of a measurement on a GPU. Worker k handles particles k, k + GPU_WORKERS, ...
 GPU_WORKERS = 16384
 
 
@@ -79,9 +79,9 @@ def volume_growth(C: ti.template(), dt: float):
 
 @ti.func
 def deformation_rate(group: ti.template(), C: ti.template()):
-    """Return a bound on how fast C changes what a particle stores: the row sum of |C + C^T| / 2 for F.
+    """Return a bound on the rate at which C changes the stored deformation, 1/s: the row sum of |C + C^T| / 2 for F.
 
-    A rotation deforms nothing: |(I + dt C) a| >= (1 - dt |D|) |a|, D the symmetric part of C. For J it is
+    Rotation does not count: |(I + dt C) a| >= (1 - dt |D|) |a|, D the symmetric part of C. For J it is
     |tr C| + sqrt(-m) with m < 0 the second invariant of C: det(I + dt C) = 1 + dt tr C + dt^2 m + ...
     """
     rate = 0.0
@@ -104,8 +104,8 @@ class Measurement:
 
     Attributes:
         state: () -> bounds of everything.
-        internal: () -> (smallest, largest) value of each internal variable, by name: for laws that harden, whose
-            stiffness follows these variables far more closely than anything else.
+        internal: () -> (smallest, largest) value of each internal variable, by name: the stiffness of laws that harden
+            depends mostly on these.
     """
 
     state: Callable[[], StateBounds]
@@ -113,7 +113,7 @@ class Measurement:
 
 
 def entries(group: ParticleGroup) -> int:
-    """Return how many maxima `widen_motion` and `widen_state` raise."""
+    """Return the number of maxima that `widen_motion` and `widen_state` raise."""
     return ENTRIES + 2 * len(group.internal)
 
 
@@ -150,7 +150,7 @@ def widen_internal(group: ti.template(), own: ti.template(), p: int, first: ti.t
 
 
 def state_bounds_of(group: ParticleGroup, maxima: Sequence[float]) -> StateBounds:
-    """Return the bounds that the maxima of all particles stand for."""
+    """Return the bounds that these maxima represent."""
     internal = _ranges(group, maxima[ENTRIES:])
     bound = StateBound(-maxima[MINUS_J_MIN], maxima[J_MAX], maxima[STRETCH_SQUARED], internal)
     return StateBounds(maxima[SPEED_SQUARED] ** 0.5, maxima[RATE], bound)
@@ -184,7 +184,7 @@ def build_maxima(count: int, size: int, widen: Callable, backend: Backend) -> Ca
         return list
     vector = ti.types.vector(size, float)
     found = ti.field(float, shape=size)
-    # Each worker keeps its own maxima and merges them once: an atomic per particle costs more than the rest.
+    # Each worker keeps its own maxima and merges them once: an atomic per particle takes longer than everything else.
     workers = CHUNK * backend.threads if backend.on_cpu else GPU_WORKERS
     on_cpu = backend.on_cpu
 

@@ -1,4 +1,4 @@
-"""Watches the state of a run: measures it as often as it can change, and gives the bounds that it sets on the step."""
+"""Follows the state of a run for its time step: when to measure, and the bounds that follow (docs/theory.md, 6.7)."""
 
 import math
 import time
@@ -15,26 +15,26 @@ from mpmcli.solver.step_cpu import StepResult
 from mpmcli.stability.limits import Limit, deformation_limit, mode_limit
 from mpmcli.stability.transfer_factors import step_inertia
 
-# The state is measured, and the limits with it, once in so many steps at least. It is earlier where a stiffness may
-# have grown since by more than this share of what time.safety leaves: nearly all, as every step tells how fast it
-# deformed.
+# Most steps between two measurements of the state. A measurement is due earlier where a stiffness may have grown since
+# by more than this share of the margin that time.safety leaves. The share is near 1 as every step reads the rate of
+# deformation back.
 MOST_UNWATCHED_STEPS, UNWATCHED_SHARE = 64, 0.95
-# The same on a GPU, where that is a guess, and where the measurement is also what sees that a particle was lost.
+# The same on a GPU, where the rate is an estimate, and where only a measurement detects lost particles.
 MOST_BLIND_STEPS, BLIND_SHARE = 16, 0.75
 # Cells per step below which a sudden stop, which turns speed into a velocity gradient of up to two speeds a cell,
 # stays clear of the bound on the deformation in a step.
 SLOW = 0.1
-# A bound falls at once and rises by this factor a step at most: a step that follows the oscillation of a
-# lone particle up and down drives it until it bursts. At 1.01 one of fourteen trials did, at 1.001 none.
+# A bound falls at once and rises by this factor per step at most. A step that follows the oscillation of a lone
+# particle excites it: at 1.01 one of fourteen trials became unstable, at 1.001 none.
 EASING = 1.001
 
 
 class StepControl:
-    """What was last measured of each group of particles, and the bounds on the step that follow from it.
+    """The last measurement of each group of particles, and the bounds on the step that follow from it.
 
     Attributes:
         seconds: wall time spent so far on measuring.
-        longest: steps that go by at most between two measurements.
+        longest: most steps between two measurements.
     """
 
     def __init__(self, scene: Scene, groups: Sequence[ParticleGroup], backend: Backend) -> None:
@@ -102,7 +102,7 @@ class StepControl:
         return [limit for limits in self._limits for limit in limits] + [self._deformation_limit]
 
     def limits_now(self) -> list[Limit]:
-        """Return every bound by the state as it is, without keeping it."""
+        """Return every bound by the state as it is, without storing it."""
         states = [measure.state() for measure in self._measure]
         limits = [limit for g, bounds in enumerate(states) for limit in self._limits_of(g, bounds)]
         return [*limits, _deformation_limit(bounds.deformation_rate for bounds in states)]
@@ -116,7 +116,7 @@ class StepControl:
     def after_step(self, dt: float, courant: float, result: StepResult | None) -> list[int]:
         """Count a step and return the groups to measure now.
 
-        What the step itself read back is taken in at once.
+        What the step read back is used at once.
 
         Args:
             dt: the step, s.
@@ -134,13 +134,13 @@ class StepControl:
             strain = dt * self._rates[g]
             sensitivity = group.law.sensitivity
             if result is None:
-                # What moves through a fifth of a cell may meet something that deforms it by about as much. Where
-                # stiffness does not grow with it, only the deformation itself bounds the step, and slow steps deform
+                # A particle that moves by a fifth of a cell may meet something that deforms it by about as much. Where
+                # stiffness does not grow with deformation, only the latter bounds the step, and slow steps deform
                 # little.
                 strain = max(strain, 0.5 * courant)
                 sensitivity = max(sensitivity, 1.0) if courant >= SLOW else sensitivity
             self._change[g] += strain * sensitivity
-            # The internal variables alone do not know yet of the last step's strain.
+            # The internal variables do not contain the last step's strain yet.
             pending = strain * group.law.hardening
             self._hardened[g] += pending
             grown = self._change[g] >= self._growth_allowed
@@ -171,7 +171,7 @@ class StepControl:
         return sound
 
     def _take(self, g: int, bounds: StateBounds) -> None:
-        """Keep the state's bounds of a group, and the limits that follow from them."""
+        """Store the bounds of a group's state, and the limits that follow from them."""
         self._bounds[g] = bounds
         self._rates[g] = bounds.deformation_rate
         self._change[g] = self._hardened[g] = 0.0
@@ -179,7 +179,7 @@ class StepControl:
         self._take_limits()
 
     def _measure_hardening(self, g: int, pending: float) -> None:
-        """Measure the internal variables of a group alone; `pending` is what they do not know of yet."""
+        """Measure only the internal variables of a group; `pending` is the growth that they do not contain yet."""
         bounds = self._bounds[g]
         self._bounds[g] = replace(bounds, bound=replace(bounds.bound, internal=self._measure[g].internal()))
         self._hardened[g] = pending
@@ -199,7 +199,7 @@ class StepControl:
         return limits
 
     def _take_limits(self) -> None:
-        """Keep the smallest of the bounds that were measured, those of stiffness apart from those of deformation."""
+        """Store the smallest measured limits of stiffness and of deformation."""
         self._stiffness_limit = min(limit for limits in self._limits for limit in limits)
         self._deformation_limit = _deformation_limit(self._rates)
 

@@ -1,7 +1,7 @@
-"""Particle to grid and back: MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015), or PIC or AFLIP in its place.
+"""Particle to grid and back: MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015), PIC or AFLIP (docs/theory.md, 2).
 
 Both transfers walk the stencil in lines of three nodes along the last axis and measure positions from its
-middle node, whose neighbours lie at -1, 0 and 1: moments are then differences of what the nodes share anyway.
+middle node, so that its nodes lie at -1, 0 and 1: moments are then differences of sums that are at hand.
 A cubic stencil has one node more, at 2.
 On the CPU every node and every row below is four numbers wide, which the compiler turns into vector
 instructions; that halves the time of the gather in 3D.
@@ -16,11 +16,11 @@ from mpmcli.solver.particles import MASS, VOLUME
 def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float, atomic: ti.template()):
     """Add the mass and the momentum of particle p, stress included, to the nodes around it.
 
-    A law with plastic flow returns the particle's state to what it can bear first. Forces change what is
-    scattered: v by kick a, and C by kick da/dx.
+    A law with plastic flow projects the particle's state first. Forces change what is scattered: v by kick a, and C by
+    kick da/dx.
 
     Node i receives w_i (m v + A (x_i - x_p)) with A = m C - dt V0 tau / D (Hu et al. 2018, eq. 18; D = h^2/4
-    for quadratic splines), and w_i m. PIC leaves m C out. Without `atomic` the caller owns those nodes.
+    for quadratic splines), and w_i m. PIC leaves m C out. Without `atomic` no other thread may write those nodes.
     """
     d = ti.static(grid.dimension)
     h = ti.static(grid.spacing)
@@ -67,7 +67,7 @@ def scatter_before(
     grid: ti.template(),
     atomic: ti.template(),
 ):
-    """Add the momentum that a particle comes with to what the nodes keep from before stress and forces."""
+    """Add the momentum of a particle, without this step's stress and forces, to `grid.before`."""
     d = ti.static(grid.dimension)
     base, distance = grid.scheme.spline.stencil(x, ti.static(1 / grid.spacing))
     w = grid.scheme.spline.weights(distance)
@@ -91,11 +91,11 @@ def add_linear(
     change: ti.template(),
     atomic: ti.template(),
 ):
-    """Add to the nodes of a stencil what varies linearly over it, weighted.
+    """Add to the nodes of a stencil a quantity that varies linearly over it, weighted by the spline.
 
     Args:
-        field: of the nodes; first: the first of them.
-        middle: what the middle node would take; change: how that changes per cell, a row for each axis.
+        field: of the nodes; first: linear index of the first node.
+        middle: the quantity at the middle node; change: its change per cell, a row for each axis.
     """
     d = ti.static(grid.dimension)
     for o, line_node in ti.static(grid.lines):
@@ -136,7 +136,7 @@ def gather(x: ti.template(), grid: ti.template(), field: ti.template()):
     """Return the velocity at a point and its gradient, sum w_i (x_i - x) v_i^T / D, of a field of the nodes.
 
     The gradient has a row for each axis: row a holds dv/dx_a, so it is the transpose of C. Both are as wide
-    as a node; what they hold beyond the d components of the velocity means nothing.
+    as a node; entries beyond the d components of the velocity have no meaning.
     """
     d = ti.static(grid.dimension)
     base, distance = grid.scheme.spline.stencil(x, ti.static(1 / grid.spacing))

@@ -1,4 +1,4 @@
-"""How particles and nodes speak to each other, as the kernels need it: one choice of the knobs of [solver]."""
+"""The transfer scheme of a scene, from its [solver] table, as constants of the kernels (docs/theory.md, 2)."""
 
 from dataclasses import dataclass
 
@@ -9,12 +9,12 @@ from mpmcli.solver.splines import SPLINES, CubicSpline, QuadraticSpline
 # Equal by identity: kernels are compiled for the object that they are given.
 @dataclass(frozen=True, eq=False)
 class TransferScheme:
-    """Constants of the kernels.
+    """Constants of the transfers between particles and nodes.
 
     Attributes:
-        spline: carries everything.
-        affine: whether particles hand their affine velocity on to the nodes, as APIC does.
-        flip: share of a particle's velocity that is its own, changed as the nodes change, and not theirs; 0 for none.
+        spline: the B-spline of both transfers.
+        affine: whether P2G includes the affine velocity C, as in APIC.
+        flip: AFLIP's share: how much of a particle's velocity is its own plus the nodes' change; 0 for none.
     """
 
     spline: QuadraticSpline | CubicSpline
@@ -23,15 +23,15 @@ class TransferScheme:
 
     @property
     def keeps_before(self) -> bool:
-        """Whether nodes keep the momentum from before stress and forces."""
+        """Whether nodes also store the momentum without this step's stress and forces."""
         return self.flip > 0
 
     @property
     def plain(self) -> bool:
-        """Whether a particle writes no more than quadratic splines and one momentum make it."""
+        """Whether splines are quadratic and nodes store one momentum."""
         return self.spline.nodes == 3 and not self.keeps_before
 
 
 def scheme_of(settings: SolverSettings) -> TransferScheme:
-    """Return the scheme that a scene asks for."""
+    """Return the scheme of a scene."""
     return TransferScheme(SPLINES[settings.kernel], settings.transfer != "pic", settings.flip or 0.0)

@@ -1,4 +1,4 @@
-"""Starts a backend and runs one small kernel on it, to see whether this machine can."""
+"""Starts a backend and runs one small kernel on it, to test whether it works on this machine."""
 
 import numpy as np
 import taichi as ti
@@ -10,7 +10,7 @@ COUNT = 1000
 
 
 def backend_is_here(arch: backend.Arch) -> bool:
-    """Say whether this machine has a device for a backend; it may still fail to start."""
+    """Return whether this machine has a device for a backend; it may still fail to start."""
     return backend._has(arch)
 
 

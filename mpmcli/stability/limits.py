@@ -1,16 +1,16 @@
-"""Closed-form bounds on the time step, one function per bound (verification: 10.1).
+"""Closed-form bounds on the time step of MLS-MPM with leapfrog, one function per bound (docs/theory.md, 6).
 
-For MLS-MPM and leapfrog. The wave bound is exact for an isolated particle, which is the least stable
-configuration: particles that share nodes allow 1.0 to 1.4 times more with APIC and quadratic B-splines. With the other
-knobs of [solver] that is so too: `transfer_factors.step_inertia` has their factor.
+The wave bound is exact for an isolated particle, which is the least stable configuration: particles that share nodes
+allow steps 1.0 to 1.4 times larger with APIC and quadratic B-splines. `transfer_factors.step_inertia` extends the bound
+to the other transfer schemes.
 """
 
 import math
 from typing import NamedTuple
 
-# Largest displacement in one step, cells: keeps a particle's stencil local (verification: 10.1).
+# Largest displacement in one step, cells: keeps a particle's stencil local (docs/theory.md, 6.3).
 COURANT = 0.5
-# Largest velocity gradient times step: keeps I + dt C, and with it J, away from zero.
+# Largest velocity gradient times step: keeps det(I + dt C), and with it J, positive (docs/theory.md, 6.4).
 DEFORMATION = 0.5
 
 WHY = {
@@ -48,12 +48,12 @@ class Limit(NamedTuple):
 
     @property
     def why(self) -> str:
-        """What the bound keeps from happening."""
+        """What the bound prevents."""
         return WHY[self.name]
 
     @property
     def fix(self) -> str:
-        """What to change for a larger step."""
+        """What allows a larger step."""
         return FIX[self.name]
 
 

@@ -1,12 +1,13 @@
-"""What the knobs of a scene's [solver] table mean in numbers, for the step and for what a run conserves."""
+"""Factors of the transfer schemes: moments of the splines, inertia for the stable step, and loss of energy per step."""
 
 from mpmcli.scene.schema import SolverSettings
 
-# h^2 over the second moment of the spline, D = sum w (x_i - x)^2: APIC divides by D (Jiang et al. 2015).
+# h^2 over the second moment of the spline, D = sum w (x_i - x)^2, by which APIC divides (Jiang et al. 2015;
+# docs/theory.md, 2.2).
 INVERSE_MOMENT = {"quadratic": 4, "cubic": 3}
 
-# Energy of a wave of wave number k that a step of APIC loses is this times (k h)^4: the leading term of the spectrum of
-# a step, two and three particles per cell and axis (verification: finding 2, for quadratic splines).
+# A step of APIC removes this times (k h)^4 of the energy of a wave of wave number k: the leading term of the spectrum
+# of a step with two and three particles per cell and axis (docs/theory.md, 2.4).
 APIC_LOSS = {"quadratic": 0.024, "cubic": 0.047}
 
 
@@ -19,17 +20,17 @@ def step_inertia(settings: SolverSettings) -> float:
     """Return the inertia that a particle's stiffness works against, over that of APIC with quadratic splines.
 
     A lone particle obeys C' = s C - a tau with a = dt / (D density), tau = S e + V C and e' = e + dt C'. APIC keeps its
-    C, s = 1, which is stable while dt^2 S + 2 dt V <= 4 D density. PIC forgets it, s = 0, and what it has left is the
-    whole kick of the stress: half as much is stable. AFLIP changes only what particles that share nodes do.
+    C, s = 1, which is stable while dt^2 S + 2 dt V <= 4 D density. With PIC
+    s = 0, and half of that is stable. AFLIP has the bound of APIC (docs/theory.md, 6.1).
     """
     return (4 / INVERSE_MOMENT[settings.kernel]) * (0.5 if settings.transfer == "pic" else 1.0)
 
 
 def loss_per_step(settings: SolverSettings, kh: float) -> float:
-    """Return the share of its energy that an elastic wave loses in a step, at wave number times spacing.
+    """Return the share of its energy that an elastic wave loses in a step, at wave number times spacing kh.
 
-    With PIC (D / h^2) (k h)^2: half of what a free transfer takes, as only one half of a wave's energy is in the
-    velocities. AFLIP loses what APIC does of the share that is not FLIP's.
+    With PIC (D / h^2) (k h)^2: half of the loss of kinetic energy in a transfer, as half of a wave's energy is kinetic.
+    AFLIP loses 1 - flip of what APIC loses (docs/theory.md, 2.4).
     """
     # Products overflow to infinity, where powers raise an error.
     square = kh * kh
