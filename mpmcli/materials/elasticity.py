@@ -1,4 +1,4 @@
-"""Parameters that every law with an isotropic elastic part shares."""
+"""Elastic constants: the parameters shared by laws with an isotropic elastic part (docs/theory.md, 5.1)."""
 
 from typing import Annotated
 

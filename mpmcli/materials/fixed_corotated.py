@@ -1,4 +1,4 @@
-"""Fixed corotated solid: linear in the stretches, and so as soft under large strain as at rest."""
+"""Fixed corotated solid: energy quadratic in the stretches, for large rotation and moderate strain."""
 
 import math
 from typing import Literal
@@ -22,10 +22,10 @@ class FixedCorotatedParameters(ElasticParameters):
 
 @ti.data_oriented
 class FixedCorotated(Law):
-    """tau = 2 mu (F - R) F^T + lambda (J - 1) J I (Stomakhin et al. 2012); plane strain in 2D.
+    """tau = 2 mu (F - R) F^T + lambda (J - 1) J I (Stomakhin et al. 2012; docs/theory.md, 5.4); plane strain in 2D.
 
-    R is the rotation nearest to F, for inverted states too (see `polar_rotation`), which pull back. Crushed
-    to nothing the solid resists with finite energy alone, and its stress vanishes with F.
+    R is the rotation nearest to F. It is defined for inverted states too, which are driven back (`polar_rotation`).
+    The energy of complete collapse is finite, and the stress vanishes as F approaches 0.
     """
 
     name = "fixed_corotated"
@@ -59,19 +59,19 @@ class FixedCorotated(Law):
 
 @ti.func
 def corotated_energy(F: ti.template(), mu: float, lame_lambda: float):
-    """Return mu |F - R|^2 + lambda/2 (J - 1)^2, J/m^3."""
+    """Return mu |F - R|^2 + lambda/2 (J - 1)^2, J/m^3 (Stomakhin et al. 2012)."""
     stretch = F - polar_rotation(F)
     volume = volume_strain(F - ti.Matrix.identity(float, F.n))
     return mu * (stretch * stretch).sum() + 0.5 * lame_lambda * volume * volume
 
 
 def corotated_stiffness(mu: float, lame_lambda: float, dimension: int, bound: StateBound) -> float:
-    """Return d lambda J (2J - 1) + 2 mu s (2s - 1), Pa, at the worst J and stretch s within `bound`, and at rest.
+    """Return the largest d lambda J (2J - 1) + 2 mu s (2s - 1), Pa, over J and stretches s within `bound` and at rest.
 
     Under C dt, the normal entries of tau in the principal frame see the matrix diag(2 mu s_i (2 s_i - 1)) +
     lambda J (2J - 1) (1 1^T), and a pair of shear entries 2 mu (s_i^2 + s_j^2)(1 - 1/(s_i + s_j)), which is largest
-    where both stretches are. The sum bounds all, and is exact at rest: d lambda + 2 mu. Of an inverted state
-    (J < 0) one stretch is negative, and s (2s - 1) at most s (2s + 1) of its size.
+    where both stretches are. The sum bounds both, and is exact at rest: d lambda + 2 mu. An inverted state
+    (J < 0) has one negative stretch, for which |s| (2 |s| + 1) bounds s (2s - 1).
     """
     ends = {1.0, bound.volume_ratio_min, bound.volume_ratio_max}
     if bound.volume_ratio_min < 0.25 < bound.volume_ratio_max:

@@ -1,4 +1,4 @@
-"""Weakly compressible fluid: pressure from the volume ratio alone, and Newtonian viscosity."""
+"""Weakly compressible fluid: pressure as a function of the volume ratio, and Newtonian viscosity."""
 
 from typing import Annotated, Literal, Self
 
@@ -14,22 +14,22 @@ from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
 # Places in the vector of constants.
 BULK_MODULUS, EXPONENT, VISCOSITY, SECOND_VISCOSITY, LARGEST_J = range(5)
 
-# The speed that "auto" assumes where nothing in the scene moves or falls, m/s.
+# Speed that "auto" assumes if nothing in the scene moves or falls, m/s.
 QUIET_SPEED = 1.0
-# The pressure of a nonlinear equation of state grows no further below this J: the largest power stays a number of
-# 32 bits. Far beyond what weak compressibility means, but a crushed particle must not turn into infinities.
+# The pressure of a nonlinear equation of state is constant below this J, so that J^-g stays within single precision for
+# the largest exponent. The value is far outside weak compressibility; it keeps crushed particles finite.
 CRUSHED = 0.05
-# In bulk the pressure itself stiffens the flow, as moving particles carry it with them: waves of pressure see the
-# tangent modulus and the pressure together, K at any J for p = K (1/J - 1). At J = 0.5 and 0.3, where this is more than
-# a lone particle's tangent, one particle per cell at random places blows up at 0.956 and 0.969 of h/c,
-# c = sqrt(K / density): the factor covers that (`scripts/stable_step_study`).
+# In bulk the pressure itself adds stiffness, because particles carry it with them: pressure waves see the sum of the
+# tangent modulus and the pressure, which is K at any J for p = K (1/J - 1) (docs/theory.md, 6.6). At J = 0.5 and 0.3,
+# where the sum exceeds the tangent modulus of a lone particle, one particle per cell at a random position becomes
+# unstable at 0.956 and 0.969 of h/c, c = sqrt(K / density). The factor covers that (`scripts/stable_step_study`).
 CARRIED = 1.2
-# Of Newton's method; some six do, from any load.
-MOST_ITERATIONS = 100
+# Limit on Newton iterations; about six suffice for any load.
+ITERATIONS_MAX = 100
 
 
 class WeaklyCompressibleParameters(MaterialParameters):
-    """Parameters of a fluid whose bulk modulus the scene may choose."""
+    """Parameters of a fluid whose bulk modulus may be "auto"."""
 
     bulk_modulus: Annotated[
         Positive | Literal["auto"],
@@ -83,19 +83,19 @@ class FluidParameters(WeaklyCompressibleParameters):
     ] = True
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
-        """Replace "auto" by K = density v^2 / compressibility, with v the highest speed of the scene."""
+        """Replace "auto" by K = density v^2 / compressibility, where v is the highest speed of the scene."""
         if self.bulk_modulus != "auto":
             return self, []
         modulus, note = soft_bulk_modulus(self.density, self.compressibility, bounds)
         return self.model_copy(update={"bulk_modulus": modulus}), [note]
 
     def volume_ratio_under(self, load: np.ndarray) -> np.ndarray:
-        """Solve K/g (J^(1-g) - J) = load by Newton's method, from J = 1; nan where J is below CRUSHED."""
+        """Return J, (n,), where K/g (J^(1-g) - J) is `load`, (n,), Pa, by Newton's method; nan below CRUSHED."""
         g, strain = self.exponent, np.asarray(load, dtype=np.float64) / self.bulk_modulus
         if g == 1:
             return np.where(strain < 1, 1 - strain, np.nan)
         J = np.ones_like(strain)
-        for _ in range(MOST_ITERATIONS):
+        for _ in range(ITERATIONS_MAX):
             step = ((J ** (1 - g) - J) / g - strain) / (((g - 1) * J**-g + 1) / g)
             J = np.clip(J + step, J / 2, 2 * J)
             if np.all(np.abs(step) <= 1e-15 * J):
@@ -104,13 +104,13 @@ class FluidParameters(WeaklyCompressibleParameters):
 
 
 def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBounds) -> tuple[float, str]:
-    """Return K = density v^2 / compressibility, Pa, with v the highest speed of the scene, and a sentence on it.
+    """Return K = density v^2 / compressibility, Pa, and a sentence that states it; v is the highest speed of the scene.
 
-    The density is the largest of any body, as a denser one may press on the fluid.
+    The density is the largest of all bodies, because a denser one may press on the fluid.
 
-    Weakly compressible flow varies in density by v^2/c^2 (Monaghan 1994); a column that is let
-    go uncompressed presses with up to 2 density g H = density v^2, the same bound. Where fluid hits
-    fluid or a wall head on, the pressure is density c v for a moment (water hammer), and so v/c.
+    The density of weakly compressible flow varies by v^2/c^2 (Monaghan 1994). A column released without
+    compression reaches a pressure of 2 density g H = density v^2, the same bound. In a head-on impact on fluid or a
+    wall the pressure briefly reaches density c v (water hammer), which varies the density by v/c.
     """
     speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
     modulus = min(max(max(density, bounds.density) * speed**2 / compressibility, 1 / LARGEST), LARGEST)
@@ -124,10 +124,10 @@ def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBound
 
 @ti.data_oriented
 class Fluid(Law):
-    """p = K/g (J^-g - 1), and tau = -J p I + viscosity (C + C^T - (2/3) tr C I) + bulk_viscosity tr C I.
+    """p = K/g (J^-g - 1) and tau = -J p I + viscosity (C + C^T - (2/3) tr C I) + bulk_viscosity tr C I.
 
-    With tension_cutoff, J is never remembered above 1: the fluid that opens in a splash has no pressure,
-    and has it again as soon as it closes.
+    With tension_cutoff the stored J is at most 1: fluid that expands in a splash has no pressure, and regains it as
+    soon as it is compressed. Source: docs/theory.md, 5.2.
     """
 
     name = "fluid"
@@ -154,10 +154,10 @@ class Fluid(Law):
         )
 
     def modes(self, parameters: FluidParameters, bound: StateBound) -> list[Mode]:
-        """d K ((g - 1) J^(1-g) + J) / g for volume, where viscosity adds (2 - 2d/3) mu + d zeta; 2 mu for shear.
+        """Return d K ((g - 1) J^(1-g) + J) / g for volume, with viscosity (2 - 2d/3) mu + d zeta, and 2 mu for shear.
 
-        -J p changes by that K-term times tr(C) dt, and tr(C) by d entries. It is convex in J, and so
-        largest at an end of its range. Far compressed fluid in bulk is stiffer: K J^(1-g), see CARRIED.
+        -J p changes by that K-term times tr(C) dt, and tr(C) is a sum of d entries. The term is convex in J,
+        therefore largest at an end of its range. Strongly compressed fluid in bulk is stiffer: K J^(1-g), see CARRIED.
         """
         d, g, K = self.dimension, parameters.exponent, parameters.bulk_modulus
         largest = min(bound.volume_ratio_max, 1.0) if parameters.tension_cutoff else bound.volume_ratio_max
@@ -169,7 +169,7 @@ class Fluid(Law):
         return modes + [Mode(0.0, 2 * parameters.viscosity)] * (parameters.viscosity > 0)
 
     def stiffest(self, parameters: FluidParameters, bounds: SceneBounds) -> StateBound:
-        """Water hammer, density c v, and the column's weight compress it."""
+        """Return the compression by water hammer, density c v, and by the weight of the column."""
         c = (parameters.bulk_modulus / parameters.density) ** 0.5
         strain = bounds.speed / c + bounds.gravity * bounds.height / c**2
         largest = 1.0 if parameters.tension_cutoff else 1 + strain

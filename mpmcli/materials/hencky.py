@@ -1,4 +1,4 @@
-"""Hencky elasticity, linear in the logarithms of the principal stretches: what the laws of soil and metal share."""
+"""Hencky elasticity, linear in the logarithms of the principal stretches; shared by sand and von Mises plasticity."""
 
 import math
 from typing import Annotated, Literal
@@ -14,9 +14,9 @@ from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import SceneBounds
 from mpmcli.scene.quantity import LARGEST, Positive
 
-# Below it a stretch counts as this much: its logarithm stays finite where a particle is flat.
+# Lower bound on a stretch, which keeps the logarithm of a flat particle finite.
 STRETCH_MIN = 1e-4
-# Young's modulus over strength that "auto" keeps at least: half a percent of strain at yield.
+# Smallest ratio of Young's modulus to strength that "auto" chooses: a yield strain of half a percent.
 MODULUS_PER_STRENGTH = 200.0
 
 Compressibility = Annotated[
@@ -42,17 +42,17 @@ YoungsModulus = Annotated[
 
 
 class HenckyParameters(ElasticParameters):
-    """Parameters of a solid whose Young's modulus the scene may choose."""
+    """Parameters of a solid whose Young's modulus may be "auto"."""
 
     youngs_modulus: YoungsModulus
     compressibility: Compressibility = 0.01
 
 
 def soft_youngs_modulus(parameters: HenckyParameters, bounds: SceneBounds) -> float:
-    """Return the E, Pa, with which the scene's weight and speed strain the volume by `compressibility`.
+    """Return Young's modulus E, Pa, for which weight and speed in the scene strain the volume by `compressibility`.
 
-    The pressure of the deepest column and of the fastest flow is density (g H + v^2), with the largest density of
-    any body, and volume feels K = lambda + 2 mu / d (in 2D that of the plane), which is proportional to E.
+    The pressure of the deepest column and of the fastest flow is density (g H + v^2), where the density is the
+    largest of all bodies. The bulk modulus K = lambda + 2 mu / d (in 2D that of the plane) is proportional to E.
     """
     speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
     pressure = max(parameters.density, bounds.density) * (bounds.gravity * bounds.height + speed**2)
@@ -62,18 +62,21 @@ def soft_youngs_modulus(parameters: HenckyParameters, bounds: SceneBounds) -> fl
 
 
 class HenckyLaw(Law):
-    """tau_i = 2 mu e_i + lambda tr e in the principal frame of F F^T, with e_i = ln s_i (Hencky 1928)."""
+    """tau_i = 2 mu e_i + lambda tr e in the principal frame of F F^T, with e_i = ln s_i (Hencky 1928).
+
+    Source: docs/theory.md, 5.5.
+    """
 
     deformation = "F"
     # d lambda + 2 mu at any strain; x coth x = 1 + x^2/3 for shear.
     sensitivity = 0.0
 
     def modes(self, parameters: HenckyParameters, bound: StateBound) -> list[Mode]:
-        """d lambda + 2 mu for normal strain, in any state; 2 mu x coth x for shear, x = ln(s_i / s_j).
+        """Return d lambda + 2 mu for normal strain, in any state, and 2 mu x coth x for shear, x = ln(s_i / s_j).
 
         Under C dt the normal strains change by the normal entries of C dt. In a pair of shear entries
         tau_ij = (tau_i - tau_j) / (s_i^2 - s_j^2) b_ij, where b_ij changes by (C_ij s_j^2 + C_ji s_i^2) dt.
-        Plastic flow only lessens the differences tau_i - tau_j.
+        Plastic flow only reduces the differences tau_i - tau_j.
         """
         mu, d = parameters.shear_modulus, self.dimension
         largest = max(math.sqrt(bound.stretch_squared_max), STRETCH_MIN)

@@ -1,4 +1,4 @@
-"""What every constitutive law states: its parameters, its state, its response to deformation, and how stiff it is."""
+"""Base class of the constitutive laws: parameters, state, response to deformation, and stiffness."""
 
 import math
 from abc import ABC, abstractmethod
@@ -14,7 +14,7 @@ from mpmcli.scene.material import Internal, MaterialParameters, SceneBounds
 
 @dataclass(frozen=True)
 class StateBound:
-    """How far the particles of one law have gone from rest, as bounds over all of them.
+    """Bounds on the state of all particles of one law.
 
     Attributes:
         volume_ratio_min, volume_ratio_max: range of J, or of det F, as stored.
@@ -29,11 +29,11 @@ class StateBound:
 
 
 class Mode(NamedTuple):
-    """One independent way in which an isolated particle answers a velocity gradient C.
+    """One eigenmode of the response of an isolated particle to a velocity gradient C (docs/theory.md, 6.1 and 6.2).
 
     Attributes:
-        stiffness: by how much tau changes per strain C dt, Pa: an eigenvalue of d tau / d(C dt).
-        viscosity: by how much tau changes with C itself, Pa s: an eigenvalue of d tau / dC.
+        stiffness: eigenvalue of d tau / d(C dt), the change of stress per strain increment, Pa.
+        viscosity: eigenvalue of d tau / dC, the change of stress per velocity gradient, Pa s.
     """
 
     stiffness: float
@@ -43,24 +43,24 @@ class Mode(NamedTuple):
 class Law(ABC):
     """One constitutive law for the particles of some bodies.
 
-    A particle stores J or F (of a law with plastic flow: the elastic part) and the law's internal variables.
-    A step deforms it, J <- J det(I + dt C) or F <- (I + dt C) F; the next one begins with `respond`, which
-    returns the stress, and the state after plastic flow where there is any.
+    A particle stores J or F (the elastic part of F if the law has plastic flow) and the internal variables of the law.
+    A step deforms it, J <- J det(I + dt C) or F <- (I + dt C) F. The next step begins with `respond`, which
+    returns the stress and the state after plastic flow.
 
-    Instances are handed to kernels as templates and compare by identity, so that two laws never share a
-    compiled kernel. What no member needs, such as viscosity, is decided at construction and not compiled.
+    Instances are passed to kernels as templates and compare by identity, so that two laws never share a
+    compiled kernel. Terms that no member needs, such as viscosity, are excluded at construction and not compiled.
 
     Attributes:
-        name: the word for it in a scene.
-        parameters: the pydantic model of its parameters, which also lists its internal variables.
-        deformation: what a particle stores, "J" (the volume ratio) or "F" (the deformation gradient).
+        name: value of `law` in a scene.
+        parameters: pydantic model of the parameters, which also lists the internal variables.
+        deformation: stored deformation, "J" (volume ratio) or "F" (deformation gradient).
         projects: whether `respond` may change the state.
         stiffness_parameters, viscosity_parameters: names of the parameters that set the stiffness and the viscosity;
             messages name the first that is a positive number. A law that calls them otherwise lists its own.
         coherent: whether the material resists being pulled apart, so that `check` reports a J far above 1.
-        sensitivity: growth of the logarithm of the largest stiffness per strain that is stored: how closely the state
-            is watched; 0 where none is stiffer than rest.
-        hardening: the same growth by way of the internal variables, which are watched by themselves: 0 without any.
+        sensitivity: growth of the logarithm of the largest stiffness per stored strain, dimensionless. It sets how
+            often the state is measured during a run; 0 if no state is stiffer than rest (docs/theory.md, 6.7).
+        hardening: the same growth caused by the internal variables, which are measured separately; 0 without any.
         members: parameters of the bodies that follow this law.
         dimension: 2 (plane strain) or 3.
         internal: the internal variables that a particle stores.
@@ -77,7 +77,7 @@ class Law(ABC):
     hardening: float = 0.0
 
     def __init_subclass__(cls, **options: object) -> None:
-        """Tell the parameters, which a scene checks before there is a law, what a particle stores."""
+        """Copy `deformation` to the parameter class, which is validated before an instance of the law exists."""
         super().__init_subclass__(**options)
         parameters = getattr(cls, "parameters", None)
         if isinstance(parameters, type) and issubclass(parameters, MaterialParameters):
@@ -90,7 +90,7 @@ class Law(ABC):
 
     @abstractmethod
     def constants(self, parameters: MaterialParameters) -> tuple[float, ...]:
-        """Return the numbers that `respond` and `energy` read, in their order; one at least."""
+        """Return the constants passed to `respond` and `energy`, in their order; at least one."""
 
     @staticmethod
     def first_set(parameters: MaterialParameters, names: Sequence[str]) -> tuple[str, float] | None:
@@ -100,16 +100,16 @@ class Law(ABC):
 
     @abstractmethod
     def modes(self, parameters: MaterialParameters, bound: StateBound) -> list[Mode]:
-        """Return the modes of an isolated particle, each with the largest values over states within `bound`.
+        """Return the modes of an isolated particle, each with its largest values over states within `bound`.
 
-        The step is stable while dt^2 stiffness + 2 dt viscosity <= density h^2 for each (verification: 10.1).
+        The step is stable if dt^2 stiffness + 2 dt viscosity <= density h^2 for each mode (docs/theory.md, 6.1).
         """
 
     def stiffest(self, parameters: MaterialParameters, bounds: SceneBounds) -> StateBound:
-        """Return the state that the scene can drive the material to, for limits before the run.
+        """Return bounds on the state that the scene can reach, for limits before the run.
 
-        An impact at speed v strains an elastic material by about v / c, and a column H high by
-        g H / c^2; a law whose stiffness grows otherwise, by hardening say, states its own.
+        An impact at speed v strains an elastic material by about v / c, and the weight of a column of height H by
+        g H / c^2. A law whose stiffness grows in another way, such as hardening, overrides this method.
         """
         stiffness = max(mode.stiffness for mode in self.modes(parameters, StateBound()))
         wave_speed = math.sqrt(stiffness / parameters.density)
@@ -117,7 +117,12 @@ class Law(ABC):
         return StateBound(1 / (1 + strain), 1 + strain, (1 + strain) ** 2)
 
     def total_volume_ratio(self, J: np.ndarray, internal: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return volume over volume at rest, (n,), of the stored J or det F and the internal variables, (n,) each."""
+        """Return the ratio of volume to volume at rest, (n,).
+
+        Args:
+            J: stored J or det F, (n,).
+            internal: each internal variable by name, (n,).
+        """
         return J
 
     @ti.func
@@ -127,19 +132,19 @@ class Law(ABC):
         """Return (tau, tau_zz, deformation, internal): the stress, and the state after plastic flow.
 
         Args:
-            deformation: J, or F as a d x d matrix, after the last step's deformation.
-            internal: vector of the internal variables in their order; one meaningless 0 where there are none.
+            deformation: J, or F as a d x d matrix, after the deformation of the last step.
+            internal: vector of the internal variables in their order; a single unused 0 if there are none.
             C: velocity gradient, d x d, 1/s.
-            dt: the step, s; only rates need it.
-            constants: vector of what `constants` returned.
+            dt: the step, s; read only by rate-dependent laws.
+            constants: vector of the values that `constants` returned.
 
         Returns:
-            tau = J sigma per volume at rest, d x d, Pa; its component out of the plane (0.0 in 3D); the
-            deformation and the internal variables, as given or projected.
+            Kirchhoff stress tau = J sigma, d x d, Pa; its out-of-plane component (0.0 in 3D), Pa; the deformation
+            and the internal variables, as given or projected.
         """
         raise NotImplementedError
 
     @ti.func
     def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
-        """Return the stored energy per volume at rest, J/m^3, of a state that `respond` returned."""
+        """Return the stored energy per volume at rest, J/m^3, for a state that `respond` returned."""
         raise NotImplementedError

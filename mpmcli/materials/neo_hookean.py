@@ -20,7 +20,10 @@ class NeoHookeanParameters(ElasticParameters):
 
 @ti.data_oriented
 class NeoHookean(Law):
-    """tau = mu (F F^T - I) + lambda ln(J) I (Bonet and Wood 2008, eq. 6.28); plane strain in 2D."""
+    """tau = mu (F F^T - I) + lambda ln(J) I (Bonet and Wood 2008, eq. 6.28); plane strain in 2D.
+
+    Source: docs/theory.md, 5.3.
+    """
 
     name = "neo_hookean"
     parameters = NeoHookeanParameters
@@ -31,12 +34,12 @@ class NeoHookean(Law):
         return (parameters.shear_modulus, parameters.lame_lambda)
 
     def modes(self, parameters: NeoHookeanParameters, bound: StateBound) -> list[Mode]:
-        """d lambda + 2 mu s^2, with s the largest stretch.
+        """Return d lambda + 2 mu s^2, where s is the largest stretch.
 
         Under C dt, tau changes by mu (C b + b C^T) dt + lambda tr(C) dt I. In the principal frame of
         b = F F^T the normal entries see the matrix 2 mu diag(s_i^2) + lambda (1 1^T), the pairs of
-        shear entries mu (s_i^2 + s_j^2): none exceeds the sum above, which is exact at rest.
-        A compressed state is no stiffer, as lambda ln(J) I changes by lambda tr(C) dt at any J.
+        shear entries mu (s_i^2 + s_j^2): no eigenvalue exceeds the sum above, which is exact at rest.
+        Compression adds no stiffness, as lambda ln(J) I changes by lambda tr(C) dt at any J.
         """
         volumetric = self.dimension * max(parameters.lame_lambda, 0.0)
         return [Mode(volumetric + 2 * parameters.shear_modulus * bound.stretch_squared_max)]
@@ -54,7 +57,7 @@ class NeoHookean(Law):
 
     @ti.func
     def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
-        """mu/2 (tr b - d) - mu ln J + lambda/2 (ln J)^2, from F - I, so that small strains keep their digits."""
+        """mu/2 (tr b - d) - mu ln J + lambda/2 (ln J)^2, from F - I, which avoids cancellation at small strain."""
         H = deformation - ti.Matrix.identity(float, deformation.n)
         log_volume = log_ratio(volume_strain(H))
         stretch = H.trace() + 0.5 * (H * H).sum()

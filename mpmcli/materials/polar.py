@@ -1,8 +1,8 @@
-"""Rotation of a deformation gradient on the device, without singular values or eigenvalues."""
+"""Polar decomposition on the device, without singular values or eigenvalues (docs/theory.md, 5.10)."""
 
 import taichi as ti
 
-# Ten reach rounding from any stretches that numbers of 32 bits can tell from flat; inverted states need a few more.
+# Ten iterations reach rounding for all stretches that single precision distinguishes from 0; inverted states need more.
 ITERATIONS_MAX = 20
 
 
@@ -15,17 +15,17 @@ def rounding() -> float:
 def polar_rotation(F: ti.template()):
     """Return R of the polar decomposition F = R S: the rotation nearest to F, and so S symmetric.
 
-    Where det F < 0 it is a rotation too, and the smallest principal stretch counts as negative (Irving, Teran
-    and Fedkiw 2004), so that stress drives an inverted particle back. Where no rotation is nearest R is finite, but
-    none: F / |F| where F is flat to the last digit in two directions, 0 at F = 0, and anything with |R| < 2 sqrt(3)
-    for a mirror image, of which the two smallest stretches are equal in size.
+    R is a rotation for det F < 0 too: the smallest principal stretch is then negative (Irving, Teran and Fedkiw 2004),
+    so that the stress drives an inverted particle back. If the nearest rotation is not unique, R is finite but not a
+    rotation: F / |F| if two stretches vanish to rounding, 0 at F = 0, and a matrix with |R| < 2 sqrt(3) if
+    det F < 0 and the two smallest stretches are equal in size.
     """
     R = ti.Matrix.identity(float, F.n)
     if ti.static(F.n == 2):
         along = F[0, 0] + F[1, 1]
         across = F[1, 0] - F[0, 1]
         length = ti.sqrt(along * along + across * across)
-        # Where it is 0, F is symmetric and R = I one of many equally near rotations.
+        # For length 0, F is symmetric and traceless, and R = I is one of many equally near rotations.
         if length > 0.0:
             R = ti.Matrix([[along, -across], [across, along]]) / length
     else:
@@ -37,11 +37,11 @@ def polar_rotation(F: ti.template()):
 def newton_rotation(F: ti.template()):
     """Return the nearest rotation in 3D by Newton's iteration, R <- (a R + b R^-T)/2 with scaling.
 
-    R^-T is the cofactor matrix over det R. Any a and b leave the principal axes alone, so that det R may be
-    dropped: a and b scale each term to the norm of a rotation, which is Higham's Frobenius scaling (1986) and needs
-    no division by a small number. With b = 1/s_1, s_1 the largest stretch, a step takes signed stretches to
-    (s_1 + s_2 s_3/s_1, s_2 + s_3, s_2 + s_3), all positive: the way back from det F <= 0. Close to a rotation
-    a = b = 1 does as well and costs less.
+    R^-T is the cofactor matrix over det R. The iteration keeps the principal axes for any a and b, so that det R may be
+    dropped: a and b scale each term to the norm of a rotation. This is the Frobenius scaling of Higham (1986), without
+    a division by a small number. With b = 1/s_1, s_1 the largest stretch, a step takes signed stretches to
+    (s_1 + s_2 s_3/s_1, s_2 + s_3, s_2 + s_3), all positive, which treats det F <= 0. Near a rotation
+    a = b = 1 converges as fast and costs less.
     """
     X = F
     resolution = ti.static(rounding())
@@ -92,6 +92,6 @@ def newton_rotation(F: ti.template()):
 
 @ti.func
 def square_sum(A: ti.template()):
-    """Return |A|^2 of a 3 x 3 matrix, by rows: three short sums keep a processor busier than one long one."""
+    """Return |A|^2 of a 3 x 3 matrix, by rows: a processor overlaps three short sums, not the terms of one."""
     rows = ti.Vector([A[i, 0] * A[i, 0] + A[i, 1] * A[i, 1] + A[i, 2] * A[i, 2] for i in ti.static(range(3))])
     return rows[0] + rows[1] + rows[2]

@@ -1,4 +1,4 @@
-"""Finds the laws: every module of this package that defines `LAW`, and every plugin that was asked for."""
+"""Finds the laws: every module of this package that defines `LAW`, and every plugin given by --plugin."""
 
 import importlib
 import pkgutil
@@ -14,12 +14,12 @@ from mpmcli.errors import InputError
 from mpmcli.materials.law import Law
 from mpmcli.scene.material import MaterialParameters
 
-# Laws of plugins, and the file of each, by the name that scenes use.
+# Laws of plugins and their files, by the name that scenes use.
 _plugins: dict[str, tuple[type[Law], Path]] = {}
 
 
 def laws() -> dict[str, type[Law]]:
-    """Return every law by the name that scenes use for it, those of plugins last."""
+    """Return all laws by the name that scenes use, plugins last."""
     return _own_laws() | {name: law for name, (law, _) in _plugins.items()}
 
 
@@ -30,7 +30,7 @@ def parameter_models() -> tuple[type[MaterialParameters], ...]:
 
 
 def load_plugins(paths: Sequence[Path]) -> tuple[type[MaterialParameters], ...]:
-    """Load these plugins in place of any earlier ones, and return the parameter models of all laws.
+    """Replace all loaded plugins by these, and return the parameter models of all laws.
 
     Raises:
         InputError: as for `load_plugin`.
@@ -45,7 +45,7 @@ def load_plugin(path: Path) -> type[Law]:
     """Run a Python file that defines `LAW`, and add that law to the registry.
 
     Raises:
-        InputError: there is no such file, it fails, its LAW is no complete law, or the law's name is taken.
+        InputError: there is no such file, it fails, its LAW is incomplete, or the name of the law is taken.
     """
     module = _run(path)
     law = getattr(module, "LAW", None)
@@ -71,7 +71,7 @@ def _own_laws() -> dict[str, type[Law]]:
 
 
 def _run(path: Path) -> ModuleType:
-    """Return the module that a file makes; nothing is written beside it, and nothing can import it by name."""
+    """Execute a file and return it as a module, without writing a cache beside it."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -79,11 +79,11 @@ def _run(path: Path) -> ModuleType:
     except (OSError, UnicodeDecodeError) as error:
         said = error.strerror if isinstance(error, OSError) else "it is no text in UTF-8"
         raise InputError(f"{path}: the file cannot be read: {said}") from None
-    # The full path: Taichi reads the source of kernels from it, wherever the process is by then.
+    # The full path: Taichi reads the source of kernels from it later, possibly from another working directory.
     file = str(path.resolve())
     module = ModuleType(f"mpmcli_plugin_{len(_plugins)}_{path.stem}")
     module.__file__ = file
-    # Classes look for their own module here.
+    # Python looks up the module of a class here.
     sys.modules[module.__name__] = module
     try:
         exec(compile(text, file, "exec"), module.__dict__)
@@ -93,7 +93,7 @@ def _run(path: Path) -> ModuleType:
 
 
 def _place(path: Path, file: str, error: BaseException) -> str:
-    """Return the path, with the line of the file on which it failed."""
+    """Return the path with the line of the file that raised the error."""
     lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
     if isinstance(error, SyntaxError) and error.filename == file:
         lines.append(error.lineno)
@@ -106,7 +106,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _incomplete(law: object) -> str | None:
-    """Return what a law lacks, or None."""
+    """Return a sentence about what a law lacks, or None."""
     if not (isinstance(law, type) and issubclass(law, Law)):
         return f"LAW must be a subclass of mpmcli.materials.law.Law; found {law!r}"
     missing = [name for name in ("name", "parameters", "deformation") if not hasattr(law, name)]

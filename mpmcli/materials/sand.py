@@ -1,4 +1,4 @@
-"""Sand: elastic grains under pressure that slide on each other with friction, and fly apart without any."""
+"""Sand: Drucker-Prager plasticity, frictional under pressure and without stress in tension."""
 
 import math
 from collections.abc import Mapping
@@ -29,9 +29,9 @@ MU, LAMBDA, TIP, SLOPE, CORRECTION = range(5)
 
 # Dense sand, 24 to 96 MPa (US Army Corps of Engineers, EM 1110-1-1904, Settlement analysis, 1990).
 REAL_MODULUS = 5e7
-# ln J beyond which grains are scattered, and open no further: a lone one would, without end, and owe the way back.
+# Upper bound on the plastic volume strain, ln J. It caps dilation, so that loose grains can recompact.
 SCATTERED = 2.0
-# In 3D the cone lets a principal stress turn to tension above it.
+# Above this angle, degrees, the cone in 3D admits a tensile principal stress.
 STEEPEST_3D = 60.0
 
 
@@ -70,7 +70,7 @@ class SandParameters(HenckyParameters):
     @field_validator("friction_angle")
     @classmethod
     def _within_the_cone(cls, value: float, info: ValidationInfo) -> float:
-        """Refuse what a circular cone in 3D cannot be: triaxial extension reaches p (1 - 2 sin(phi) / sqrt(3))."""
+        """Reject angles whose cone in 3D admits tension: triaxial extension reaches p (1 - 2 sin(phi) / sqrt(3))."""
         in_3d = isinstance(info.context, dict) and scene_dimension(info) == 3
         if in_3d and value > STEEPEST_3D:
             raise flaw(
@@ -80,7 +80,7 @@ class SandParameters(HenckyParameters):
         return value
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
-        """Replace "auto" by the softest modulus that the scene allows, real sand's at most."""
+        """Replace "auto" by the softest modulus that the scene allows, at most that of real sand."""
         if self.youngs_modulus != "auto":
             return self, []
         soft = soft_youngs_modulus(self, bounds)
@@ -98,20 +98,21 @@ class SandParameters(HenckyParameters):
 
 @ti.data_oriented
 class Sand(HenckyLaw):
-    """Drucker-Prager plasticity on Hencky strain (Klar et al. 2016), matched to Mohr-Coulomb in plane strain.
+    """Drucker-Prager plasticity in Hencky strain (Klar et al. 2016), matched to Mohr-Coulomb in plane strain.
 
-    With p = -(lambda + 2 mu / d) tr e, the mean pressure, and s the deviator of tau, both in d dimensions,
+    The yield condition is (docs/theory.md, 5.7)
 
-        |s| <= sqrt(2) (p sin(phi) + c cos(phi)):
+        |s| <= sqrt(2) (p sin(phi) + c cos(phi)),
 
-    the largest shear stress in the plane is p sin(phi) + c cos(phi), so that phi is the friction angle that acts, in
-    2D and in 3D under plane strain. (Klar's alpha would match triaxial compression, and never yield in plane
-    strain from phi = 42.2 on; here, phi acts in triaxial compression as asin(3 sin(phi) / (2 sqrt(3) + sin(phi))).)
-    Sliding keeps tr e, and so makes no volume. Past the tip of the cone, at a tension of c cot(phi), the grains
-    come apart: the strain goes back to the tip, and what was taken is added to the plastic volume strain v.
-    Pressed together, the sand uses v up first and has pressure only then (after Tampubolon et al. 2017), so that
-    ln J = tr e + v, J being the total volume ratio, until it is scattered at v = 2. In 2D the stress out of the
-    plane is reported as the mean of those in it, which is what flow in plane strain takes it to.
+    where p = -(lambda + 2 mu / d) tr e is the mean pressure and s the deviator of tau, both in d dimensions. The
+    largest shear stress in the plane is then p sin(phi) + c cos(phi), so that phi is the effective friction angle in
+    2D, and in 3D under plane strain. (The alpha of Klar et al. matches triaxial compression; in plane strain it never
+    yields for phi >= 42.2 degrees. The angle in triaxial compression is asin(3 sin(phi) / (2 sqrt(3) + sin(phi))).)
+    Plastic shear keeps tr e and causes no dilation. Beyond the tip of the cone, at a tension of c cot(phi), the grains
+    separate: the strain returns to the tip, and the difference is added to the plastic volume strain v. Compression
+    first reduces v and causes pressure only at v = 0 (after Tampubolon et al. 2017). Therefore ln J = tr e + v, where J
+    is the total volume ratio; v is at most 2. In 2D the out-of-plane stress is the mean of the in-plane principal
+    stresses, which plastic flow in plane strain approaches.
     """
 
     name = "sand"
@@ -123,7 +124,7 @@ class Sand(HenckyLaw):
         self.closes = any(member.volume_correction for member in members)
 
     def constants(self, parameters: SandParameters) -> tuple[float, ...]:
-        """mu, lambda, the volume strain at the tip, |dev e| per volume strain below it, and whether v is closed."""
+        """Return mu, lambda, volume strain at the tip, |dev e| per volume strain below it, and volume_correction."""
         mu, lam = parameters.shear_modulus, parameters.lame_lambda
         bulk = lam + 2 * mu / self.dimension
         phi = math.radians(parameters.friction_angle)

@@ -1,4 +1,4 @@
-"""Snow: elastic within narrow bounds of the stretch, and harder the more it was packed."""
+"""Snow: fixed corotated elasticity with bounded stretches, and hardening by compaction."""
 
 import math
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from mpmcli.scene.quantity import Positive
 # Places in the vector of constants.
 MU, LAMBDA, SMALLEST_STRETCH, LARGEST_STRETCH, HARDENING, SMALLEST_PLASTIC_J, LARGEST_PLASTIC_J = range(7)
 
-# Without much hardening nothing else bounds the plastic volume ratio.
+# Bounds on the plastic volume ratio, for snow with little hardening.
 PACKED_MOST, LOOSE_MOST = 0.1, 10.0
 
 
@@ -60,7 +60,7 @@ class SnowParameters(ElasticParameters):
 
     @property
     def plastic_range(self) -> tuple[float, float]:
-        """Smallest and largest J_P that snow remembers."""
+        """Smallest and largest plastic volume ratio J_P, dimensionless."""
         reach = math.log(self.hardening_limit) / self.hardening if self.hardening > 0 else math.inf
         return max(1 - reach, PACKED_MOST), min(1 + reach, LOOSE_MOST)
 
@@ -74,13 +74,12 @@ class SnowParameters(ElasticParameters):
 class Snow(Law):
     """tau_i = h (2 mu (s_i - 1) s_i + lambda (J_E - 1) J_E), h = exp(hardening (1 - J_P)) (Stomakhin et al. 2013).
 
-    The elastic stretches s_i are clamped to [1 - critical_compression, 1 + critical_stretch], what they lose goes
-    into J_P, and the particle keeps F_E = Q diag(s) Q^T, with J_E = det F_E. Plane strain in 2D.
+    The elastic stretches s_i are clamped to [1 - critical_compression, 1 + critical_stretch], and the excess multiplies
+    J_P. The particle stores F_E = Q diag(s) Q^T, with J_E = det F_E (docs/theory.md, 5.6). Plane strain in 2D.
 
-    J_P is bounded so that h stays within [1/hardening_limit, hardening_limit]. Below, snow is as hard as it gets.
-    Above, J_P would grow without end in a flying fragment, which would then have to be crushed by as much before
-    it carried anything, and a heap of fragments would sink into itself; so it counts as loose snow. A mirror image,
-    det F_E < 0, counts as what it mirrors.
+    J_P is bounded so that h stays within [1/hardening_limit, hardening_limit]. The upper bound on J_P keeps fragments
+    in flight from expanding without limit; such fragments would have to be compressed by as much before they carried
+    load, and a heap of them would collapse. A state with det F_E < 0 is treated as its mirror image.
     """
 
     name = "snow"
@@ -103,15 +102,15 @@ class Snow(Law):
         )
 
     def modes(self, parameters: SnowParameters, bound: StateBound) -> list[Mode]:
-        """h times the stiffness of the fixed corotated solid, or that of packing where it is more.
+        """Return h times the stiffness of the fixed corotated solid, or the stiffness of packing if that is larger.
 
         In the principal frame the normal entries of tau see a matrix with one column per stretch: within its bounds
-        the elastic one, outside -hardening J_P tau_i, as only J_P and with it h changes. No eigenvalue exceeds
+        the elastic one, outside -hardening J_P tau_i, as only J_P and therefore h changes. No eigenvalue exceeds
         the largest sum of a column's absolute values, h (2 mu s (2s - 1) + d lambda J_E (2 J_E - 1)) or
-        d hardening J_P max|tau_i|. Shear entries are softer outside, where tau_i - tau_j grows no more.
+        d hardening J_P max|tau_i|. Shear entries are softer outside, where tau_i - tau_j is constant.
 
-        h is that of the state after the projection that comes next: a determinant below that of one stretch at its
-        lower bound and the rest at their largest packs J_P by as much.
+        h is evaluated after the next projection: a determinant below the product of one stretch at its lower bound
+        and the others at their largest reduces J_P by their ratio.
         """
         d = self.dimension
         low, high = 1 - parameters.critical_compression, 1 + parameters.critical_stretch
@@ -139,11 +138,11 @@ class Snow(Law):
         return 2 * parameters.shear_modulus * shear + abs(parameters.lame_lambda) * volume
 
     def stiffest(self, parameters: SnowParameters, bounds: SceneBounds) -> StateBound:
-        """Packed by a compaction wave, or by the column's weight.
+        """Return the state behind a compaction wave, or under the weight of the column.
 
-        Behind a wave that stops the speed v and packs by the strain e the stress is density (v^2/e + g H), by the
-        balance of momentum, and packs to the e where h(e) times the yield stress in confined compression is as much.
-        The density is the largest of any body, as a denser one may fall on the snow.
+        By the balance of momentum, the stress behind a wave that stops the speed v and compacts by the strain e is
+        density (v^2/e + g H). It compacts to the strain e for which h(e) times the yield stress in confined compression
+        equals it. The density is the largest of all bodies, because a denser one may fall on the snow.
         """
         low, high = 1 - parameters.critical_compression, 1 + parameters.critical_stretch
         modulus = 2 * parameters.shear_modulus + parameters.lame_lambda
@@ -174,7 +173,7 @@ class Snow(Law):
         F = deformation
         variables = internal
         Q, s = principal_stretches(F)
-        # A stretch that a projection has set must not pack again for its rounding.
+        # The rounding of a stretch set by an earlier projection must not count as plastic flow.
         slack = ti.static(6.0 * rounding())
         lost = 1.0
         flows = 0

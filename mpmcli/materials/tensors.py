@@ -1,12 +1,12 @@
-"""Small tensors: determinants of many at once on the host, and strains that keep their digits on the device."""
+"""Small tensors: determinants of arrays on the host, and strains without cancellation on the device."""
 
 import numpy as np
 import taichi as ti
 
 
 def determinant(F: np.ndarray) -> np.ndarray:
-    """Return det F, (n,), of 2 x 2 or 3 x 3 matrices, (n, d, d), written out: tenfold faster than a factorisation."""
-    # A run that breaks down may hold anything, and is still looked at.
+    """Return det F, (n,), of 2 x 2 or 3 x 3 matrices, (n, d, d), written out: ten times as fast as a factorisation."""
+    # A run that became unstable may hold any number, and is still examined.
     with np.errstate(over="ignore", invalid="ignore"):
         if F.shape[-1] == 2:
             return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
@@ -19,7 +19,7 @@ def determinant(F: np.ndarray) -> np.ndarray:
 
 @ti.func
 def volume_strain(H: ti.template()):
-    """Return det(I + H) - 1 from the displacement gradient H, without the cancellation near H = 0."""
+    """Return det(I + H) - 1 from the displacement gradient H, without cancellation near H = 0."""
     minors = H.determinant()
     if ti.static(H.n == 3):
         square = H @ H

@@ -1,4 +1,4 @@
-"""Viscoplastic fluid: rests below its yield stress and flows above, as lava, mud and paste do."""
+"""Viscoplastic fluid: elastic below its yield stress, viscous above; lava, mud, paste."""
 
 from typing import Annotated, Literal, Self
 
@@ -15,11 +15,11 @@ from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
 # Places in the vector of constants.
 BULK_MODULUS, SHEAR_MODULUS, YIELD_STRESS, CONSISTENCY, FLOW_INDEX, LARGEST_J = range(6)
 
-# The elastic shear strain at yield that shear_modulus = "auto" allows.
+# Largest elastic shear strain at yield for shear_modulus = "auto".
 YIELD_STRAIN = 0.05
-# The opening, as ln J, that leaves a torn particle 1/e of its shear stress.
+# Dilation, as ln J, that reduces the shear stress of a torn particle to 1/e.
 TEAR_STRAIN = 0.1
-# J below which a particle counts as inverted, and mean of the isochoric b above which it counts as flat.
+# A particle with J below the first is treated as inverted; with a mean of the isochoric b above the second, as flat.
 CRUSHED, FLAT = 1e-9, 100.0
 ITERATIONS_MAX = 30
 
@@ -60,7 +60,7 @@ class ViscoplasticParameters(WeaklyCompressibleParameters):
     ] = False
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
-        """Replace "auto" by the fluid's bulk modulus, and by a shear modulus that hardly shows."""
+        """Replace "auto" by the bulk modulus of the fluid, and by a shear modulus of small strain at yield."""
         bulk, shear, notes = self.bulk_modulus, self.shear_modulus, []
         if bulk == "auto":
             bulk, note = soft_bulk_modulus(self.density, self.compressibility, bounds)
@@ -78,14 +78,14 @@ class ViscoplasticParameters(WeaklyCompressibleParameters):
 class Viscoplastic(Law):
     """tau = K (J - 1) I + G dev(b) with b = J^(-2/d) F F^T, relaxing by ((q - yield_stress)/consistency)^(1/n).
 
-    An elastic solid up to the shear stress q = |dev tau|/sqrt(2) = yield_stress, which therefore stands still for
-    ever, and above it a fluid of shear stress yield_stress + consistency rate^n in steady flow, like the foam of Yue
-    et al. 2015. Relaxation is implicit over the step, so that no viscosity shortens the step. A particle stores the
-    lower triangular factor of its elastic F F^T, of which rotations say nothing, with det F the total volume ratio.
+    The material is an elastic solid for shear stresses q = |dev tau|/sqrt(2) up to yield_stress, and can rest
+    indefinitely. Above, the shear stress of steady flow is yield_stress + consistency rate^n (Yue et al. 2015;
+    docs/theory.md, 5.9). Relaxation is implicit over the step, so that viscosity does not limit the step. A particle
+    stores the lower triangular factor of its elastic F F^T, which omits the rotation; det F is the total volume ratio.
 
-    With tension_cutoff J is never remembered above 1, as in the fluid, and shear stress falls by J^(-1/TEAR_STRAIN):
-    what has opened by a tenth is torn and forgets, while the tremble of matter at rest costs it little. In 2D dev is
-    taken in the plane, with nothing deviatoric across it. Inverted and flat particles forget their shape.
+    With tension_cutoff the stored J is at most 1, as in the fluid, and the shear stress falls by J^(-1/TEAR_STRAIN):
+    material that has dilated by a tenth is torn, while small oscillations of material at rest change little. In 2D
+    dev is taken in the plane, without an out-of-plane deviator. Inverted and flat particles lose their shape.
     """
 
     name = "viscoplastic"
@@ -110,11 +110,12 @@ class Viscoplastic(Law):
         )
 
     def modes(self, parameters: ViscoplasticParameters, bound: StateBound) -> list[Mode]:
-        """d K J for volume, and 2 G b_max for shear, with b_max the largest eigenvalue of the isochoric b.
+        """Return d K J for volume, and 2 G b_max for shear, with b_max the largest eigenvalue of the isochoric b.
 
-        The two do not couple: C = c I leaves the isochoric b alone, and the rest of C changes dev b only, by
+        The two do not couple: C = c I does not change the isochoric b, and the rest of C changes dev b only, by
         G (b_i + b_j) at most for a pair of shear entries and by diag(2 G b_i) without its trace for the normal ones.
-        Relaxation shrinks what results, for any step. Far compressed matter in bulk is stiffer: K, see `fluid.CARRIED`.
+        Relaxation reduces the result for any step. Strongly compressed matter in bulk is stiffer: K, see
+        `fluid.CARRIED`.
         """
         largest = min(bound.volume_ratio_max, 1.0) if parameters.tension_cutoff else bound.volume_ratio_max
         smallest = max(bound.volume_ratio_min, CRUSHED)
@@ -142,7 +143,7 @@ class Viscoplastic(Law):
         if ti.static(self.tears):
             largest = constants[LARGEST_J]
             if largest < J:
-                # What rounding opens must not add up.
+                # Dilation by rounding must not accumulate.
                 opened = ti.static(1.0 + 8.0 * rounding())
                 if opened < J:
                     share *= J ** (-1.0 / TEAR_STRAIN)
@@ -157,10 +158,10 @@ class Viscoplastic(Law):
 
     @ti.func
     def remaining(self, q: float, modulus_time: float, constants: ti.template()):
-        """Return by which factor the shear stress q, Pa, relaxes: 1 below yield, else (yield_stress + x) / q.
+        """Return the factor by which the shear stress q, Pa, relaxes: 1 below yield, else (yield_stress + x) / q.
 
-        x solves x = over - G dt (x/consistency)^(1/n) with over = q - yield_stress, where for G stands G mean(b),
-        the modulus at finite strain (Simo and Hughes 1998, box 9.1); modulus_time is its product with dt, Pa s.
+        x solves x = over - G mean(b) dt (x/consistency)^(1/n) with over = q - yield_stress; G mean(b) is the modulus at
+        finite strain (Simo and Hughes 1998, box 9.1), and modulus_time its product with dt, Pa s.
         """
         over = q - constants[YIELD_STRESS]
         share = 1.0
@@ -169,7 +170,7 @@ class Viscoplastic(Law):
             if ti.static(self.bingham):
                 rest = over / (1.0 + modulus_time / constants[CONSISTENCY])
             else:
-                # As w + D w^n = 1, of the part w = 1 - x / over that relaxes, D = consistency (over / G dt)^n / over.
+                # The relaxed part w = 1 - x / over solves w + D w^n = 1, D = consistency (over / G dt)^n / over.
                 n = constants[FLOW_INDEX]
                 D = ti.min(constants[CONSISTENCY] * (over / modulus_time) ** n / over, 1e30)
                 if n > 1.0:
@@ -185,7 +186,7 @@ class Viscoplastic(Law):
         """K (J - 1 - ln J) + G/2 (tr b - d)."""
         J = ti.max(deformation.determinant(), CRUSHED)
         dev, mean = isochoric_parts(deformation, length_ratio(J, deformation.n))
-        # Of det(dev + mean I) = 1, so that small strains keep their digits.
+        # From det(dev + mean I) = 1, which avoids cancellation at small strain.
         excess = 0.5 * (dev * dev).sum() / (mean + 1.0)
         if ti.static(deformation.n == 3):
             excess = (0.5 * (dev * dev).sum() * mean - dev.determinant()) / (mean * mean + mean + 1.0)
@@ -211,11 +212,11 @@ def isochoric_parts(F: ti.template(), size: float):
 
 @ti.func
 def isochoric_mean(dev: ti.template(), above: float):
-    """Return m with det(dev + m I) = 1 and dev + m I positive definite, starting from some larger m."""
+    """Return m with det(dev + m I) = 1 and dev + m I positive definite; `above` is an upper bound on m."""
     square = 0.5 * (dev * dev).sum()
     m = ti.sqrt(1.0 + square)
     if ti.static(dev.n == 3):
-        # m^3 - square m + det dev = 1, convex from the root on: Newton's steps go down, and stop there.
+        # m^3 - square m + det dev = 1, convex above the root: Newton's method decreases to it.
         m = above
         constant = dev.determinant() - 1.0
         resolution = ti.static(4.0 * rounding())
@@ -234,7 +235,7 @@ def triangular_factor(dev: ti.template(), mean: float, J: float, size: float):
     F = ti.Matrix.zero(float, dev.n, dev.n)
     F[0, 0] = ti.sqrt(dev[0, 0] + mean)
     F[1, 0] = dev[1, 0] / F[0, 0]
-    # The last entry is that of a determinant which rounding does not change.
+    # The last entry follows from the determinant, so that rounding does not change the volume.
     if ti.static(dev.n == 2):
         F *= size
         F[1, 1] = J / F[0, 0]

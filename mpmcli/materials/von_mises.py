@@ -1,4 +1,4 @@
-"""Metal and clay: elastic up to a yield stress, and plastic flow at constant volume beyond it."""
+"""Metal and clay: elastic up to a yield stress, then plastic flow at constant volume."""
 
 import math
 from collections.abc import Mapping
@@ -49,7 +49,7 @@ class VonMisesParameters(HenckyParameters):
     )
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
-        """Replace "auto" by the softest modulus that the scene allows and that yields at a small strain."""
+        """Replace "auto" by the softest modulus that the scene allows and whose yield strain is small."""
         if self.youngs_modulus != "auto":
             return self, []
         soft = soft_youngs_modulus(self, bounds)
@@ -66,11 +66,11 @@ class VonMisesParameters(HenckyParameters):
 
 @ti.data_oriented
 class VonMises(HenckyLaw):
-    """J2 plasticity on Hencky strain with linear isotropic hardening: sqrt(3/2) |dev tau| <= yield_stress + H a.
+    """J2 plasticity in Hencky strain with linear isotropic hardening: sqrt(3/2) |dev tau| <= yield_stress + H a.
 
-    a is the equivalent plastic strain. The return is radial, and exact for linear hardening (Simo 1992; de Souza
-    Neto, Peric and Owen 2008, box 7.5); it keeps the volume. 2D is true plane strain: plastic flow along z is
-    made up by elastic strain along z, which the particle stores beside the elastic F of the plane.
+    a is the equivalent plastic strain. The return mapping is radial and exact for linear hardening (Simo 1992; de Souza
+    Neto, Peric and Owen 2008, box 7.5; docs/theory.md, 5.8), and keeps the volume. 2D is plane strain: elastic strain
+    along z balances plastic flow along z, and the particle stores it beside the in-plane elastic F.
     """
 
     name = "von_mises"
