@@ -1,6 +1,6 @@
 """What the example scenes should give, and how far a result is from it, one function per scene.
 
-Each takes an opened result and returns one phrase for the table of README.md.
+Each takes an opened result and returns one phrase for the table of docs/scenes.md.
 """
 
 import math

@@ -156,7 +156,7 @@ def test_the_frames_and_the_asked_step_are_heeded() -> None:
 
 
 def test_the_loss_is_that_of_the_law() -> None:
-    """0.024 (k h)^4 per step, and so more per second in smaller steps (verification: finding 2; H19)."""
+    """0.024 (k h)^4 per step, and so more per second in smaller steps (docs/theory.md, 2.4)."""
     assert wave_loss(2.0, 0.1, 1e-3) == pytest.approx(0.024 * (math.pi * 0.05) ** 4 / 1e-3)
     assert wave_loss(2.0, 0.1, 1e-4) == pytest.approx(10 * wave_loss(2.0, 0.1, 1e-3))
 

@@ -1,4 +1,4 @@
-"""The pictures of the README: there is one of every example scene, they are small, and the script makes them."""
+"""The pictures of docs/scenes.md: there is one of every example scene, they are small, and the script makes them."""
 
 import importlib.machinery
 import importlib.util
@@ -15,7 +15,7 @@ from PIL import Image
 from mpmcli.render.files.picture_file import digest_of
 
 PICTURES = ROOT / "docs" / "pictures"
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
 BYTES_MAX = 3e6
 
 
@@ -33,8 +33,8 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 def test_every_scene_has_a_picture_on_the_page(script: ModuleType) -> None:
     names = sorted(path.stem for path in (ROOT / "configs").glob("*.toml"))
     assert sorted(script.MONTAGES) == names
-    section = README[README.index("<!-- pictures:") : README.index("<!-- end of pictures -->")]
-    shown = re.findall(r"\(docs/pictures/(\w+)\.png\)", section)
+    section = PAGE[PAGE.index("<!-- pictures:") : PAGE.index("<!-- end of pictures -->")]
+    shown = re.findall(r"\(pictures/(\w+)\.png\)", section)
     assert sorted(shown) == names
     assert sorted(path.stem for path in PICTURES.glob("*.png")) == names
     for _, options in script.MONTAGES.values():

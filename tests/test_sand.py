@@ -1,4 +1,4 @@
-"""Sand: the return mapping (verification: 7.2), the friction angle that acts (7.1), cohesion, volume, wild states."""
+"""Sand: the return mapping (docs/theory.md, 5.7), the friction angle that acts (7.1), cohesion, volume, wild states."""
 
 import math
 from collections.abc import Callable, Iterator

@@ -199,7 +199,7 @@ def test_ticks_are_written_as_numbers(digit: int, power: int) -> None:
 
 
 def test_the_copy_in_the_documents_says_the_same_in_less(written: Path, tmp_path: Path, report: Report) -> None:
-    """Every run is a line of its JSON, and the README gets the table on top, with links into the copy."""
+    """Every run is a line of its JSON, and docs/validation.md gets the table on top, with links into the copy."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(ROOT / "scripts")
         patch.setattr(sys, "dont_write_bytecode", True)
@@ -217,4 +217,4 @@ def test_the_copy_in_the_documents_says_the_same_in_less(written: Path, tmp_path
     assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["invented.svg", "settings.svg"]
     told = script.headline(page).split("\n\n")
     assert [block.split()[0] for block in told] == ["mpmcli", "**1", "|"]
-    assert "[invented](docs/validation/report.md#invented)" in told[2]
+    assert "[invented](validation/report.md#invented)" in told[2]

@@ -20,7 +20,7 @@ def test_the_data_are_three_fronts_and_a_height() -> None:
 
 
 def test_the_series_of_the_larger_column_agree() -> None:
-    """(i), read off figure 3, and (iii), from table 2, are of one column: 2.5 %, T = 0.8 to 3.3 (verification: 6.4)."""
+    """(i), from figure 3, and (iii), from table 2, are of one column: 2.5 %, T = 0.8 to 3.3 (docs/theory.md, 10)."""
     i, _, iii = measured("front")
     here = (i.T > 0.8) & (i.T < 3.3)
     assert np.interp(i.T[here], iii.T, iii.value) == pytest.approx(i.value[here], rel=0.025)

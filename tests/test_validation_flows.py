@@ -11,7 +11,7 @@ from mpmcli.validation.transfer_loss import apic_factor
 
 @pytest.mark.parametrize(("time", "a"), [(0.2, 0.82082616), (0.76, 0.51426647), (1.0, 0.43946077), (2.0, 0.27181408)])
 def test_half_axis_is_the_published_one(time: float, a: float) -> None:
-    """The table of verification 6.3, and the same motion in other units of time."""
+    """The ellipse of docs/theory.md, 10, and the same motion in other units of time."""
     assert half_axis(time) == pytest.approx(a, abs=1e-8)
     assert half_axis(time / 50, 50.0) == pytest.approx(a, abs=1e-8)
 
@@ -26,7 +26,7 @@ def test_half_axis_solves_its_other_equation() -> None:
 
 
 def test_waves_swing_as_the_limits_say() -> None:
-    """The tank of verification 6.2; -(k a)^2/8 in deep water; no change by amplitude where k d = 1.058."""
+    """The tank of docs/theory.md, 10; -(k a)^2/8 in deep water; no change by amplitude where k d = 1.058."""
     assert standing_wave_frequency(9.81, np.pi, 0.5) == pytest.approx(5.316553, abs=5e-7)
     deep = standing_wave_frequency(9.81, 1.0, 40.0, 0.1) / standing_wave_frequency(9.81, 1.0, 40.0)
     assert deep == pytest.approx(1 - 0.1**2 / 8, abs=1e-12)

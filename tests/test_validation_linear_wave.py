@@ -1,4 +1,4 @@
-"""What linear analysis says of a wave, against its closed form (verification: 1.2)."""
+"""What linear analysis says of a wave, against its closed form (docs/theory.md, 2.4)."""
 
 import math
 

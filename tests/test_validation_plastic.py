@@ -14,7 +14,7 @@ from mpmcli.validation.setting import Setting
 
 
 def test_the_closed_form_of_confined_snow_is_the_table() -> None:
-    """Rows of verification 8, Pa."""
+    """Rows of the table of Stomakhin's law, Pa."""
     stretch = np.array([0.99, 0.97, 0.95, 0.90, 0.80])
     assert confined_stress(stretch) == pytest.approx(
         [-1555.5556, -4114.6219, -5157.7953, -9092.0187, -28526.1446], rel=1e-6
@@ -37,7 +37,7 @@ def test_snow_under_its_own_weight_is_as_high_as_the_sum_of_its_stretches() -> N
 
 @pytest.mark.slow
 def test_steep_sand_is_rejected_by_the_band_of_the_column(backend_of: Callable, record_property: Callable) -> None:
-    """A friction angle of 63 degrees runs out to half of the lower end of the band (verification: 7.5)."""
+    """A friction angle of 63 degrees runs out to half of the lower end of the band (docs/theory.md, 10)."""
     case, setting = all_cases()["sand_column_2"], Setting()
     n = case.levels["coarse"][0]
     tables = case.tables(n, setting)

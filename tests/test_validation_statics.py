@@ -11,7 +11,7 @@ from mpmcli.validation.cases import column_dynamic, column_static, spinning_disc
 from mpmcli.validation.elastica import Beam
 from mpmcli.validation.quasi_static import smooth_ramp, window_weights
 
-# P L^2 / EI, shortening / L, deflection / L, angle of the tip in degrees (verification: 5.1).
+# P L^2 / EI, shortening / L, deflection / L, angle of the tip in degrees (docs/theory.md, 10).
 ELASTICA = [
     (0.25, 0.004118, 0.082746, 7.121),
     (1, 0.056433, 0.301721, 26.434),
@@ -19,7 +19,7 @@ ELASTICA = [
     (5, 0.387628, 0.713792, 69.636),
     (10, 0.554996, 0.810609, 81.949),
 ]
-# Law, E, height at rest of a column of 50 m (verification: 4.1).
+# Law, E, height at rest of a column of 50 m (docs/theory.md, 10).
 SETTLED = [
     ("von_mises", 1e6, 49.03799142),
     ("neo_hookean", 1e6, 49.01333014),

@@ -121,7 +121,7 @@ def expected_steps(facts: SceneFacts) -> int:
 def wave_loss(thickness: float, spacing: float, step: float, settings: SolverSettings = USUAL) -> float:
     """Return the share of its energy that the longest wave across a body loses, 1/s, at a step (s).
 
-    With k = pi / thickness; the transfers damp per step, not per second (verification: finding 2).
+    With k = pi / thickness; the transfers damp per step, not per second (docs/theory.md, 2.4).
     """
     return loss_per_step(settings, math.pi * spacing / thickness) / step
 

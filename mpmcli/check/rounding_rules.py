@@ -8,7 +8,7 @@ from mpmcli.check.finding import Finding
 # Largest relative rounding error of a number of 32 bits.
 HALF_ULP = 2.0**-24
 # Rounding of a position over the way of the fastest particle in a step. At 1 such a particle stands still, and at a
-# tenth all that are ten times slower do (hard case H18; verification: 9.7).
+# tenth all that are ten times slower do (hard case H18; docs/theory.md, 8.3).
 LOST_MOTION = 0.1
 # Stress that the rounding of F makes, over the stress that gravity or speed makes (hard case H9).
 STRESS_NOISE = 0.01

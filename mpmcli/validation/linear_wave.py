@@ -1,4 +1,4 @@
-"""What one step of the scheme does to a small elastic wave, by von Neumann's analysis (verification: 1.2)."""
+"""What one step of the scheme does to a small elastic wave, by von Neumann's analysis (docs/theory.md, 2.4)."""
 
 from dataclasses import dataclass
 

@@ -14,7 +14,7 @@ def apic_factor(angles: Sequence[float], places: np.ndarray | None = None) -> fl
     Nodes hold one number per wave, so that a step multiplies it: with the weights w_i and the levers x_i - x_p in
     cells, by the mean over particles of |sum w_i e_i|^2 + 4 |sum w_i (x_i - x_p) e_i|^2, e_i = exp(i k.x_i). On a
     lattice it is a product over axes: A A + A B + B A in 2D. Hence 1 - 0.024 (kh)^4 along an axis, and
-    1 - 0.110 (kh)^4 for the wave vector (k, k) (verification: 6.5).
+    1 - 0.110 (kh)^4 for the wave vector (k, k) (docs/theory.md, 2.4).
 
     Args:
         angles: k h along each axis.

@@ -56,7 +56,7 @@ def edge_of_a_node() -> Outcome:
     """H7: the acceleration that one stressed particle gives a node at 1.499 h, lone, with a neighbour, in a corner.
 
     Node i receives w_i tau (x_i - x_p) 4 V0 / h^2, and as much mass as w_i says, so that no weight remains in the
-    acceleration: its components are at most 4 |tau| |x_i - x_p| / (rho h^2) <= 6 |tau| / (rho h) (verification: 10.1)
+    acceleration: its components are at most 4 |tau| |x_i - x_p| / (rho h^2) <= 6 |tau| / (rho h) (docs/theory.md, 6.1)
     """
     tau, dt = 1e4, 1e-6
     # J with the pressure tau per volume at rest: p J = K (1 - J).

@@ -100,7 +100,7 @@ def steep_sand() -> Outcome:
 
     A cube under a pressure that its inertia holds for the time of the test is sheared at a constant rate, faster than
     waves come in from its surface: sin(phi) = (s1 - s3) / (s1 + s3) in the plane, in its middle. Klar's alpha for 45
-    degrees never yields there (verification: 7.1).
+    degrees never yields there (docs/theory.md, 5.7).
     """
     E, nu, density, phi = 1e6, 0.3, 1600.0, 45.0
     sand = {**SAND, "youngs_modulus": E, "poissons_ratio": nu, "friction_angle": phi}

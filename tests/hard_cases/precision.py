@@ -70,7 +70,7 @@ def far_origin() -> Outcome:
     """H18: the same falling cube in a domain whose lower corner lies at 0, 1e3 and 1e6 m, in f32.
 
     Positions count from that corner, so that only their start is rounded, to 1e-16 of the distance. Stored from zero,
-    a step of v dt would be rounded by 6e-8 |x| / (v dt) (verification: 9.7).
+    a step of v dt would be rounded by 6e-8 |x| / (v dt) (docs/theory.md, 8.3).
     """
     places, rounded = {}, 0.0
     origins = (0.0, 1e3, 1e6)

@@ -104,7 +104,7 @@ def block_at_rest(steps: int) -> Outcome:
 def slosh(periods: int) -> Outcome:
     """H11: the first slosh mode of a tank of 1 m, 0.5 m deep, from linear waves at its greatest speed.
 
-    w^2 = g k tanh(k d), k = pi / L; the surface would rise by 0.02 m (verification: 6.2).
+    w^2 = g k tanh(k d), k = pi / L; the surface would rise by 0.02 m (docs/theory.md, 10).
     """
     n, depth, rise = 16, 0.5, 0.02
     h, k = 1 / n, np.pi

@@ -10,7 +10,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.solver import Solver
 
-# The bar of verification 1.1: fixed at x = 0, free at x = L unless its end is fixed too.
+# The bar of docs/theory.md, 10: fixed at x = 0, free at x = L unless its end is fixed too.
 L, YOUNG, DENSITY = 25.0, 100.0, 1.0
 C = np.sqrt(YOUNG / DENSITY)
 CELLS, STRIP = 13, 5
@@ -113,7 +113,7 @@ CASES = [
     HardCase(
         "H2",
         "ringing, null space",
-        "the fixed-free bar of verification 1.1 with 4 particles per cell and direction, 50 periods",
+        "the fixed-free bar with 4 particles per cell and direction, 50 periods",
         "velocities that the grid cannot see stay below 1e-2 v0",
         True,
         lambda: ringing(50),

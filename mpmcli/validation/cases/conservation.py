@@ -1,4 +1,4 @@
-"""Free bodies that spin and ring: momenta and energy over thousands of steps (verification: 9.1 to 9.3, 9.9)."""
+"""Free bodies that spin and ring: momenta and energy over thousands of steps (docs/theory.md, 10)."""
 
 import math
 from typing import Any

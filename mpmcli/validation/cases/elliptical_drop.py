@@ -22,7 +22,7 @@ class EllipticalDrop(Case):
     varies = ("precision", "kernel", "transfer", "per_axis", "safety")
     title = "Elliptical drop"
     group = "fluids"
-    source = "Monaghan 1994 (JCP 110:399); a(t) from its energy, verification 6.3"
+    source = "Monaghan 1994 (JCP 110:399); a(t) from its energy"
     resolution = "cells along the radius"
     levels = {"coarse": (10, 20), "default": (10, 20, 40), "fine": (20, 40, 80)}  # noqa: RUF012
     measures = (

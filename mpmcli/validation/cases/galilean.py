@@ -1,4 +1,4 @@
-"""A vibrating rod that flies through the grid, and one at rest: what motion adds to the error (verification: 9.6)."""
+"""A vibrating rod that flies through the grid, and one at rest: what motion adds to the error (docs/theory.md, 10)."""
 
 import math
 from typing import Any

@@ -51,7 +51,7 @@ class Hydrostatic(Case):
     name = "hydrostatic"
     title = "Hydrostatic column"
     group = "fluids"
-    source = "verification 6.1 b, with c = 10 sqrt(2 g H)"
+    source = "docs/theory.md, 10, with c = 10 sqrt(2 g H)"
     resolution = "cells along the height"
     levels = {"coarse": (16, 32), "default": (16, 32, 64), "fine": (32, 64, 128)}  # noqa: RUF012
     modulus = 100 * 2 * WEIGHT
@@ -118,7 +118,7 @@ class HydrostaticDrop(Case):
     varies = ("precision", "transfer", "walls")
     title = "Column of water let go"
     group = "fluids"
-    source = "d'Alembert's solution of the linear column, verification 4.2 and 6.1 a"
+    source = "d'Alembert's solution of the linear column"
     resolution = "cells along the height"
     levels = {"coarse": (16, 32), "default": (16, 32, 64), "fine": (32, 64, 128)}  # noqa: RUF012
     # Stiff, so that the column is nearly linear: its weight at rest compresses it by 0.1 % at the base. Sound runs as

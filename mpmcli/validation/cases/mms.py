@@ -1,4 +1,4 @@
-"""Manufactured solutions: a standing wave of large amplitude, made exact by a body force (verification: 1.3, 1.5)."""
+"""Manufactured solutions: a standing wave of large amplitude, made exact by a body force (docs/theory.md, 10)."""
 
 import math
 from typing import Any

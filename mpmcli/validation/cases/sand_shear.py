@@ -51,7 +51,7 @@ class SandShear(Case):
     )
     note = (
         "A law of plasticity in the solver, and no discretisation: homogeneous motion is exact. Klar's alpha, which is "
-        "that of triaxial compression, would act as 27.5 degrees here, 7.7 % too weak (verification: 7.1)."
+        "that of triaxial compression, would act as 27.5 degrees here, 7.7 % too weak (docs/theory.md, 5.7)."
     )
 
     def tables(self, n: int, setting: Setting) -> dict[str, Any]:

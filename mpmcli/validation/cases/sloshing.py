@@ -28,7 +28,7 @@ class Sloshing(Case):
     varies = ("precision", "kernel", "transfer", "walls", "safety")
     title = "Sloshing in a tank"
     group = "fluids"
-    source = "w^2 = g k tanh(k d); its change by amplitude: Tadjbakhsh and Keller 1960 (JFM 8:442); verification 6.2"
+    source = "w^2 = g k tanh(k d); its change by amplitude: Tadjbakhsh and Keller 1960 (JFM 8:442)"
     resolution = "cells along the tank"
     levels = {"coarse": (24, 32), "default": (24, 32, 64), "fine": (32, 64, 128)}  # noqa: RUF012
     measures = (

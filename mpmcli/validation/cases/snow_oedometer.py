@@ -18,7 +18,7 @@ STRIP = 5
 
 
 def confined_stress(stretch: np.ndarray) -> np.ndarray:
-    """Return the Cauchy stress along the axis at a stretch below 1, Pa (verification: 8, uniaxial rows).
+    """Return the Cauchy stress along the axis at a stretch below 1, Pa (docs/theory.md, 5.6).
 
     sigma = exp(xi (1 - J_P)) (2 mu (s - 1) s + lambda (J_E - 1) J_E) / J with the elastic stretch s = J_E, which is
     the stretch up to the critical compression, and J_P what is left of J.

@@ -33,7 +33,7 @@ class TaylorGreen(Case):
     name = "taylor_green"
     title = "Taylor-Green vortex"
     group = "fluids"
-    source = "Taylor and Green 1937 (Proc. R. Soc. A 158:499), a cell of it between slip walls; verification 6.5"
+    source = "Taylor and Green 1937 (Proc. R. Soc. A 158:499), a cell of it between slip walls"
     resolution = "cells along the box"
     levels = {"coarse": (16, 32), "default": (16, 32, 64), "fine": (32, 64, 128)}  # noqa: RUF012
     measures = (

@@ -1,4 +1,4 @@
-"""Two elastic disks that meet head on, and what that conserves (Sulsky, Chen and Schreyer 1994; verification: 3.1)."""
+"""Two elastic disks that meet head on, and what that conserves (Sulsky, Chen and Schreyer 1994; docs/theory.md, 10)."""
 
 import math
 from typing import Any

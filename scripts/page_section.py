@@ -1,17 +1,33 @@
-"""Parts of README.md that a command writes: the lines between a pair of markers."""
+"""Sections of the pages under docs/ that a command writes: the lines between a pair of markers."""
 
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-README = ROOT / "README.md"
+DOCS = ROOT / "docs"
 
 
-def replace_section(name: str, text: str, file: Path = README) -> None:
+def page_of(name: str) -> Path:
+    """Return the page of docs/ that has the section.
+
+    Raises:
+        ValueError: not exactly one page has it.
+    """
+    pages = [page for page in DOCS.glob("*.md") if f"<!-- {name}:" in page.read_text(encoding="utf-8")]
+    if len(pages) != 1:
+        raise ValueError(f"one page of docs/ needs a section <!-- {name}: ... -->, not {len(pages)}")
+    return pages[0]
+
+
+def replace_section(name: str, text: str, file: Path | None = None) -> None:
     """Put `text` between `<!-- NAME: ... -->` and `<!-- end of NAME -->`, each on a line of its own.
+
+    Args:
+        file: the page; by default the one of docs/ that has the section.
 
     Raises:
         ValueError: the file does not hold exactly one such pair.
     """
+    file = file or page_of(name)
     lines = file.read_text(encoding="utf-8").splitlines()
     starts = [i for i, line in enumerate(lines) if line.startswith(f"<!-- {name}:")]
     ends = [i for i, line in enumerate(lines) if line == f"<!-- end of {name} -->"]

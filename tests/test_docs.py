@@ -1,4 +1,4 @@
-"""The README: every command and every line of Python on it runs, and its tables come from the scripts."""
+"""The README and the pages of docs/: every command on them runs, links lead somewhere, tables come from the scripts."""
 
 import importlib.util
 import json
@@ -21,6 +21,12 @@ from mpmcli.scene import parse_scene, scene_to_toml
 from mpmcli.scene.functions import FUNCTIONS
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+# The README's commands come first: the others read the result that it makes.
+PAGES = {"README.md": README} | {
+    f"docs/{path.name}": path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").glob("*.md"))
+}
+# Written by scripts, and without commands.
+STUDIES = {"docs/hard-cases.md", "docs/stable-step.md"}
 
 # Commands that are run in a shorter form. The README gives the one of the demo itself.
 SHORTER = {
@@ -42,9 +48,38 @@ SLOW = {
 }
 
 
-def blocks(language: str) -> list[str]:
-    """The fenced blocks of a language, in order."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+def blocks(language: str, page: str) -> list[str]:
+    """Return the fenced blocks of a language on a page, in order."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", PAGES[page], re.MULTILINE | re.DOTALL)
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of the headings of a page, as GitHub makes them, and those that it sets itself."""
+    text = page.read_text(encoding="utf-8")
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    slugs = {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+    return slugs | set(re.findall(r'(?:id|name)="([^"]+)"', text))
+
+
+def test_the_readme_is_short() -> None:
+    assert len(README.splitlines()) <= 150
+
+
+def test_every_page_is_reached_from_the_readme_and_ends_in_something_that_runs() -> None:
+    for page in PAGES.keys() - {"README.md"}:
+        assert f"({page})" in README
+        assert page in STUDIES or blocks("sh", page), page
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_links_lead_somewhere(name: str) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", PAGES[name]):
+        if target.startswith("http"):
+            continue
+        place, _, anchor = target.partition("#")
+        path = (ROOT / name).parent / place if place else ROOT / name
+        assert path.exists(), f"{name}: {target}"
+        assert not anchor or anchor in anchors(path), f"{name}: {target}"
 
 
 def test_the_shorter_demo_is_what_the_readme_says():
@@ -54,15 +89,15 @@ def test_the_shorter_demo_is_what_the_readme_says():
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory) -> Path:
     """A copy of the repository, with the installation that scripts/demo would make, and drop.toml of the README."""
-    directory = tmp_path_factory.mktemp("readme") / "mpmcli"
+    directory = tmp_path_factory.mktemp("docs") / "mpmcli"
     directory.mkdir()
-    for name in ("configs", "scripts", "mpmcli", "README.md", "pyproject.toml", "constraints.txt"):
+    for name in ("configs", "docs", "scripts", "mpmcli", "README.md", "pyproject.toml", "constraints.txt"):
         source = ROOT / name
         if source.is_dir():
             shutil.copytree(source, directory / name, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(source, directory / name)
-    scene = blocks("toml")[0]
+    scene = blocks("toml", "README.md")[0]
     (directory / "drop.toml").write_text(scene, encoding="utf-8")
     programs = directory / ".venv" / "bin"
     programs.mkdir(parents=True)
@@ -77,8 +112,14 @@ def checkout(tmp_path_factory) -> Path:
 
 
 def run_commands(checkout: Path, *, slow: bool) -> dict[str, subprocess.CompletedProcess]:
-    """Run the commands of the README in order in the copy: those in SLOW, or all others."""
-    lines = [line for block in blocks("sh") for line in block.splitlines() if line and line not in NOT_RUN]
+    """Run the commands of all pages in order in the copy: those in SLOW, or all others."""
+    lines = [
+        line
+        for page in PAGES
+        for block in blocks("sh", page)
+        for line in block.splitlines()
+        if line and line not in NOT_RUN
+    ]
     environment = {**os.environ, "PATH": f"{checkout / '.venv' / 'bin'}{os.pathsep}{os.environ['PATH']}"}
     (checkout / "results").mkdir(exist_ok=True)
     return {
@@ -97,7 +138,7 @@ def failed(done: dict[str, subprocess.CompletedProcess]) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def commands(checkout) -> dict[str, subprocess.CompletedProcess]:
-    """What came of every command of the README but the slow ones."""
+    """What came of every command but the slow ones."""
     return run_commands(checkout, slow=False)
 
 
@@ -111,7 +152,7 @@ def test_every_slow_command_runs(checkout):
     done = run_commands(checkout, slow=True)
     assert set(done) == SLOW
     assert not failed(done)
-    page = (checkout / "README.md").read_text(encoding="utf-8")
+    page = (checkout / "docs" / "materials.md").read_text(encoding="utf-8")
     section = page[page.index("<!-- materials:") : page.index("<!-- end of materials -->")]
     # Of 2D alone, as it was asked for.
     assert "| `fluid` + `sand` |" in section and "3D" not in section
@@ -139,7 +180,7 @@ def test_the_commands_make_what_the_readme_says(commands, checkout):
 
 def test_three_lines_of_h5py_read_a_result(commands, checkout, monkeypatch):
     monkeypatch.chdir(checkout)
-    (code,) = blocks("python")
+    (code,) = blocks("python", "docs/results.md")
     assert len(code.splitlines()) == 3
     result = open_result(checkout / "results" / "drop")
     expected = list(result.frames([]))
@@ -159,12 +200,13 @@ def test_three_lines_of_h5py_read_a_result(commands, checkout, monkeypatch):
         names["file"].close()
 
 
-def test_the_ledger_of_the_readme_is_complete():
-    told = README[README.index("**The ledger**") : README.index("While a run goes on")]
+def test_the_table_of_the_ledger_is_complete():
+    page = PAGES["docs/results.md"]
+    told = page[page.index("## The ledger") : page.index("## Streams")]
     assert set(COLUMNS) <= set(re.findall(r"`(\w+)`", told))
 
 
-def test_the_keys_of_the_readme_are_those_of_a_scene():
+def test_the_table_of_keys_is_complete():
     """Each row of the table of keys names keys of its table, and all of them."""
     from mpmcli.scene.domain import Domain
     from mpmcli.scene.schema import Body, Force, Output, SolverSettings, Time
@@ -178,21 +220,23 @@ def test_the_keys_of_the_readme_are_those_of_a_scene():
         "[solver]": SolverSettings,
     }
     for table, model in models.items():
-        row = next(line for line in README.splitlines() if line.startswith(f"| `{table}` |"))
+        row = next(line for line in PAGES["docs/scenes.md"].splitlines() if line.startswith(f"| `{table}` |"))
         missing = set(model.model_fields) - set(re.findall(r"`(\w+)`", row))
         assert not missing, f"{table}: {missing}"
 
 
-def test_the_expressions_of_the_readme_belong_to_its_scene():
+def test_the_expressions_of_the_page_belong_to_the_first_scene():
     """Put into the first scene, the fragment makes another that loads, and says what it said."""
-    scene, fragment = (tomllib.loads(block) for block in blocks("toml"))
+    scene = tomllib.loads(blocks("toml", "README.md")[0])
+    fragment = tomllib.loads(blocks("toml", "docs/scenes.md")[0])
     scene["domain"] |= fragment["domain"]
     scene["bodies"][0] |= fragment["bodies"][0]
     loaded = parse_scene({**scene, "forces": fragment["forces"]}, laws=parameter_models()).scene
     text = scene_to_toml(loaded)
     for line in ('gravity = ["sin(2 * t)", -9.81]', 'acceleration = ["-40 * (x - X)", "5 if t < 0.1 else 0"]'):
         assert line in text.splitlines()
-    told = README[README.index("### Forces and initial") : README.index("## Materials")]
+    page = PAGES["docs/scenes.md"]
+    told = page[page.index("## Forces and initial") : page.index("## Example scenes")]
     assert set(FUNCTIONS) <= set(re.findall(r"\w+", told))
 
 
@@ -216,7 +260,8 @@ def scripts(monkeypatch):
 def test_the_scene_table_covers_every_config(scripts):
     known = scripts("known_answers.py").KNOWN_ANSWERS
     assert sorted(known) == sorted(path.stem for path in (ROOT / "configs").glob("*.toml"))
-    section = README[README.index("<!-- scenes:") : README.index("<!-- end of scenes -->")]
+    page = PAGES["docs/scenes.md"]
+    section = page[page.index("<!-- scenes:") : page.index("<!-- end of scenes -->")]
     assert all(section.count(f"`{name}`") == 2 for name in known)
 
 
@@ -244,7 +289,7 @@ def test_the_known_answer_of_the_drop_measures_an_error(scripts, tmp_path):
 def test_a_section_is_replaced_between_its_markers(scripts, tmp_path):
     file = tmp_path / "page.md"
     file.write_text("before\n<!-- t: by hand -->\nold\n<!-- end of t -->\nafter\n", encoding="utf-8")
-    replace_section = scripts("readme_section.py").replace_section
+    replace_section = scripts("page_section.py").replace_section
     replace_section("t", "new\n\nlines\n", file)
     assert file.read_text(encoding="utf-8") == "before\n<!-- t: by hand -->\nnew\n\nlines\n<!-- end of t -->\nafter\n"
     with pytest.raises(ValueError, match="needs one <!-- u"):
@@ -252,8 +297,8 @@ def test_a_section_is_replaced_between_its_markers(scripts, tmp_path):
 
 
 def test_the_bench_table_is_written_from_its_json(commands, checkout):
-    """The command of the README wrote it into the README of the copy."""
-    page = (checkout / "README.md").read_text(encoding="utf-8")
+    """The command of the page wrote it into the page of the copy."""
+    page = (checkout / "docs" / "speed.md").read_text(encoding="utf-8")
     section = page[page.index("<!-- bench:") : page.index("<!-- end of bench -->")]
     report = json.loads((checkout / "results" / "bench.json").read_text(encoding="utf-8"))
     assert f"**{report['cases'][0]['ratio']:.1f}**" in section
