@@ -29,8 +29,8 @@ MATERIALS = {
 }
 # Of the name of each scene: the materials of its bodies, its dimension, and further tables.
 SCENES = {name: ((name,), 2, {}) for name in MATERIALS} | {
-    "3D, two laws": (("fluid", "snow"), 3, {}),
-    "several bodies, FLIP": (("sand", "sand", "fluid"), 2, {"solver": {"transfer": "aflip", "flip": 0.9}}),
+    "3D": (("fluid",), 3, {}),
+    "several bodies, FLIP": (("fluid", "fluid"), 2, {"solver": {"transfer": "aflip", "flip": 0.9}}),
     "forces": (("fluid", "neo_hookean"), 2, {"forces": [{"acceleration": ["3*sin(20*t) - 5*x", "2*X"]}]}),
 }
 NAMES = tuple(SCENES)
