@@ -1,51 +1,25 @@
-"""The parts of a page, before it is Markdown or HTML."""
+"""The blocks of a page, as Markdown."""
 
-from dataclasses import dataclass
-
-
-@dataclass(frozen=True)
-class Heading:
-    """A heading of level 1, 2 or 3, and what links to it call it."""
-
-    level: int
-    text: str
-    anchor: str = ""
+from collections.abc import Collection, Iterable, Sequence
 
 
-@dataclass(frozen=True)
-class Paragraph:
-    """A paragraph; `code`, **bold** and [text](link) as in Markdown."""
-
-    text: str
+def heading(level: int, text: str, anchor: str = "") -> str:
+    """Return a heading of level 1, 2 or 3, and the anchor that links to it name."""
+    return (f'<a id="{anchor}"></a>\n\n' if anchor else "") + f"{'#' * level} {text}"
 
 
-@dataclass(frozen=True)
-class Bullets:
-    """A list of lines, each as a paragraph."""
-
-    lines: tuple[str, ...]
+def bullets(lines: Iterable[str]) -> str:
+    """Return a list of lines."""
+    return "\n".join(f"* {line}" for line in lines)
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table; the columns numbered in `right` are aligned to the right. Cells as in a paragraph.
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], right: Collection[int], folded: str = "") -> str:
+    """Return a table; the columns numbered in `right` are aligned to the right.
 
-    Attributes:
-        folded: whether a page that can do so hides it until it is asked for; what it is called then.
+    Args:
+        folded: summary of a table that is hidden until it is opened; "" where it is not.
     """
-
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    right: frozenset[int] = frozenset()
-    folded: str = ""
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure of its own file; `text` says what it shows to whoever does not see it."""
-
-    name: str
-    text: str
-
-
-Block = Heading | Paragraph | Bullets | Table | Picture
+    rule = ["---:" if column in right else "---" for column in range(len(head))]
+    lines = (" | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in row) for row in (head, rule, *rows))
+    text = "\n".join(f"| {line} |" for line in lines)
+    return f"<details>\n<summary>{folded}</summary>\n\n{text}\n\n</details>" if folded else text

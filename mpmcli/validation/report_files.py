@@ -10,7 +10,6 @@ from mpmcli.validation.figure_settings import draw_settings
 from mpmcli.validation.figures import draw_case
 from mpmcli.validation.journal import FIGURES
 from mpmcli.validation.page_html import to_html
-from mpmcli.validation.page_markdown import to_markdown
 from mpmcli.validation.report import Report
 from mpmcli.validation.report_page import SETTINGS_FIGURE, TITLE, figure_name, report_page
 
@@ -24,11 +23,11 @@ def write_report(report: Report, directory: Path) -> None:
     pictures = {figure_name(entry): draw_case(entry) for entry in report.case_reports}
     if len(report.compared) > 1:
         pictures[SETTINGS_FIGURE] = draw_settings(report.compared)
-    blocks = report_page(report)
+    page = report_page(report)
     texts = {
         "report.json": json.dumps(finite_json(report.as_dict()), indent=1, ensure_ascii=False, allow_nan=False) + "\n",
-        "report.md": to_markdown(blocks, FIGURES),
-        "report.html": to_html(TITLE, blocks, pictures),
+        "report.md": page,
+        "report.html": to_html(TITLE, page, {f"{FIGURES}/{name}": picture for name, picture in pictures.items()}),
     }
     try:
         (directory / FIGURES).mkdir(exist_ok=True)

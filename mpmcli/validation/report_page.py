@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 from mpmcli.validation.choice import outcome, reason
 from mpmcli.validation.comparison import Compared, Ratios
+from mpmcli.validation.journal import FIGURES
 from mpmcli.validation.matrix import label_of
-from mpmcli.validation.page import Block, Bullets, Heading, Paragraph, Picture, Table
+from mpmcli.validation.page import bullets, heading, table
 from mpmcli.validation.report import SUMMARY, CaseReport, Report, RunRow, seconds_text, summary_row
 from mpmcli.validation.setting import Setting
 
@@ -40,15 +41,15 @@ READING = (
 )
 
 
-def report_page(report: Report) -> list[Block]:
-    """Return the whole page."""
-    blocks: list[Block] = [
-        Heading(1, TITLE),
-        Paragraph(INTRODUCTION),
-        Paragraph(_environment(report)),
-        Paragraph(_outcome(report)),
+def report_page(report: Report) -> str:
+    """Return the whole page as Markdown; its figures are links to files in FIGURES, beside it."""
+    blocks: list[str] = [
+        heading(1, TITLE),
+        INTRODUCTION,
+        _environment(report),
+        _outcome(report),
         _summary(report),
-        Paragraph(
+        (
             "Error, n and order are of the default setting, the order between its two finest resolutions (of those "
             "before a floor, where a case says that it has one). "
             "The cheapest setting is the one that reaches an error of 1 % in the least seconds, interpolated between "
@@ -60,20 +61,22 @@ def report_page(report: Report) -> list[Block]:
     ]
     if len(report.compared) > 1:
         blocks += _settings(report)
-    blocks += [Heading(2, "How to read the figures"), Bullets(READING)]
+    blocks += [heading(2, "How to read the figures"), bullets(READING)]
     blocks.append(
-        Paragraph(
-            "Scenes that break solvers of this kind have no error to measure; how they end is in `docs/hard-cases.md`, "
-            "and how far the largest stable step is from the true one in `docs/stable-step.md`."
-        )
+        "Scenes that break solvers of this kind have no error to measure; how they end is in `docs/hard-cases.md`, "
+        "and how far the largest stable step is from the true one in `docs/stable-step.md`."
     )
     group = None
     for entry in report.case_reports:
         if entry.case.group != group:
             group = entry.case.group
-            blocks.append(Heading(2, GROUPS[group]))
+            blocks.append(heading(2, GROUPS[group]))
         blocks += _case(entry)
-    return blocks
+    return "\n\n".join(blocks) + "\n"
+
+
+def _picture(name: str, text: str) -> str:
+    return f"![{text}]({FIGURES}/{name})"
 
 
 def figure_name(entry: CaseReport) -> str:
@@ -109,40 +112,40 @@ def _outcome(report: Report) -> str:
     return f"**{passed} of {len(entries)} cases pass.** {len(runs)} runs{failed}."
 
 
-def _summary(report: Report) -> Table:
+def _summary(report: Report) -> str:
     rows = []
     for entry in report.case_reports:
         name, verdict, *rest = summary_row(entry)
         rows.append((f"[{name}](#{name})", entry.case.title, verdict if verdict == "pass" else f"**{verdict}**", *rest))
-    return Table((SUMMARY[0], "problem", *SUMMARY[1:]), tuple(rows), frozenset({3, 4, 5, 7, 8}))
+    return table((SUMMARY[0], "problem", *SUMMARY[1:]), rows, {3, 4, 5, 7, 8})
 
 
-def _failures(report: Report) -> list[Block]:
+def _failures(report: Report) -> list[str]:
     lines = [f"**{e.case.name}** {reason}" for e in report.case_reports for reason in e.verdict.reasons]
-    return [Heading(2, "What failed"), Bullets(tuple(lines))] if lines else []
+    return [heading(2, "What failed"), bullets(lines)] if lines else []
 
 
-def _settings(report: Report) -> list[Block]:
+def _settings(report: Report) -> list[str]:
     rows = [
         (entry.label, _ratio(entry.error), _ratio(entry.seconds), _ratio(entry.to_equal), _failed(entry))
         for entry in report.compared
     ]
     head = ("setting", "error at equal n", "seconds at equal n", "seconds to an equal error", "runs that failed")
     return [
-        Heading(2, "What each setting does"),
-        Paragraph(
+        heading(2, "What each setting does"),
+        (
             "Each setting changes one thing of the default. Figures are ratios to the default setting, below 1 is "
             "better: the geometric mean over the cases, and in brackets the best and the worst case. An equal error is "
             "the smallest one that both reach; where one is better than that at its coarsest, or the other never gets "
             "there, the true ratio is larger still. Errors of nothing but round-off are left out. The Courant "
             "fraction is varied at one resolution only. In the figure a dot is a case, the marker is the mean."
         ),
-        Table(head, tuple(rows), frozenset({1, 2, 3, 4})),
-        Picture(SETTINGS_FIGURE, "Ratios of error and time of every setting to those of the default one"),
-        Heading(2, "Why the defaults are what they are"),
-        Paragraph(outcome(report.compared)),
-        Bullets(tuple(reason(entry) for entry in report.compared)),
-        Paragraph(BEYOND),
+        table(head, rows, {1, 2, 3, 4}),
+        _picture(SETTINGS_FIGURE, "Ratios of error and time of every setting to those of the default one"),
+        heading(2, "Why the defaults are what they are"),
+        outcome(report.compared),
+        bullets(reason(entry) for entry in report.compared),
+        BEYOND,
     ]
 
 
@@ -156,33 +159,31 @@ def _failed(entry: Compared) -> str:
     return f"{entry.failed} of {entry.runs}" if entry.failed else "0"
 
 
-def _case(entry: CaseReport) -> list[Block]:
+def _case(entry: CaseReport) -> list[str]:
     case = entry.case
     measures = [
         f"**{measure.name}**{f' ({measure.unit})' if measure.unit else ''}: {measure.text}" for measure in case.measures
     ]
-    blocks: list[Block] = [
-        Heading(3, case.title, case.name),
-        Paragraph(
-            f"`mpmcli validate {case.name}`; {entry.verdict.word}. Source: {case.source}. n counts {case.resolution}."
-        ),
-        Bullets(tuple(measures)),
+    blocks: list[str] = [
+        heading(3, case.title, case.name),
+        f"`mpmcli validate {case.name}`; {entry.verdict.word}. Source: {case.source}. n counts {case.resolution}.",
+        bullets(measures),
     ]
     if case.note:
-        blocks.append(Paragraph(case.note))
-    blocks += [Paragraph(reason) for reason in entry.verdict.reasons]
-    blocks.append(Picture(figure_name(entry), f"{case.title}: error against cost, resolution and Courant fraction"))
+        blocks.append(case.note)
+    blocks += entry.verdict.reasons
+    blocks.append(_picture(figure_name(entry), f"{case.title}: error against cost, resolution and Courant fraction"))
     blocks.append(_checks(entry))
     named = [f"{measure.name}{f', {measure.unit}' if measure.unit else ''}" for measure in case.measures]
     costs = ("order", "particles", "steps", "seconds", "M particle-steps/s", "compile s")
     rows = tuple(_run(row, [measure.name for measure in case.measures]) for row in entry.rows)
-    right = frozenset(range(1, 2 + len(named) + len(costs)))
+    right = range(1, 2 + len(named) + len(costs))
     head = ("setting", "n", *named, *costs, "outcome")
-    blocks.append(Table(head, rows, right, folded=f"All {len(rows)} runs of {case.name}"))
+    blocks.append(table(head, rows, right, folded=f"All {len(rows)} runs of {case.name}"))
     return blocks
 
 
-def _checks(entry: CaseReport) -> Table:
+def _checks(entry: CaseReport) -> str:
     rows = [
         (
             check.subject,
@@ -195,7 +196,7 @@ def _checks(entry: CaseReport) -> Table:
         for check in entry.verdict.checks
     ]
     head = ("measure", "setting", "n", "value", "bound", "verdict")
-    return Table(head, tuple(rows), frozenset({2, 3, 4}))
+    return table(head, rows, {2, 3, 4})
 
 
 def _run(row: RunRow, measures: Sequence[str]) -> tuple[str, ...]:
