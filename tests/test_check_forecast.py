@@ -178,5 +178,5 @@ def test_the_command_probes_and_writes_nothing(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(Solver, "step", broken)
     outcome = run_here("check", path, "--threads", "2")
     assert outcome.status == 1
-    assert "error: The run broke down within 0 steps of the probe: the run became unstable" in outcome.stdout
+    assert "error: The run became unstable within 0 steps of the probe: the run became unstable" in outcome.stdout
     assert "not ok: 1 error" in outcome.stdout

@@ -11,6 +11,7 @@ from check_scenes import FLUID, SOLID, box, check, found, loaded
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import SEVERITIES
 from mpmcli.check.rounding_rules import HALF_ULP, LOST_MOTION, STRESS_NOISE
+from mpmcli.materials.registry import laws
 
 H = 1 / 64
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e7}
@@ -256,3 +257,10 @@ def test_findings_are_sentences_and_sorted() -> None:
     for finding in findings:
         for sentence in (finding.what, finding.fix):
             assert sentence[0].isupper() and sentence.endswith(".") and ".." not in sentence
+
+
+def test_a_law_declares_the_parameters_that_set_its_stiffness(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The fix of the wave limit names the first of `Law.stiffness_parameters`, with its value."""
+    monkeypatch.setattr(laws()["fluid"], "stiffness_parameters", ("unknown", "density"))
+    (limit,) = (one for one in check().limits if (one.name, one.state) == ("wave", "rest"))
+    assert limit.fix.startswith("A quarter of density = 1000 or ")

@@ -170,7 +170,7 @@ def test_stiffness_is_the_largest_within_the_bound(probes: Probes, exponent: flo
 def test_viscous_modes(probes: Probes, d: int) -> None:
     """2 mu for shear and (2 - 2d/3) mu + d zeta for volume: the eigenvalues of d tau / dC.
 
-    With zeta = 2/3 mu viscosity acts on tr C like on shear, and the step's bound is that of docs/theory.md, 6.1
+    With zeta = 2/3 mu viscosity acts on tr C like on shear, and the step's bound is that of docs/theory.md, 6.2
     d (c dt/h)^2 + 4 nu dt/h^2 <= 1.
     """
     mu = 3.0

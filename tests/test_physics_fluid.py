@@ -1,4 +1,4 @@
-"""A viscous film against its closed form (docs/theory.md, 2.4)."""
+"""A viscous film against its closed form (docs/theory.md, 10)."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ DENSITY = 1000.0
 
 
 def test_a_viscous_film_runs_down_with_its_profile(backend_of: Callable, record_property: Callable) -> None:
-    """u = g sin(theta) (2 H y - y^2) / (2 nu) in the end, and the start-up series before it (docs/theory.md, 2.4).
+    """u = g sin(theta) (2 H y - y^2) / (2 nu) in the end, and the start-up series before it (docs/theory.md, 10).
 
     A film H deep on a stick wall at theta = 45 degrees, at rest under its own pressure, judged in the middle third of
     its length L = 20 H while neither end has come near. From rest the flow misses its end by the modes
@@ -41,7 +41,7 @@ def test_a_viscous_film_runs_down_with_its_profile(backend_of: Callable, record_
     solver.groups[0].set_deformation(1 / (1 + DENSITY * GRAVITY * np.cos(theta) * (H - Y) / modulus))
     step, limit = solver.stable_step()
     assert (limit.name, limit.body) == ("viscosity", "oil")
-    # That of shear, which sound has no part in (docs/theory.md, 6.1).
+    # That of shear, which sound has no part in (docs/theory.md, 6.2).
     assert step == pytest.approx(asked.time.safety * h**2 / (4 * nu))
     middle = (length * H / 3 < X) & (2 * length * H / 3 > X)
     y = np.unique(np.round(Y, 9))

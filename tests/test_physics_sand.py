@@ -1,4 +1,4 @@
-"""Sand that is tossed and lands (hard case H16). How it collapses and shears is in the validation cases."""
+"""Sand that is tossed and lands (docs/hard-cases.md, H16). How it collapses and shears is in the validation cases."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Layers on an inclined plane: which sand and which mud stay, and how fast the others flow (docs/theory.md, 5.7)."""
+"""Layers on an inclined plane: which sand and which mud stay, and how fast the others flow (docs/theory.md, 10)."""
 
 from collections.abc import Callable
 
@@ -53,7 +53,7 @@ def hencky_stretch(tau: np.ndarray) -> np.ndarray:
 def test_sand_stays_on_a_gentle_slope_and_flows_on_a_steep_one(
     backend_of: Callable, phi: float, stays: bool, record_property: Callable
 ) -> None:
-    """A layer between two end walls on a stick floor: binary, 2 degrees off the friction angle (docs/theory.md, 5.7).
+    """A layer between two end walls on a stick floor: binary, 2 degrees off the friction angle (docs/theory.md, 10).
 
     It starts from sigma_xx = sigma_yy = -rho g cos(theta) (H - y), sigma_xy = rho g sin(theta) (H - y). Where sand
     flows like this, in simple shear at constant volume, its stress is aligned with its rate, at 45 degrees to the

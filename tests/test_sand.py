@@ -1,4 +1,4 @@
-"""Sand: the return mapping (docs/theory.md, 5.7), the friction angle that acts (7.1), cohesion, volume, wild states."""
+"""Sand (docs/theory.md, 5.7): return mapping, effective friction angle, cohesion, volume, extreme states."""
 
 import math
 from collections.abc import Callable, Iterator

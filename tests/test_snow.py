@@ -17,7 +17,7 @@ PARAMETERS = SnowParameters(density=400.0)
 MU, LAMBDA = PARAMETERS.shear_modulus, PARAMETERS.lame_lambda
 LOW, HIGH = 1 - 0.025, 1 + 0.0075
 EPSILON = {"f64": 2.3e-16, "f32": 1.2e-7}
-# Path, stretch, and what the table of docs/theory.md, 5.6, says of J_P, h, tau_11 and sigma_11.
+# Path, stretch, and J_P, h, tau_11 and sigma_11 by the formulas of docs/theory.md, 5.6, to six digits.
 TABLE = [
     ("uniaxial", 0.99, 1, 1, -1540.0, -1555.5556),
     ("uniaxial", 0.97, 0.99487179, 1.05262, -3991.1832, -4114.6219),
@@ -87,7 +87,7 @@ def follow(probe: LawProbe, F: np.ndarray, increments: int) -> Response:
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_every_row_of_the_table(probes: Probes, d: int) -> None:
-    """J_P, h, tau, sigma of docs/theory.md, 5.6: to its digits; as formulas to 1e-10 in f64 and 1e-5 in f32."""
+    """J_P, h, tau, sigma of TABLE: all digits as tabulated; as formulas to 1e-10 in f64 and 1e-5 in f32."""
     rows = [row for row in TABLE if row[0] in ("uniaxial", f"isotropic {d}D")]
     F = np.array([table_state(path, stretch, d) for path, stretch, *_ in rows]).astype(probes.real).astype(float)
     answer = probes[d](F)

@@ -1,1 +1,1 @@
-"""What `mpmcli check` finds: in a scene before it runs, and in a result after."""
+"""`mpmcli check`: the check of a scene before it runs, and of a result after."""

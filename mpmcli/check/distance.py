@@ -1,4 +1,4 @@
-"""How far apart two shapes are."""
+"""Distance between two shapes."""
 
 from collections.abc import Iterator
 
@@ -8,13 +8,13 @@ from mpmcli.check.extent import edge_distances
 from mpmcli.scene import Scene
 from mpmcli.scene.shapes import Ball, Box, Cylinder, Form, Polygon
 
-# Alternating projections end where a round moves the point by less than this fraction of the distance.
+# Alternating projections end when an iteration changes the distance by less than this fraction of it.
 SETTLED = 1e-6
 ROUNDS = 500
 
 
 def close_pairs(scene: Scene, reach: float) -> Iterator[tuple[int, int, float]]:
-    """Yield (i, j, distance in m) for every two bodies no further apart than `reach`."""
+    """Yield (i, j, distance in m) for every two bodies no farther apart than `reach`, m."""
     bounds = [body.shape.form.bounds() for body in scene.bodies]
     lowers, uppers = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
     for j in range(1, len(bounds)):
@@ -26,7 +26,7 @@ def close_pairs(scene: Scene, reach: float) -> Iterator[tuple[int, int, float]]:
 
 
 def distance_between(first: Form, second: Form) -> float:
-    """Return the distance of two shapes that do not overlap, m; exact, but for cylinders, where it is iterated."""
+    """Return the distance of two shapes that do not overlap, m; iterative for two cylinders or box and cylinder."""
     if isinstance(first, Ball):
         return max(0.0, distance_from(np.array(first.center), second) - first.radius)
     if isinstance(second, Ball):
@@ -49,7 +49,7 @@ def distance_from(point: np.ndarray, form: Form) -> float:
 
 
 def _outline(form: Form) -> np.ndarray:
-    """Return the corners of a polygon, or of a rectangle, in order, (k, 2)."""
+    """Return the vertices of a polygon or rectangle in order, (k, 2), m."""
     if isinstance(form, Polygon):
         return np.array(form.vertices)
     (x0, y0), (x1, y1) = form.bounds()
@@ -75,7 +75,7 @@ def _nearest_in(point: np.ndarray, form: Form) -> np.ndarray:
 
 
 def _distance_of_convex(first: Form, second: Form) -> float:
-    """Return the distance of two convex shapes by projecting a point on each in turn (Cheney and Goldstein 1959)."""
+    """Return the distance of two convex shapes, m, by alternating projections (Cheney and Goldstein 1959)."""
     b = np.mean(second.bounds(), axis=0)
     before = np.inf
     for _ in range(ROUNDS):

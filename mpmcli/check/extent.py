@@ -1,4 +1,4 @@
-"""How thick a shape is: what the grid has to resolve."""
+"""Thickness of a shape, which the grid has to resolve."""
 
 import math
 from collections.abc import Collection
@@ -8,16 +8,14 @@ import numpy as np
 from mpmcli.scene import Scene
 from mpmcli.scene.shapes import Ball, Box, Cylinder, Form, Polygon
 
-# Of the extent of a polygon, to which its inscribed circle is found.
+# Accuracy of the inscribed circle of a polygon, relative to the extent of the polygon.
 RESOLUTION = 1e-3
-
-
-# Of a cell, within which a body reaches a wall.
+# Distance from a wall, in cells, below which a body touches it.
 TOUCHING = 1e-3
 
 
 def spanned_axes(scene: Scene, form: Form) -> set[int]:
-    """Return the axes along which a box reaches from wall to wall and slips on both: a slice of endless matter."""
+    """Return the axes along which a box spans the domain between walls without "stick", as unbounded matter does."""
     if not isinstance(form, Box):
         return set()
     domain = scene.domain
@@ -34,7 +32,7 @@ def spanned_axes(scene: Scene, form: Form) -> set[int]:
 def thickness(form: Form, endless: Collection[int] = ()) -> float:
     """Return the diameter of the largest ball that fits into a shape, m: its thinnest extent where it is convex.
 
-    Of a box, axes along which it is `endless` do not count, unless all are.
+    The axes in `endless` are ignored for a box, unless all axes are in it.
     """
     if isinstance(form, Ball):
         return 2 * form.radius
@@ -47,13 +45,13 @@ def thickness(form: Form, endless: Collection[int] = ()) -> float:
 
 
 def height_along(form: Form, direction: np.ndarray) -> float:
-    """Return the extent of the bounding box of a shape along a unit vector, (d,), m."""
+    """Return the extent of the bounding box of a shape along a unit vector, (d,); m."""
     lower, upper = form.bounds()
     return float((upper - lower) @ np.abs(direction))
 
 
 def edge_distances(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Return the distance of each point, (n, 2), from the outline of a polygon, (k, 2): (n,)."""
+    """Return the distance of each point, (n, 2), from the outline of a polygon, (k, 2): (n,), m."""
     nearest = np.full(len(points), np.inf)
     for a, b in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
         t = np.clip((points - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
@@ -64,8 +62,8 @@ def edge_distances(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 def _inradius(form: Polygon) -> float:
     """Return the radius of the largest circle inside a polygon.
 
-    Squares that may still hold a better centre are halved until none can be better by RESOLUTION: no point of a
-    square is further from the outline than its centre is, plus half a diagonal.
+    Squares that may contain a better centre are halved until none can improve the result by RESOLUTION. No point of
+    a square is farther from the outline than the centre of the square plus half a diagonal.
     """
     vertices = np.array(form.vertices)
     lower, upper = form.bounds()

@@ -1,4 +1,4 @@
-"""What the rules of a check read: the scene, and everything that is worked out of it once."""
+"""Quantities of a scene that the rules of the check share, each computed once."""
 
 import math
 from dataclasses import dataclass
@@ -15,14 +15,15 @@ from mpmcli.scene import Body, Scene, SceneBounds, scene_bounds
 
 @dataclass(frozen=True, eq=False)
 class BodyFacts:
-    """One body.
+    """Quantities of one body.
 
     Attributes:
-        body: as the scene has it; law: of this body alone.
-        arrival: where its free flight ends.
-        thickness: of its thinnest extent, m; that across the whole domain is none, where its walls let it slip.
-        height: extent along gravity, m; the largest one where there is no gravity.
-        stiffness, stiffest: largest of any mode at rest and in the stiffest state, Pa.
+        body: body of the scene.
+        law: instance of its law for this body only.
+        arrival: end of its free flight.
+        thickness: smallest extent, m, without axes along which the body spans the domain and slips on the walls.
+        height: extent along gravity, m; the largest extent if there is no gravity.
+        stiffness, stiffest: largest stiffness of any mode, Pa, at rest and in the stiffest state.
     """
 
     body: Body
@@ -40,38 +41,39 @@ class BodyFacts:
 
     @property
     def wave_speed(self) -> float:
-        """sqrt(S / (d density)) in the stiffest state, m/s: of a fluid the speed of sound, sqrt(K / density)."""
+        """sqrt(S / (d density)) in the stiffest state, m/s; the speed of sound sqrt(K / density) of a fluid."""
         return float(np.sqrt(self.stiffest / (self.law.dimension * self.body.material.density)))
 
     @property
     def own_loss(self) -> float:
         """Rate at which the material itself damps a wave across the body, 1/s: 2 nu k^2, k = pi / thickness.
 
-        That of plastic flow is not known before, and counts as infinite.
+        The rate of plastic flow is not known before the run, and is taken as infinite.
         """
         if self.law.deformation == "F" and self.law.projects:
             return math.inf
         modes = self.law.modes(self.body.material, StateBound())
-        # A mode has twice the viscosity.
+        # The viscosity of a mode is twice that of the material.
         viscosity = max(mode.viscosity for mode in modes) / self.body.material.density
         k = math.pi / self.thickness
-        # Products overflow to infinity, where powers raise an error.
+        # A product overflows to infinity; a power would raise OverflowError.
         return viscosity * k * k if viscosity else 0.0
 
     @property
     def flows(self) -> bool:
-        """Whether the body may change its shape for good."""
+        """Whether the body may deform permanently."""
         return self.law.deformation == "J" or self.law.projects
 
 
 class SceneFacts:
-    """A scene, and what follows from it; cheap parts at once and the rest when it is asked for.
+    """Quantities of a scene; those of the bodies are computed on first use.
 
     Attributes:
-        scene: the scene; bounds: what it can reach.
-        limits: every bound on its step.
-        bodies: facts of each body, in the scene's order.
-        binding, binding_at_start: the bound that is smallest throughout, and at the start.
+        scene: the scene.
+        bounds: largest speed, gravity, height and density that the scene can reach.
+        limits: all bounds on the step.
+        bodies: quantities of each body, in the order of the scene.
+        binding, binding_at_start: smallest bound throughout, and at the start.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -83,8 +85,8 @@ class SceneFacts:
 
     @cached_property
     def bodies(self) -> tuple[BodyFacts, ...]:
-        """Facts of each body."""
-        # Of a gravity that depends on time, that of the start.
+        """Quantities of each body, in the order of the scene."""
+        # Gravity that depends on time is taken at the start.
         down = np.nan_to_num(self.scene.domain.gravity_at(0.0))
         g = float(np.linalg.norm(down))
         found = []
@@ -108,7 +110,7 @@ class SceneFacts:
 
     @property
     def step(self) -> float:
-        """safety times the smallest bound that the scene can reach, s."""
+        """safety times the smallest bound in any state that the scene can reach, s."""
         return self.scene.time.safety * self.binding.value
 
     @property
@@ -117,16 +119,16 @@ class SceneFacts:
         return self.scene.time.safety * self.binding_at_start.value
 
     def taken(self, step: float) -> float:
-        """Return the step that a run takes where `step` is stable, s: time.step and the frames' interval cap it."""
+        """Return the step of a run in which `step` (s) is stable: at most time.step and the interval of the frames."""
         asked = self.scene.time.step
         return min(step, self.interval, step if asked == "auto" else asked)
 
     @property
     def interval(self) -> float:
-        """Time between two frames, s."""
+        """Interval between two frames, s."""
         return self.scene.time.end / self.scene.time.frames
 
     @property
     def first_contact(self) -> float:
-        """Time of the first contact of any body, s: until then no material is stiffer than at rest."""
+        """Time of the first contact of any body, s; until then no material is stiffer than at rest."""
         return min(facts.arrival.time for facts in self.bodies)

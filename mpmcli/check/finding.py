@@ -1,26 +1,26 @@
-"""One thing that a check found, with what triggers it and what to change."""
+"""Findings of a check: each states what is wrong, the number that shows it, and what to change."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Literal
 
 Severity = Literal["error", "warning", "note"]
-# From the gravest down.
+# In decreasing order of severity.
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a check found.
+    """One finding of a check.
 
     Attributes:
-        severity: "error": the run or result cannot be trusted; "warning": it probably cannot; "note": good to know.
+        severity: "error": the run or result is wrong; "warning": it is probably wrong; "note": information only.
         rule: short name of the rule, such as "thin-body".
-        what: one sentence that says what was found, with its numbers and units.
-        fix: one sentence that says what to change.
-        value: the number that triggers it, None where there is none.
-        body: name of the body concerned, "" where it is not a single one.
-        frame: index of the first frame concerned, None for a scene, or where it is none in particular.
+        what: one sentence that states the finding, with numbers and units.
+        fix: one sentence that states what to change.
+        value: number that triggers the finding, or None.
+        body: name of the body concerned, "" if there is no single one.
+        frame: index of the first frame concerned, None for a scene or if there is no particular frame.
     """
 
     severity: Severity
@@ -37,7 +37,7 @@ class Finding:
         return f"{self.severity}: {self.what} {self.fix}"
 
     def as_dict(self) -> dict:
-        """Return it as JSON can hold it."""
+        """Return the finding as a dictionary for JSON."""
         return dict(vars(self))
 
 
@@ -65,7 +65,7 @@ class _Seen:
 
 
 class FrameFindings:
-    """Findings by rule; a fault that goes on from frame to frame is one finding, not hundreds."""
+    """Findings of a result by rule. A fault that persists over frames is one finding, at its first frame."""
 
     def __init__(self) -> None:
         self._seen: dict[tuple[str, str, str], _Seen] = {}
@@ -81,11 +81,11 @@ class FrameFindings:
         body: str = "",
         kind: str = "",
     ) -> None:
-        """Note a fault.
+        """Add a fault.
 
         Args:
             what: a sentence without its period.
-            kind: tells faults of one rule apart that are to be told each for itself, such as the array's name.
+            kind: distinguishes faults of one rule that are reported separately, such as the name of an array.
         """
         key = (severity, rule, kind)
         if key not in self._seen:
@@ -94,18 +94,18 @@ class FrameFindings:
             self._seen[key].frames.add(frame)
 
     def frames_of(self, rule: str) -> set[int]:
-        """Return the frames that a rule has found fault with."""
+        """Return the numbers of the frames with findings of a rule."""
         return set().union(*(seen.frames for seen in self._seen.values() if seen.rule == rule))
 
     def found(self) -> tuple[Finding, ...]:
-        """Return all of it, the gravest first, and by frame among the equally grave."""
+        """Return all findings by severity, and by frame within a severity."""
         ordered = sorted(self._seen.values(), key=lambda seen: -1 if seen.frame is None else seen.frame)
         return gravest_first(_finding(seen) for seen in ordered)
 
 
 def _finding(seen: _Seen) -> Finding:
     more = len(seen.frames) - 1
-    suffix = f"; so it is in {more} more frame{'s' if more > 1 else ''}" if more > 0 else ""
+    suffix = f"; the same is found in {more} more frame{'s' if more > 1 else ''}" if more > 0 else ""
     return Finding(
         seen.severity, seen.rule, f"{seen.what}{suffix}.", seen.fix, value=seen.value, body=seen.body, frame=seen.frame
     )

@@ -1,4 +1,4 @@
-"""When each body first meets a wall or another body, and how fast: until then it flies freely and stays as it is."""
+"""Time and speed of the first contact of each body; until then it is in free flight and does not deform."""
 
 import math
 from dataclasses import dataclass
@@ -8,17 +8,17 @@ import numpy as np
 from mpmcli.scene import Scene, scene_bounds
 from mpmcli.scene.initial import moves_unevenly
 
-# Cells between two things that meet through the grid already.
+# Distance, in cells, below which two bodies, or a body and a wall, interact through the grid.
 CONTACT = 1.0
 
 
 @dataclass(frozen=True)
 class Arrival:
-    """Where the free flight of a body ends.
+    """End of the free flight of a body.
 
     Attributes:
-        time: of its first contact, s; 0 where it is in contact from the start, infinite where it never is.
-        speed: at which it closes in on whatever it first meets along each axis, the largest, m/s.
+        time: first contact, s; 0 if it is in contact at the start, infinite if there is no contact.
+        speed: largest closing speed, m/s, over the walls and bodies that it meets.
     """
 
     time: float
@@ -26,10 +26,10 @@ class Arrival:
 
 
 def arrivals(scene: Scene) -> list[Arrival]:
-    """Return the arrival of each body, of its bounding box, from its velocity, gravity, walls and the other bodies.
+    """Return the arrival of the bounding box of each body, from velocities, gravity, walls and the other bodies.
 
-    Bodies fall alike, so that two of them approach each other steadily. How they rotate and deform is left out. Where
-    forces act, or gravity or a velocity is an expression, nothing is known of the flight: all bodies count as arrived.
+    All bodies have the same acceleration, so that two approach each other at constant velocity. Rotation and
+    deformation are ignored. If forces act, or gravity or a velocity is an expression, all bodies arrive at time 0.
     """
     if scene.forces or not scene.domain.steady or any(moves_unevenly(body) for body in scene.bodies):
         return [Arrival(0.0, scene_bounds(scene).speed)] * len(scene.bodies)
@@ -57,34 +57,34 @@ def arrivals(scene: Scene) -> list[Arrival]:
 
 
 def _fall(gap: float, speed: float, gravity: float, reach: float) -> tuple[float, float]:
-    """Return when a gap that closes at `speed` and faster by `gravity` (m/s^2) is down to `reach`, and the speed then.
+    """Return the time, s, at which a gap that closes at `speed` and accelerates by `gravity` is `reach`, and the speed.
 
-    A body that is there already has the speed at which it goes on closing.
+    If the gap is smaller than `reach` already, the speed is that at which it closes.
     """
     left = gap - reach
     if left <= 0:
-        # Through what is left of the gap it still gathers speed.
+        # It accelerates over the remaining gap.
         return 0.0, math.sqrt(max(0.0, max(speed, 0.0) ** 2 + 2 * gravity * max(gap, 0.0)))
     square = speed**2 + 2 * gravity * left
     if square < 0 or (speed <= 0 and gravity <= 0):
         return math.inf, 0.0
     arrival = math.sqrt(square)
-    # The root of speed t + gravity t^2/2 = left that does not cancel.
+    # The root of speed t + gravity t^2/2 = left without cancellation.
     time = 2 * left / (speed + arrival) if speed > 0 else (arrival - speed) / gravity
     return time, math.sqrt(max(0.0, speed**2 + 2 * gravity * gap))
 
 
 def _meetings(low: np.ndarray, high: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Return when a box first overlaps others, (n,), s; infinite where it never does.
+    """Return the time at which a box first overlaps each of n others, (n,), s; infinite if it does not.
 
     Args:
-        low, high: (n, d), how far it has to go for the overlap to begin and to end along each axis, m.
-        velocity: (n, d), its velocity relative to each of the others, m/s.
+        low, high: displacement at which the overlap along each axis begins and ends, (n, d), m.
+        velocity: velocity relative to each of the others, (n, d), m/s.
     """
     moving = velocity != 0
     safe = np.where(moving, velocity, 1.0)
     ends = np.sort(np.stack([low / safe, high / safe]), axis=0)
-    # Along an axis without motion they overlap always, or never.
+    # Along an axis without relative motion they overlap always or never.
     always = (low <= 0) & (high >= 0)
     enter = np.where(moving, ends[0], np.where(always, -np.inf, np.inf))
     leave = np.where(moving, ends[1], np.where(always, np.inf, -np.inf))

@@ -1,4 +1,4 @@
-"""What a run will take: steps, time, memory and disk, before it starts."""
+"""Forecast of the steps, time, memory and disk space of a run."""
 
 import math
 from dataclasses import dataclass
@@ -14,37 +14,40 @@ from mpmcli.solver.plan import Plan
 from mpmcli.solver.solver import POSITION_ERROR
 from mpmcli.stability.transfer_factors import loss_per_step
 
-# Bytes of a packed file beside its particles, measured on files of 51 to 151 frames in 2D and 3D: the headers of
-# its data sets, and per frame the tables of steps and ledger without momenta.
+# Bytes of a packed file without particles, measured on files of 51 to 151 frames in 2D and 3D: headers of the data
+# sets, and per frame the tables of steps and ledger without momenta.
 HEADER_BYTES = 21_500
 FRAME_BYTES = 324
-# Base64 makes 4 bytes of 3. A particle is a cell of its own: number, offset and type; text around them.
+# Base64 encodes 3 bytes as 4. Each particle is one cell, with number, offset and type; the rest is XML.
 BASE64 = 4 / 3
 CELL_BYTES = 24
 VTU_BYTES = 1300
-# Seconds to make a frame durable, and bytes that a disk takes in a second, as measured where the output of five scenes
-# took 20 to 40 ms a frame.
+# Seconds to flush a frame to disk, and bytes per second of a disk, measured where output of five scenes took 20 to
+# 40 ms per frame.
 FRAME_SECONDS = 0.015
 DISK_BYTES_PER_SECOND = 4e8
 # A frame is written once as a segment, read, written into the packed file, and compared: four passes.
 DISK_PASSES = 4
-# Knobs of a scene that chooses none.
+# Default solver settings.
 USUAL = SolverSettings()
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a run will take.
+    """Forecast of a run.
 
     Attributes:
-        steps: expected number of time steps; steps_range: if every step were as at the start, and if every one were
-            as in the stiffest state.
-        frames: stored frames, that at 0 included.
-        seconds: wall time of the run, None without a probe; compile_seconds: of it, for the kernels.
+        steps: expected number of time steps.
+        steps_range: number of steps with the step of the start, and with the step of the stiffest state.
+        frames: number of stored frames, including the first.
+        seconds: wall time of the run, None without a probe.
+        compile_seconds: part of it for the compilation of kernels, None without a probe.
         step_seconds: wall time of a step, None without a probe.
-        device_bytes: of all fields on the device; host_bytes: of the arrays of one frame and the initial state.
-        file_bytes: of the packed file, not compressed; vtk_bytes: of the series of --format vtk.
-        dissipation: share of its energy per second that a wave twice as long as the thinnest body loses, 1/s.
+        device_bytes: size of all fields on the device.
+        host_bytes: size of the arrays of one frame and of the initial state.
+        file_bytes: size of the packed file without compression.
+        vtk_bytes: size of the series of --format vtk.
+        dissipation: share of energy per second lost by a wave twice as long as the thinnest body, 1/s.
     """
 
     steps: int
@@ -60,12 +63,12 @@ class Forecast:
     dissipation: float
 
     def as_dict(self) -> dict:
-        """Return it as JSON can hold it."""
+        """Return the forecast as a dictionary for JSON."""
         return {**vars(self), "steps_range": list(self.steps_range)}
 
 
 def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
-    """Return what a run of the scene will take; times only where a probe has measured them."""
+    """Return the forecast of a run; times are None without a probe."""
     scene = facts.scene
     steps = expected_steps(facts)
     file_bytes = packed_bytes(scene, plan.particles)
@@ -100,15 +103,15 @@ def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
 
 
 def steps_at(facts: SceneFacts, step: float) -> int:
-    """Return the steps of a run in which `step` (s) is stable throughout: equal ones end on each frame."""
-    # As the solver splits an interval, with its tolerance for round-off.
+    """Return the number of steps of a run in which `step` (s) is stable; equal steps end on each frame."""
+    # The same division of an interval, with the same tolerance for round-off, as in the solver.
     return facts.scene.time.frames * max(1, math.ceil(facts.interval / facts.taken(step) - 1e-6))
 
 
 def expected_steps(facts: SceneFacts) -> int:
-    """Return the expected number of steps: those of rest up to the first contact, then those of the stiffest state.
+    """Return the expected number of steps: steps of rest until the first contact, then steps of the stiffest state.
 
-    Elastic bodies go on ringing after they were hit, and what has hardened stays hard. Frames split both parts.
+    Elastic bodies keep oscillating after an impact, and hardening is permanent. Frames divide both parts.
     """
     frames = facts.scene.time.frames
     free = min(1.0, facts.first_contact / facts.scene.time.end)
@@ -119,15 +122,15 @@ def expected_steps(facts: SceneFacts) -> int:
 
 
 def wave_loss(thickness: float, spacing: float, step: float, settings: SolverSettings = USUAL) -> float:
-    """Return the share of its energy that the longest wave across a body loses, 1/s, at a step (s).
+    """Return the share of energy per second that the longest wave across a body loses at a step (s), 1/s.
 
-    With k = pi / thickness; the transfers damp per step, not per second (docs/theory.md, 2.4).
+    Its wave number is k = pi / thickness. The transfers damp per step, not per second (docs/theory.md, 2.4).
     """
     return loss_per_step(settings, math.pi * spacing / thickness) / step
 
 
 def layout_of(scene: Scene) -> FrameLayout:
-    """Return the layout of the frames that a run will store."""
+    """Return the layout of the frames of a run."""
     d = scene.dimension
     real = "float64" if scene.solver.precision == "f64" else "float32"
     far = float(np.abs([scene.domain.origin, scene.domain.upper]).max())

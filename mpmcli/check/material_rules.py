@@ -1,4 +1,4 @@
-"""Rules on materials in their scene: too fast, too soft, nearly incompressible, too unequal, too steep."""
+"""Rules on materials: impact speed, softness, locking, density ratio, friction angle."""
 
 import math
 from collections.abc import Iterator
@@ -6,22 +6,21 @@ from collections.abc import Iterator
 from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
 
-# Poisson's ratio from which linear fields of one particle per quarter cell lock (H10).
+# Poisson's ratio above which displacement fields of four particles per cell lock (docs/hard-cases.md, H10).
 LOCKING = 0.49
-# Densities further apart make the light body follow the heavy one within a step (H4).
+# Ratio of densities above which the light body follows the heavy one within a step (docs/hard-cases.md, H4).
 DENSITY_RATIO = 100.0
-# Speed over wave speed: the density of a fluid varies by its square, and 0.1 is the most that "auto" allows. A block of
-# linear fluid that hits a wall at five times its speed of sound is crushed to nothing.
+# Ratios of speed to wave speed. The density of a fluid varies by the square, and "auto" allows at most 0.1. A block of
+# linear fluid that hits a wall at five times its speed of sound collapses.
 FAST, SUPERSONIC = 1 / 3, 1.0
-# Weight of the column over Young's modulus: a third is the strain under which a body is no longer the shape that was
-# drawn.
+# Ratio of the weight of a column to Young's modulus above which the body does not keep its initial shape.
 SOFT = 0.3
-# Degrees by which the friction angle that acts in triaxial extension may exceed the one that was asked for.
+# Degrees by which the friction angle in triaxial extension may exceed the given one.
 STEEP = 10.0
 
 
 def material_findings(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield what is to be said of the materials."""
+    """Yield the findings on materials."""
     flowing = any(body.flows for body in facts.bodies)
     for body in facts.bodies:
         yield from _impact(facts, body, flowing=flowing)
@@ -32,7 +31,7 @@ def material_findings(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _impact(facts: SceneFacts, body: BodyFacts, *, flowing: bool) -> Iterator[Finding]:
-    """What keeps its shape meets others as fast as it falls; what flows, and whatever it may hit, at any speed."""
+    """Yield impact speeds near the wave speed; in scenes with flow any body may be hit at the highest speed."""
     speed = facts.bounds.speed if flowing else body.arrival.speed
     if body.wave_speed == 0 or speed <= FAST * body.wave_speed:
         return
@@ -87,7 +86,7 @@ def _locking(body: BodyFacts) -> Iterator[Finding]:
 
 
 def _friction(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
-    """The cone that is matched to plane strain acts in triaxial compression and extension as another angle."""
+    """Yield the friction angles in triaxial compression and extension of a cone matched to plane strain."""
     angle = getattr(body.body.material, "friction_angle", None)
     if angle is None or facts.scene.dimension == 2:
         return

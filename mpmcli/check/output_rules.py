@@ -1,4 +1,4 @@
-"""Rules on what is stored, and where it has room: frames, the disk, memory."""
+"""Rules on output: number of frames, disk space, memory."""
 
 import shutil
 from collections.abc import Iterator
@@ -11,14 +11,14 @@ from mpmcli.errors import InputError
 from mpmcli.plain_text import size_text
 from mpmcli.solver.plan import Plan, require_room
 
-# More frames than this are as many files while the run goes on, and hours of writing.
+# During a run each frame is a file; more than this take hours to write.
 MOST_FRAMES = 100_000
-# While the frames are packed they lie on the disk twice.
+# While the frames are packed, two copies are on the disk.
 COPIES = 2
 
 
 def output_findings(facts: SceneFacts, plan: Plan, forecast: Forecast, directory: Path) -> Iterator[Finding]:
-    """Yield what is to be said of frames, disk and memory; `directory` is where results would go."""
+    """Yield the findings on frames, disk and memory; `directory` is where results would be written."""
     scene = facts.scene
     if facts.interval < facts.step_at_start:
         yield Finding(
@@ -37,10 +37,10 @@ def output_findings(facts: SceneFacts, plan: Plan, forecast: Forecast, directory
             f"Set time.frames to {MOST_FRAMES:,} or fewer.",
             forecast.frames,
         )
-    # Where results would go need not exist yet.
+    # The directory need not exist yet.
     place = next(place for place in (directory.absolute(), *directory.absolute().parents) if place.exists())
     disk = shutil.disk_usage(place)
-    # File systems that are no disk, such as that of processes, have no size.
+    # File systems without a disk, such as /proc, have no size.
     if COPIES * forecast.file_bytes > disk.free and disk.total > 0:
         yield Finding(
             "warning",

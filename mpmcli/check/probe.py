@@ -1,4 +1,4 @@
-"""Runs the beginning of a scene for a moment, to know what a step costs on this machine."""
+"""Probe: measures the cost of a step by running the first seconds of a scene on this machine."""
 
 import time
 from dataclasses import dataclass
@@ -9,22 +9,22 @@ from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.plan import Plan, make_plan, require_room
 from mpmcli.solver.solver import Solver
 
-# Steps that are not counted: the first compiles, and the caches of the processor fill.
+# Steps that are not counted: the first compiles, and the next fill the caches of the processor.
 WARM_UP = 3
 
 
 @dataclass(frozen=True)
 class Probe:
-    """What a moment of a run cost.
+    """Measured cost of the start of a run.
 
     Attributes:
-        backend: that it ran on.
-        start_seconds: to start the backend, sample and allocate.
-        compile_seconds: of the first step and frame beyond a usual one.
-        step_seconds: wall time of a step, None where the run became unstable at once.
-        frame_seconds: to build a frame and its ledger row.
-        steps: that were measured.
-        failure: the sentence of an unstable run, "" otherwise.
+        backend: backend of the probe.
+        start_seconds: time to start the backend, sample and allocate.
+        compile_seconds: time of the first step and frame in excess of later ones.
+        step_seconds: wall time of a step, None if the run became unstable in the first one.
+        frame_seconds: time to build a frame and its ledger row.
+        steps: number of measured steps.
+        failure: message of an unstable run, "" otherwise.
     """
 
     backend: Backend
@@ -39,10 +39,10 @@ class Probe:
 def probe_scene(
     loaded: LoadedScene, *, arch: Arch = "auto", threads: int | None = None, seconds: float = 2.0
 ) -> tuple[Probe, Plan]:
-    """Run the scene for some seconds of stepping; it starts Taichi in this process and writes nothing.
+    """Run a scene for `seconds` of wall time; it starts Taichi in this process and writes nothing.
 
     Returns:
-        What it cost, and the plan of a run on the backend that came.
+        The measured cost, and the plan of a run on the backend that was started.
 
     Raises:
         InputError: the backend is not available, or the scene does not fit into memory.
@@ -56,7 +56,7 @@ def probe_scene(
     start = time.perf_counter() - began
     solver.frame(0, [])
     first_frame = time.perf_counter() - began - start
-    # The memory of the second one is new, as that of no later one is.
+    # The smallest of three: the second frame allocates memory, later ones reuse it.
     frame = min(_seconds_of_a_frame(solver) for _ in range(3))
     compiled = max(0.0, first_frame - frame)
     steps, spent, failure = 0, 0.0, ""
@@ -71,7 +71,7 @@ def probe_scene(
             _advance(solver)
             steps += 1
             spent = time.perf_counter() - since
-        # A GPU answers only here.
+        # A GPU is synchronised only here.
         solver.measure_state(0.0)
         spent = time.perf_counter() - since
     except UnstableRunError as error:
@@ -80,7 +80,7 @@ def probe_scene(
 
 
 def _advance(solver: Solver) -> None:
-    """Take one step as the run would, but for the frames on whose times it lands."""
+    """Take one step of a run, ignoring the times of frames."""
     dt, _ = solver.stable_step()
     interval = solver.scene.time.end / solver.scene.time.frames
     solver.step(min(dt, interval))

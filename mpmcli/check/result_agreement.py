@@ -1,4 +1,4 @@
-"""Holds the ledger against the frames: sums that can be taken again from what is stored must be the same."""
+"""Agreement of ledger and frames: sums over the stored particles must equal those of the ledger."""
 
 import numpy as np
 
@@ -8,14 +8,14 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.header import RunHeader
 
-# Relative, of numbers that are taken in single precision once more.
+# Relative tolerance for quantities stored in single precision.
 SINGLE = 1e-5
-# Sums in double precision of the very numbers that the ledger was summed from.
+# Relative tolerance for sums in double precision over the numbers that the ledger sums.
 DOUBLE = 1e-9
 
 
 class AgreementCheck:
-    """Checks frames one after the other; the masses of the particles come from the frames or from the scene.
+    """Compares frames with the ledger, in order; particle masses come from the frames or from the scene.
 
     Attributes:
         largest: largest relative difference found.
@@ -29,11 +29,11 @@ class AgreementCheck:
         self.largest = 0.0
 
     def check(self, number: int, frame: Frame, row: LedgerRow, J: np.ndarray | None, steps: int | None) -> None:
-        """Check a frame of finite numbers.
+        """Check a frame whose values are finite.
 
         Args:
-            J: volume ratio of each particle, (n,), None where it is not stored.
-            steps: taken since the frame before, by the frames; None where that one is not known.
+            J: volume ratio of each particle, (n,), or None if it is not stored.
+            steps: number of steps since the previous frame, from the frames; None if that frame is not known.
         """
         if len(frame.position) == 0:
             return
@@ -55,10 +55,10 @@ class AgreementCheck:
         if "mass" in frame.fields:
             self._compare(number, "mass", total, row.mass, SINGLE * row.mass)
         if off > SINGLE:
-            return  # a run that was filled otherwise than its scene says, or one whose mass has its own finding
-        # Masses that are not quite those of the solver leave the sums as wrong as they are.
+            return  # the sampling differs from that of the scene, or the mass has a finding of its own
+        # Sums are at most as accurate as the masses.
         precision = max(DOUBLE, 10 * off)
-        # No BLAS: its threads would fight with those of the other processes that a data set is checked by.
+        # einsum rather than BLAS, whose threads would compete with other processes that check results.
         momentum = np.array([np.einsum("i,i->", m, column) for column in frame.velocity.T])
         speeds = np.sqrt(np.einsum("ij,ij->i", frame.velocity, frame.velocity))
         moving = float(np.einsum("i,i->", m, speeds))
@@ -70,11 +70,11 @@ class AgreementCheck:
     def _potential(
         self, number: int, frame: Frame, row: LedgerRow, m: np.ndarray, momentum: np.ndarray, precision: float
     ) -> None:
-        """The ledger takes it half a step back, and the last step lies between the smallest and the largest."""
+        """Compare the potential, which the ledger evaluates half a step earlier, for all possible last steps."""
         header = self._header
         if header.gravity is None or header.origin is None or not header.gravity.any():
             return
-        # Positions that were moved by an origin were rounded once more.
+        # The addition of the origin rounds positions once more.
         rounding = 0.0 if not header.origin.any() else float(np.finfo(frame.position.dtype).eps) * header.farthest
         weight = float(m.sum()) * float(np.linalg.norm(header.gravity))
         tolerance = weight * (rounding + precision * float(np.linalg.norm(header.upper - header.origin)))

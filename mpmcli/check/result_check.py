@@ -1,4 +1,4 @@
-"""`mpmcli check RESULT`: whether a run stayed stable and its frames are whole, and where they are not."""
+"""`mpmcli check RESULT`: whether a run stayed stable and its frames are complete."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ from mpmcli.output.segments import PACKED
 from mpmcli.plain_json import finite_json
 
 Verdict = Literal["stable", "suspect", "unstable"]
-# How the figures are told to people.
+# Labels of the figures in text.
 TOLD = {
     "energy_growth": "energy growth / turned over",
     "energy_lost": "energy lost / turned over",
@@ -38,21 +38,23 @@ TOLD = {
 
 @dataclass(frozen=True)
 class ResultCheck:
-    """What was found in a result.
+    """Result of the check of a run.
 
     Attributes:
-        path: what was read; kind: "packed", "segments", "series", or "none" where nothing can be read.
-        status: how the run ended by its record, "unknown" where there is none.
-        findings: the gravest first.
-        first_bad_frame: number of the first frame that an error or a warning is about; None where there is none.
-        limit: name of the bound on the step that was nearest at that frame, "" where it is not known.
-        frames: number of frames read; frames_expected: of the whole run, None where it is not known.
+        path: file or directory read.
+        kind: "packed", "segments", "series", or "none" if nothing can be read.
+        status: status of the run in its record, "unknown" without one.
+        findings: by decreasing severity.
+        first_bad_frame: number of the first frame with an error or a warning, or None.
+        limit: name of the bound on the step that was smallest at that frame, "" if it is not known.
+        frames: number of frames read.
+        frames_expected: number of frames of the whole run, None if it is not known.
         particles: number of particles.
-        figures: numbers by name, None where there is none to tell: energy_growth and energy_lost (relative to the
+        figures: numbers by name, None if not available: energy_growth and energy_lost (relative to the
             energy turned over), mass_change (relative), momentum_drift (relative, far from walls), momentum_frames
-            (in which it was sure), courant_max (cells), deformation_max (in a step, where affine is stored),
-            displacement_ratio (largest displacement between frames over what the ledger allows),
-            ledger_difference (largest relative difference between ledger and frames that was found), speed_max (m/s),
+            (number of frames compared), courant_max (cells), deformation_max (in a step, if affine is stored),
+            displacement_ratio (largest displacement between frames over the largest that the ledger allows),
+            ledger_difference (largest relative difference between ledger and frames), speed_max (m/s),
             volume_ratio_min, volume_ratio_max, step_min, step_max (s), step_ratio (smallest over first),
             bytes (of particle data read).
     """
@@ -70,17 +72,17 @@ class ResultCheck:
 
     @property
     def verdict(self) -> Verdict:
-        """ "unstable" with an error, "suspect" with a warning, "stable" without either."""
+        """ "unstable" with an error, "suspect" with a warning and no error, otherwise "stable"."""
         if not passes(self.findings):
             return "unstable"
         return "stable" if passes(self.findings, strict=True) else "suspect"
 
     def passes(self, strict: bool = False) -> bool:
-        """Return whether the result can be used: no error, and with `strict` no warning."""
+        """Return whether there is no error; with `strict`, no warning either."""
         return passes(self.findings, strict=strict)
 
     def as_dict(self) -> dict:
-        """Return all of it as JSON can hold it."""
+        """Return the check as a dictionary for JSON."""
         return {
             "ok": self.passes(),
             "verdict": self.verdict,
@@ -97,7 +99,7 @@ class ResultCheck:
         }
 
     def text(self) -> str:
-        """Return it for people: the verdict, the figures, and a line for each finding."""
+        """Return the check as text: the verdict, the figures, and a line for each finding."""
         bad = "" if self.first_bad_frame is None else f", first bad frame {self.first_bad_frame}"
         limit = f', nearest limit "{self.limit}"' if bad and self.limit else ""
         expected = "" if self.frames_expected is None else f" of {self.frames_expected}"
@@ -113,10 +115,10 @@ class ResultCheck:
 
 
 def check_result(path: Path) -> ResultCheck:
-    """Read the ledger and the frames of a result, one frame at a time, and say what is wrong with it.
+    """Check the ledger and the frames of a result, one frame at a time.
 
     Args:
-        path: a packed file, a directory, its segments, or the .pvd of a series; of a run that has ended or not.
+        path: a packed file, a directory, its segments, or the .pvd of a series. The run need not have ended.
 
     Raises:
         InputError: there is nothing at `path`, or nothing that this version of mpmcli wrote.
@@ -129,7 +131,7 @@ def check_result(path: Path) -> ResultCheck:
     if opened.entries:
         figures |= _check_frames(opened, header, findings)
     if opened.kind == "segments" and (opened.path / PACKED).exists():
-        # The run has come to its end meanwhile, and has packed the frames.
+        # The run ended during the check, and has packed its frames.
         return check_result(opened.path)
     found = findings.found()
     bad = [f.frame for f in found if f.severity != "note" and f.frame is not None]
@@ -149,7 +151,7 @@ def check_result(path: Path) -> ResultCheck:
 
 
 def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindings) -> dict[str, float | None]:
-    """Read every frame once, and check it against itself, the one before it, and the ledger."""
+    """Read each frame once; check its values, and compare it with the previous frame and the ledger."""
     state, motion = StateCheck(header, findings), MotionCheck(header, findings)
     agreement = AgreementCheck(header, findings)
     momentum = MomentumCheck(header, findings, opened.entries[0].row)
@@ -166,7 +168,7 @@ def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindin
             before = None
             continue
         size += sum(array.nbytes for array in arrays_of(frame, ids).values())
-        # What is not finite is told once; it must not make the rest complain, too.
+        # Values that are not finite have one finding, and must not cause others.
         with np.errstate(invalid="ignore", over="ignore"):
             sound = state.check(number, frame, ids, entry.count)
             J = state.volume_ratio(frame)
@@ -191,7 +193,7 @@ def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindin
 
 
 def _limit_at(opened: OpenedResult, number: int) -> str:
-    """Return the bound that was nearest at a frame: by the ledger up to it, or by the diagnosis of a run that broke."""
+    """Return the bound that was smallest at a frame: from the ledger, or from the diagnosis of an unstable run."""
     last = max((entry.number for entry in opened.entries), default=-1)
     diagnosed = ((opened.record or {}).get("failure") or {}).get("limit")
     if number > last and diagnosed:

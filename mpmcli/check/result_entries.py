@@ -1,4 +1,4 @@
-"""Opening a result that may be damaged: every frame that can be read, and a finding for what cannot."""
+"""Opens a result that may be damaged: the frames that can be read, and findings for the others."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_HEADER
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-# What HDF5, numpy and the XML reader raise on a file whose content contradicts itself.
+# Exceptions of HDF5, numpy and the XML reader on files with inconsistent content.
 DAMAGE = (InputError, OSError, RuntimeError, ValueError, KeyError, IndexError, TypeError, AttributeError)
 RUN_AGAIN = "Copy the file again from where it was made, or run the scene again."
 
@@ -27,11 +27,13 @@ class Entry:
     """One frame of a result, not yet read.
 
     Attributes:
-        number: of the frame, by the name of its file where it has one of its own.
-        said: number of the frame by its content.
-        time: s, as the file lists it.
-        row: of the ledger.
-        count: particles, as the file lists them.
+        number: number of the frame, from the name of its file if it has its own.
+        said: number of the frame in its content.
+        time: time listed in the file, s.
+        row: row of the ledger.
+        count: number of particles listed in the file.
+        result: result that holds the frame.
+        k: index of the frame in `result`.
     """
 
     number: int
@@ -63,13 +65,14 @@ class Entry:
 
 @dataclass(frozen=True)
 class OpenedResult:
-    """What can be read of a result.
+    """The readable part of a result.
 
     Attributes:
-        kind: "packed", "segments", "series", or "none" where nothing can be read.
-        header: facts about the run.
-        record: content of run.json, None where there is none.
-        entries: the frames in the order of the files.
+        path: file or directory read.
+        kind: "packed", "segments", "series", or "none" if nothing can be read.
+        header: header of the run.
+        record: content of run.json, or None.
+        entries: frames in the order of the files.
     """
 
     path: Path
@@ -86,7 +89,7 @@ def arrays_of(frame: Frame, ids: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
-    """Open a result as far as it goes.
+    """Open a result as far as it can be read.
 
     Raises:
         InputError: there is nothing at `path`, or nothing that this version of mpmcli wrote.
@@ -113,7 +116,7 @@ def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
 
 
 def _open_segments(directory: Path, findings: FrameFindings) -> OpenedResult:
-    """Open each sealed segment for itself, so that a damaged one does not hide the others."""
+    """Open each sealed segment separately, so that damage to one does not affect the others."""
     entries: list[Entry] = []
     for segment in sealed_segments(directory):
         number = int(segment.stem.split("_")[1])
@@ -139,7 +142,7 @@ def _entry(result: Result, k: int, number: int) -> Entry:
 
 
 def _is_damage(path: Path, error: Exception) -> bool:
-    """Say whether mpmcli wrote what lies there, so that it is broken rather than something else."""
+    """Return whether mpmcli wrote the file, so that it is damaged rather than of another kind."""
     directory = path if path.is_dir() else path.parent
     if not path.exists() or path.suffix == ".vtu":
         return False
@@ -149,7 +152,7 @@ def _is_damage(path: Path, error: Exception) -> bool:
         if not packed.exists() and not (path / SERIES).exists():
             return ours  # a run that wrote no frame
         path = packed if packed.exists() else path / SERIES
-    # open_result names a cause where something could not be read, and none where it is of another kind or version.
+    # open_result sets a cause if the file could not be read, and none if it is of another kind or version.
     if isinstance(error, InputError) and error.__cause__ is None:
         return False
     if ours or (path.parent / SERIES_HEADER).exists():

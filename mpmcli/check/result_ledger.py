@@ -1,4 +1,4 @@
-"""Checks the ledger of a result for itself: finite numbers, mass, energy, Courant number, volumes and steps."""
+"""Checks the ledger of a result: finite numbers, mass, energy, Courant number, volumes and steps."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -12,19 +12,19 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.header import RunHeader
 from mpmcli.stability.limits import COURANT
 
-# Energy that comes from nowhere, relative to what was turned over so far. The scenes in configs stay below 2e-4, bodies
-# thrown at a wall at up to five times their speed of sound below 1e-3.
+# Growth of energy without a source, relative to the energy turned over (docs/theory.md, 9.3). The scenes in configs
+# stay below 2e-4, bodies thrown at a wall at up to five times their speed of sound below 1e-3.
 ENERGY_SUSPECT, ENERGY_WRONG = 1e-2, 1e-1
-# Of all energy there is: what single precision may leave of it from step to step.
+# Rounding of energy in single precision, relative to the total energy.
 ENERGY_ROUNDING = 1e-4
 # Masses are summed in double precision and never change.
 MASS_ERROR = 1e-9
-# Beyond a bound by less than this: the surprise of an impact, which time.safety is for.
+# A bound may be exceeded by this factor in an impact; time.safety allows for it.
 MARGIN = 1.1
-# Steps that shrink to less than this part of the first ones.
+# Smallest accepted ratio of a step to the first one.
 COLLAPSE = 1e-2
-# Cells that something must move in one step to have left everything behind that it acted on. Impacts near the speed of
-# sound reach 1.7 in single steps and gain no energy; it is the speed of a node, which particles rarely have.
+# Cells per step above which particles leave all nodes that they act on. Impacts near the speed of sound reach 1.7 in
+# single steps without a gain of energy: it is the speed of a node, which particles rarely reach.
 LEFT_BEHIND = 2.0
 LOWER_SAFETY = "Lower time.safety, or refine the domain."
 
@@ -34,7 +34,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
 
     Returns:
         Figures by name: energy_growth, energy_lost, mass_change, courant_max, speed_max, volume_ratio_min,
-        volume_ratio_max, step_min, step_max, step_ratio; None where there is no number for it.
+        volume_ratio_max, step_min, step_max, step_ratio; None if not available.
     """
     rows: list[tuple[int, LedgerRow]] = []
     for entry in entries:
@@ -67,7 +67,7 @@ def _not_finite(row: LedgerRow) -> str:
 
 
 def _mass(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> float:
-    # The median, so that one row that is off is the one that is named, the first row too.
+    # The median identifies a single deviating row, including the first one.
     usual = float(np.median([row.mass for _, row in rows]))
     largest = 0.0
     for number, row in rows:
@@ -82,13 +82,13 @@ def _mass(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> float:
 def _energy(
     rows: list[tuple[int, LedgerRow]], header: RunHeader, findings: FrameFindings
 ) -> tuple[float | None, float | None]:
-    """Find growth of the total energy above its lowest value so far, and what is lost by the end.
+    """Return the largest growth of the total energy above its running minimum, and the loss by the end.
 
-    Both are relative to the energy turned over: the largest kinetic energy so far and the ranges of potential and
-    elastic energy, since the zero of a potential is arbitrary. Nothing is known of either where the scene is driven.
+    Both are relative to the energy turned over: the largest kinetic energy so far plus the ranges of potential and
+    elastic energy, since the zero of a potential is arbitrary. Both are None if forces drive the scene.
     """
     if header.driven:
-        what = "Forces or a gravity of time do work, so that neither energy nor momentum can be held against a balance"
+        what = "Forces or a gravity that depends on time do work, so that energy and momentum are not conserved"
         findings.add("note", "driven", None, what, "Nothing needs to be done.")
         return None, None
     kinetic = np.array([row.kinetic for _, row in rows])
@@ -101,7 +101,7 @@ def _energy(
     for (number, _), value in zip(rows, growth.tolist(), strict=True):
         if value > ENERGY_SUSPECT:
             severity = "error" if value > ENERGY_WRONG else "warning"
-            what = f"By frame {number} the energy has grown by {value:.3g} of what was turned over, with no source"
+            what = f"By frame {number} the energy has grown by {value:.3g} of the energy turned over, without a source"
             findings.add(severity, "energy", number, what, LOWER_SAFETY, value=value)
     return float(growth.max()), float((total[0] - total[-1]) / turned[-1])
 
@@ -147,7 +147,7 @@ def _steps(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> dict[s
                 f"Before frame {number} the step fell to {row.step_min:.3g} s, where the run began with {first:.3g} s, "
                 f'by the bound "{row.limit}"'
             )
-            fix = "Look for what became so fast, so stiff or so deformed there."
+            fix = "Look for a high speed, stiffness or deformation in this frame."
             findings.add("warning", "step-collapse", number, what, fix, value=row.step_min / first)
     smallest = min(row.step_min for _, row in stepped)
     return {

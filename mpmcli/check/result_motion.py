@@ -1,4 +1,4 @@
-"""Checks what moves between two frames: no particle outruns the solver, and momentum is kept away from the walls."""
+"""Checks the motion between two frames: largest displacement, and conservation of momentum away from walls."""
 
 from dataclasses import dataclass
 
@@ -13,10 +13,10 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.header import RunHeader
 from mpmcli.stability.limits import DEFORMATION
 
-# On a GPU the Courant number is an estimate between measurements, and what pushes may double the speed.
+# On a GPU the Courant number is estimated between measurements, during which an impact may double the speed.
 GPU_FACTOR = 2.0
-# A particle may part from what its neighbours do by this much: cells, and part of the farthest any could move.
-# Largest seen over the scenes in configs: 1.2 cells where 67 were possible.
+# Allowed deviation of a displacement from that of the neighbours: cells, and share of the largest possible
+# displacement. The largest deviation in the scenes in configs is 1.2 cells, where 67 were possible.
 OUTLIER_CELLS, OUTLIER_PART = 1.0, 0.2
 NEIGHBOURS = 3
 CANDIDATES = 8
@@ -29,11 +29,11 @@ class _Moment:
 
 
 class MotionCheck:
-    """Checks frames in their order.
+    """Checks the displacements of frames, in order.
 
     Attributes:
-        largest_ratio: largest displacement between two frames over the farthest that the ledger allows.
-        deformation: largest deformation in a step, by the velocity gradients where they are stored, else None.
+        largest_ratio: largest displacement between two frames over the largest that the ledger allows.
+        deformation: largest deformation in a step, from the velocity gradients; None if they are not stored.
     """
 
     def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
@@ -44,11 +44,13 @@ class MotionCheck:
         self.deformation: float | None = None
 
     def check(self, number: int, frame: Frame, row: LedgerRow, sound: np.ndarray | None) -> None:
-        """Compare a frame with the one before it, where that is known.
+        """Compare a frame with the previous one, if that is known.
 
         Args:
-            row: of the ledger, for the steps between the two.
-            sound: which particles are finite, (n,); None for all.
+            number: number of the frame.
+            frame: the frame.
+            row: row of the ledger for the steps between the two.
+            sound: which particles have finite values, (n,) bool; None for all.
         """
         before, self._before = self._before, _Moment(number, frame)
         if "affine" in frame.fields and sound is None and len(frame.position) > 0:
@@ -80,11 +82,11 @@ class MotionCheck:
             self._outlier(number, frame, before.frame, row.time - before.frame.time, allowed)
 
     def forget(self) -> None:
-        """Compare nothing with the frames so far, as the next one could not be read."""
+        """Forget the previous frame, because a frame could not be read."""
         self._before = None
 
     def _deformation(self, number: int, frame: Frame, row: LedgerRow) -> None:
-        """As the limit on the step has it."""
+        """Compare the deformation in a step with the bound on the step (docs/theory.md, 6.4)."""
         n, d = frame.position.shape
         C = frame.fields["affine"].reshape(n, d, d)
         rate = deformation_rate(C, keeps_J=False)
@@ -105,18 +107,18 @@ class MotionCheck:
             self._findings.add(severity, "deformation", number, what, LOWER_SAFETY, value=deformation, body=body)
 
     def _repeated(self, number: int, frame: Frame, before: Frame, row: LedgerRow) -> None:
-        """A frame that repeats the one before it, though something moves, bit for bit."""
+        """Find a frame that is identical to the previous one although particles move."""
         speed = float(np.abs(frame.velocity).max())
         far = speed * (row.time - before.time) > 1e3 * self._header.place_error(frame.position.dtype)
         if far and np.array_equal(frame.velocity, before.velocity):
-            what = f"Frame {number} repeats frame {number - 1}, though something moves at {speed:.4g} m/s"
+            what = f"Frame {number} repeats frame {number - 1}, although particles move at {speed:.4g} m/s"
             self._findings.add("error", "repeated-frame", number, what, TOUCHED, value=speed)
 
     def _outlier(self, number: int, frame: Frame, before: Frame, time: float, allowed: float) -> None:
-        """A particle that moved otherwise than its neighbours did, and than its own velocities say.
+        """Find a particle whose displacement agrees neither with its velocities nor with its neighbours.
 
-        With one change of velocity on the way x1 - x0 differs from t (v0 + v1)/2 by at most t |v1 - v0|/2. Bodies that
-        bounce to and fro between two frames differ by more, but all of their particles do.
+        After a single change of velocity x1 - x0 differs from t (v0 + v1)/2 by at most t |v1 - v0|/2. Bodies that
+        bounce several times between two frames differ by more, but so do all of their particles.
         """
         h = self._header.spacing
         if h is None:
@@ -132,7 +134,7 @@ class MotionCheck:
             near = near[near != p]
             if len(near) < NEIGHBOURS:
                 continue
-            # The median: another one astray next to it must not hide it.
+            # The median is not affected by a second displaced particle nearby.
             apart = float(np.linalg.norm(own[p] - np.median(own[near], axis=0)))
             apart -= 0.5 * time * float(np.linalg.norm(change[p] - np.median(change[near], axis=0)))
             if apart > threshold:
@@ -146,10 +148,10 @@ class MotionCheck:
 
 
 def reach(header: RunHeader, row: LedgerRow, stored: np.dtype) -> float | None:
-    """Return how far a particle can have moved since the frame before, m: steps times Courant number times h.
+    """Return the largest possible displacement since the previous frame, m: steps times Courant number times h.
 
-    Each step rounds the position, and so does the file, whose type of positions is given. None where the ledger or
-    the header does not tell.
+    Each step rounds the position, and so does the file, whose type of positions is `stored`. None if the ledger or
+    the header lacks a number.
     """
     if header.spacing is None or not np.isfinite(row.courant_max):
         return None
@@ -159,16 +161,16 @@ def reach(header: RunHeader, row: LedgerRow, stored: np.dtype) -> float | None:
 
 
 class MomentumCheck:
-    """Holds the momentum of the ledger against P0 + M g (t - dt/2), as long as no wall can have acted on it.
+    """Compares the momentum of the ledger with P0 + M g (t - dt/2) while no wall can have acted.
 
-    Velocities are those of the middle of the last step, which is as long as one of those before the frame.
-
-    The momentum along an axis is kept while no particle comes near a wall normal to it, or a wall that sticks. The
-    angular momentum is kept without gravity and far from all walls, by transfers that keep it.
+    Velocities are those in the middle of the last step, whose length is between the smallest and the largest.
+    The momentum along an axis is conserved while no particle is near a wall normal to the axis or a wall with
+    "stick". The angular momentum is conserved without gravity and far from all walls, if the transfer conserves it
+    (docs/theory.md, 9.2).
 
     Attributes:
-        drift: largest difference, relative to sqrt(2 M E_kin), a bound on sum m |v|; None where it was never sure.
-        frames: number of frames in which it could be checked along one axis at least.
+        drift: largest difference, relative to sqrt(2 M E_kin), a bound on sum m |v|; None if never compared.
+        frames: number of frames compared along at least one axis.
     """
 
     # A particle acts on nodes up to 1.5 cells away, and the first plane of nodes of a wall is the wall itself.
@@ -186,7 +188,7 @@ class MomentumCheck:
         self.frames = 0
 
     def check(self, number: int, frame: Frame, row: LedgerRow) -> None:
-        """Check the row of a frame; every frame must come, in order."""
+        """Check the row of a frame; frames must come in order, without gaps."""
         header = self._header
         known = header.origin is not None and header.gravity is not None and header.sticking is not None
         if not known or header.driven or not self._free.any() or len(frame.position) == 0:
@@ -199,7 +201,7 @@ class MomentumCheck:
             gone = self._distance is None or allowed is None
             touching = np.ones(header.dimension, bool) if gone else ~(self._distance > near + allowed)
             self._free &= ~touching
-            # A wall that sticks acts along itself, too.
+            # A wall with "stick" acts along its tangents too.
             if (touching & np.array(header.sticking)).any():
                 self._free[:] = False
         lowest, highest = extent(frame.position)
@@ -208,7 +210,7 @@ class MomentumCheck:
             self._compare(number, row)
 
     def lost(self) -> None:
-        """Trust nothing from here on: a frame could not be read, or is not finite."""
+        """Compare no further frames: one could not be read, or is not finite."""
         self._free[:] = False
 
     def _compare(self, number: int, row: LedgerRow) -> None:
@@ -227,7 +229,7 @@ class MomentumCheck:
         drift = float(max(difference, angular, 0.0)) / scale
         self.frames += 1
         self.drift = max(self.drift or 0.0, drift)
-        # Rounding may go the same way in every step.
+        # Rounding may have the same sign in every step.
         if drift > 1e-3 + self._steps * header.epsilon:
             what = (
                 f"By frame {number} momentum has drifted by {drift:.3g} of what moves, though no wall was near and "

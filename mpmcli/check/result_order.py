@@ -1,4 +1,4 @@
-"""Whether all frames of a result are there, once each, at their times, and how the run ended."""
+"""Checks that a result holds each frame once, at its time, and how the run ended."""
 
 from collections.abc import Sequence
 
@@ -6,17 +6,17 @@ from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_entries import RUN_AGAIN, Entry, OpenedResult
 from mpmcli.output.header import RunHeader
 
-# Relative to the length of the run; frames land on their times exactly.
+# Tolerance of times, relative to the duration of the run.
 TIME_ERROR = 1e-9
 
 
 def frames_expected(opened: OpenedResult, header: RunHeader) -> int | None:
-    """Return how many frames the whole run has, None where nothing says so."""
+    """Return the number of frames of the whole run, None if it is not known."""
     return (opened.record or {}).get("frames_expected") or header.frames
 
 
 def check_order(opened: OpenedResult, header: RunHeader, findings: FrameFindings) -> None:
-    """Check the numbers of the frames, their times, and that those of a finished run are all there."""
+    """Check the numbers and times of the frames, and that a finished run has all of them."""
     entries = opened.entries
     _numbers(entries, findings)
     _times(entries, header, findings)
@@ -26,7 +26,7 @@ def check_order(opened: OpenedResult, header: RunHeader, findings: FrameFindings
     if expected is not None and entries and max(numbers) >= expected:
         what = f"There is a frame {max(numbers)}, where the scene has frames 0 to {expected - 1} only"
         findings.add("error", "extra-frames", expected, what, "Remove what was added to the result.")
-    # What is missing at the end of a run that broke off is told by its status.
+    # Frames missing at the end of a run that did not finish are reported by its status.
     whole = expected if expected is not None and status in (None, "finished") else max(numbers, default=-1) + 1
     there = {entry.number for entry in entries} | findings.frames_of("unreadable")
     first, count = _missing(there, whole if expected is None else min(whole, expected))
@@ -37,8 +37,8 @@ def check_order(opened: OpenedResult, header: RunHeader, findings: FrameFindings
 
 
 def _missing(there: set[int], whole: int) -> tuple[int, int]:
-    """Return the first of the numbers below `whole` that is not there, and how many are not."""
-    # A damaged file may give any number, so they are not all counted through.
+    """Return the first missing number below `whole`, and how many are missing."""
+    # A damaged file may state any number, so that a loop over all of them could be endless.
     known = sorted(number for number in there if 0 <= number < whole)
     first = next((k for k, number in enumerate(known) if k != number), len(known))
     return first, whole - len(known)

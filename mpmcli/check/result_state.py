@@ -1,4 +1,4 @@
-"""Checks one frame for itself: finite numbers, particles inside the domain, labels, volumes."""
+"""Checks the values of a frame: finite numbers, particles inside the domain, labels, volumes."""
 
 import numpy as np
 
@@ -6,14 +6,14 @@ from mpmcli.check.finding import FrameFindings
 from mpmcli.frames.frame import Frame
 from mpmcli.output.header import RunHeader
 
-# A J below the first is no state that a law is meant for; above the second, one that holds together would have torn.
+# No law is valid for J below the first. Coherent material would have torn for J above the second.
 CRUSHED, BLOWN_UP = 0.1, 10.0
 LOOK = "Look at this particle, and lower time.safety or refine the domain where it is."
 TOUCHED = "The file was changed after the run; copy it again or run the scene again."
 
 
 class StateCheck:
-    """Checks frames one after the other; what does not change is held against the first one."""
+    """Checks frames in order; quantities that are constant in a run are compared with the first frame."""
 
     def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
         self._header = header
@@ -24,7 +24,7 @@ class StateCheck:
         """Check a frame, given the ids of its rows and the number of particles that the file lists.
 
         Returns:
-            Which particles are finite in all they have, (n,) bool; None where all are.
+            Which particles have finite values only, (n,) bool; None if all have.
         """
         n = len(frame.position)
         first = self._first if self._first is not None else frame
@@ -38,7 +38,7 @@ class StateCheck:
         self._labels(number, frame, first, ids)
         self._twins(number, frame)
         self._constants(number, frame, first)
-        # Of the first frame only what is held against later ones; the rest of it need not stay in memory.
+        # Only the arrays that later frames are compared with stay in memory.
         if self._first is None:
             kept = {name: frame.fields[name] for name in ("mass",) if name in frame.fields}
             self._first = Frame(
@@ -47,7 +47,7 @@ class StateCheck:
         return sound
 
     def volume_ratio(self, frame: Frame) -> np.ndarray | None:
-        """Return J of each particle as stored, or from the density; None where neither is."""
+        """Return J of each particle as stored, or from the density, (n,); None if neither is stored."""
         if "volume_ratio" in frame.fields:
             return frame.fields["volume_ratio"]
         densities = np.array(self._header.densities)
@@ -81,7 +81,7 @@ class StateCheck:
             return
         tolerance = 4 * header.place_error(frame.position.dtype)
         low, high = header.origin - tolerance, header.upper + tolerance
-        # A NaN fails both comparisons, and is passed over below: it has its own finding.
+        # A NaN fails both comparisons and is ignored below; it has its own finding.
         lowest, highest = extent(frame.position)
         if (lowest >= low).all() and (highest <= high).all():
             return
@@ -102,7 +102,7 @@ class StateCheck:
         labels["material"] = (frame.material, first.material)
         for name, (found, expected) in labels.items():
             if len(found) != len(expected):
-                continue  # told as a matter of the count
+                continue  # a finding of the count
             changed = np.flatnonzero(found != expected)
             if len(changed):
                 p = int(changed[0])
@@ -120,7 +120,7 @@ class StateCheck:
                 self._findings.add("error", "label", number, what, TOUCHED, kind=f"{name} range")
 
     def _twins(self, number: int, frame: Frame) -> None:
-        """Find particles that are in one place with one velocity; in a wall's corner several may come to lie."""
+        """Find particles of equal position and velocity, except on walls, where several may coincide."""
         n = len(frame.position)
         keys = _hashes(frame.position)
         ordered = np.sort(keys)
@@ -135,11 +135,11 @@ class StateCheck:
         if same.any():
             at = int(np.flatnonzero(same)[0])
             p, q = sorted((int(order[at]), int(order[at + 1])))
-            what = f"In frame {number} particles {p} and {q} are one and the same: equal in place and velocity"
+            what = f"In frame {number} particles {p} and {q} are duplicates: equal in position and velocity"
             self._findings.add("error", "duplicated-particles", number, what, TOUCHED, value=int(same.sum()))
 
     def _constants(self, number: int, frame: Frame, first: Frame) -> None:
-        """Masses stay, and density times J is the density at rest."""
+        """Check that masses are constant, and that density times J is the density at rest."""
         mass = frame.fields.get("mass")
         if mass is not None and len(mass) == len(first.fields["mass"]):
             changed = np.flatnonzero(mass != first.fields["mass"])
@@ -163,7 +163,7 @@ class StateCheck:
                 self._findings.add("error", "density", number, what, TOUCHED, value=float(error[p]))
 
     def check_volume(self, number: int, frame: Frame, J: np.ndarray) -> None:
-        """Judge the volume ratio of each particle, (n,)."""
+        """Check the volume ratio of each particle, (n,)."""
         fine = J[np.isfinite(J)]
         if len(fine) == 0 or (fine.min() >= CRUSHED and fine.max() <= BLOWN_UP):
             return
@@ -181,7 +181,7 @@ class StateCheck:
                 self._findings.add(severity, "volume", number, what, fix, float(J[p]), body, kind=word)
 
     def _holds_together(self, frame: Frame) -> np.ndarray:
-        """Say of each particle whether its law resists to being pulled apart."""
+        """Return whether the law of each particle is coherent, (n,) bool."""
         coherent = [law.coherent for law in self._header.laws]
         if not _within(frame.material, len(coherent)):
             return np.zeros(len(frame.material), bool)
@@ -192,7 +192,7 @@ class StateCheck:
 
 
 def extent(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and the upper corner of the particles, (d,) each; column by column, which is faster."""
+    """Return the lower and the upper corner of the particles, (d,) each, m; column by column, which is faster."""
     return np.array([x.min() for x in position.T]), np.array([x.max() for x in position.T])
 
 
@@ -201,8 +201,8 @@ def _within(labels: np.ndarray, count: int) -> bool:
 
 
 def _hashes(position: np.ndarray) -> np.ndarray:
-    """Return a number for each row, (n,) uint64: equal for equal rows, and hardly ever otherwise."""
-    # -0.0 and 0.0 are one place.
+    """Return a hash of each row, (n,) uint64."""
+    # Adding 0.0 turns -0.0 into 0.0.
     columns = [np.ascontiguousarray(column + 0.0).view(f"u{column.itemsize}") for column in position.T]
     result = np.zeros(len(position), np.uint64)
     for column in columns:

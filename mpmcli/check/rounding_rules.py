@@ -1,4 +1,4 @@
-"""Rules on what single precision cannot tell apart: small motions in a wide domain, small strains of a stiff body."""
+"""Rules on single precision: small motions in a wide domain, small strains of a stiff body (docs/theory.md, 8.3)."""
 
 from collections.abc import Iterator
 
@@ -7,15 +7,15 @@ from mpmcli.check.finding import Finding
 
 # Largest relative rounding error of a number of 32 bits.
 HALF_ULP = 2.0**-24
-# Rounding of a position over the way of the fastest particle in a step. At 1 such a particle stands still, and at a
-# tenth all that are ten times slower do (hard case H18; docs/theory.md, 8.3).
+# Rounding of a position over the displacement of the fastest particle in a step. At 1 that particle does not move, at
+# 0.1 particles ten times slower do not (docs/theory.md, 8.3; docs/hard-cases.md, H18).
 LOST_MOTION = 0.1
-# Stress that the rounding of F makes, over the stress that gravity or speed makes (hard case H9).
+# Ratio of the stress from rounding of F to the stress from gravity or speed (docs/hard-cases.md, H9).
 STRESS_NOISE = 0.01
 
 
 def rounding_findings(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield what is to be said of solver.precision."""
+    """Yield the findings on solver.precision."""
     if facts.scene.solver.precision == "f64":
         return
     yield from _positions(facts)
@@ -23,7 +23,7 @@ def rounding_findings(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _positions(facts: SceneFacts) -> Iterator[Finding]:
-    """Positions count from the origin of the domain, so that its extent is the largest."""
+    """Positions are relative to the origin of the domain, so that its extent is the largest."""
     extent = max(facts.scene.domain.size)
     way = facts.bounds.speed * facts.taken(facts.step_at_start)
     if way == 0:

@@ -1,4 +1,4 @@
-"""The check of a scene before it runs: which step is safe and why, what will go wrong, and what it will take."""
+"""Check of a scene before the run: the safe step and its cause, findings, and a forecast; as data and as text."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -21,26 +21,28 @@ from mpmcli.scene import LoadedScene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.plan import Plan, make_plan
 
-# Steps that no run will ever take; the counts of a forecast are exact below 2^53.
+# A scene of more steps is rejected; the counts of a forecast are exact below 2^53.
 MOST_STEPS = 1e15
-# Rows of the table of limits; of more, those that bind least are left out.
+# Largest number of rows in the table of limits; the largest limits are left out.
 MOST_ROWS = 16
-# Findings of one rule that are told.
+# Largest number of findings of one rule in the text.
 MOST_ALIKE = 5
 
 
 @dataclass(frozen=True)
 class SceneCheck:
-    """What the check of a scene found.
+    """Result of the check of a scene.
 
     Attributes:
-        source: the file; title: of the scene.
-        limits: every bound on the step, in the order of the bodies, those of motion last.
-        binding, binding_at_start: the smallest of them, in any state and at the start.
-        step, step_at_start: safety times these, s: the step that is safe throughout, and the first one.
-        findings: the gravest first.
-        plan: fields and passes; forecast: steps, time, memory and disk.
-        notes: what was chosen for the scene as it was loaded.
+        source: file of the scene.
+        title: title of the scene.
+        limits: all bounds on the step, in the order of the bodies, those of motion last.
+        binding, binding_at_start: smallest bound in any state, and at the start.
+        step, step_at_start: safety times these, s.
+        findings: by decreasing severity.
+        plan: fields and passes.
+        forecast: steps, time, memory and disk space.
+        notes: values chosen for "auto" when the scene was loaded.
     """
 
     source: str
@@ -60,11 +62,11 @@ class SceneCheck:
         return passes(self.findings, strict=strict)
 
     def text(self) -> str:
-        """Return it as text for people: limits, findings, plan, forecast, and the outcome."""
+        """Return the check as text: limits, findings, plan, forecast, and the outcome."""
         return scene_text(self)
 
     def as_dict(self) -> dict:
-        """Return all of it as JSON can hold it; `ok` is whether it passes."""
+        """Return the check as a dictionary for JSON; `ok` is whether it passes."""
         return {
             "ok": self.passes(),
             "scene": self.source,
@@ -88,12 +90,12 @@ def check_scene(
     """Check a scene; Taichi is not started and nothing is written.
 
     Args:
-        plan: of the run, or of the probe; that of a run on all cores of the CPU where None.
-        probe: what a moment of the run cost, for the forecast of time.
-        directory: where results would go, for the room on its disk.
+        plan: plan of the run or of the probe; None for a run on all cores of the CPU.
+        probe: measured cost of a step, for the forecast of time.
+        directory: where results would be written, for the free space of its disk.
 
     Raises:
-        InputError: no step is stable, as where gravity is infinite at some time.
+        InputError: no step is stable, for example because gravity is infinite at some time.
     """
     scene = loaded.scene
     facts = SceneFacts(scene)
@@ -117,8 +119,8 @@ def check_scene(
             Finding(
                 "error",
                 "probe",
-                f"The run broke down within {probe.steps} steps of the probe: {probe.failure.rstrip('.')}.",
-                "Start it nearer to rest: with slower bodies, a stiffer material, or a lower time.safety.",
+                f"The run became unstable within {probe.steps} steps of the probe: {probe.failure.rstrip('.')}.",
+                "Use slower bodies, a stiffer material, or a lower time.safety.",
                 probe.steps,
             )
         )
@@ -152,7 +154,7 @@ def scene_text(check: SceneCheck) -> str:
 
 
 def _limits(check: SceneCheck) -> str:
-    """One row for each bound, in the order of the scene; a bound that the stiffest state leaves alone has one row."""
+    """Return one row for each bound, in the order of the scene; one row only if the stiffest state has the same."""
     shown, left_out = _rows(check)
     table = text_table(
         ("body", "limit", "state", "largest step", ""),
@@ -192,7 +194,7 @@ def _steps(check: SceneCheck) -> str:
 
 
 def _findings(check: SceneCheck) -> str:
-    """One line each; of many that one rule has found, the first ones."""
+    """Return one line for each finding, and of each rule the first MOST_ALIKE only."""
     lines, told = [], Counter[str]()
     for finding in check.findings:
         told[finding.rule] += 1

@@ -1,4 +1,4 @@
-"""Every bound on the time step that a scene will meet, from its text alone: at rest, and in the stiffest state."""
+"""Bounds on the time step of a scene before the run: at rest, and in the stiffest state (docs/theory.md, 6)."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -16,10 +16,10 @@ from mpmcli.scene.schema import SolverSettings
 from mpmcli.stability.limits import FIX, WHY, deformation_limit, mode_limit, speed_limit
 from mpmcli.stability.transfer_factors import step_inertia
 
-# In an impact a cell stops on one side while matter comes in on the other from two nodes: two speeds per cell.
+# Velocity gradient of an impact, in speeds per cell: one side of a cell stops while matter enters from two nodes.
 IMPACT_GRADIENT = 2.0
-# A wave that meets a free surface throws matter off at twice its speed, and jets out of a corner are about as fast:
-# 1.6 to 2.5 times the speed of the fall in seven scenes of eight, 3 times in one where bodies splash each other.
+# A wave that reaches a free surface ejects matter at twice its speed, and jets from a corner are about as fast: 1.6 to
+# 2.5 times the speed of the fall in seven scenes of eight, 3 times in one with colliding bodies.
 JET = 2.0
 
 
@@ -28,13 +28,13 @@ class SceneLimit:
     """One bound on the time step of a scene.
 
     Attributes:
-        value: the largest step that it allows, s, without the safety.
+        value: largest stable step, s, without the safety factor.
         name: "wave", "viscosity", "speed" or "deformation".
-        body: name of the body that sets it, "" where no single one does.
-        state: "rest", the scene as it starts; "stiffest", what the scene can drive it to.
+        body: name of the body that sets it, "" if there is no single one.
+        state: "rest", the start of the scene, or "stiffest", the stiffest state that the scene can reach.
         meaning: the state in words.
-        why, fix: one sentence each, with the numbers of this scene.
-        bound: the state of the material, None where the bound does not depend on it.
+        why, fix: one sentence each, with numbers of the scene.
+        bound: bounds on the state of the material, None if the limit does not depend on it.
     """
 
     value: float
@@ -47,7 +47,7 @@ class SceneLimit:
     bound: StateBound | None = None
 
     def as_dict(self) -> dict:
-        """Return it as JSON can hold it; `volume_ratio` and `internal` are ranges."""
+        """Return the limit as a dictionary for JSON; `volume_ratio` and `internal` are ranges."""
         bound = self.bound
         return {
             "value": self.value,
@@ -63,12 +63,12 @@ class SceneLimit:
 
 
 def law_of(body: Body, dimension: int) -> Law:
-    """Return the law of one body alone."""
+    """Return an instance of the law of one body, for that body only."""
     return laws()[body.material.law]([body.material], dimension)
 
 
 def scene_limits(scene: Scene, bounds: SceneBounds) -> list[SceneLimit]:
-    """Return every bound: of each body at rest and in its stiffest state, then those of motion."""
+    """Return all limits: of each body at rest and in its stiffest state, then those of motion."""
     found = []
     for body in scene.bodies:
         law = law_of(body, scene.dimension)
@@ -78,7 +78,7 @@ def scene_limits(scene: Scene, bounds: SceneBounds) -> list[SceneLimit]:
 
 
 def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene: Scene) -> Iterator[SceneLimit]:
-    """Yield the tightest bound of each name that the modes of one body set in one state."""
+    """Yield the smallest limit of each name that the modes of one body set in one state."""
     material, spacing = body.material, scene.domain.spacing
     inertia = step_inertia(scene.solver)
     scheme = _scheme_text(scene.solver, inertia)
@@ -113,7 +113,7 @@ def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene:
 
 
 def _scheme_text(settings: SolverSettings, inertia: float) -> dict[str, str]:
-    """Return by which factor knobs other than usual change the bounds of waves and of viscosity, in words."""
+    """Return a clause on the factor by which transfer and kernel change the limits, "" for the default ones."""
     if inertia == 1:
         return {"wave": "", "viscosity": ""}
     chosen = f'; transfer = "{settings.transfer}" with kernel = "{settings.kernel}" is stable at'
@@ -124,7 +124,7 @@ def _scheme_text(settings: SolverSettings, inertia: float) -> dict[str, str]:
 
 
 def _motion_limits(scene: Scene, bounds: SceneBounds) -> Iterator[SceneLimit]:
-    """Yield the bounds of the speeds and velocity gradients that the scene starts with, and can reach."""
+    """Yield the limits set by speeds and velocity gradients, at the start and reachable in the scene."""
     h = scene.domain.spacing
     fastest = max(scene.bodies, key=highest_speed)
     initial, reached = highest_speed(fastest), bounds.speed
@@ -172,7 +172,7 @@ def _motion_limits(scene: Scene, bounds: SceneBounds) -> Iterator[SceneLimit]:
 
 
 def _initial_rate(body: Body, dimension: int) -> float:
-    """Return how fast a body deforms at the start, 1/s."""
+    """Return the largest rate of deformation of a body at the start, 1/s."""
     if body.velocity_gradient is None and not moves_unevenly(body):
         return 0.0
     _, C = initial_motion(body, body_points(body) if moves_unevenly(body) else np.zeros((1, dimension)))
@@ -181,13 +181,13 @@ def _initial_rate(body: Body, dimension: int) -> float:
 
 
 def _parameter(body: Body, names: tuple[str, ...], otherwise: str) -> str:
-    """Return the first of some parameters that a body has, with its value."""
+    """Return the first of the named parameters that a body has, with its value, as text."""
     found = Law.first_set(body.material, names)
     return f"{found[0]} = {found[1]:.4g}" if found else otherwise
 
 
 def _state_text(bound: StateBound) -> str:
-    """Say what a state bound is: how far compressed or opened, and its internal variables where they moved."""
+    """Return a state bound as text: the range of J, and those of the internal variables."""
     words = [
         f"{name} = {low:.3g}" + ("" if low == high else f" to {high:.3g}")
         for name, (low, high) in bound.internal.items()
@@ -199,9 +199,9 @@ def _state_text(bound: StateBound) -> str:
 
 
 def smallest(limits: Sequence[SceneLimit], *, at_rest: bool = False) -> SceneLimit:
-    """Return the limit that binds, in any state or in that at the start.
+    """Return the smallest limit, in any state or at the start.
 
-    A bound that is the same in both is said to be that at rest.
+    Of equal limits, that at rest is returned.
     """
     chosen = [limit for limit in limits if limit.state == "rest" or not at_rest]
     return min(chosen, key=lambda limit: limit.value)

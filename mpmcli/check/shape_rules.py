@@ -1,4 +1,4 @@
-"""Rules on what the grid can resolve: thin bodies, gaps, walls that are nearly touched, and particles per cell."""
+"""Rules on resolution: thin bodies, gaps between bodies, distance from walls, and particles per cell."""
 
 from collections.abc import Iterator
 
@@ -9,22 +9,22 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.scene.quantity import AXES
 
-# Cells across a body below which its motion within itself is lost: with three, one particle row has neighbours on
-# both sides that do not feel the surface (the stencil is three nodes wide; hard case H12).
+# Cells across a body below which internal motion is not resolved. The stencil is three nodes wide, so that with three
+# cells one row of particles is not affected by the surface (docs/hard-cases.md, H12).
 FEWEST_CELLS = 3.0
-# Cells that the kernels of two particles reach over together, by kernel: closer ones always share a node.
+# Distance, in cells, below which two particles always share a node, by kernel.
 REACH = {"quadratic": 2.0, "cubic": 3.0}
-# Cells below which a gap is contact on purpose: round-off, and bodies set on each other by hand.
+# Distance, in cells, below which a gap counts as intended contact.
 TOUCHING = 0.1
-# Cells from a wall within which a body feels it: the stencil reaches 1.5 nodes, its matter half of that.
+# Distance, in cells, below which a wall acts on a body.
 WALL_REACH = 1.0
-# Particles along an axis of a cell: below two, stretched matter tears (numerical fracture) and the sum over
-# particles is no integral; above four they cost without making anything more accurate.
+# Particles per axis of a cell. Below two, stretched matter tears (numerical fracture) and sums over particles are poor
+# quadratures; above four, the cost grows without a gain in accuracy.
 FEWEST_PER_AXIS, MOST_PER_AXIS = 2, 4
 
 
 def shape_findings(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield what is to be said of shapes and their particles."""
+    """Yield the findings on shapes and their particles."""
     yield from _thin(facts)
     yield from _gaps(facts)
     yield from _walls(facts)
@@ -35,9 +35,9 @@ def _thin(facts: SceneFacts) -> Iterator[Finding]:
     h = facts.scene.domain.spacing
     for body in facts.bodies:
         cells = body.thickness / h
-        # A body of just so many cells is not thin for the rounding of its corners.
+        # The tolerance allows for rounding of the corners.
         if cells < FEWEST_CELLS * (1 - 1e-6):
-            lost = "its motion as a whole is right at best" if cells < 1 else "it bends and waves as if it were stiffer"
+            lost = "at best its motion as a whole is correct" if cells < 1 else "it is too stiff in bending and waves"
             yield Finding(
                 "warning",
                 "thin-body",
@@ -58,13 +58,13 @@ def _gaps(facts: SceneFacts) -> Iterator[Finding]:
         if cells <= TOUCHING or cells >= reach:
             continue
         first, second = bodies[i], bodies[j]
-        # Bodies that come to rest on each other end there anyway; those that pass are dragged along.
+        # Bodies with equal velocity would come to rest in contact; those that pass each other are dragged along.
         passing = not np.array_equal(first.velocity, second.velocity)
         yield Finding(
             "warning" if passing else "note",
             "gap",
-            f'Bodies "{first.name}" and "{second.name}" are {cells:.2g} cells apart and act on each other already, as '
-            f"the grid joins what is closer than {reach:g} cells.",
+            f'Bodies "{first.name}" and "{second.name}" are {cells:.2g} cells apart and already act on each other, as '
+            f"the grid couples particles closer than {reach:g} cells.",
             f"Set them {reach * h:.3g} m apart, or make the spacing {distance / reach:.3g} m, to keep them apart.",
             cells,
             first.name,
@@ -86,7 +86,7 @@ def _walls(facts: SceneFacts) -> Iterator[Finding]:
                     yield Finding(
                         "note",
                         "wall-margin",
-                        f'Body "{body.name}" begins {cells:.2g} cells from the wall {face} and feels it already.',
+                        f'Body "{body.name}" begins {cells:.2g} cells from the wall {face}, which already acts on it.',
                         f"Let it touch the wall, or set it {WALL_REACH * h:.3g} m or more from it.",
                         float(cells),
                         body.name,
@@ -119,7 +119,7 @@ def _particles(facts: SceneFacts) -> Iterator[Finding]:
                 "note",
                 "particles-per-cell",
                 f'Body "{body.name}" has {count} particles per cell, which cost {count / fewest:.3g} times the usual '
-                f"{fewest}; the grid, not the particles, limits what is resolved.",
+                f"{fewest}; the resolution is that of the grid, not of the particles.",
                 f"Set particles_per_cell = {most} or fewer, and spend the time on a finer grid.",
                 count,
                 body.name,

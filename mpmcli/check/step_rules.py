@@ -8,22 +8,23 @@ from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import wave_loss
 from mpmcli.stability.transfer_factors import step_inertia
 
-# A step this much smaller than the stable one costs four times the time and loses four times the energy (H19).
+# Ratio to the stable step below which a step is reported: four times the cost and loss of energy (docs/hard-cases.md,
+# H19).
 SMALL_STEP = 0.25
-# Share of its energy that the longest wave across the thinnest body may lose in the whole run before it is told.
+# Share of energy, lost in the run by the longest wave across the thinnest body, above which it is reported.
 NOTED_LOSS = 0.1
-# What a step above the limit does.
-LONE = "a lone particle blows up above it, and the run with it"
+# Consequence of a step above each limit.
+LONE = "above it a lone particle, and with it the run, is unstable"
 CONSEQUENCE = {
     "wave": LONE,
     "viscosity": LONE,
-    "speed": "particles outrun what the grid says of them",
-    "deformation": "particles are turned inside out",
+    "speed": "particles leave the nodes that they act on",
+    "deformation": "particles are inverted",
 }
 
 
 def step_findings(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield what is to be said of time.step, and of the energy that the steps lose."""
+    """Yield the findings on time.step, and on the energy lost by the steps."""
     step = facts.scene.time.step
     if step != "auto":
         yield from _asked(facts, step)
@@ -80,7 +81,7 @@ def _asked(facts: SceneFacts, step: float) -> Iterator[Finding]:
 
 
 def _courant(facts: SceneFacts, step: float) -> str:
-    """Return the Courant number in brackets where a wave binds: c dt / h with c = sqrt(S / (d density))."""
+    """Return the Courant number c dt / h, c = sqrt(S / (d density)), in brackets if a wave limit binds, else ""."""
     rest = facts.binding_at_start
     if rest.name != "wave":
         return ""
@@ -89,10 +90,10 @@ def _courant(facts: SceneFacts, step: float) -> str:
 
 
 def _dissipation(facts: SceneFacts) -> Iterator[Finding]:
-    """Only of bodies that would keep their energy: plastic flow and viscosity take more than the scheme does."""
+    """Yield the loss of energy by the transfers, unless plastic flow or viscosity of the body dissipates more."""
     step = facts.taken(facts.step_at_start)
     h, end = facts.scene.domain.spacing, facts.scene.time.end
-    # Of (k h)^4 or, with PIC, (k h)^2, in twice as many steps.
+    # The loss per step is of order (k h)^4, with PIC (k h)^2, in twice as many steps.
     part = "a half" if facts.scene.solver.transfer == "pic" else "an eighth"
     for body in facts.bodies:
         rate = wave_loss(body.thickness, h, step, facts.scene.solver)

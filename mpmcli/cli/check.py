@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 @click.argument("path", type=click.Path(path_type=Path))
 @set_option
 @plugin_option
-@click.option("--no-probe", is_flag=True, help="Leave out the two seconds of the scene that time a step.")
-@click.option("--strict", is_flag=True, help="Let warnings fail the check as errors do.")
+@click.option("--no-probe", is_flag=True, help="Skip the run of two seconds that measures the time of a step.")
+@click.option("--strict", is_flag=True, help="Treat warnings as errors.")
 @threads_option
 @json_option
 def command(
@@ -30,10 +30,10 @@ def command(
     threads: int | None,
     as_json: bool,
 ) -> int:
-    """Say which step is safe in a scene (PATH.toml) and why, and what the run will take.
+    """Check a scene (PATH.toml): the stable step and its cause, likely faults, and the cost of the run.
 
-    Or say whether a result stayed stable: its directory, particles.vtkhdf or particles.pvd. Nothing is written.
-    Exit code 1 where an error is found, or with --strict a warning.
+    Or check whether a result is stable and complete: its directory, particles.vtkhdf or particles.pvd. Nothing is
+    written. The exit code is 1 if there is an error, or with --strict a warning.
     """
     if path.suffix == ".toml":
         check = _of_scene(path, overrides, plugins, threads, probing=not no_probe)

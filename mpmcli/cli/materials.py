@@ -14,7 +14,7 @@ from mpmcli.cli.streams import print_json, print_text
 if TYPE_CHECKING:
     from rich.console import Console
 
-# Columns of text where there is no terminal that says its width.
+# Width of the text, in columns, if stdout is not a terminal.
 WIDTH = 140
 
 
@@ -23,10 +23,10 @@ WIDTH = 140
 @plugin_option
 @json_option
 def command(name: str | None, plugins: tuple[Path, ...], as_json: bool) -> None:
-    """List the laws and presets that a material may follow, or show the one called NAME.
+    """List the laws and presets of materials, or show the one called NAME.
 
-    Parameters come with their units, ranges and defaults, presets with their sources, and knobs with the
-    values that they stand for.
+    Parameters are listed with units, ranges and defaults, presets with their sources, and knobs with the
+    values that they set.
     """
     from mpmcli.errors import InputError
     from mpmcli.materials.registry import laws, load_plugins
@@ -58,7 +58,7 @@ def command(name: str | None, plugins: tuple[Path, ...], as_json: bool) -> None:
 
 
 def _summary(law: type) -> str:
-    """Return the first line of what a law's module says of itself, or else its class."""
+    """Return the first line of the docstring of a law's module, or of its class."""
     module = sys.modules.get(law.__module__)
     text = getattr(module, "__doc__", None) or inspect.getdoc(law) or ""
     return next(iter(text.strip().splitlines()), "").rstrip(".")
@@ -118,7 +118,7 @@ def _plain(value: object) -> str:
 
 
 def _say_table(console: "Console", head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print columns, of which the last one wraps."""
+    """Print a table whose last column wraps."""
     from rich.table import Table
     from rich.text import Text
 
