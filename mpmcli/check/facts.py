@@ -12,6 +12,9 @@ from mpmcli.check.scene_limits import SceneLimit, law_of, scene_limits, smallest
 from mpmcli.materials.law import Law, StateBound
 from mpmcli.scene import Body, Scene, SceneBounds, scene_bounds
 
+# Lower bound on a thickness, m. A process that runs Taichi flushes smaller numbers to 0.
+SMALLEST = float(np.finfo(np.float64).tiny)
+
 
 @dataclass(frozen=True, eq=False)
 class BodyFacts:
@@ -100,7 +103,7 @@ class SceneFacts:
                     body,
                     law,
                     arrival,
-                    thickness(form, spanned_axes(self.scene, form)),
+                    max(thickness(form, spanned_axes(self.scene, form)), SMALLEST),
                     height,
                     stiffness,
                     max(stiffness, stiffest),
