@@ -68,7 +68,7 @@ class MirrorImages:
         acts = self.walls.acting(node, depth, mirror, upper)
         for images in range(ti.static(2**self.dimension)):
             if self.has_image(images, acts, depth):
-                field[self.image(grid, node, mirror, images)] = self.mirrored(value, images, upper)
+                field[self.image(grid, node, mirror, images)] = self.mirrored_value(value, images, upper)
 
     @ti.func
     def image_sum(
@@ -91,7 +91,7 @@ class MirrorImages:
         for images in range(ti.static(2**self.dimension)):
             if self.has_image(images, acts, depth):
                 value = pulled(field[self.image(grid, node, mirror, images)], self.dimension, gravity_step)
-                total += self.mirrored(value, images, upper)
+                total += self.mirrored_value(value, images, upper)
         return total
 
     @ti.func
@@ -112,7 +112,7 @@ class MirrorImages:
         return grid.linear_index(place)
 
     @ti.func
-    def mirrored(self, value: ti.template(), images: int, upper: ti.template()):
+    def mirrored_value(self, value: ti.template(), images: int, upper: ti.template()):
         """Return momentum or velocity mirrored: the normal part always, the rest where the wall sticks."""
         result = value
         for a in ti.static(range(self.dimension)):
