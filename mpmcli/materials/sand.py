@@ -1,4 +1,4 @@
-"""Sand: Drucker-Prager plasticity, frictional under pressure and without stress in tension."""
+"""Sand: Drucker-Prager plasticity, frictional under pressure; grains separate in tension."""
 
 import math
 from collections.abc import Mapping
