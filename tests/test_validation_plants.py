@@ -158,15 +158,15 @@ PLANTS = (
     Plant(
         "pressure halved",
         "materials/fluid.py",
-        "spherical = constants[0] * (J - 1.0)",
-        "spherical = 0.5 * constants[0] * (J - 1.0)",
+        "spherical = constants[BULK_MODULUS] * (J - 1.0)",
+        "spherical = 0.5 * constants[BULK_MODULUS] * (J - 1.0)",
         ("hydrostatic",),
     ),
     Plant(
         "viscosity halved",
         "materials/fluid.py",
-        "tau += constants[2] * (C + C.transpose())",
-        "tau += 0.5 * constants[2] * (C + C.transpose())",
+        "tau += constants[VISCOSITY] * (C + C.transpose())",
+        "tau += 0.5 * constants[VISCOSITY] * (C + C.transpose())",
         ("homogeneous",),
     ),
     Plant(
@@ -179,8 +179,8 @@ PLANTS = (
     Plant(
         "exponent of the equation of state",
         "materials/fluid.py",
-        "(1.0 - crushed ** (-constants[1]))",
-        "(1.0 - crushed ** (-constants[1] - 1.0))",
+        "(1.0 - crushed ** (-constants[EXPONENT]))",
+        "(1.0 - crushed ** (-constants[EXPONENT] - 1.0))",
         ("homogeneous",),
     ),
     Plant(
@@ -193,22 +193,22 @@ PLANTS = (
     Plant(
         "lambda of the neo-Hookean solid doubled",
         "materials/neo_hookean.py",
-        "constants[1] * ti.log(deformation.determinant())",
-        "2.0 * constants[1] * ti.log(deformation.determinant())",
+        "constants[LAMBDA] * ti.log(deformation.determinant())",
+        "2.0 * constants[LAMBDA] * ti.log(deformation.determinant())",
         ("homogeneous",),
     ),
     Plant(
         "lambda of the corotated solid with J squared",
         "materials/fixed_corotated.py",
-        "pressure_part = constants[1] * (J - 1.0) * J",
-        "pressure_part = constants[1] * (J - 1.0) * J * J",
+        "pressure_part = constants[LAMBDA] * (J - 1.0) * J",
+        "pressure_part = constants[LAMBDA] * (J - 1.0) * J * J",
         ("homogeneous",),
     ),
     Plant(
         "mu of the corotated solid halved",
         "materials/fixed_corotated.py",
-        "tau = constants[0] * (stretched + stretched.transpose())",
-        "tau = constants[0] * stretched",
+        "tau = constants[MU] * (stretched + stretched.transpose())",
+        "tau = constants[MU] * stretched",
         ("homogeneous",),
     ),
     Plant(
@@ -235,8 +235,8 @@ PLANTS = (
     Plant(
         "snow that softens as it packs",
         "materials/snow.py",
-        "hardness = ti.exp(constants[4] * (1.0 - variables[0]))",
-        "hardness = ti.exp(constants[4] * (variables[0] - 1.0))",
+        "hardness = ti.exp(constants[HARDENING] * (1.0 - variables[0]))",
+        "hardness = ti.exp(constants[HARDENING] * (variables[0] - 1.0))",
         ("snow_oedometer",),
     ),
     Plant(
