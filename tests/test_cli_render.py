@@ -16,7 +16,7 @@ from PIL import Image
 from mpmcli.output import Result, VtkSeriesStore, open_result
 from mpmcli.output.segments import SEGMENTS
 from mpmcli.render.files.picture_file import settings_digest, write_picture
-from mpmcli.render.request import Request, assign
+from mpmcli.render.request import Request, plan_render
 
 pytestmark = pytest.mark.usefixtures("drawing")
 
@@ -118,9 +118,9 @@ def test_a_film_has_its_frames_and_its_length(run: Path, tmp_path: Path) -> None
 def test_an_interrupt_ends_a_film_that_is_put_together(run: Path, tmp_path: Path) -> None:
     film = tmp_path / "film.mp4"
     settings = Request(movie=film, output=tmp_path / "out", size="64x64")
-    assign(open_result(run), replace(settings, movie=None, frames="all")).carry_out(1)
+    plan_render(open_result(run), replace(settings, movie=None, frames="all")).carry_out(1)
     with pytest.raises(KeyboardInterrupt):
-        assign(open_result(run), settings).carry_out(1, stop=lambda: True)
+        plan_render(open_result(run), settings).carry_out(1, stop=lambda: True)
     assert not film.exists() and len(list((tmp_path / "out").iterdir())) == FRAMES
 
 

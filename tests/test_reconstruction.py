@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mpmcli.frames.frame import Frame
-from mpmcli.render.look import LOOKS
-from mpmcli.render.subject import Subject
+from mpmcli.render.appearance import APPEARANCES
+from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.surfaces.reconstruction import Mesh, reconstruct
 from mpmcli.render.surfaces.save_surface import flat_mesh, save_surface, surface_paths, write_series
 
@@ -139,13 +139,13 @@ def area_of(mesh: Mesh) -> float:
     return 0.5 * float(twice.sum())
 
 
-def subject_with(dimension: int, *names: str) -> Subject:
+def subject_with(dimension: int, *names: str) -> RenderScene:
     upper = UPPER if dimension == 3 else (1.0, 1.0, 0.0)
     up = (0.0, 0.0, 1.0) if dimension == 3 else (0.0, 1.0, 0.0)
     bodies = tuple(range(len(names)))
-    looks = tuple(LOOKS[name] for name in names)
+    appearances = tuple(APPEARANCES[name] for name in names)
     spacing = 2 * DISTANCE
-    return Subject(
+    return RenderScene(
         "",
         dimension,
         LOWER,
@@ -153,7 +153,7 @@ def subject_with(dimension: int, *names: str) -> Subject:
         spacing,
         up,
         names,
-        looks,
+        appearances,
         bodies,
         (DISTANCE,) * len(names),
         (1e3,) * len(names),
@@ -170,11 +170,11 @@ def frame_of(position: np.ndarray, body: np.ndarray | int = 0, index: int = 12) 
 def test_saved_surfaces_are_read_by_others(dimension: int, tmp_path: Path) -> None:
     import pyvista as pv
 
-    subject = subject_with(dimension, "water", "sand")
+    scene = subject_with(dimension, "water", "sand")
     first, second = (lattice((12,) * dimension, (corner,) * dimension) for corner in (0.0, 0.5))
     frame = frame_of(np.concatenate([first, second]), np.repeat([0, 1], 12**dimension))
-    written = save_surface(subject, frame, tmp_path / "meshes")
-    assert written == surface_paths(subject, tmp_path / "meshes", 12)
+    written = save_surface(scene, frame, tmp_path / "meshes")
+    assert written == surface_paths(scene, tmp_path / "meshes", 12)
     assert [path.name for path in written[:2]] == ["surface_water_000012.vtp", "surface_water_000012.obj"]
     for path, corner in zip(written, (0.0, 0.0, 0.5, 0.5), strict=True):
         data = pv.read(path)
@@ -182,7 +182,7 @@ def test_saved_surfaces_are_read_by_others(dimension: int, tmp_path: Path) -> No
         assert size == pytest.approx((12 * DISTANCE) ** dimension, rel=0.06), path.name
         assert data.bounds[0] == pytest.approx(corner, abs=0.3 * DISTANCE)
     assert pv.read(written[0]).field_data["TimeValue"][0] == 0.25
-    index = write_series(subject, tmp_path / "meshes", [(13, 0.5), (12, 0.25)])[0]
+    index = write_series(scene, tmp_path / "meshes", [(13, 0.5), (12, 0.25)])[0]
     assert index.read_text().index("000012") < index.read_text().index("000013")
 
 

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mpmcli.output import Result
-from mpmcli.render.canvas import Canvas
 from mpmcli.render.color_by import color_by
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.labels import cut, length_text, round_length, ticks_of, time_text
-from mpmcli.render.painter import open_studio
+from mpmcli.render.painter import set_up
+from mpmcli.render.picture_layout import PictureLayout
 from mpmcli.render.pictures import picture_digest
+from mpmcli.render.render_scene import render_scene_of
 from mpmcli.render.settings import Settings
-from mpmcli.render.subject import subject_of
 from mpmcli.render.theme import THEMES, rgb_bytes
 from mpmcli.render.view import view_of
 
@@ -27,20 +27,20 @@ LIGHT = THEMES["light"]
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
     facts = header((2.0, 1.0), 0.1, [WATER, JELLY])
-    return write(tmp_path_factory.mktemp("canvas") / "run", facts, [frame(k, np.ones((4, 2))) for k in range(5)])
+    return write(tmp_path_factory.mktemp("layout") / "run", facts, [frame(k, np.ones((4, 2))) for k in range(5)])
 
 
-def canvas_of(result: Result, size: tuple[int, int] = (800, 500), by: str = "speed", **options) -> Canvas:
-    subject = subject_of(result)
-    colors = color_by(by, result, subject, LIGHT, limits=(0.0, 8.0) if by == "speed" else None)
-    return Canvas(size, subject, LIGHT, tuple(result.times.tolist()), colors, **options)
+def canvas_of(result: Result, size: tuple[int, int] = (800, 500), by: str = "speed", **options) -> PictureLayout:
+    scene = render_scene_of(result)
+    colors = color_by(by, result, scene, LIGHT, limits=(0.0, 8.0) if by == "speed" else None)
+    return PictureLayout(size, scene, LIGHT, tuple(result.times.tolist()), colors, **options)
 
 
-def composed(canvas: Canvas, count: int = 1, missing: int = 0) -> np.ndarray:
-    view = view_of(canvas.subject, "iso", canvas.stage_size)
-    width, height = canvas.stage_size
+def composed(layout: PictureLayout, count: int = 1, missing: int = 0) -> np.ndarray:
+    view = view_of(layout.scene, "iso", layout.viewport_size)
+    width, height = layout.viewport_size
     blank = np.full((height, width, 3), 255, np.uint8)
-    return canvas.compose([blank] * count, view, [0.01 * k for k in range(count)], missing)
+    return layout.compose([blank] * count, view, [0.01 * k for k in range(count)], missing)
 
 
 def count_of(picture: np.ndarray, color: str) -> int:
@@ -48,9 +48,9 @@ def count_of(picture: np.ndarray, color: str) -> int:
 
 
 def test_the_scale_bar_is_as_long_as_it_says(result: Result) -> None:
-    canvas = canvas_of(result)
-    picture = composed(canvas)
-    view = view_of(canvas.subject, "iso", canvas.stage_size)
+    layout = canvas_of(result)
+    picture = composed(layout)
+    view = view_of(layout.scene, "iso", layout.viewport_size)
     text = (picture == rgb_bytes(LIGHT.text)).all(axis=2)
     # The longest run of pixels in the lower margin is the bar.
     row = max(text[-40:], key=lambda row: row[: len(row) // 2].sum())
@@ -61,11 +61,11 @@ def test_the_scale_bar_is_as_long_as_it_says(result: Result) -> None:
 
 
 def test_walls_are_drawn_around_the_domain_and_nowhere_within(result: Result) -> None:
-    canvas = canvas_of(result)
-    picture = composed(canvas)
-    view = view_of(canvas.subject, "iso", canvas.stage_size)
-    (x0, y1, _), (x1, y0, _) = view.pixels(np.array([canvas.subject.lower, canvas.subject.upper]))
-    top = (500 - canvas.stage_size[1]) // 2
+    layout = canvas_of(result)
+    picture = composed(layout)
+    view = view_of(layout.scene, "iso", layout.viewport_size)
+    (x0, y1, _), (x1, y0, _) = view.pixels(np.array([layout.scene.lower, layout.scene.upper]))
+    top = (500 - layout.viewport_size[1]) // 2
     rows, columns = np.nonzero((picture == rgb_bytes(LIGHT.wall)).all(axis=2))
     assert columns.min() >= x0 - 3 and columns.max() <= x1 + 3
     assert rows.min() - top >= y0 - 3 and rows.max() - top <= y1 + 3
@@ -74,27 +74,27 @@ def test_walls_are_drawn_around_the_domain_and_nowhere_within(result: Result) ->
 
 
 def test_the_bar_shows_the_colours_of_its_values(result: Result) -> None:
-    canvas = canvas_of(result)
-    assert isinstance(canvas.colors, Coloring)
-    picture = composed(canvas)
-    bottom, top = (tuple(color) for color in canvas.colors.rgb(np.array([0.0, 8.0])).tolist())
+    layout = canvas_of(result)
+    assert isinstance(layout.colors, Coloring)
+    picture = composed(layout)
+    bottom, top = (tuple(color) for color in layout.colors.rgb(np.array([0.0, 8.0])).tolist())
     places = [np.flatnonzero((picture == color).all(axis=2).any(axis=1)) for color in (top, bottom)]
     assert places[0].mean() < places[1].mean()
     assert count_of(picture, LIGHT.missing) == 0
-    assert count_of(composed(canvas, missing=3), LIGHT.missing) > 50
+    assert count_of(composed(layout, missing=3), LIGHT.missing) > 50
 
 
 def test_the_legend_has_each_material(result: Result) -> None:
-    canvas = canvas_of(result, by="material")
-    picture = composed(canvas)
-    assert all(count_of(picture, look.ink) > 60 for look in canvas.subject.looks)
+    layout = canvas_of(result, by="material")
+    picture = composed(layout)
+    assert all(count_of(picture, appearance.ink) > 60 for appearance in layout.scene.appearances)
 
 
 def test_a_legend_says_how_many_kinds_it_has_no_room_for(result: Result) -> None:
-    canvas = canvas_of(result, by="body")
+    layout = canvas_of(result, by="body")
     inks = tuple(f"#{k:02x}2030" for k in range(1, 41))
     many = Categories("body", tuple(f"body {k}" for k in range(40)), inks, tuple(range(40)))
-    picture = composed(replace(canvas, colors=many))
+    picture = composed(replace(layout, colors=many))
     shown = [count_of(picture, ink) > 60 for ink in inks]
     told = sum(shown)
     assert 5 < told < 40 and all(shown[:told])
@@ -107,22 +107,22 @@ def test_titles_and_names_may_hold_what_no_font_has(tmp_path: Path) -> None:
     facts = header((1.0, 1.0), 0.1, [WATER, JELLY])
     facts |= {"title": "two\nlines,\ta tab\r\x01 and \u6c34", "bodies": ["left\nhand", " \t "]}
     result = write(tmp_path / "run", facts, [frame(0, np.ones((4, 2)))])
-    subject = subject_of(result)
-    assert subject.title == "two lines, a tab and \u6c34" and subject.bodies == ("left hand", "")
+    scene = render_scene_of(result)
+    assert scene.title == "two lines, a tab and \u6c34" and scene.bodies == ("left hand", "")
     assert composed(canvas_of(result, by="body")).shape == (500, 800, 3)
 
 
 def test_walls_of_a_slice_are_where_its_domain_ends(tmp_path: Path) -> None:
     run = write(tmp_path / "run", header((1.0, 2.0, 0.5), 0.1, [WATER]), [frame(0, np.ones((1, 3)))])
-    studio = open_studio(run, Settings("density", None, (640, 360), camera="side"))
-    width, height = studio.canvas.stage_size
+    setup = set_up(run, Settings("density", None, (640, 360), camera="side"))
+    width, height = setup.layout.viewport_size
     blank = np.full((height, width, 3), 255, np.uint8)
-    picture = studio.canvas.compose([blank], studio.view, [0.0])[:, :width]
+    picture = setup.layout.compose([blank], setup.view, [0.0])[:, :width]
     rows, columns = np.nonzero((picture == rgb_bytes(LIGHT.wall)).all(axis=2))
-    scale = studio.view.pixels_per_metre
+    scale = setup.view.pixels_per_metre
     # 2 m by 0.5 m, and a line on each side.
     assert np.ptp(columns) == pytest.approx(2.0 * scale, abs=5) and np.ptp(rows) == pytest.approx(0.5 * scale, abs=5)
-    assert not open_studio(run, Settings("dots", "speed", (640, 360), camera="side")).canvas.walls
+    assert not set_up(run, Settings("dots", "speed", (640, 360), camera="side")).layout.walls
 
 
 @pytest.mark.parametrize("planned", [True, False])
@@ -135,7 +135,7 @@ def test_a_film_writes_all_times_alike_also_while_its_run_goes_on(tmp_path: Path
         frames = [replace(frame(k, np.ones((1, 2))), time=pause * k) for k in range(count)]
         run = write(tmp_path / str(count), facts, frames)
         digests.append(picture_digest(run, settings, [1]))
-        labels.append(time_text(pause, open_studio(run, settings).canvas.times))
+        labels.append(time_text(pause, set_up(run, settings).layout.times))
     if planned:
         assert digests[0] == digests[1] and labels == ["t = 0.1 s"] * 2
     else:
@@ -151,12 +151,12 @@ def test_every_size_is_possible(result: Result, size: tuple[int, int], by: str) 
 
 
 def test_a_montage_places_its_pictures_in_rows(result: Result) -> None:
-    canvas = canvas_of(result, grid=(3, 2))
-    width, height = canvas.stage_size
+    layout = canvas_of(result, grid=(3, 2))
+    width, height = layout.viewport_size
     inks = ["#102030", "#203040", "#304050", "#405060", "#506070"]
     pictures = [np.full((height, width, 3), rgb_bytes(ink), np.uint8) for ink in inks]
-    view = view_of(canvas.subject, "iso", canvas.stage_size)
-    whole = canvas.compose(pictures, view, [0.0] * 5)
+    view = view_of(layout.scene, "iso", layout.viewport_size)
+    whole = layout.compose(pictures, view, [0.0] * 5)
     middles = []
     for ink in inks:
         rows, columns = np.nonzero((whole == rgb_bytes(ink)).all(axis=2))
@@ -168,10 +168,10 @@ def test_a_montage_places_its_pictures_in_rows(result: Result) -> None:
 
 
 def test_a_height_that_follows_from_the_scene_leaves_no_empty_band(result: Result) -> None:
-    canvas = canvas_of(result, (900, 900), grid=(2, 2))
+    layout = canvas_of(result, (900, 900), grid=(2, 2))
     for _ in range(4):
-        canvas = replace(canvas, size=(900, canvas.height_for(0.5)))
-    width, height = canvas.stage_size
+        layout = replace(layout, size=(900, layout.height_for(0.5)))
+    width, height = layout.viewport_size
     assert height / width == pytest.approx(0.5, abs=2 / width)
 
 
@@ -192,9 +192,9 @@ def test_pressures_beyond_reason_have_few_digits(result: Result) -> None:
 
 
 def test_times_of_a_montage_do_not_run_into_each_other(result: Result) -> None:
-    canvas = canvas_of(result, (160, 120), grid=(6, 1), by="material")
-    picture = composed(canvas, 5)
-    above = picture[24:36, : 5 * canvas.stage_size[0]]
+    layout = canvas_of(result, (160, 120), grid=(6, 1), by="material")
+    picture = composed(layout, 5)
+    above = picture[24:36, : 5 * layout.viewport_size[0]]
     assert (above == rgb_bytes(LIGHT.ground)).all()
     assert not (composed(canvas_of(result, (900, 300), grid=(6, 1)), 5)[30:60, :600] == 255).all()
 

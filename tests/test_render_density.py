@@ -8,7 +8,7 @@ from drawn_results import WATER, frame, header, lattice, write
 
 from mpmcli.output import Result
 from mpmcli.render.density import DensityPainter, Slice, density_colors, grid_density, slice_of
-from mpmcli.render.subject import subject_of
+from mpmcli.render.render_scene import render_scene_of
 from mpmcli.render.theme import THEMES, rgb_bytes
 from mpmcli.render.view import view_of
 
@@ -52,7 +52,7 @@ def test_a_block_has_its_density_up_to_the_walls(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("camera", "across"), [("iso", (0, 2)), ("front", (0, 2)), ("side", (1, 2)), ("top", (0, 1))])
 def test_a_slice_has_the_density_of_its_place(tmp_path: Path, camera: str, across: tuple[int, int]) -> None:
     result = filled(tmp_path, (0.6, 0.4, 0.5))
-    plane = slice_of(subject_of(result), camera)
+    plane = slice_of(render_scene_of(result), camera)
     assert plane.across == across
     density = grid_density(result.frame(0), result.header, plane)
     # The slice from the side lies on the edge of the block, where half of the kernel is.
@@ -62,12 +62,12 @@ def test_a_slice_has_the_density_of_its_place(tmp_path: Path, camera: str, acros
 
 def test_the_image_shows_the_block_where_it_is(tmp_path: Path) -> None:
     result = filled(tmp_path, (1.0, 0.5))
-    subject = subject_of(result)
-    view = view_of(subject, "iso", (320, 200))
-    plane = slice_of(subject, "iso")
+    scene = render_scene_of(result)
+    view = view_of(scene, "iso", (320, 200))
+    plane = slice_of(scene, "iso")
     colors = density_colors(result, plane, LIGHT)
     assert colors.limits == (0.0, pytest.approx(2000.0, rel=1e-4))
-    painter = DensityPainter(result.header, subject, view, LIGHT, plane, colors)
+    painter = DensityPainter(result.header, scene, view, LIGHT, plane, colors)
     picture = painter.draw(result.frame(0))
     left, right, outside = view.pixels(np.array([[0.2, 0.25, 0.0], [0.8, 0.25, 0.0], [1.02, 0.25, 0.0]]))[:, :2].astype(
         int

@@ -13,7 +13,7 @@ from mpmcli.output import Result
 from mpmcli.render.color_by import color_by
 from mpmcli.render.dots import OVERLAP, DotsPainter, samples_of
 from mpmcli.render.hidden import hidden
-from mpmcli.render.subject import Subject, subject_of
+from mpmcli.render.render_scene import RenderScene, render_scene_of
 from mpmcli.render.theme import THEMES, rgb_bytes
 from mpmcli.render.view import View, view_of
 
@@ -26,14 +26,14 @@ H = 0.05
 
 def painted(
     directory: Path, frames: list[Frame], size: tuple[float, ...], by: str = "speed", camera: str = "iso", **options
-) -> tuple[list[np.ndarray], View, Result, Subject]:
+) -> tuple[list[np.ndarray], View, Result, RenderScene]:
     """Draw frames of a domain that begins at the origin."""
     result = write(directory / "run", header(size, H, [WATER]), frames)
-    subject = subject_of(result)
-    view = view_of(subject, camera, SIZE)
-    colors = color_by(by, result, subject, LIGHT, **options)
-    painter = DotsPainter(subject, view, LIGHT, colors, int(result.particle_counts.max()))
-    return [painter.draw(result.frame(k, painter.fields)) for k in range(len(frames))], view, result, subject
+    scene = render_scene_of(result)
+    view = view_of(scene, camera, SIZE)
+    colors = color_by(by, result, scene, LIGHT, **options)
+    painter = DotsPainter(scene, view, LIGHT, colors, int(result.particle_counts.max()))
+    return [painter.draw(result.frame(k, painter.fields)) for k in range(len(frames))], view, result, scene
 
 
 def ink(picture: np.ndarray) -> np.ndarray:
@@ -54,11 +54,11 @@ def deep(points: np.ndarray) -> np.ndarray:
 
 def test_dots_cover_their_particles_and_nothing_else(tmp_path: Path) -> None:
     block = lattice((0.2, 0.1), (0.7, 0.4), H / 2)
-    (picture,), view, _, subject = painted(tmp_path, [frame(0, block)], (1.0, 0.75))
+    (picture,), view, _, scene = painted(tmp_path, [frame(0, block)], (1.0, 0.75))
     drawn = ink(picture)
     assert at(drawn, view.pixels(deep(block))).all()
     # The area of a block, and half a dot around it, nothing else.
-    scale, reach = view.pixels_per_metre, 0.5 * OVERLAP * subject.distances[0]
+    scale, reach = view.pixels_per_metre, 0.5 * OVERLAP * scene.distances[0]
     (x0, y1, _), (x1, y0, _) = view.pixels(np.array([[0.2, 0.1, 0.0], [0.7, 0.4, 0.0]]))
     rows, columns = np.nonzero(drawn)
     assert columns.min() + 1 >= x0 - reach * scale - 1 and columns.max() <= x1 + reach * scale + 1
@@ -68,8 +68,8 @@ def test_dots_cover_their_particles_and_nothing_else(tmp_path: Path) -> None:
 
 def test_a_dot_is_round_and_as_large_as_it_should_be(tmp_path: Path) -> None:
     place = np.array([[0.5, 0.375]])
-    (picture,), view, _, subject = painted(tmp_path, [frame(0, place)], (1.0, 0.75))
-    radius = 0.5 * OVERLAP * subject.distances[0] * view.pixels_per_metre
+    (picture,), view, _, scene = painted(tmp_path, [frame(0, place)], (1.0, 0.75))
+    radius = 0.5 * OVERLAP * scene.distances[0] * view.pixels_per_metre
     rows, columns = np.nonzero(ink(picture))
     x, y, _ = view.pixels(deep(place))[0]
     distance = np.hypot(columns + 0.5 - x, rows + 0.5 - y)
@@ -87,9 +87,9 @@ def test_far_from_the_origin_dots_are_where_they_are(tmp_path: Path, size: tuple
         facts = header(size, H, [WATER]) | {"origin": [origin] * len(size)}
         places = replace(frame(0, block), position=block + origin, velocity=np.zeros_like(block))
         result = write(tmp_path / f"{origin:g}", facts, [places])
-        subject = subject_of(result)
-        view = view_of(subject, "iso", SIZE)
-        painter = DotsPainter(subject, view, LIGHT, color_by("speed", result, subject, LIGHT), len(block))
+        scene = render_scene_of(result)
+        view = view_of(scene, "iso", SIZE)
+        painter = DotsPainter(scene, view, LIGHT, color_by("speed", result, scene, LIGHT), len(block))
         pictures.append(painter.draw(result.frame(0)))
     differing = (np.abs(pictures[0].astype(int) - pictures[1]).max(axis=2) > 30).mean()
     # The camera's own place is rounded, which moves edges by a little of a pixel.
@@ -141,9 +141,9 @@ def test_the_nearer_ball_hides_the_farther_one(tmp_path: Path) -> None:
 def test_perspective_makes_near_balls_larger(tmp_path: Path) -> None:
     places = np.array([[0.5, 0.02, 0.5], [0.5, 0.98, 0.5]])
     result = write(tmp_path / "run", header((1.0, 1.0, 1.0), 0.2, [WATER]), [frame(0, places)])
-    subject = replace(subject_of(result), lower=(0.0, 0.0, 0.0))
-    view = view_of(subject, "0.2,-2,0.5,0.5,0.5,0.5", (600, 400))
-    painter = DotsPainter(subject, view, LIGHT, color_by("speed", result, subject, LIGHT), 2)
+    scene = replace(render_scene_of(result), lower=(0.0, 0.0, 0.0))
+    view = view_of(scene, "0.2,-2,0.5,0.5,0.5,0.5", (600, 400))
+    painter = DotsPainter(scene, view, LIGHT, color_by("speed", result, scene, LIGHT), 2)
     drawn = painter.draw(result.frame(0)) < 120
     diameters = []
     for place in places:
@@ -151,7 +151,7 @@ def test_perspective_makes_near_balls_larger(tmp_path: Path) -> None:
         column = drawn[:, int(x)].any(axis=1)
         around = column[max(0, int(y) - 40) : int(y) + 40]
         diameters.append(around.sum())
-        expected = OVERLAP * subject.distances[0] * view.pixels_per_metre * view.distance / depth
+        expected = OVERLAP * scene.distances[0] * view.pixels_per_metre * view.distance / depth
         # Layers of distance leave 2 % here, pixels one.
         assert diameters[-1] == pytest.approx(expected, rel=0.08, abs=2.0)
     assert diameters[0] > 1.3 * diameters[1]
@@ -209,19 +209,19 @@ def test_pictures_and_dots_are_no_larger_than_what_can_be_drawn(tmp_path: Path) 
     large = [((15_000, 100), 1000, 5.0), ((7000, 7000), 1000, 5.0), ((1280, 720), 10**6, 5.0), ((900, 900), 9, 200.0)]
     assert [samples_of(*each) for each in large] == [1] * 4
     result = write(tmp_path / "run", header((1.0, 0.5), 0.4, [WATER]), [frame(0, np.array([[0.5, 0.25]]))])
-    subject = subject_of(result)
-    view = view_of(subject, "iso", (900, 500))
-    painter = DotsPainter(subject, view, LIGHT, color_by("speed", result, subject, LIGHT), 1)
+    scene = render_scene_of(result)
+    view = view_of(scene, "iso", (900, 500))
+    painter = DotsPainter(scene, view, LIGHT, color_by("speed", result, scene, LIGHT), 1)
     across = ink(painter.draw(result.frame(0))).any(axis=0).sum()
-    expected = OVERLAP * subject.distances[0] * view.pixels_per_metre
+    expected = OVERLAP * scene.distances[0] * view.pixels_per_metre
     assert 150 < expected < 255 and across == pytest.approx(expected, abs=3)
 
 
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
     block = lattice((0.2, 0.2, 0.1), (0.8, 0.8, 0.4), H / 2)
-    _, _, result, subject = painted(tmp_path, [frame(0, block)], (1.0, 1.0, 0.75))
-    view = view_of(subject, "iso", SIZE)
-    painter = DotsPainter(subject, view, LIGHT, color_by("speed", result, subject, LIGHT), len(block))
+    _, _, result, scene = painted(tmp_path, [frame(0, block)], (1.0, 1.0, 0.75))
+    view = view_of(scene, "iso", SIZE)
+    painter = DotsPainter(scene, view, LIGHT, color_by("speed", result, scene, LIGHT), len(block))
     still = result.frame(0)
     used = []
     for _ in range(3):
@@ -234,7 +234,7 @@ def test_memory_does_not_grow_with_the_number_of_frames(tmp_path: Path) -> None:
 
 def test_the_same_frame_gives_the_same_pixels(tmp_path: Path) -> None:
     block = lattice((0.2, 0.2, 0.1), (0.8, 0.8, 0.4), H / 2)
-    (first,), _, result, subject = painted(tmp_path, [frame(0, block)], (1.0, 1.0, 0.75))
-    view = view_of(subject, "iso", SIZE)
-    again = DotsPainter(subject, view, LIGHT, color_by("speed", result, subject, LIGHT), len(block))
+    (first,), _, result, scene = painted(tmp_path, [frame(0, block)], (1.0, 1.0, 0.75))
+    view = view_of(scene, "iso", SIZE)
+    again = DotsPainter(scene, view, LIGHT, color_by("speed", result, scene, LIGHT), len(block))
     np.testing.assert_array_equal(first, again.draw(result.frame(0)))

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mpmcli.frames.frame import Frame
+from mpmcli.render.appearance import APPEARANCES
 from mpmcli.render.liquids.fluid import FluidPainter
-from mpmcli.render.look import LOOKS
-from mpmcli.render.subject import Subject
+from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.theme import THEMES
 from mpmcli.render.view import View, view_of
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("drawing")
 SIZE = (320, 180)
 SPACING = 0.04
 DISTANCE = SPACING / 2
-SUBJECT = Subject(
+SUBJECT = RenderScene(
     title="water and jelly",
     dimension=3,
     lower=(0.0, 0.0, 0.0),
@@ -26,7 +26,7 @@ SUBJECT = Subject(
     spacing=SPACING,
     up=(0.0, 0.0, 1.0),
     bodies=("water", "jelly"),
-    looks=(LOOKS["water"], LOOKS["jelly"]),
+    appearances=(APPEARANCES["water"], APPEARANCES["jelly"]),
     material_of=(0, 1),
     distances=(DISTANCE, DISTANCE),
     densities=(1000.0, 1000.0),
@@ -67,7 +67,7 @@ def changed(image: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def painter() -> FluidPainter:
-    """Return a painter of the subject from the front, where the floor is seen edge-on and takes no shadows."""
+    """Return a painter of the scene from the front, where the floor is seen edge-on and takes no shadows."""
     return FluidPainter(SUBJECT, FRONT, THEMES["light"])
 
 
@@ -188,9 +188,9 @@ def test_shadow_falls_on_the_floor():
 
 @pytest.mark.parametrize("name", ["honey", "lava", "mud"])
 def test_materials_look_like_what_they_are(name: str):
-    subject = replace(SUBJECT, looks=(LOOKS[name], LOOKS["jelly"]))
+    scene = replace(SUBJECT, appearances=(APPEARANCES[name], APPEARANCES["jelly"]))
     for theme in ("light", "dark"):
-        painter = FluidPainter(subject, FRONT, THEMES[theme])
+        painter = FluidPainter(scene, FRONT, THEMES[theme])
         lump = box((0.5, 0.2, 0.2), (1.1, 0.6, 0.6))
         red, green, blue = painter.draw(frame_of((lump, WATER)))[covered(lump, FRONT, 0.3 * DISTANCE)].mean(axis=0)
         # All three are warm; lava is red, honey is yellow between red and green, mud is hardly coloured.

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from mpmcli.frames.frame import Frame
-from mpmcli.render.look import LOOKS
-from mpmcli.render.subject import Subject
-from mpmcli.render.surfaces.lighting import lights_of
+from mpmcli.render.appearance import APPEARANCES
+from mpmcli.render.render_scene import RenderScene
+from mpmcli.render.shading.lighting import lights_of
 from mpmcli.render.surfaces.surface import SurfacePainter
 from mpmcli.render.theme import THEMES
 from mpmcli.render.view import View, view_of
@@ -37,12 +37,12 @@ class ByColumn:
         return values
 
 
-def subject_with(dimension: int, *names: str) -> Subject:
+def subject_with(dimension: int, *names: str) -> RenderScene:
     upper = (1.0, 1.0, 1.0) if dimension == 3 else (1.0, 1.0, 0.0)
     up = (0.0, 0.0, 1.0) if dimension == 3 else (0.0, 1.0, 0.0)
-    looks = tuple(LOOKS[name] for name in names)
+    appearances = tuple(APPEARANCES[name] for name in names)
     count = len(names)
-    return Subject(
+    return RenderScene(
         title="",
         dimension=dimension,
         lower=(0.0, 0.0, 0.0),
@@ -50,7 +50,7 @@ def subject_with(dimension: int, *names: str) -> Subject:
         spacing=2 * DISTANCE,
         up=up,
         bodies=names,
-        looks=looks,
+        appearances=appearances,
         material_of=tuple(range(count)),
         distances=(DISTANCE,) * count,
         densities=(1e3,) * count,
@@ -71,8 +71,8 @@ def ball(dimension: int, radius: float, middle: float = 0.5) -> np.ndarray:
 
 @cache
 def painter(dimension: int, names: tuple[str, ...], camera: str = "front", theme: str = "light") -> SurfacePainter:
-    subject = subject_with(dimension, *names)
-    return SurfacePainter(subject, view_of(subject, camera, SIZE), THEMES[theme])
+    scene = subject_with(dimension, *names)
+    return SurfacePainter(scene, view_of(scene, camera, SIZE), THEMES[theme])
 
 
 def mask_of(tool: SurfacePainter, frame: Frame) -> np.ndarray:
@@ -164,10 +164,10 @@ def test_one_particle_shows_and_none_does_not_fail(dimension: int, name: str) ->
 def test_colours_follow_a_field(dimension: int, name: str) -> None:
     from matplotlib import colormaps
 
-    subject = subject_with(dimension, name)
-    view = view_of(subject, "front", SIZE)
+    scene = subject_with(dimension, name)
+    view = view_of(scene, "front", SIZE)
     position = ball(dimension, 0.4)
-    picture = SurfacePainter(subject, view, LIGHT, ByColumn()).draw(frame_of(position)).astype(float)
+    picture = SurfacePainter(scene, view, LIGHT, ByColumn()).draw(frame_of(position)).astype(float)
     x = np.linspace(0.2, 0.8, 25)
     places = np.full((len(x), dimension), 0.5)
     places[:, 0] = x
@@ -181,11 +181,11 @@ def test_colours_follow_a_field(dimension: int, name: str) -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_values_that_are_no_numbers_have_their_own_colour(dimension: int) -> None:
-    subject = subject_with(dimension, "jelly")
-    view = view_of(subject, "front", SIZE)
+    scene = subject_with(dimension, "jelly")
+    view = view_of(scene, "front", SIZE)
     position = ball(dimension, 0.4)
     colors = ByColumn(unknown=tuple(np.flatnonzero(position[:, 0] > 0.5).tolist()))
-    picture = SurfacePainter(subject, view, LIGHT, colors).draw(frame_of(position)).astype(int)
+    picture = SurfacePainter(scene, view, LIGHT, colors).draw(frame_of(position)).astype(int)
     right, left = (picture[on(view, 0.5 + shift * np.eye(dimension)[:1])][0] for shift in (0.2, -0.2))
     assert right[0] > 2 * right[1]
     assert right[2] > 2 * right[1]
@@ -202,8 +202,8 @@ def test_the_same_frame_has_the_same_bytes(dimension: int) -> None:
     picture = first.draw(frame)
     first.draw(frame_of(parts[0]))
     assert (first.draw(frame) == picture).all()
-    subject = subject_with(dimension, *names)
-    again = SurfacePainter(subject, view_of(subject, "iso", SIZE), LIGHT)
+    scene = subject_with(dimension, *names)
+    again = SurfacePainter(scene, view_of(scene, "iso", SIZE), LIGHT)
     assert (again.draw(frame) == picture).all()
 
 

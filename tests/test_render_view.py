@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mpmcli.errors import InputError
-from mpmcli.render.look import look_of
-from mpmcli.render.stage import Stage
-from mpmcli.render.subject import Subject
+from mpmcli.render.appearance import appearance_of
+from mpmcli.render.offscreen import OffscreenRenderer
+from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.theme import THEMES
 from mpmcli.render.view import CAMERAS, MARGIN, aspect_of, view_of
 
-SUBJECT = Subject(
+SUBJECT = RenderScene(
     title="",
     dimension=3,
     lower=(-1.0, 0.5, 2.0),
@@ -23,7 +23,7 @@ SUBJECT = Subject(
     spacing=0.1,
     up=(0.0, 0.0, 1.0),
     bodies=("body",),
-    looks=(look_of("fluid", WATER),),
+    appearances=(appearance_of("fluid", WATER),),
     material_of=(0,),
     distances=(0.05,),
     densities=(1000.0,),
@@ -32,8 +32,8 @@ SUBJECT = Subject(
 FLAT = replace(SUBJECT, dimension=2, lower=(-1.0, 0.5, 0.0), upper=(2.0, 1.5, 0.0), up=(0.0, 1.0, 0.0))
 
 
-def corners(subject: Subject) -> np.ndarray:
-    low, high = np.array(subject.lower), np.array(subject.upper)
+def corners(scene: RenderScene) -> np.ndarray:
+    low, high = np.array(scene.lower), np.array(scene.upper)
     return np.array([[(low, high)[i >> axis & 1][axis] for axis in range(3)] for i in range(8)])
 
 
@@ -42,7 +42,7 @@ def test_points_fall_where_vtk_puts_them(drawing: str, camera: str) -> None:
     from vtkmodules.vtkRenderingCore import vtkCoordinate
 
     view = view_of(SUBJECT, camera, (320, 200))
-    stage = Stage(view, THEMES["light"])
+    stage = OffscreenRenderer(view, THEMES["light"])
     stage.render()
     points = np.concatenate([corners(SUBJECT), [[0.3, 0.9, 2.2]]])
     for point, (x, y, _) in zip(points, view.pixels(points), strict=True):
@@ -55,12 +55,12 @@ def test_points_fall_where_vtk_puts_them(drawing: str, camera: str) -> None:
     stage.close()
 
 
-@pytest.mark.parametrize("subject", [SUBJECT, FLAT], ids=["3d", "2d"])
+@pytest.mark.parametrize("scene", [SUBJECT, FLAT], ids=["3d", "2d"])
 @pytest.mark.parametrize("size", [(320, 200), (90, 400)])
 @pytest.mark.parametrize("camera", CAMERAS)
-def test_the_camera_frames_the_domain(subject: Subject, camera: str, size: tuple[int, int]) -> None:
-    camera = camera if subject.dimension == 3 else "iso"
-    seen = view_of(subject, camera, size).pixels(corners(subject))[:, :2]
+def test_the_camera_frames_the_domain(scene: RenderScene, camera: str, size: tuple[int, int]) -> None:
+    camera = camera if scene.dimension == 3 else "iso"
+    seen = view_of(scene, camera, size).pixels(corners(scene))[:, :2]
     free = np.stack([seen.min(axis=0), np.array(size) - seen.max(axis=0)]) / size
     # In the middle, nothing outside, and no smaller than it must be.
     assert free.min() >= MARGIN - 1e-6
@@ -122,11 +122,11 @@ def test_a_camera_needs_something_to_look_at() -> None:
 
 def test_materials_look_like_the_presets_they_are_nearest_to() -> None:
     fluid = {"law": "fluid", "density": 1000.0}
-    assert look_of("fluid", fluid).name == "water"
-    assert look_of("fluid", {**fluid, "viscosity": 1e-3}).name == "water"
-    assert look_of("fluid", {**fluid, "density": 1400.0, "viscosity": 8.0}).name == "honey"
-    assert look_of("neo_hookean", JELLY).name == "jelly"
-    assert look_of("fixed_corotated", {**JELLY, "density": 950.0, "youngs_modulus": 2e6}).name == "rubber"
-    assert look_of("von_mises", {"density": 2700.0, "yield_stress": 3e7}).name == "metal"
-    first, second = look_of("my_law", {}), look_of("my_other_law", {}, others=1)
+    assert appearance_of("fluid", fluid).name == "water"
+    assert appearance_of("fluid", {**fluid, "viscosity": 1e-3}).name == "water"
+    assert appearance_of("fluid", {**fluid, "density": 1400.0, "viscosity": 8.0}).name == "honey"
+    assert appearance_of("neo_hookean", JELLY).name == "jelly"
+    assert appearance_of("fixed_corotated", {**JELLY, "density": 950.0, "youngs_modulus": 2e6}).name == "rubber"
+    assert appearance_of("von_mises", {"density": 2700.0, "yield_stress": 3e7}).name == "metal"
+    first, second = appearance_of("my_law", {}), appearance_of("my_other_law", {}, others=1)
     assert first.name == "my_law" and first.ink != second.ink

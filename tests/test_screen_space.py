@@ -20,7 +20,7 @@ SCALE = 100.0
 
 
 def pixels_of(points: np.ndarray) -> np.ndarray:
-    """Look along z at points (n, 3), m: pixels from the left and from the top, and the distance, m."""
+    """Appearance along z at points (n, 3), m: pixels from the left and from the top, and the distance, m."""
     return np.stack([SCALE * points[:, 0], SCALE * points[:, 1], 5.0 - points[:, 2]], axis=1)
 
 

@@ -135,7 +135,7 @@ def test_one_process_tries_once_and_its_children_not_at_all(probe, monkeypatch):
     assert choose_window() == "vtkFakeWindow"
     monkeypatch.setattr(window, "_chosen", None)
     assert choose_window() == "vtkFakeWindow"
-    # A child for which another class is set has to look for itself.
+    # A child for which another class is set has to appearance for itself.
     monkeypatch.setattr(window, "_chosen", None)
     monkeypatch.setenv(SETTING, EGL)
     with pytest.raises(InputError):

@@ -88,16 +88,16 @@ def command(
     """
     from mpmcli.cli.progress_bar import ProgressBar
     from mpmcli.output import open_result
-    from mpmcli.render.request import Request, assign
+    from mpmcli.render.request import Request, plan_render
 
     # Without a home it tells at length where it keeps its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     request = Request(
         output, mode, frames, color, clim, cmap, size, camera, theme, movie, fps, montage, save_surface, overwrite
     )
-    assignment = assign(open_result(result), request)
-    with ProgressBar(assignment.due, "frames", quiet=quiet) as bar, interrupts_wait():
-        done = assignment.carry_out(workers, watch=bar.show, stop=interrupt_came)
+    plan = plan_render(open_result(result), request)
+    with ProgressBar(plan.due, "frames", quiet=quiet) as bar, interrupts_wait():
+        done = plan.carry_out(workers, watch=bar.show, stop=interrupt_came)
     for warning in done.warnings:
         click.echo(f"warning: {warning}", err=True)
     if as_json:

@@ -10,8 +10,8 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.output.result import Result
 from mpmcli.render.coloring import Categories, Coloring
+from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.settings import LIMIT_MAX, LIMIT_MIN
-from mpmcli.render.subject import Subject
 from mpmcli.render.theme import Theme
 from mpmcli.scene.schema import ParticleField
 from mpmcli.scene.sentences import listed, nearest
@@ -57,7 +57,7 @@ class _Value:
 def color_by(
     name: str,
     result: Result,
-    subject: Subject,
+    scene: RenderScene,
     theme: Theme,
     limits: tuple[float, float] | None = None,
     cmap: str | None = None,
@@ -74,13 +74,16 @@ def color_by(
         InputError: the result stores no such thing, or there is no such colour map.
     """
     if name == "material":
-        looks = subject.looks
-        names, inks = tuple(look.name for look in looks), tuple(look.ink for look in looks)
-        return Categories("material", names, inks, subject.material_of)
+        appearances = scene.appearances
+        names, inks = (
+            tuple(appearance.name for appearance in appearances),
+            tuple(appearance.ink for appearance in appearances),
+        )
+        return Categories("material", names, inks, scene.material_of)
     if name == "body":
-        inks = tuple(BODY_INKS[k % len(BODY_INKS)] for k in range(len(subject.bodies)))
-        return Categories("body", subject.bodies, inks, tuple(range(len(subject.bodies))))
-    value = _value(name, result, subject)
+        inks = tuple(BODY_INKS[k % len(BODY_INKS)] for k in range(len(scene.bodies)))
+        return Categories("body", scene.bodies, inks, tuple(range(len(scene.bodies))))
+    value = _value(name, result, scene)
     if limits is None:
         limits = _limits(value, result)
     two_way = value.middle is not None and limits[0] < value.middle < limits[1]
@@ -95,9 +98,9 @@ def color_by(
     )
 
 
-def _value(name: str, result: Result, subject: Subject) -> _Value:
+def _value(name: str, result: Result, scene: RenderScene) -> _Value:
     stored = result.field_names
-    densities = np.array(subject.densities)
+    densities = np.array(scene.densities)
     if name == "speed":
         return _Value("speed", "m/s", (), lambda frame: _length(frame.velocity), floor=0.0)
     if name == "id":

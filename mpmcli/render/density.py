@@ -9,7 +9,7 @@ from mpmcli.output.header import RunHeader
 from mpmcli.output.result import Result
 from mpmcli.render.color_by import color_map
 from mpmcli.render.coloring import Coloring
-from mpmcli.render.subject import Subject
+from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.theme import Theme, rgb_bytes
 from mpmcli.render.view import View
 
@@ -37,14 +37,14 @@ class Slice:
     place: float = 0.0
 
 
-def slice_of(subject: Subject, camera: str) -> Slice:
+def slice_of(scene: RenderScene, camera: str) -> Slice:
     """Return the plane in the middle of the domain that a camera looks at from the front; "iso" as "front"."""
-    if subject.dimension == 2:
+    if scene.dimension == 2:
         return Slice((0, 1))
-    up = int(np.argmax(np.abs(subject.up)))
+    up = int(np.argmax(np.abs(scene.up)))
     right, depth = (axis for axis in range(3) if axis != up)
     across, normal = {"top": ((right, depth), up), "side": ((depth, up), right)}.get(camera, ((right, up), depth))
-    return Slice(across, normal, 0.5 * (subject.lower[normal] + subject.upper[normal]))
+    return Slice(across, normal, 0.5 * (scene.lower[normal] + scene.upper[normal]))
 
 
 def grid_density(frame: Frame, header: RunHeader, plane: Slice) -> np.ndarray:
@@ -120,11 +120,11 @@ class DensityPainter:
     fields: tuple[str, ...] = ()
 
     def __init__(
-        self, header: RunHeader, subject: Subject, view: View, theme: Theme, plane: Slice, colors: Coloring
+        self, header: RunHeader, scene: RenderScene, view: View, theme: Theme, plane: Slice, colors: Coloring
     ) -> None:
         self._header, self._plane, self._colors = header, plane, colors
         self._size, self._ground = view.size, np.array(rgb_bytes(theme.ground), dtype=np.float64)
-        low, high = np.array(subject.lower), np.array(subject.upper)
+        low, high = np.array(scene.lower), np.array(scene.upper)
         corners = np.tile(0.5 * (low + high), (2, 1))
         across = list(plane.across)
         corners[:, across] = np.stack([low, high])[:, across]

@@ -9,8 +9,8 @@ from mpmcli.frames.frame import Frame
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.depth_shading import depth_shaded
 from mpmcli.render.hidden import hidden
-from mpmcli.render.stage import Stage
-from mpmcli.render.subject import Subject
+from mpmcli.render.offscreen import OffscreenRenderer
+from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.theme import Theme
 from mpmcli.render.view import View
 
@@ -41,27 +41,27 @@ class DotsPainter:
         count: particles of the largest frame.
     """
 
-    def __init__(self, subject: Subject, view: View, theme: Theme, colors: Coloring | Categories, count: int) -> None:
-        self._subject = subject
+    def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | Categories, count: int) -> None:
+        self._scene = scene
         self._view = view
         self._colors = colors
         self.fields = colors.fields
-        self._flat = subject.dimension == 2
-        self._diameters = OVERLAP * np.array(subject.distances)
+        self._flat = scene.dimension == 2
+        self._diameters = OVERLAP * np.array(scene.distances)
         largest = float(self._diameters.max()) * view.pixels_per_metre
-        self._stage = Stage(view, theme, samples=samples_of(view.size, count, largest))
+        self._offscreen = OffscreenRenderer(view, theme, samples=samples_of(view.size, count, largest))
         self._levels = self._all_levels()
-        self._corner = np.array(subject.lower)
+        self._corner = np.array(scene.lower)
         self._actors: dict[int, tuple[pv.PolyData, pv.Actor]] = {}
         if not self._flat:
-            self._stage.add_light()
-            self._stage.add_box(subject.lower, subject.upper, theme.wall)
+            self._offscreen.add_light()
+            self._offscreen.add_box(scene.lower, scene.upper, theme.wall)
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return (h, w, 3) uint8; particles without a place are left out."""
         placed = np.isfinite(frame.position).all(axis=1)
         points = np.zeros((int(placed.sum()), 3))
-        points[:, : self._subject.dimension] = frame.position[placed]
+        points[:, : self._scene.dimension] = frame.position[placed]
         colors, body = self._colors.particle_rgb(frame)[placed], frame.body[placed]
         sizes = self._pixels(points, body)
         if not self._flat and len(points):
@@ -72,11 +72,13 @@ class DotsPainter:
         for level, size in enumerate(self._levels.tolist()):
             chosen = level_of == level
             self._set(level, points[chosen], colors[chosen], size)
-        self._stage.render()
-        picture = self._stage.picture()
+        self._offscreen.render()
+        picture = self._offscreen.picture()
         if self._flat:
             return picture
-        return depth_shaded(picture, self._stage.depth(), float(self._diameters.max()), self._view, self._stage.samples)
+        return depth_shaded(
+            picture, self._offscreen.depth(), float(self._diameters.max()), self._view, self._offscreen.samples
+        )
 
     def _pixels(self, points: np.ndarray, body: np.ndarray) -> np.ndarray:
         """Return the diameter of each dot in pixels, (n,)."""
@@ -93,7 +95,7 @@ class DotsPainter:
         inside = (pixels[:, :2] >= 0).all(axis=1) & (pixels[:, :2] < self._view.size).all(axis=1) & (pixels[:, 2] > 0)
         result = np.zeros(len(points), dtype=bool)
         # A sample may be missing at the edge of a disc; one that lies in a square covers it and its eight neighbours.
-        edge = 1.0 / self._stage.samples
+        edge = 1.0 / self._offscreen.samples
         side = (0.5 * float(sizes.min()) - edge) / math.sqrt(8.0)
         if side >= 0.5 * edge and inside.any():
             reach = math.ceil((0.5 * float(sizes[inside].max()) + edge) / side)
@@ -121,7 +123,7 @@ class DotsPainter:
         if level not in self._actors:
             mesh = pv.PolyData(np.zeros((1, 3), np.float32))
             mesh.point_data["rgb"] = np.zeros((1, 3), np.uint8)
-            actor = self._stage.plotter.add_points(
+            actor = self._offscreen.plotter.add_points(
                 mesh,
                 scalars="rgb",
                 rgb=True,
@@ -138,7 +140,7 @@ class DotsPainter:
             self._actors[level] = mesh, actor
         mesh, actor = self._actors[level]
         actor.visibility = len(points) > 0
-        actor.prop.point_size = size * self._stage.samples
+        actor.prop.point_size = size * self._offscreen.samples
         if len(points) == 0:
             return
         shown = pv.PolyData((points - self._corner).astype(np.float32))

@@ -7,13 +7,13 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.output.result import Result
-from mpmcli.render.canvas import Canvas
 from mpmcli.render.color_by import color_by
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.density import DensityPainter, density_colors, slice_of
 from mpmcli.render.dots import DotsPainter
+from mpmcli.render.picture_layout import PictureLayout
+from mpmcli.render.render_scene import RenderScene, render_scene_of
 from mpmcli.render.settings import Settings, require_possible
-from mpmcli.render.subject import Subject, subject_of
 from mpmcli.render.theme import THEMES
 from mpmcli.render.view import View, aspect_of, view_of
 
@@ -38,7 +38,7 @@ class Painter(Protocol):
 
 
 @dataclass(frozen=True)
-class Studio:
+class RenderSetup:
     """All that pictures of one result with one setting share, but the painter and its window.
 
     Attributes:
@@ -48,73 +48,75 @@ class Studio:
 
     result: Result
     settings: Settings
-    subject: Subject
+    scene: RenderScene
     colors: Coloring | Categories | None
-    canvas: Canvas
+    layout: PictureLayout
     view: View
 
     def painter(self) -> Painter:
         """Make the painter; it opens a window."""
-        settings, subject, view = self.settings, self.subject, self.view
+        settings, scene, view = self.settings, self.scene, self.view
         theme = THEMES[settings.theme]
         count = int(self.result.particle_counts.max())
         if settings.mode == "density":
             assert isinstance(self.colors, Coloring)
-            plane = slice_of(subject, settings.camera)
-            return DensityPainter(self.result.header, subject, view, theme, plane, self.colors)
-        if settings.mode == "fluid" and subject.dimension == 3:
+            plane = slice_of(scene, settings.camera)
+            return DensityPainter(self.result.header, scene, view, theme, plane, self.colors)
+        if settings.mode == "fluid" and scene.dimension == 3:
             from mpmcli.render.liquids.fluid import FluidPainter
 
-            return FluidPainter(subject, view, theme)
+            return FluidPainter(scene, view, theme)
         if settings.mode in ("surface", "fluid"):
             from mpmcli.render.surfaces.surface import SurfacePainter
 
             if settings.mode == "fluid":
-                subject = _grained(subject)
-            return SurfacePainter(subject, view, theme, self.colors if isinstance(self.colors, Coloring) else None)
+                scene = _grained(scene)
+            return SurfacePainter(scene, view, theme, self.colors if isinstance(self.colors, Coloring) else None)
         assert self.colors is not None
-        return DotsPainter(subject, view, theme, self.colors, count)
+        return DotsPainter(scene, view, theme, self.colors, count)
 
 
-def open_studio(result: Result, settings: Settings) -> Studio:
+def set_up(result: Result, settings: Settings) -> RenderSetup:
     """Find out what pictures of a result need, and fill in what the settings leave open.
 
     Raises:
         InputError: the colours, the camera or the size are not possible.
     """
-    subject, theme = subject_of(result), THEMES[settings.theme]
+    scene, theme = render_scene_of(result), THEMES[settings.theme]
     camera = settings.camera
     colors: Coloring | Categories | None
     if settings.mode == "density":
-        plane = slice_of(subject, camera)
+        plane = slice_of(scene, camera)
         colors = density_colors(result, plane, theme, settings.limits, settings.cmap)
         camera = "front" if camera not in ("side", "top") else camera
     elif settings.color is None or (settings.mode == "surface" and settings.color == "material"):
-        colors = _legend(subject) if len(subject.looks) > 1 else None
+        colors = _legend(scene) if len(scene.appearances) > 1 else None
     else:
-        colors = color_by(settings.color, result, subject, theme, settings.limits, settings.cmap)
+        colors = color_by(settings.color, result, scene, theme, settings.limits, settings.cmap)
     if isinstance(colors, Coloring):
         settings = replace(settings, limits=colors.limits)
     width, height = settings.size
     times = expected_times(result)
     # Elsewhere in 3D they are the edges of a box, and part of the scene.
-    walls = subject.dimension == 2 or settings.mode == "density"
+    walls = scene.dimension == 2 or settings.mode == "density"
     # In perspective a length has no one size.
-    parallel = view_of(subject, camera, (width, width)).parallel
-    canvas = Canvas((width, height or width), subject, theme, times, colors, settings.grid, walls, parallel)
+    parallel = view_of(scene, camera, (width, width)).parallel
+    layout = PictureLayout((width, height or width), scene, theme, times, colors, settings.grid, walls, parallel)
     if height is None:
-        aspect = min(max(aspect_of(subject, camera), FLATTEST), 1.0 / FLATTEST)
+        aspect = min(max(aspect_of(scene, camera), FLATTEST), 1.0 / FLATTEST)
         for _ in range(FITTING_ROUNDS):
-            canvas = replace(canvas, size=(width, canvas.height_for(aspect)))
-        settings = replace(settings, size=canvas.size)
-        require_possible(*canvas.size, f"{width}xauto")
-    return Studio(result, settings, subject, colors, canvas, view_of(subject, camera, canvas.stage_size))
+            layout = replace(layout, size=(width, layout.height_for(aspect)))
+        settings = replace(settings, size=layout.size)
+        require_possible(*layout.size, f"{width}xauto")
+    return RenderSetup(result, settings, scene, colors, layout, view_of(scene, camera, layout.viewport_size))
 
 
-def _grained(subject: Subject) -> Subject:
+def _grained(scene: RenderScene) -> RenderScene:
     """Let everything that is no liquid be drawn as grains."""
-    looks = (look if look.liquid else replace(look, finish="grains") for look in subject.looks)
-    return replace(subject, looks=tuple(looks))
+    appearances = (
+        appearance if appearance.liquid else replace(appearance, finish="grains") for appearance in scene.appearances
+    )
+    return replace(scene, appearances=tuple(appearances))
 
 
 def expected_times(result: Result) -> tuple[float, ...]:
@@ -130,12 +132,15 @@ def expected_times(result: Result) -> tuple[float, ...]:
     return tuple(result.times.tolist())
 
 
-def _legend(subject: Subject) -> Categories:
+def _legend(scene: RenderScene) -> Categories:
     """Return the legend of materials that look like what they are."""
-    names, inks = tuple(look.name for look in subject.looks), tuple(look.color for look in subject.looks)
-    return Categories("material", names, inks, subject.material_of)
+    names, inks = (
+        tuple(appearance.name for appearance in scene.appearances),
+        tuple(appearance.color for appearance in scene.appearances),
+    )
+    return Categories("material", names, inks, scene.material_of)
 
 
-def usual_color(subject: Subject) -> str:
+def usual_color(scene: RenderScene) -> str:
     """Return what dots are coloured by where nobody says: materials where they differ, or else speed."""
-    return "material" if len(subject.looks) > 1 else "speed"
+    return "material" if len(scene.appearances) > 1 else "speed"

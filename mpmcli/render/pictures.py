@@ -14,7 +14,7 @@ from mpmcli.render.coloring import Coloring
 from mpmcli.render.files.picture_file import digest_of, settings_digest, write_picture
 from mpmcli.render.frame_workers import render_frames
 from mpmcli.render.labels import time_text
-from mpmcli.render.painter import Painter, Studio, expected_times, open_studio
+from mpmcli.render.painter import Painter, RenderSetup, expected_times, set_up
 from mpmcli.render.settings import Settings
 from mpmcli.render.window import choose_window
 
@@ -22,7 +22,7 @@ FOREIGN = "{path} is there already, and mpmcli render did not make it: give anot
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedPicture:
     """A picture of one frame that is to be there in the end.
 
     Attributes:
@@ -62,29 +62,29 @@ class PictureJob:
 
     source: Path
     settings: Settings
-    plan: dict[int, Planned] = field(repr=False)
+    plan: dict[int, PlannedPicture] = field(repr=False)
 
     def start(self) -> Callable[[int], Outcome]:
         """Open the result and a window, and return what makes and writes the picture of a frame."""
-        studio = open_studio(open_result(self.source), self.settings)
-        easel = Easel(studio)
+        setup = set_up(open_result(self.source), self.settings)
+        renderer = PictureRenderer(setup)
 
         def make(k: int) -> Outcome:
             outcomes: list[Outcome] = []
-            picture = easel.picture([k], lambda _, outcome: outcomes.append(outcome))
+            picture = renderer.picture([k], lambda _, outcome: outcomes.append(outcome))
             write_picture(self.plan[k].path, picture, self.plan[k].digest)
             return outcomes[0]
 
         return make
 
 
-class Easel:
+class PictureRenderer:
     """A painter at work: whole pictures of frames, read one at a time."""
 
-    def __init__(self, studio: Studio) -> None:
+    def __init__(self, setup: RenderSetup) -> None:
         choose_window()
-        self._studio = studio
-        self._painter: Painter = studio.painter()
+        self._setup = setup
+        self._painter: Painter = setup.painter()
 
     def picture(self, ks: Sequence[int], watch: Callable[[int, Outcome], None] = lambda k, outcome: None) -> np.ndarray:
         """Return the picture of a frame, or the montage of several, (h, w, 3) uint8.
@@ -92,19 +92,19 @@ class Easel:
         Args:
             watch: told of each frame that has been drawn, and what came up in it.
         """
-        studio, drawn, times, missing = self._studio, [], [], 0
+        setup, drawn, times, missing = self._setup, [], [], 0
         for k in ks:
-            frame = studio.result.frame(k, self._painter.fields)
+            frame = setup.result.frame(k, self._painter.fields)
             drawn.append(self._painter.draw(frame))
             times.append(frame.time)
             outcome = Outcome(self._missing(frame), int((~np.isfinite(frame.position).all(axis=1)).sum()))
             missing += outcome.missing
             watch(k, outcome)
-        return studio.canvas.compose(drawn, studio.view, times, missing)
+        return setup.layout.compose(drawn, setup.view, times, missing)
 
     def _missing(self, frame: Frame) -> int:
-        colors = self._studio.colors
-        if not isinstance(colors, Coloring) or self._studio.settings.mode == "density":
+        colors = self._setup.colors
+        if not isinstance(colors, Coloring) or self._setup.settings.mode == "density":
             return 0
         return int((~np.isfinite(colors.values(frame))).sum())
 
@@ -125,7 +125,7 @@ def picture_digest(result: Result, settings: Settings, ks: Sequence[int]) -> str
 
 def plan_pictures(
     result: Result, settings: Settings, ks: Sequence[int], path_of: Callable[[int], Path], *, overwrite: bool
-) -> list[Planned]:
+) -> list[PlannedPicture]:
     """Say which pictures are to be made; those that are there and still right are not made again.
 
     Args:
@@ -141,7 +141,7 @@ def plan_pictures(
         there = digest_of(path)
         if is_foreign(there) and not overwrite:
             raise InputError(FOREIGN.format(path=path))
-        plan.append(Planned(k, path, digest, there == digest and not overwrite))
+        plan.append(PlannedPicture(k, path, digest, there == digest and not overwrite))
     return plan
 
 
@@ -153,7 +153,7 @@ def is_foreign(there: str | None) -> bool:
 def make_pictures(
     source: Path,
     settings: Settings,
-    plan: Sequence[Planned],
+    plan: Sequence[PlannedPicture],
     workers: int,
     *,
     watch: Callable[[int, Outcome], None] = lambda k, outcome: None,
@@ -162,7 +162,7 @@ def make_pictures(
     """Make the pictures of a plan that are not there yet.
 
     Args:
-        source: path of the result; settings: as `open_studio` has filled them in.
+        source: path of the result; settings: as `set_up` has filled them in.
         workers, watch, stop: see `render_frames`.
 
     Raises:

@@ -6,15 +6,15 @@ from pathlib import Path
 
 from mpmcli.errors import InputError
 from mpmcli.output.result import Result
-from mpmcli.render.assignment import Assignment
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.files.film import check_film, film_digest
 from mpmcli.render.files.picture_file import digest_of, require_writable
 from mpmcli.render.frame_choice import choose_frames, evenly_spaced
-from mpmcli.render.painter import open_studio, usual_color
-from mpmcli.render.pictures import FOREIGN, Planned, is_foreign, picture_digest, picture_name, plan_pictures
+from mpmcli.render.painter import set_up, usual_color
+from mpmcli.render.pictures import FOREIGN, PlannedPicture, is_foreign, picture_digest, picture_name, plan_pictures
+from mpmcli.render.render_plan import RenderPlan
+from mpmcli.render.render_scene import render_scene_of
 from mpmcli.render.settings import Mode, Settings, parse_grid, parse_limits, parse_size
-from mpmcli.render.subject import subject_of
 from mpmcli.render.surfaces.save_surface import surface_paths
 from mpmcli.render.view import CAMERAS
 
@@ -51,7 +51,7 @@ class Request:
         return USUAL_FPS if self.fps is None else self.fps
 
 
-def assign(result: Result, request: Request) -> Assignment:
+def plan_render(result: Result, request: Request) -> RenderPlan:
     """Check a request and work out what it means.
 
     Raises:
@@ -70,7 +70,7 @@ def assign(result: Result, request: Request) -> Assignment:
     usual = USUAL_MONTAGE_SIZE if request.montage else USUAL_SIZE
     settings = Settings(
         mode=request.mode,
-        color=request.color or (usual_color(subject_of(result)) if request.mode == "dots" else None),
+        color=request.color or (usual_color(render_scene_of(result)) if request.mode == "dots" else None),
         size=parse_size(request.size or usual),
         camera=request.camera,
         theme=request.theme,
@@ -78,29 +78,29 @@ def assign(result: Result, request: Request) -> Assignment:
         cmap=request.cmap,
         grid=grid,
     )
-    studio = open_studio(result, settings)
-    if (request.clim or request.cmap) and not isinstance(studio.colors, Coloring):
+    setup = set_up(result, settings)
+    if (request.clim or request.cmap) and not isinstance(setup.colors, Coloring):
         option = "--clim" if request.clim else "--cmap"
         raise InputError(f"{option} is for colours that stand for a value: give --color-by speed, or another one.")
     if request.montage:
         path = _montage_path(result, settings.mode, request.output)
-        digest = picture_digest(result, studio.settings, ks)
+        digest = picture_digest(result, setup.settings, ks)
         there = digest_of(path)
         if is_foreign(there) and not request.overwrite:
             raise InputError(FOREIGN.format(path=path))
-        plan = [Planned(ks[0], path, digest, there == digest and not request.overwrite)]
+        plan = [PlannedPicture(ks[0], path, digest, there == digest and not request.overwrite)]
     else:
         path_of = _paths(result, settings.mode, request, len(ks))
-        plan = plan_pictures(result, studio.settings, ks, path_of, overwrite=request.overwrite)
+        plan = plan_pictures(result, setup.settings, ks, path_of, overwrite=request.overwrite)
     if request.save_surface is not None and not request.overwrite:
-        for path in (path for k in ks for path in surface_paths(studio.subject, request.save_surface, k)):
+        for path in (path for k in ks for path in surface_paths(setup.scene, request.save_surface, k)):
             if path.exists():
                 raise InputError(f"{path} is there already: give another directory, or --overwrite.")
     surface = None if request.save_surface is None else request.save_surface / "surface"
     for path in (plan[0].path, request.movie, surface):
         if path is not None:
             require_writable(path)
-    return Assignment(studio, ks, plan, request.movie, request.rate, request.save_surface, request.overwrite)
+    return RenderPlan(setup, ks, plan, request.movie, request.rate, request.save_surface, request.overwrite)
 
 
 def _require_sense(request: Request) -> None:

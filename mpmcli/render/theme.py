@@ -11,8 +11,8 @@ class Theme:
     """Colours, "#rrggbb".
 
     Attributes:
-        ground: of the canvas, and behind the particles in 2D.
-        sky, horizon: of the room behind a 3D scene, above and below.
+        ground: of the layout, and behind the particles in 2D.
+        sky, horizon: of the background of a 3D scene, above and below.
         floor: what shadows fall on.
         text: titles and numbers; faint: what is there to be found, not to be seen.
         wall: lines of the domain.

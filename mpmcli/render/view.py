@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpmcli.errors import InputError
-from mpmcli.render.subject import Subject
+from mpmcli.render.render_scene import RenderScene
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -81,7 +81,7 @@ class View:
         camera.clipping_range = (self.near, self.far)
 
 
-def view_of(subject: Subject, camera: str, size: tuple[int, int]) -> View:
+def view_of(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
     """Frame the domain of a run.
 
     Args:
@@ -92,28 +92,28 @@ def view_of(subject: Subject, camera: str, size: tuple[int, int]) -> View:
     Raises:
         InputError: `camera` is none of these, or not for a scene in 2D.
     """
-    if subject.dimension == 2 and camera not in ("iso", "front"):
+    if scene.dimension == 2 and camera not in ("iso", "front"):
         raise InputError(f"--camera {camera} is for scenes in 3D: this one is in 2D, and drawn in its plane.")
     if camera not in CAMERAS:
-        return _free_view(subject, camera, size)
-    up = np.array(subject.up)
+        return _free_view(scene, camera, size)
+    up = np.array(scene.up)
     right = np.eye(3)[int(np.argmin(np.abs(up)))]
     front = np.cross(right, up)
-    if subject.dimension == 2 or camera == "front":
-        return _framed(subject, front, up, size, parallel=True)
+    if scene.dimension == 2 or camera == "front":
+        return _framed(scene, front, up, size, parallel=True)
     if camera == "side":
-        return _framed(subject, right, up, size, parallel=True)
+        return _framed(scene, right, up, size, parallel=True)
     if camera == "top":
-        return _framed(subject, up, -front, size, parallel=True)
+        return _framed(scene, up, -front, size, parallel=True)
     turn, rise = math.radians(AZIMUTH), math.radians(ELEVATION)
     level = math.cos(turn) * front + math.sin(turn) * right
-    return _framed(subject, math.cos(rise) * level + math.sin(rise) * up, up, size, parallel=False)
+    return _framed(scene, math.cos(rise) * level + math.sin(rise) * up, up, size, parallel=False)
 
 
-def aspect_of(subject: Subject, camera: str) -> float:
+def aspect_of(scene: RenderScene, camera: str) -> float:
     """Return the height of the domain over its width, as a camera sees it, with the margin around it."""
-    view = view_of(subject, camera, (SQUARE, SQUARE))
-    seen = np.ptp(view.pixels(_corners(subject))[:, :2], axis=0) + 2 * MARGIN * SQUARE
+    view = view_of(scene, camera, (SQUARE, SQUARE))
+    seen = np.ptp(view.pixels(_corners(scene))[:, :2], axis=0) + 2 * MARGIN * SQUARE
     return float(seen[1] / seen[0])
 
 
@@ -124,15 +124,15 @@ def _axes(back: np.ndarray, up: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(back, right), back])
 
 
-def _corners(subject: Subject) -> np.ndarray:
-    low, high = np.array(subject.lower), np.array(subject.upper)
+def _corners(scene: RenderScene) -> np.ndarray:
+    low, high = np.array(scene.lower), np.array(scene.upper)
     picks = np.array([[i >> axis & 1 for axis in range(3)] for i in range(8)])
     return np.where(picks == 1, high, low)
 
 
-def _framed(subject: Subject, back: np.ndarray, up: np.ndarray, size: tuple[int, int], *, parallel: bool) -> View:
+def _framed(scene: RenderScene, back: np.ndarray, up: np.ndarray, size: tuple[int, int], *, parallel: bool) -> View:
     """Return the nearest view from a direction in which the whole domain is seen, its projection in the middle."""
-    corners, axes = _corners(subject), _axes(back, up)
+    corners, axes = _corners(scene), _axes(back, up)
     focus = corners.mean(axis=0)
     room = 1.0 - 2.0 * MARGIN
     aspect = size[0] / size[1]
@@ -151,10 +151,10 @@ def _framed(subject: Subject, back: np.ndarray, up: np.ndarray, size: tuple[int,
         shift = 0.5 * (outline.min(axis=1) + outline.max(axis=1)) * distance * room
         focus = focus + shift @ axes[:2]
     position = focus + distance * axes[2]
-    return _view(subject, size, position, focus, up, 2 * tangent * distance, parallel)
+    return _view(scene, size, position, focus, up, 2 * tangent * distance, parallel)
 
 
-def _free_view(subject: Subject, camera: str, size: tuple[int, int]) -> View:
+def _free_view(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
     try:
         numbers = np.array([float(word) for word in camera.split(",")])
     except ValueError:
@@ -162,22 +162,22 @@ def _free_view(subject: Subject, camera: str, size: tuple[int, int]) -> View:
     what = f'--camera "{camera}" is not a camera: give {", ".join(CAMERAS)}, or six numbers x,y,z,x,y,z in metres'
     if len(numbers) != 6 or not np.isfinite(numbers).all():
         raise InputError(f"{what}, where it stands and what it looks at.")
-    low, high = np.array(subject.lower), np.array(subject.upper)
+    low, high = np.array(scene.lower), np.array(scene.upper)
     if np.abs(numbers.reshape(2, 3) - 0.5 * (low + high)).max() > FARTHEST * (high - low).max():
         raise InputError(f"{what}: this one is too far from the domain for anything to be seen.")
     position, focus = numbers[:3], numbers[3:]
-    back, up = position - focus, np.array(subject.up)
+    back, up = position - focus, np.array(scene.up)
     if np.linalg.norm(back) <= 1e-9 * max(np.abs(numbers).max(), 1e-300):
         raise InputError(f"{what}: this one looks at where it stands.")
     if np.linalg.norm(np.cross(back, up)) <= 1e-6 * np.linalg.norm(back):
         # Straight up or down: any other direction will do for the upper edge.
         up = np.eye(3)[(int(np.argmax(np.abs(up))) + 1) % 3]
     height = 2 * math.tan(math.radians(0.5 * ANGLE)) * float(np.linalg.norm(back))
-    return _view(subject, size, position, focus, up, height, parallel=False)
+    return _view(scene, size, position, focus, up, height, parallel=False)
 
 
 def _view(
-    subject: Subject,
+    scene: RenderScene,
     size: tuple[int, int],
     position: np.ndarray,
     focus: np.ndarray,
@@ -186,9 +186,9 @@ def _view(
     parallel: bool,
 ) -> View:
     axes = _axes(position - focus, up)
-    depths = (position - _corners(subject)) @ axes[2]
-    # Room for shadows and for what has left the domain.
-    spare = 0.1 * float(np.ptp(_corners(subject), axis=0).max())
+    depths = (position - _corners(scene)) @ axes[2]
+    # FluidBackground for shadows and for what has left the domain.
+    spare = 0.1 * float(np.ptp(_corners(scene), axis=0).max())
     near, far = float(depths.min()) - spare, float(depths.max()) + spare
     near = max(near, 1e-3 * float(np.linalg.norm(position - focus)))
     plain = [tuple(float(number) for number in vector) for vector in (position, focus, up)]

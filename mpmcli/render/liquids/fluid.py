@@ -11,14 +11,14 @@ import numpy as np
 from mpmcli.frames.frame import Frame
 from mpmcli.render.depth_shading import depth_shaded
 from mpmcli.render.dots import OVERLAP
-from mpmcli.render.liquids.fluid_room import SAMPLES, Room
+from mpmcli.render.liquids.fluid_background import SAMPLES, FluidBackground
 from mpmcli.render.liquids.fluid_shading import displayed, fluid_lights, linear, optics_of, shaded, transmitted
 from mpmcli.render.liquids.liquid_surface import Liquid, Surface, layers_of, scale_at, surface_of, window_of
 from mpmcli.render.liquids.pixel_rays import plane
 from mpmcli.render.liquids.screen_space import NOTHING, sampled
-from mpmcli.render.subject import Subject
-from mpmcli.render.surfaces.lighting import lights_of
-from mpmcli.render.surfaces.material_groups import Group, groups_of
+from mpmcli.render.render_scene import RenderScene
+from mpmcli.render.shading.lighting import lights_of
+from mpmcli.render.shading.material_groups import Group, groups_of
 from mpmcli.render.theme import Theme, rgb_bytes
 from mpmcli.render.view import View
 
@@ -59,29 +59,29 @@ class FluidPainter:
 
     fields: tuple[str, ...] = ()
 
-    def __init__(self, subject: Subject, view: View, theme: Theme) -> None:
-        self._subject, self._view = subject, view
-        extent = np.subtract(subject.upper, subject.lower)
+    def __init__(self, scene: RenderScene, view: View, theme: Theme) -> None:
+        self._scene, self._view = scene, view
+        extent = np.subtract(scene.upper, scene.lower)
         # What a liquid takes of the light is told by the size of the scene: a beaker and a reservoir look alike.
         self._length = float(np.cbrt(np.prod(np.maximum(extent, 1e-3 * extent.max()))))
-        lamp = lights_of(subject, view, theme).lamp
-        self._room = Room(subject, view, theme, lamp)
-        self._lights = fluid_lights(theme, view.axes @ lamp, view.axes @ np.array(subject.up))
+        lamp = lights_of(scene, view, theme).lamp
+        self._background = FluidBackground(scene, view, theme, lamp)
+        self._lights = fluid_lights(theme, view.axes @ lamp, view.axes @ np.array(scene.up))
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return the picture of a frame, (h, w, 3) uint8; particles without a place (NaN) are left out."""
-        groups = groups_of(self._subject, frame)
-        solids = [group for group in groups if not group.look.liquid]
-        picture, depth = self._room.things(solids, [_colors(group) for group in solids])
-        image = self._room.base(groups)
+        groups = groups_of(self._scene, frame)
+        solids = [group for group in groups if not group.appearance.liquid]
+        picture, depth = self._background.things(solids, [_colors(group) for group in solids])
+        image = self._background.base(groups)
         samples = self._samples(picture, depth, max((group.distance for group in solids), default=None))
-        liquids = [self._liquid(group, frame) for group in groups if group.look.liquid]
+        liquids = [self._liquid(group, frame) for group in groups if group.appearance.liquid]
         liquids = [liquid for liquid in liquids if len(liquid.pixels)]
         window = window_of(liquids, self._view)
         if window is None:
             _add(image, samples)
         else:
-            surface = surface_of(liquids, window, self._view, self._subject)
+            surface = surface_of(liquids, window, self._view, self._scene)
             layers = layers_of(liquids, window, depth, SAMPLES, image.shape[:2])
             self._pour(image, samples, surface, liquids, layers)
         return (displayed(image) * 255 + 0.5).astype(np.uint8)
@@ -95,9 +95,9 @@ class FluidPainter:
         reach = (LEAVES_TRACES * group.distance * scale)[:, None]
         inside = (pixels[seen, :2] > -reach).all(axis=1) & (pixels[seen, :2] < np.array(view.size) + reach).all(axis=1)
         seen, scale = seen[inside], scale[inside]
-        body = np.clip(frame.body[group.rows[seen]], 0, len(self._subject.bodies) - 1)
-        volume = np.array(self._subject.distances)[body] ** 3
-        return Liquid(group.look, group.distance, group.position[seen], pixels[seen], scale, volume)
+        body = np.clip(frame.body[group.rows[seen]], 0, len(self._scene.bodies) - 1)
+        volume = np.array(self._scene.distances)[body] ** 3
+        return Liquid(group.appearance, group.distance, group.position[seen], pixels[seen], scale, volume)
 
     def _samples(self, picture: np.ndarray, depth: np.ndarray, distance: float | None) -> list[Sample]:
         """Part a picture with several samples to a pixel, leaving out what shows nothing.
@@ -136,7 +136,7 @@ class FluidPainter:
         depth += np.float32(LIES_ON * min(liquid.distance for liquid in liquids))
         before = [sample.distance < depth[sample.row, sample.column] for sample in samples]
         # Part of the light that a liquid takes from the floor beside it falls through it on the floor under it.
-        behind = image + np.float32(FALLS_THROUGH) * (self._room.bare - image)
+        behind = image + np.float32(FALLS_THROUGH) * (self._background.bare - image)
         _add(behind, [_chosen(sample, ~front) for sample, front in zip(samples, before, strict=True)])
         alpha = np.zeros((*image.shape[:2], 1), np.float32)
         alpha[picture] = surface.alpha[part][..., None]
@@ -167,18 +167,18 @@ class FluidPainter:
         for liquid, layer in zip(liquids, layers, strict=True):
             here = layer[row, column]
             thickness += here
-            through *= transmitted(liquid.look, here, self._length)
+            through *= transmitted(liquid.appearance, here, self._length)
         bend = np.minimum(thickness, BENDS * self._length) * scale_at(view, depth)
         light = np.zeros((*window.shape, 3), np.float32)
         for k, liquid in enumerate(liquids):
             mine = np.flatnonzero(owner == k)
             if len(mine) == 0:
                 continue
-            shift = optics_of(liquid.look).bend * bend[mine, None] * normal[mine, :2]
+            shift = optics_of(liquid.appearance).bend * bend[mine, None] * normal[mine, :2]
             x = np.clip(column[mine] + window.left + 0.5 - shift[:, 0], 0, width)
             y = np.clip(row[mine] + window.top + 0.5 + shift[:, 1], 0, height)
             light[row[mine], column[mine]] = shaded(
-                liquid.look,
+                liquid.appearance,
                 normal[mine],
                 towards[mine],
                 through[mine],
@@ -192,7 +192,7 @@ class FluidPainter:
 def _colors(group: Group) -> np.ndarray:
     """Return the colours of dots (n, 3) uint8, each a little lighter or darker."""
     tone = 1 + TONE * group.hashes[:, :1]
-    return np.clip(np.array(rgb_bytes(group.look.color)) * tone + 0.5, 0, 255).astype(np.uint8)
+    return np.clip(np.array(rgb_bytes(group.appearance.color)) * tone + 0.5, 0, 255).astype(np.uint8)
 
 
 def _chosen(sample: Sample, which: np.ndarray) -> Sample:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.render.look import Finish, Look
+from mpmcli.render.appearance import Appearance, Finish
 from mpmcli.render.theme import Theme, rgb
 
 # Of the light that meets a surface of water head-on, the share that it reflects: ((n - 1) / (n + 1))^2, n = 1.33.
@@ -57,11 +57,11 @@ LAVA = Optics(
 )
 
 
-def optics_of(look: Look) -> Optics:
+def optics_of(appearance: Appearance) -> Optics:
     """Return how light goes through a material."""
-    if look.name.startswith("lava"):
+    if appearance.name.startswith("lava"):
         return LAVA
-    return FINISHES.get(look.finish, FINISHES["matte"])
+    return FINISHES.get(appearance.finish, FINISHES["matte"])
 
 
 def linear(color: np.ndarray) -> np.ndarray:
@@ -125,7 +125,7 @@ def _lights(
     return Lights(*vectors, strength, ambient)
 
 
-def transmitted(look: Look, thickness: np.ndarray, length: float) -> np.ndarray:
+def transmitted(appearance: Appearance, thickness: np.ndarray, length: float) -> np.ndarray:
     """Return the share of light (..., 3) that is left behind a thickness (...), by the law of Beer and Lambert.
 
     Args:
@@ -133,14 +133,14 @@ def transmitted(look: Look, thickness: np.ndarray, length: float) -> np.ndarray:
         length: over which the liquid takes what its optics say, m: that of the scene, so that a beaker and a
             reservoir look alike.
     """
-    optics = optics_of(look)
-    loss = -np.log(np.clip(linear(np.array(rgb(look.color))), 1e-3, 0.98))
+    optics = optics_of(appearance)
+    loss = -np.log(np.clip(linear(np.array(rgb(appearance.color))), 1e-3, 0.98))
     loss = loss / loss.max() * optics.depths + optics.milk
     return np.exp(-(thickness[..., None] + np.float32(SKIN * length)) * (loss / length).astype(np.float32))
 
 
 def shaded(
-    look: Look,
+    appearance: Appearance,
     normal: np.ndarray,
     towards: np.ndarray,
     through: np.ndarray,
@@ -157,8 +157,8 @@ def shaded(
         behind: (n, 3) light from what lies behind.
         hollow: (n,) how much the surface is a hollow, from -1 of a ridge to 1 of a crease.
     """
-    optics = optics_of(look)
-    color = linear(np.array(rgb(look.color)))
+    optics = optics_of(appearance)
+    color = linear(np.array(rgb(appearance.color)))
     facing = np.clip(np.einsum("ij,ij->i", normal, towards), 0, 1)[:, None]
     lit = normal @ lights.lamp
     # Light that has been scattered inside wraps around the edges of its shadow.

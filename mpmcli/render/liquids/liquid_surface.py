@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mpmcli.render.appearance import Appearance
 from mpmcli.render.hidden import hidden
 from mpmcli.render.liquids.pixel_rays import plane, rays
 from mpmcli.render.liquids.screen_space import NOTHING, blurred, normals, smoothed, sphere_depths, thickness
-from mpmcli.render.look import Look
-from mpmcli.render.subject import Subject
+from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.view import View
 
 # Radius of the spheres that stand for particles, in distances between particles: they overlap.
@@ -40,7 +40,7 @@ class Liquid:
         volume: (n,) of each particle at rest, m^3.
     """
 
-    look: Look
+    appearance: Appearance
     distance: float
     position: np.ndarray
     pixels: np.ndarray
@@ -116,12 +116,12 @@ def window_of(liquids: Sequence[Liquid], view: View) -> Window | None:
     return Window(left, top, right - left, bottom - top)
 
 
-def surface_of(liquids: Sequence[Liquid], window: Window, view: View, subject: Subject) -> Surface:
+def surface_of(liquids: Sequence[Liquid], window: Window, view: View, scene: RenderScene) -> Surface:
     """Find the surface of the liquids, all of them as one body."""
-    inside = all(_is_inside(liquid, subject) for liquid in liquids)
-    whole = [_mirrored(liquid, view, subject) if inside else liquid for liquid in liquids]
+    inside = all(_is_inside(liquid, scene) for liquid in liquids)
+    whole = [_mirrored(liquid, view, scene) if inside else liquid for liquid in liquids]
     depth, owner, core = _nearest([_moved(liquid, window) for liquid in whole], window)
-    entry, exit_ = _passage(window, view, subject) if inside else (None, None)
+    entry, exit_ = _passage(window, view, scene) if inside else (None, None)
     if exit_ is not None:
         beyond = depth > exit_
         depth[beyond] = NOTHING
@@ -210,17 +210,17 @@ def _spheres(pixels: np.ndarray, scale: np.ndarray, radius: float, shape: tuple[
     return np.repeat(np.repeat(coarse, side, axis=0), side, axis=1)[:rows, :columns]
 
 
-def _is_inside(liquid: Liquid, subject: Subject) -> bool:
+def _is_inside(liquid: Liquid, scene: RenderScene) -> bool:
     slack = 0.3 * liquid.distance
-    low, high = np.array(subject.lower) - slack, np.array(subject.upper) + slack
+    low, high = np.array(scene.lower) - slack, np.array(scene.upper) + slack
     return bool(((liquid.position >= low) & (liquid.position <= high)).all())
 
 
-def _mirrored(liquid: Liquid, view: View, subject: Subject) -> Liquid:
+def _mirrored(liquid: Liquid, view: View, scene: RenderScene) -> Liquid:
     """Add the mirror images of the particles at the walls: the surface then meets a wall without a gap or a dent."""
     images = []
     for axis in range(3):
-        for wall in (subject.lower[axis], subject.upper[axis]):
+        for wall in (scene.lower[axis], scene.upper[axis]):
             near = np.abs(liquid.position[:, axis] - wall) < MIRRORED * liquid.distance
             image = liquid.position[near]
             image[:, axis] = 2 * wall - image[:, axis]
@@ -237,9 +237,9 @@ def _mirrored(liquid: Liquid, view: View, subject: Subject) -> Liquid:
     )
 
 
-def _passage(window: Window, view: View, subject: Subject) -> tuple[np.ndarray, np.ndarray]:
+def _passage(window: Window, view: View, scene: RenderScene) -> tuple[np.ndarray, np.ndarray]:
     """Return where the rays of pixels enter the domain and where they leave it, m; `NOTHING` twice where they miss."""
-    low, high = np.array(subject.lower), np.array(subject.upper)
+    low, high = np.array(scene.lower), np.array(scene.upper)
     start, direction = rays(view, window.left, window.top, *window.shape)
     first, last = np.full(window.shape, -np.inf), np.full(window.shape, np.inf)
     for axis in range(3):

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli.render.surfaces.lighting import Lights
+from mpmcli.render.shading.lighting import Lights
 from mpmcli.render.view import View
 
 # Radius of a ball, in distances between particles: a little more than half, so that a heap has no holes.

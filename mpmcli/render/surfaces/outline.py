@@ -5,11 +5,11 @@ import math
 import numpy as np
 
 from mpmcli.frames.frame import Frame
+from mpmcli.render.appearance import Appearance
 from mpmcli.render.coloring import Coloring
-from mpmcli.render.look import Look
-from mpmcli.render.subject import Subject
+from mpmcli.render.render_scene import RenderScene
+from mpmcli.render.shading.material_groups import Group, groups_of
 from mpmcli.render.surfaces.coverage import SPREAD, Grid, cover_of, disk_nodes, gaussian, spread, with_images
-from mpmcli.render.surfaces.material_groups import Group, groups_of
 from mpmcli.render.surfaces.tints import shades
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.view import View
@@ -35,9 +35,9 @@ ROUGHNESS, CRUMB = 0.55, 0.75
 class OutlinePainter:
     """Draws a 2D run as filled bodies."""
 
-    def __init__(self, subject: Subject, view: View, theme: Theme, colors: Coloring | None = None) -> None:
+    def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> None:
         """Find the pixels that show the domain; nothing is drawn yet."""
-        self.subject, self.view, self.theme, self.colors = subject, view, theme, colors
+        self.scene, self.view, self.theme, self.colors = scene, view, theme, colors
         width, height = view.size
         # Each pixel is a node; rows of the grid run upwards.
         edge = 1.0 / view.pixels_per_metre
@@ -46,8 +46,8 @@ class OutlinePainter:
         self.grid = Grid((float(corner[0]), float(corner[1])), edge, (height, width))
         x = corner[0] + edge * np.arange(width)
         y = corner[1] + edge * np.arange(height)
-        self.inside = _within(y, subject.lower[1], subject.upper[1], edge)[:, None] * _within(
-            x, subject.lower[0], subject.upper[0], edge
+        self.inside = _within(y, scene.lower[1], scene.upper[1], edge)[:, None] * _within(
+            x, scene.lower[0], scene.upper[0], edge
         )
 
     def draw(self, frame: Frame) -> np.ndarray:
@@ -55,7 +55,7 @@ class OutlinePainter:
         height, width = self.grid.shape
         picture = np.empty((height, width, 3), dtype=np.float32)
         picture[:] = rgb(self.theme.ground)
-        groups = groups_of(self.subject, frame)
+        groups = groups_of(self.scene, frame)
         covers = [self._cover(group) for group in groups]
         if groups:
             finest = min(group.distance for group in groups)
@@ -74,8 +74,8 @@ class OutlinePainter:
         """Return the share of each pixel's surroundings that a group covers, (h, w); its edge is where it is 1/2."""
         step = _coarseness(group.distance, self.grid)
         grid = _coarser(self.grid, step)
-        cover = cover_of(group.position, group.distance, self.subject.lower, self.subject.upper, grid)
-        if group.look.finish == "crumbly" and self.colors is None:
+        cover = cover_of(group.position, group.distance, self.scene.lower, self.scene.upper, grid)
+        if group.appearance.finish == "crumbly" and self.colors is None:
             cover = cover + ROUGHNESS * self._crumbs(group, grid) * np.clip(4.0 * cover * (1.0 - cover), 0.0, 1.0)
         return _finer(cover, step, self.grid.shape)
 
@@ -94,19 +94,19 @@ class OutlinePainter:
         rim = np.clip(1.0 - self._inwards(cover, group.distance) / (RIM * self.view.size[1] / 720.0), 0.0, 1.0)
         # Drops are all rim, and would be dark.
         rim *= np.clip(3.0 * body - 0.3, 0.0, 1.0)
-        return color * (1.0 - DARKER.get(group.look.finish, 0.28) * rim)[..., None]
+        return color * (1.0 - DARKER.get(group.appearance.finish, 0.28) * rim)[..., None]
 
     def _by_look(self, group: Group, depth: np.ndarray, lit: np.ndarray) -> np.ndarray:
         """Return the colours (h, w, 3) of the material of a group, by depth and light as `_relief` finds them."""
-        base = np.array(rgb(group.look.color), dtype=np.float32)
+        base = np.array(rgb(group.appearance.color), dtype=np.float32)
         ground = np.array(rgb(self.theme.ground), dtype=np.float32)
         if np.abs(base - ground).max() < 0.15:
             # White on white: as much of the ink as tells it from the paper.
-            base = base + np.float32(0.25) * (np.array(rgb(group.look.ink), dtype=np.float32) - base)
-        if group.look.finish == "grains":
+            base = base + np.float32(0.25) * (np.array(rgb(group.appearance.ink), dtype=np.float32) - base)
+        if group.appearance.finish == "grains":
             return self._grainy(group, base, depth, lit)
-        color = _shaded(group.look, base, depth, lit)
-        if group.look.finish == "crumbly":
+        color = _shaded(group.appearance, base, depth, lit)
+        if group.appearance.finish == "crumbly":
             step = _coarseness(group.distance, self.grid)
             noise = _finer(self._crumbs(group, _coarser(self.grid, step)), step, self.grid.shape)
             color = color * (1.0 + 0.10 * np.clip(noise, -1.0, 1.0))[..., None]
@@ -138,8 +138,8 @@ class OutlinePainter:
         """Return the rows and columns of coarse pixels within the domain."""
         found = []
         for axis, size in ((1, shape[0]), (0, shape[1])):
-            low = (self.subject.lower[axis] - self.grid.corner[axis]) / (self.grid.edge * step)
-            high = (self.subject.upper[axis] - self.grid.corner[axis]) / (self.grid.edge * step)
+            low = (self.scene.lower[axis] - self.grid.corner[axis]) / (self.grid.edge * step)
+            high = (self.scene.upper[axis] - self.grid.corner[axis]) / (self.grid.edge * step)
             first = min(max(math.ceil(low), 0), size - 1)
             found.append(slice(first, min(max(math.floor(high), first + 1), size)))
         return found[0], found[1]
@@ -149,7 +149,7 @@ class OutlinePainter:
         values = np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows]
         known = np.isfinite(values)
         deviation = SPREAD * group.distance
-        position, source = with_images(group.position, 3.0 * deviation, self.subject.lower, self.subject.upper)
+        position, source = with_images(group.position, 3.0 * deviation, self.scene.lower, self.scene.upper)
         step = _coarseness(group.distance, self.grid)
         grid = _coarser(self.grid, step)
         area = group.distance**2
@@ -179,7 +179,7 @@ class OutlinePainter:
         return (shade * (1.02 + 0.10 * lit - 0.06 * depth))[..., None] * base
 
 
-def _shaded(look: Look, base: np.ndarray, depth: np.ndarray, lit: np.ndarray) -> np.ndarray:
+def _shaded(appearance: Appearance, base: np.ndarray, depth: np.ndarray, lit: np.ndarray) -> np.ndarray:
     """Return the colours (h, w, 3) of a smooth body.
 
     Args:
@@ -189,28 +189,28 @@ def _shaded(look: Look, base: np.ndarray, depth: np.ndarray, lit: np.ndarray) ->
     depth, lit = depth[..., None], lit[..., None]
     white = np.ones(3, dtype=np.float32)
     toward, away = np.maximum(lit, 0.0), np.maximum(-lit, 0.0)
-    if look.name.startswith("lava"):
+    if appearance.name.startswith("lava"):
         hot = np.array([1.0, 0.62, 0.16], dtype=np.float32)
         crust = np.array([0.30, 0.05, 0.03], dtype=np.float32)
         color = crust + np.clip(1.8 * depth, 0.0, 1.0) * (base - crust)
         return color + np.clip(1.6 * depth - 0.6, 0.0, 1.0) * 0.75 * (hot - color)
-    if look.finish == "water":
+    if appearance.finish == "water":
         pale = base + 0.42 * (white - base)
         color = pale + np.clip(1.25 * depth, 0.0, 1.0) * (base * 0.93 - pale)
         return color + 0.25 * toward * (white - color)
-    if look.finish == "syrup":
+    if appearance.finish == "syrup":
         deep = base * np.array([0.86, 0.72, 0.6], dtype=np.float32)
         color = np.minimum(base * 1.06, 1.0) + depth * (deep - base)
         return color + 0.45 * toward * (1.0 - depth) * (white - color)
-    if look.finish == "translucent":
+    if appearance.finish == "translucent":
         pale = base + 0.30 * (white - base)
         color = base * 0.96 + (1.0 - depth) * 0.55 * (pale - base)
         return (color + 0.30 * toward * (white - color)) * (1.0 - 0.16 * away)
-    if look.finish == "crumbly":
+    if appearance.finish == "crumbly":
         shade = np.array([0.74, 0.83, 0.95], dtype=np.float32)
         color = base * (0.90 + 0.10 * depth)
         return color + (0.10 + 0.75 * away) * (shade - color) * (1.0 - 0.5 * depth)
-    if look.finish == "metal":
+    if appearance.finish == "metal":
         color = base * (0.88 + 0.12 * depth)
         return (color + 0.65 * toward * (white - color)) * (1.0 - 0.38 * away)
     color = base * (1.0 - 0.03 * depth)

@@ -14,9 +14,9 @@ from mpmcli.frames.frame import Frame
 from mpmcli.output.durable import sealed, write_text
 from mpmcli.output.result import Result, open_result
 from mpmcli.render.frame_workers import render_frames
-from mpmcli.render.subject import Subject, subject_of
+from mpmcli.render.render_scene import RenderScene, render_scene_of
+from mpmcli.render.shading.material_groups import Group, groups_of
 from mpmcli.render.surfaces.coverage import FINENESS, cover_of, grid_over
-from mpmcli.render.surfaces.material_groups import Group, groups_of
 from mpmcli.render.surfaces.reconstruction import Mesh, reconstruct
 
 if TYPE_CHECKING:
@@ -26,10 +26,12 @@ if TYPE_CHECKING:
 NODES = 3e7
 
 
-def surface_paths(subject: Subject, directory: Path, index: int) -> list[Path]:
+def surface_paths(scene: RenderScene, directory: Path, index: int) -> list[Path]:
     """Return the files that `save_surface` writes for a frame whose every material has particles."""
     return [
-        directory / f"surface_{slug(look.name)}_{index:06d}.{kind}" for look in subject.looks for kind in ("vtp", "obj")
+        directory / f"surface_{slug(appearance.name)}_{index:06d}.{kind}"
+        for appearance in scene.appearances
+        for kind in ("vtp", "obj")
     ]
 
 
@@ -38,7 +40,7 @@ def slug(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") or "material"
 
 
-def save_surface(subject: Subject, frame: Frame, directory: Path) -> list[Path]:
+def save_surface(scene: RenderScene, frame: Frame, directory: Path) -> list[Path]:
     """Write the surface of every material of a frame, `surface_<material>_<frame>.vtp` and `.obj`.
 
     A material without particles in the domain has a file without points, so that a series has no gaps. Lengths are
@@ -58,12 +60,12 @@ def save_surface(subject: Subject, frame: Frame, directory: Path) -> list[Path]:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{directory} cannot be made for the surfaces: {error.strerror or error}.") from error
-    groups = groups_of(subject, frame)
+    groups = groups_of(scene, frame)
     written = []
-    for number, look in enumerate(subject.looks):
-        meshes = [_mesh(subject, group) for group in groups if group.key[0] == number]
+    for number, appearance in enumerate(scene.appearances):
+        meshes = [_mesh(scene, group) for group in groups if group.key[0] == number]
         mesh = _joined(meshes)
-        stem = f"surface_{slug(look.name)}_{frame.index:06d}"
+        stem = f"surface_{slug(appearance.name)}_{frame.index:06d}"
         for path, write in ((directory / f"{stem}.vtp", _write_vtp), (directory / f"{stem}.obj", _write_obj)):
             try:
                 write(path, mesh, frame.time)
@@ -73,15 +75,15 @@ def save_surface(subject: Subject, frame: Frame, directory: Path) -> list[Path]:
     return written
 
 
-def write_series(subject: Subject, directory: Path, frames: Sequence[tuple[int, float]]) -> list[Path]:
+def write_series(scene: RenderScene, directory: Path, frames: Sequence[tuple[int, float]]) -> list[Path]:
     """Write `surface_<material>.vtp.series` for every material, by which ParaView knows the times of its files.
 
     Args:
         frames: numbers and times, s, of the frames that have been saved, in any order.
     """
     written = []
-    for look in subject.looks:
-        name = slug(look.name)
+    for appearance in scene.appearances:
+        name = slug(appearance.name)
         files = [{"name": f"surface_{name}_{index:06d}.vtp", "time": time} for index, time in sorted(frames)]
         path = directory / f"surface_{name}.vtp.series"
         write_text(path, json.dumps({"file-series-version": "1.0", "files": files}, indent=1) + "\n")
@@ -99,10 +101,10 @@ class SurfaceJob:
     def start(self) -> Callable[[int], None]:
         """Open the result, and return what writes the surfaces of a frame."""
         result = open_result(self.source)
-        subject = subject_of(result)
+        scene = render_scene_of(result)
 
         def save(k: int) -> None:
-            save_surface(subject, result.frame(k, ()), self.directory)
+            save_surface(scene, result.frame(k, ()), self.directory)
 
         return save
 
@@ -124,13 +126,13 @@ def save_surfaces(
         KeyboardInterrupt: `stop` said so.
     """
     render_frames(SurfaceJob(result.path, directory), ks, workers, watch=watch, stop=stop)
-    write_series(subject_of(result), directory, [(int(result.numbers[k]), float(result.times[k])) for k in ks])
+    write_series(render_scene_of(result), directory, [(int(result.numbers[k]), float(result.times[k])) for k in ks])
 
 
-def _mesh(subject: Subject, group: Group) -> Mesh:
-    if subject.dimension == 3:
-        return reconstruct(group.position, group.distance, subject.lower, subject.upper)
-    return flat_mesh(group.position, group.distance, subject.lower, subject.upper)
+def _mesh(scene: RenderScene, group: Group) -> Mesh:
+    if scene.dimension == 3:
+        return reconstruct(group.position, group.distance, scene.lower, scene.upper)
+    return flat_mesh(group.position, group.distance, scene.lower, scene.upper)
 
 
 def flat_mesh(position: np.ndarray, distance: float, lower: Sequence[float], upper: Sequence[float]) -> Mesh:

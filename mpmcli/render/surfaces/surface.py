@@ -4,9 +4,9 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.render.coloring import Coloring
-from mpmcli.render.subject import Subject
+from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.surfaces.outline import OutlinePainter
-from mpmcli.render.surfaces.solid_stage import SolidStage
+from mpmcli.render.surfaces.surface_renderer import SurfaceRenderer
 from mpmcli.render.theme import Theme
 from mpmcli.render.view import View
 
@@ -18,12 +18,12 @@ class SurfacePainter:
         fields: that are read of each frame.
     """
 
-    def __init__(self, subject: Subject, view: View, theme: Theme, colors: Coloring | None = None) -> None:
+    def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> None:
         """Choose the way of drawing: in space by triangles, in the plane by the density of particles."""
         self.fields = () if colors is None else colors.fields
         self.view = view
-        kind = SolidStage if subject.dimension == 3 else OutlinePainter
-        self.painter = kind(subject, view, theme, colors)
+        kind = SurfaceRenderer if scene.dimension == 3 else OutlinePainter
+        self.painter = kind(scene, view, theme, colors)
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return the picture of a frame, (h, w, 3) uint8."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.render.coloring import Coloring
-from mpmcli.render.surfaces.material_groups import Group
+from mpmcli.render.shading.material_groups import Group
 from mpmcli.render.theme import rgb
 
 # Colours in a table of a colour map.

@@ -1,13 +1,13 @@
-"""What stands behind a 3D scene: a room that is brighter below than above, and a floor with shadows on it."""
+"""What stands behind a 3D scene: a gradient that is brighter below than above, and a floor with shadows on it."""
 
 import numpy as np
 
-from mpmcli.render.subject import Subject
-from mpmcli.render.surfaces.occlusion import Occlusion
+from mpmcli.render.render_scene import RenderScene
+from mpmcli.render.shading.occlusion import Occlusion
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.view import View
 
-# Distance from the domain over which the floor fades into the room, in longest sides of the domain.
+# Distance from the domain over which the floor fades into the gradient, in longest sides of the domain.
 FADE = 0.55
 # Share of the floor's light that comes from the lamp; the rest comes from the sky.
 LAMP_SHARE = 0.5
@@ -15,24 +15,24 @@ LAMP_SHARE = 0.5
 STEP = 2
 
 
-class Backdrop:
-    """The room of one run and view: its floor under every pixel is found once, its shadows for every frame."""
+class Background:
+    """The background of one run and view. Its floor under every pixel is found once, its shadows for every frame."""
 
-    def __init__(self, subject: Subject, view: View, theme: Theme) -> None:
+    def __init__(self, scene: RenderScene, view: View, theme: Theme) -> None:
         self.view, self.theme = view, theme
         width, height = view.size
         down = np.linspace(0.0, 1.0, height)[:, None]
         ease = down * down * (3.0 - 2.0 * down)
         column = (1.0 - ease) * np.array(rgb(theme.sky)) + ease * np.array(rgb(theme.horizon))
-        self.room = np.broadcast_to(column[:, None], (height, width, 3)).astype(np.float32)
+        self.gradient = np.broadcast_to(column[:, None], (height, width, 3)).astype(np.float32)
         # Coarse nodes that span the picture, corners included.
         self.nodes = (-(-height // STEP) + 1, -(-width // STEP) + 1)
         rows, columns = np.meshgrid(*(np.arange(n) * STEP for n in self.nodes), indexing="ij")
-        points, hit = _on_floor(subject, view, columns.ravel() + 0.5, rows.ravel() + 0.5)
-        beside = np.maximum(np.array(subject.lower) - points, points - np.array(subject.upper))
-        beside[:, int(np.argmax(np.abs(subject.up)))] = 0.0
+        points, hit = _on_floor(scene, view, columns.ravel() + 0.5, rows.ravel() + 0.5)
+        beside = np.maximum(np.array(scene.lower) - points, points - np.array(scene.upper))
+        beside[:, int(np.argmax(np.abs(scene.up)))] = 0.0
         away = np.linalg.norm(np.maximum(beside, 0.0), axis=1)
-        side = max(np.subtract(subject.upper, subject.lower))
+        side = max(np.subtract(scene.upper, scene.lower))
         self.share = np.where(hit, np.exp(-((away / (FADE * side)) ** 2)), 0.0).astype(np.float32)
         # What hardly shows is not worked out.
         self.seen = np.flatnonzero(self.share > 1e-3)
@@ -41,7 +41,7 @@ class Backdrop:
     def image(self, occlusion: Occlusion | None) -> np.ndarray:
         """Return (h, w, 3) uint8, with the shadows that are cast, if any."""
         if not len(self.seen):
-            return (255.0 * self.room + 0.5).astype(np.uint8)
+            return (255.0 * self.gradient + 0.5).astype(np.uint8)
         light = np.ones(len(self.share), dtype=np.float32)
         if occlusion is not None:
             lamp, sky = occlusion.on_floor(self.points)
@@ -51,7 +51,7 @@ class Backdrop:
         floor = np.array(rgb(self.theme.floor), dtype=np.float32)
         # Shadows are taken in light as the eye counts it, and are never black.
         bright = np.maximum(light, 0.0) ** 0.7 * 0.82 + 0.18
-        image = self.room + share[..., None] * (floor * bright[..., None] - self.room)
+        image = self.gradient + share[..., None] * (floor * bright[..., None] - self.gradient)
         return (255.0 * np.clip(image, 0.0, 1.0) + 0.5).astype(np.uint8)
 
     def _spread(self, values: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ class Backdrop:
         return fine[:height, :width]
 
 
-def _on_floor(subject: Subject, view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _on_floor(scene: RenderScene, view: View, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where the rays of pixels meet the floor, (n, 3), and whether they do, from above, (n,)."""
     right, up, back = view.axes
     width, height = view.size
@@ -77,9 +77,9 @@ def _on_floor(subject: Subject, view: View, x: np.ndarray, y: np.ndarray) -> tup
         starts, rays = np.array(view.position) + shift, np.broadcast_to(-back, shift.shape)
     else:
         starts, rays = np.broadcast_to(np.array(view.position), shift.shape), shift - view.distance * back
-    axis = int(np.argmax(np.abs(subject.up)))
-    level = subject.lower[axis] if subject.up[axis] > 0 else subject.upper[axis]
-    fall = rays[:, axis] * np.sign(subject.up[axis])
+    axis = int(np.argmax(np.abs(scene.up)))
+    level = scene.lower[axis] if scene.up[axis] > 0 else scene.upper[axis]
+    fall = rays[:, axis] * np.sign(scene.up[axis])
     hit = fall < -1e-4 * np.linalg.norm(rays, axis=1)
     length = (level - starts[:, axis]) / np.where(hit, rays[:, axis], 1.0)
     hit &= length > 0.0

@@ -10,11 +10,11 @@ from mpmcli.errors import InputError
 from mpmcli.output.header import BodyHeader
 from mpmcli.output.result import Result
 from mpmcli.plain_text import one_line
-from mpmcli.render.look import OTHERS, Look, look_of
+from mpmcli.render.appearance import OTHERS, Appearance, appearance_of
 
 
 @dataclass(frozen=True)
-class Subject:
+class RenderScene:
     """Facts of a run; b bodies, m materials. Everything is in three dimensions: z = 0 in 2D.
 
     Attributes:
@@ -24,8 +24,8 @@ class Subject:
         spacing: of the grid, m.
         up: direction against gravity, along an axis, (3,).
         bodies: b names.
-        looks: m looks, of materials that differ; two of one kind differ in their names.
-        material_of: (b,) index into `looks`.
+        appearances: m appearances, of materials that differ; two of one kind differ in their names.
+        material_of: (b,) index into `appearances`.
         distances: (b,) between neighbouring particles at the start, m.
         densities: (b,) at rest, kg/m^3.
         fields: names of what is stored of each particle, beside position, velocity, body and material.
@@ -38,14 +38,14 @@ class Subject:
     spacing: float
     up: tuple[float, ...]
     bodies: tuple[str, ...]
-    looks: tuple[Look, ...]
+    appearances: tuple[Appearance, ...]
     material_of: tuple[int, ...]
     distances: tuple[float, ...]
     densities: tuple[float, ...]
     fields: tuple[str, ...]
 
 
-def subject_of(result: Result) -> Subject:
+def render_scene_of(result: Result) -> RenderScene:
     """Read the facts off the header of a result.
 
     Raises:
@@ -56,9 +56,9 @@ def subject_of(result: Result) -> Subject:
         raise InputError(f"{result.path} does not say what its domain is, so that no picture can be framed.")
     bodies = header.bodies or (BodyHeader("all", {}, None, 2**d),)
     names = tuple(one_line(body.name) for body in bodies)
-    looks, material_of = _materials(names, [body.material for body in bodies])
+    appearances, material_of = _materials(names, [body.material for body in bodies])
     flat = [0.0] * (3 - d)
-    return Subject(
+    return RenderScene(
         title=one_line(header.title),
         dimension=d,
         lower=(*header.origin.tolist(), *flat),
@@ -66,7 +66,7 @@ def subject_of(result: Result) -> Subject:
         spacing=header.spacing,
         up=_up(header.steady_gravity, d),
         bodies=names,
-        looks=looks,
+        appearances=appearances,
         material_of=material_of,
         distances=tuple(header.spacing / body.particles_per_cell ** (1 / d) for body in bodies),
         densities=tuple(body.density or 1000.0 for body in bodies),
@@ -85,22 +85,24 @@ def _up(gravity: np.ndarray | None, d: int) -> tuple[float, ...]:
     return tuple(up.tolist())
 
 
-def _materials(bodies: Sequence[str], tables: Sequence[Mapping[str, Any]]) -> tuple[tuple[Look, ...], tuple[int, ...]]:
+def _materials(
+    bodies: Sequence[str], tables: Sequence[Mapping[str, Any]]
+) -> tuple[tuple[Appearance, ...], tuple[int, ...]]:
     """Find the materials that differ, and which each body has."""
     kinds: list[Mapping[str, Any]] = []
     firsts: list[str] = []
-    looks: list[Look] = []
+    appearances: list[Appearance] = []
     material_of = []
     for body, table in zip(bodies, tables, strict=True):
         if table not in kinds:
-            others = sum(look.ink in OTHERS for look in looks)
-            looks.append(look_of(table.get("law", "material"), table, others))
+            others = sum(appearance.ink in OTHERS for appearance in appearances)
+            appearances.append(appearance_of(table.get("law", "material"), table, others))
             kinds.append(table)
             firsts.append(body)
         material_of.append(kinds.index(table))
-    names = [look.name for look in looks]
+    names = [appearance.name for appearance in appearances]
     told = [
-        look if names.count(look.name) == 1 else replace(look, name=f"{look.name} ({body})")
-        for look, body in zip(looks, firsts, strict=True)
+        appearance if names.count(appearance.name) == 1 else replace(appearance, name=f"{appearance.name} ({body})")
+        for appearance, body in zip(appearances, firsts, strict=True)
     ]
     return tuple(told), tuple(material_of)

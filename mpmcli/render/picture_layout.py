@@ -9,7 +9,7 @@ import numpy as np
 
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.labels import cut, font_of, length_text, round_length, ticks_of, time_text
-from mpmcli.render.subject import Subject
+from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.theme import Theme, rgb_bytes
 from mpmcli.render.view import View
 
@@ -35,7 +35,7 @@ NO_NUMBER = "no number"
 
 
 @dataclass(frozen=True)
-class Canvas:
+class PictureLayout:
     """The frame of all pictures of one film, or of the pictures of a montage.
 
     Args:
@@ -48,7 +48,7 @@ class Canvas:
     """
 
     size: tuple[int, int]
-    subject: Subject
+    scene: RenderScene
     theme: Theme
     times: tuple[float, ...]
     colors: Coloring | Categories | None
@@ -57,9 +57,9 @@ class Canvas:
     scale_bar: bool = True
 
     @property
-    def stage_size(self) -> tuple[int, int]:
+    def viewport_size(self) -> tuple[int, int]:
         """Pixels of each picture of the scene, (width, height)."""
-        left, top, right, bottom = self._stage
+        left, top, right, bottom = self._offscreen
         columns, rows = self.grid
         gap = self._px(GAP)
         width = (right - left - (columns - 1) * gap) // columns
@@ -72,17 +72,17 @@ class Canvas:
         """Return the whole picture, (height, width, 3) uint8.
 
         Args:
-            pictures: of the scene, of the size of the stage, row by row.
+            pictures: of the scene, of the size of the viewport, row by row.
             times: of each, s.
             missing: particles whose value is not a number.
         """
         from PIL import Image, ImageDraw
 
-        canvas = Image.new("RGB", self.size, rgb_bytes(self.theme.ground))
-        draw = ImageDraw.Draw(canvas)
+        layout = Image.new("RGB", self.size, rgb_bytes(self.theme.ground))
+        draw = ImageDraw.Draw(layout)
         for k, (picture, time) in enumerate(zip(pictures, times, strict=True)):
             x, y = self._place(k)
-            canvas.paste(Image.fromarray(picture), (x, y))
+            layout.paste(Image.fromarray(picture), (x, y))
             if self._label:
                 self._time(draw, time, (x, y - self._label // 2))
             if self.walls:
@@ -94,16 +94,16 @@ class Canvas:
             self._color_bar(draw, self.colors, missing)
         elif self.colors is not None:
             self._legend(draw, self.colors)
-        return np.asarray(canvas)
+        return np.asarray(layout)
 
     def height_for(self, aspect: float) -> int:
         """Return the height of the whole picture at which those of the scene are so many times as high as wide."""
         rows = self.grid[1]
-        stage = round(self.stage_size[0] * aspect) + self._label
-        return self._px(TOP) + self._bottom + rows * stage + (rows - 1) * self._px(GAP)
+        viewport = round(self.viewport_size[0] * aspect) + self._label
+        return self._px(TOP) + self._bottom + rows * viewport + (rows - 1) * self._px(GAP)
 
     @property
-    def _stage(self) -> tuple[int, int, int, int]:
+    def _offscreen(self) -> tuple[int, int, int, int]:
         """Where pictures of the scene go: left, top, right, bottom, pixels."""
         width, height = self.size
         return 0, self._px(TOP), width - self._column, height - self._bottom
@@ -120,7 +120,7 @@ class Canvas:
     def _place(self, k: int) -> tuple[int, int]:
         """Return left and top of the k-th picture of the scene."""
         row, column = divmod(k, self.grid[0])
-        (width, height), (left, top, _, _), gap = self.stage_size, self._stage, self._px(GAP)
+        (width, height), (left, top, _, _), gap = self.viewport_size, self._offscreen, self._px(GAP)
         return left + column * (width + gap), top + row * (height + self._label + gap) + self._label
 
     @property
@@ -155,20 +155,20 @@ class Canvas:
             draw.text((self.size[0] - pad, middle), told, self.theme.text, small, anchor="rm")
             # The room of the longest time, so that a title does not change its length in a film.
             room -= pad + max(small.getlength(time_text(t, self.times)) for t in (*self.times[-1:], time))
-        title = cut(self.subject.title, lambda text: font.getlength(text) <= room)
+        title = cut(self.scene.title, lambda text: font.getlength(text) <= room)
         draw.text((pad, middle), title, self.theme.text, font, anchor="lm")
 
     def _time(self, draw: "ImageDraw", time: float, place: tuple[int, int]) -> None:
         """Write the time above a picture of a montage, where there is room for it."""
         font, told = font_of(self._px(SMALL)), time_text(time, self.times)
-        free = self.stage_size[0] - font.getlength(told)
+        free = self.viewport_size[0] - font.getlength(told)
         if free >= 0:
             start = place[0] + min(self._px(PAD), free)
             draw.text((start, place[1]), told, self.theme.text, font, anchor="lm")
 
     def _walls(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
         """Draw the walls around the domain, outside of it, so that nothing within is hidden."""
-        corners = view.pixels(np.array([self.subject.lower, self.subject.upper]))
+        corners = view.pixels(np.array([self.scene.lower, self.scene.upper]))
         edges = np.rint(corners[:, :2] + place).astype(int)
         (x0, y0), (x1, y1) = edges.min(axis=0).tolist(), edges.max(axis=0).tolist()
         w = self._px(2)
@@ -191,10 +191,10 @@ class Canvas:
 
     def _legend(self, draw: "ImageDraw", colors: Categories) -> None:
         font = font_of(self._px(SMALL))
-        x = self._stage[2] + self._px(PAD)
+        x = self._offscreen[2] + self._px(PAD)
         room = self.size[0] - x - self._px(PAD + SWATCH + 8)
         swatch, step = self._px(SWATCH), self._px(SWATCH + 10)
-        y = self._stage[1] + self._px(PAD)
+        y = self._offscreen[1] + self._px(PAD)
         rows = max(1, int((self.size[1] - self._px(PAD) - swatch - y) / step) + 1)
         told = rows - 1 if len(colors.names) > rows else rows
         for name, ink in zip(colors.names[:told], colors.inks, strict=False):
@@ -223,9 +223,9 @@ class Canvas:
 
     def _color_bar(self, draw: "ImageDraw", colors: Coloring, missing: int) -> None:
         font = font_of(self._px(SMALL))
-        x = self._stage[2] + self._px(PAD)
+        x = self._offscreen[2] + self._px(PAD)
         line = self._px(SMALL + 6)
-        y = self._stage[1] + self._px(4)
+        y = self._offscreen[1] + self._px(4)
         for text in self._bar_heading(colors):
             draw.text((x, y), text, self.theme.text, font, anchor="lt")
             y += line

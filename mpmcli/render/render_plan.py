@@ -9,14 +9,14 @@ from mpmcli.cores import available_cores
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.files.film import film_digest, write_film
 from mpmcli.render.files.picture_file import settings_digest, write_picture
-from mpmcli.render.painter import Studio
-from mpmcli.render.pictures import Easel, Outcome, Planned, make_pictures
+from mpmcli.render.painter import RenderSetup
+from mpmcli.render.pictures import Outcome, PictureRenderer, PlannedPicture, make_pictures
 from mpmcli.render.surfaces.save_surface import save_surfaces
 
 
 @dataclass(frozen=True)
-class Done:
-    """What came of an assignment.
+class RenderSummary:
+    """What came of an plan.
 
     Attributes:
         pictures: files, by frame; the one of a montage.
@@ -42,18 +42,18 @@ class Done:
 
 
 @dataclass(frozen=True)
-class Assignment:
+class RenderPlan:
     """Pictures, a film or a montage of a result, all questions answered; nothing is drawn yet.
 
     Attributes:
-        studio: what all pictures share.
+        setup: what all pictures share.
         ks: positions of the frames in the result.
         plan: the picture files, one for each frame; one for a montage.
     """
 
-    studio: Studio
+    setup: RenderSetup
     ks: list[int]
-    plan: list[Planned]
+    plan: list[PlannedPicture]
     movie: Path | None
     fps: float
     save_surface: Path | None
@@ -67,7 +67,7 @@ class Assignment:
 
     @property
     def _is_montage(self) -> bool:
-        return self.studio.settings.grid != (1, 1)
+        return self.setup.settings.grid != (1, 1)
 
     def carry_out(
         self,
@@ -75,7 +75,7 @@ class Assignment:
         *,
         watch: Callable[[int], None] = lambda done: None,
         stop: Callable[[], bool] = lambda: False,
-    ) -> Done:
+    ) -> RenderSummary:
         """Draw what is due, and put the film together.
 
         Args:
@@ -89,7 +89,7 @@ class Assignment:
             KeyboardInterrupt: `stop` said so; pictures that are done stay.
         """
         workers = workers or available_cores()
-        source, settings = self.studio.result.path, self.studio.settings
+        source, settings = self.setup.result.path, self.setup.settings
         outcomes: dict[int, Outcome] = {}
         done = 0
 
@@ -105,11 +105,11 @@ class Assignment:
         else:
             make_pictures(source, settings, self.plan, workers, watch=seen, stop=stop)
         if self.save_surface is not None:
-            save_surfaces(self.studio.result, self.ks, self.save_surface, workers, watch=seen, stop=stop)
+            save_surfaces(self.setup.result, self.ks, self.save_surface, workers, watch=seen, stop=stop)
         if self.movie is not None:
             self._put_together(self.movie, stop)
         made = sum(not planned.made for planned in self.plan)
-        return Done([planned.path for planned in self.plan], made, self.movie, self._warnings(outcomes))
+        return RenderSummary([planned.path for planned in self.plan], made, self.movie, self._warnings(outcomes))
 
     def _draw_montage(self, seen: Callable[[int, Outcome], None], stop: Callable[[], bool]) -> None:
         (planned,) = self.plan
@@ -121,7 +121,7 @@ class Assignment:
             if stop():
                 raise KeyboardInterrupt
 
-        write_picture(planned.path, Easel(self.studio).picture(self.ks, watched), planned.digest)
+        write_picture(planned.path, PictureRenderer(self.setup).picture(self.ks, watched), planned.digest)
 
     def _put_together(self, movie: Path, stop: Callable[[], bool]) -> None:
         def watched(_: int) -> None:
@@ -135,8 +135,8 @@ class Assignment:
     def _warnings(self, outcomes: dict[int, Outcome]) -> list[str]:
         """Say what could not be shown as it is, once for all frames."""
         told = []
-        numbers = self.studio.result.numbers
-        colors = self.studio.colors
+        numbers = self.setup.result.numbers
+        colors = self.setup.colors
         missing = [k for k in sorted(outcomes) if outcomes[k].missing]
         if missing and isinstance(colors, Coloring):
             most = _particles([outcomes[k].missing for k in missing])

@@ -1,6 +1,6 @@
 """Lamps, and how each finish meets their light: the shader that colours every point of a surface.
 
-The light of the room is a formula of the direction (sky, ground, a lamp with a soft edge, a strip behind): it lights
+The light is a formula of the direction (sky, ground, a lamp with a soft edge, a strip behind): it lights
 what is dull and is mirrored in what is glossy. What is clear shows the picture behind it, bent by its normals and
 dimmed by its thickness, after the law of Beer and Lambert, with Schlick's approximation of Fresnel's mirror.
 """
@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.render.look import Finish, Look
-from mpmcli.render.subject import Subject
-from mpmcli.render.surfaces.material_groups import Group
-from mpmcli.render.surfaces.occlusion import Occlusion, occlusion_of
+from mpmcli.render.appearance import Appearance, Finish
+from mpmcli.render.render_scene import RenderScene
+from mpmcli.render.shading.material_groups import Group
+from mpmcli.render.shading.occlusion import Occlusion, occlusion_of
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.view import View
 
@@ -46,20 +46,20 @@ class Lights:
     ground: np.ndarray
 
 
-def occlusion_by(subject: Subject, groups: Sequence[Group], lamp: np.ndarray) -> Occlusion | None:
+def occlusion_by(scene: RenderScene, groups: Sequence[Group], lamp: np.ndarray) -> Occlusion | None:
     """Return what the particles of some groups take of the light of a lamp in direction (3,), None without any."""
     if not groups:
         return None
     counts = [len(group.position) for group in groups]
     volumes = np.repeat([group.distance**3 for group in groups], counts)
-    opacity = np.repeat([OPACITY.get(group.look.finish, 1.0) for group in groups], counts)
-    return occlusion_of(subject, np.concatenate([group.position for group in groups]), volumes, opacity, lamp)
+    opacity = np.repeat([OPACITY.get(group.appearance.finish, 1.0) for group in groups], counts)
+    return occlusion_of(scene, np.concatenate([group.position for group in groups]), volumes, opacity, lamp)
 
 
-def lights_of(subject: Subject, view: View, theme: Theme) -> Lights:
+def lights_of(scene: RenderScene, view: View, theme: Theme) -> Lights:
     """Set up the lamps about a camera: one over the left shoulder, one behind, one from the side."""
     right, up, back = view.axes
-    above = np.array(subject.up)
+    above = np.array(scene.up)
     dark = theme.name == "dark"
     return Lights(
         lamp=_unit(-0.42 * right + 1.0 * above + 0.40 * back - 0.1 * up),
@@ -85,7 +85,7 @@ def vertex_code() -> tuple[str, str]:
 
 
 def fragment_code(
-    subject: Subject, view: View, lights: Lights, look: Look, finer: int, *, by_field: bool
+    scene: RenderScene, view: View, lights: Lights, appearance: Appearance, finer: int, *, by_field: bool
 ) -> tuple[str, str]:
     """Return what the fragment shader declares and does for one material.
 
@@ -93,12 +93,12 @@ def fragment_code(
         finer: pixels of the window to one of the view, along each axis.
         by_field: the tints mean something, so that light must not change them much.
     """
-    side = max(np.subtract(subject.upper, subject.lower))
-    volume_length = float(np.prod(np.maximum(np.subtract(subject.upper, subject.lower), 1e-12))) ** (1 / 3)
+    side = max(np.subtract(scene.upper, scene.lower))
+    volume_length = float(np.prod(np.maximum(np.subtract(scene.upper, scene.lower), 1e-12))) ** (1 / 3)
     constants = {
-        "lowerWall": _vec(subject.lower),
-        "upperWall": _vec(subject.upper),
-        "upwards": _vec(subject.up),
+        "lowerWall": _vec(scene.lower),
+        "upperWall": _vec(scene.upper),
+        "upwards": _vec(scene.up),
         "lampTo": _vec(lights.lamp),
         "rimTo": _vec(lights.rim),
         "fillTo": _vec(lights.fill),
@@ -113,14 +113,14 @@ def fragment_code(
     }
     declared = _carried("in")
     declared += "".join(f"const vec3 {name} = {value};\n" for name, value in constants.items())
-    declared += f"const float grainSize = {max(subject.distances):.9g};\n"
+    declared += f"const float grainSize = {max(scene.distances):.9g};\n"
     declared += f"const float wallGap = {1e-5 * side:.9g};\n"
     declared += f"const float thickUnit = {0.3 * volume_length:.9g};\n"
     declared += f"const vec2 pictureSize = vec2({finer * view.size[0]}.0, {finer * view.size[1]}.0);\n"
     declared += f"const float pixelsToMetre = {finer * view.pixels_per_metre:.9g};\n"
     declared += _ROOM
-    kind: str = "field" if by_field else look.finish
-    if look.name.startswith("lava") and kind == "syrup":
+    kind: str = "field" if by_field else appearance.finish
+    if appearance.name.startswith("lava") and kind == "syrup":
         kind = "lava"
     towards = "toCamera" if view.parallel else "normalize(cameraAt - worldPoint)"
     return declared, _COMMON.replace("TOWARDS", towards) + _FINISHES.get(kind, _FINISHES["matte"]) + _TONE

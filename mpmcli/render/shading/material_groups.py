@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpmcli.frames.frame import Frame
-from mpmcli.render.look import Look
-from mpmcli.render.subject import Subject
+from mpmcli.render.appearance import Appearance
+from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.surfaces.reconstruction import drawable
 
 
@@ -16,14 +16,14 @@ class Group:
 
     Attributes:
         key: the material, and the body where bodies of one material stay apart.
-        look: of the material.
+        appearance: of the material.
         rows: (n,) of the frame.
         position: (n, d) float64, m.
         distance: between neighbouring particles at the start, m; the largest of its bodies.
     """
 
     key: tuple[int, int]
-    look: Look
+    appearance: Appearance
     rows: np.ndarray
     position: np.ndarray
     distance: float
@@ -39,18 +39,18 @@ class Group:
         return (words.astype(np.float64) / 2.0**31 - 1.0).astype(np.float32)
 
 
-def groups_of(subject: Subject, frame: Frame) -> list[Group]:
+def groups_of(scene: RenderScene, frame: Frame) -> list[Group]:
     """Return the groups of a frame that have particles to be drawn, in the order of materials and bodies."""
-    material_of, distances = np.array(subject.material_of), np.array(subject.distances)
+    material_of, distances = np.array(scene.material_of), np.array(scene.distances)
     body = np.clip(frame.body, 0, len(material_of) - 1)
     material = material_of[body]
-    sound = drawable(frame.position, subject.lower, subject.upper, max(subject.distances))
+    sound = drawable(frame.position, scene.lower, scene.upper, max(scene.distances))
     groups = []
-    for m, look in enumerate(subject.looks):
+    for m, appearance in enumerate(scene.appearances):
         bodies = [b for b in range(len(material_of)) if material_of[b] == m]
-        for key, members in [((m, -1), bodies)] if look.liquid else [((m, b), [b]) for b in bodies]:
+        for key, members in [((m, -1), bodies)] if appearance.liquid else [((m, b), [b]) for b in bodies]:
             rows = np.flatnonzero(sound & (material == m) & np.isin(body, members))
             if len(rows):
                 distance = float(distances[members].max())
-                groups.append(Group(key, look, rows, frame.position[rows].astype(np.float64), distance))
+                groups.append(Group(key, appearance, rows, frame.position[rows].astype(np.float64), distance))
     return groups

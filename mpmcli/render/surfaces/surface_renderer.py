@@ -1,4 +1,4 @@
-"""The stage of 3D surfaces: one off-screen window, its meshes replaced with every frame."""
+"""Draws 3D surfaces in one off-screen window, its meshes replaced with every frame."""
 
 from typing import Any
 
@@ -6,13 +6,13 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.render.coloring import Coloring
-from mpmcli.render.stage import averaged, window_pixels
-from mpmcli.render.subject import Subject
-from mpmcli.render.surfaces import lighting
-from mpmcli.render.surfaces.backdrop import Backdrop
+from mpmcli.render.offscreen import averaged, window_pixels
+from mpmcli.render.render_scene import RenderScene
+from mpmcli.render.shading import lighting
+from mpmcli.render.shading.background import Background
+from mpmcli.render.shading.material_groups import Group, groups_of
+from mpmcli.render.shading.occlusion import Occlusion
 from mpmcli.render.surfaces.grains import JITTER, grain_colors, new_grains, pose_grains
-from mpmcli.render.surfaces.material_groups import Group, groups_of
-from mpmcli.render.surfaces.occlusion import Occlusion
 from mpmcli.render.surfaces.reconstruction import SMOOTHING_ROUNDS, Mesh, reconstruct
 from mpmcli.render.surfaces.thickness import thickness_at
 from mpmcli.render.surfaces.tints import painted, shades, tints_of
@@ -25,23 +25,23 @@ FINER, LONGEST = 2, 8192
 ROUNDS = {"crumbly": 2}
 
 
-class SolidStage:
-    """Draws a 3D run as bodies in a lit room."""
+class SurfaceRenderer:
+    """Draws a 3D run as bodies against a lit background."""
 
-    def __init__(self, subject: Subject, view: View, theme: Theme, colors: Coloring | None = None) -> None:
+    def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> None:
         """Open the window; nothing is drawn yet."""
         import pyvista as pv
 
-        self.subject, self.view, self.theme, self.colors = subject, view, theme, colors
-        self.backdrop = Backdrop(subject, view, theme)
-        self.lights = lighting.lights_of(subject, view, theme)
+        self.scene, self.view, self.theme, self.colors = scene, view, theme, colors
+        self.background = Background(scene, view, theme)
+        self.lights = lighting.lights_of(scene, view, theme)
         self.finer = FINER if FINER * max(view.size) <= LONGEST else 1
         self.plotter = pv.Plotter(off_screen=True, window_size=[self.finer * n for n in view.size], lighting="none")
         self.plotter.disable_anti_aliasing()
-        self.behind, self.room = _texture(), _texture()
-        for texture in (self.behind, self.room):
-            _put(texture, self.backdrop.image(None))
-        self.plotter.renderer.SetBackgroundTexture(self.room)
+        self.behind, self.background_texture = _texture(), _texture()
+        for texture in (self.behind, self.background_texture):
+            _put(texture, self.background.image(None))
+        self.plotter.renderer.SetBackgroundTexture(self.background_texture)
         self.plotter.renderer.TexturedBackgroundOn()
         self.actors: dict[Any, Any] = {}
         self._add_walls()
@@ -49,16 +49,16 @@ class SolidStage:
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return the picture of a frame, (h, w, 3) uint8."""
-        groups = groups_of(self.subject, frame)
-        occlusion = lighting.occlusion_by(self.subject, groups, self.lights.lamp)
+        groups = groups_of(self.scene, frame)
+        occlusion = lighting.occlusion_by(self.scene, groups, self.lights.lamp)
         clear = []
         for actor in self.actors.values():
             actor.SetVisibility(False)
         for group in groups:
             actor = self._posed(group, frame, occlusion)
-            if group.look.finish in lighting.CLEAR and self.colors is None:
+            if group.appearance.finish in lighting.CLEAR and self.colors is None:
                 clear.append(actor)
-        _put(self.room, self.backdrop.image(occlusion))
+        _put(self.background_texture, self.background.image(occlusion))
         if clear:
             # What is clear shows the picture of all the rest.
             for actor in clear:
@@ -75,19 +75,21 @@ class SolidStage:
 
     def _posed(self, group: Group, frame: Frame, occlusion: Occlusion | None) -> Any:
         """Return the actor of a group, with the mesh of this frame."""
-        if group.look.finish == "grains":
+        if group.appearance.finish == "grains":
             return self._posed_grains(group, frame, occlusion)
-        attributes = {"rough": group.hashes} if group.look.finish == "crumbly" or group.look.name == "lava" else {}
+        attributes = (
+            {"rough": group.hashes} if group.appearance.finish == "crumbly" or group.appearance.name == "lava" else {}
+        )
         if self.colors is not None:
             attributes |= tints_of(group, self.colors, frame)
         mesh = reconstruct(
             group.position,
             group.distance,
-            self.subject.lower,
-            self.subject.upper,
+            self.scene.lower,
+            self.scene.upper,
             attributes,
-            rounds=ROUNDS.get(group.look.finish, SMOOTHING_ROUNDS),
-            close=group.look.finish == "crumbly",
+            rounds=ROUNDS.get(group.appearance.finish, SMOOTHING_ROUNDS),
+            close=group.appearance.finish == "crumbly",
         )
         actor = self.actors.get(group.key)
         if actor is None:
@@ -101,7 +103,7 @@ class SolidStage:
         if actor is None:
             actor = self.actors[group.key] = new_grains(self.view, self.lights, group.distance)
             self.plotter.renderer.AddActor(actor)
-        color = np.array(rgb(group.look.color))
+        color = np.array(rgb(group.appearance.color))
         hashes = group.hashes
         if self.colors is not None:
             color = shades(np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows], self.colors)
@@ -109,9 +111,9 @@ class SolidStage:
             hashes = np.zeros_like(hashes)
         lamp, sky = np.ones((2, len(hashes)))
         if occlusion is not None:
-            lamp, sky = occlusion.at(group.position, np.broadcast_to(self.subject.up, group.position.shape))
+            lamp, sky = occlusion.at(group.position, np.broadcast_to(self.scene.up, group.position.shape))
         moved = np.clip(
-            group.position + JITTER * group.distance * group.hashes[:, ::-1], self.subject.lower, self.subject.upper
+            group.position + JITTER * group.distance * group.hashes[:, ::-1], self.scene.lower, self.scene.upper
         )
         pose_grains(actor, moved, grain_colors(color, hashes, lamp, sky))
         actor.SetVisibility(True)
@@ -125,9 +127,9 @@ class SolidStage:
         light = np.ones((count, 4), dtype=np.float32)
         if occlusion is not None and count:
             light[:, 0], light[:, 1] = occlusion.at(mesh.points, mesh.normals)
-            if group.look.finish in lighting.CLEAR:
+            if group.appearance.finish in lighting.CLEAR:
                 light[:, 2] = thickness_at(self.view, group.position, group.distance, mesh.points)
-        tint = np.broadcast_to(lighting.linear(group.look.color), (count, 3))
+        tint = np.broadcast_to(lighting.linear(group.appearance.color), (count, 3))
         if self.colors is not None:
             tint = painted(mesh.attributes, self.colors)
         rough = mesh.attributes.get("rough", np.zeros((count, 3), dtype=np.float32))
@@ -157,7 +159,7 @@ class SolidStage:
         shader.AddVertexShaderReplacement("//VTK::Normal::Dec", True, f"//VTK::Normal::Dec\n{declared}", False)
         shader.AddVertexShaderReplacement("//VTK::Normal::Impl", True, f"//VTK::Normal::Impl\n{done}", False)
         declared, done = lighting.fragment_code(
-            self.subject, self.view, self.lights, group.look, self.finer, by_field=self.colors is not None
+            self.scene, self.view, self.lights, group.appearance, self.finer, by_field=self.colors is not None
         )
         # After all that the window does itself; its own lights and textures are left out.
         shader.AddFragmentShaderReplacement("//VTK::TCoord::Dec", True, f"//VTK::TCoord::Dec\n{declared}", False)
@@ -169,7 +171,7 @@ class SolidStage:
     def _add_walls(self) -> None:
         import pyvista as pv
 
-        low, high = self.subject.lower, self.subject.upper
+        low, high = self.scene.lower, self.scene.upper
         box = pv.Box(bounds=(low[0], high[0], low[1], high[1], low[2], high[2]))
         walls = self.plotter.add_mesh(
             box.extract_all_edges(),

@@ -1,4 +1,4 @@
-"""The room around a liquid: what lies behind it and before it, the floor, and the shadows on it."""
+"""What lies behind a liquid and before it, the floor, and the shadows on it."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -7,11 +7,11 @@ import numpy as np
 
 from mpmcli.render.dots import OVERLAP, SMALLEST
 from mpmcli.render.liquids.fluid_shading import linear
-from mpmcli.render.stage import Stage
-from mpmcli.render.subject import Subject
-from mpmcli.render.surfaces.backdrop import Backdrop
-from mpmcli.render.surfaces.lighting import occlusion_by
-from mpmcli.render.surfaces.material_groups import Group
+from mpmcli.render.offscreen import OffscreenRenderer
+from mpmcli.render.render_scene import RenderScene
+from mpmcli.render.shading.background import Background
+from mpmcli.render.shading.lighting import occlusion_by
+from mpmcli.render.shading.material_groups import Group
 from mpmcli.render.theme import Theme
 from mpmcli.render.view import View
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 SAMPLES = 2
 
 
-class Room:
+class FluidBackground:
     """The background, the floor and its shadows, and one off-screen window for lines and dots."""
 
-    def __init__(self, subject: Subject, view: View, theme: Theme, lamp: np.ndarray) -> None:
-        self._subject, self._view, self._lamp = subject, view, lamp
-        self._backdrop = Backdrop(subject, view, theme)
-        self._stage = Stage(replace(view, size=(view.size[0] * SAMPLES, view.size[1] * SAMPLES)), theme)
-        self._stage.add_box(subject.lower, subject.upper, theme.wall, width=1.6 * SAMPLES)
+    def __init__(self, scene: RenderScene, view: View, theme: Theme, lamp: np.ndarray) -> None:
+        self._scene, self._view, self._lamp = scene, view, lamp
+        self._background = Background(scene, view, theme)
+        self._offscreen = OffscreenRenderer(replace(view, size=(view.size[0] * SAMPLES, view.size[1] * SAMPLES)), theme)
+        self._offscreen.add_box(scene.lower, scene.upper, theme.wall, width=1.6 * SAMPLES)
         # The background without shadows (h, w, 3), in amounts of light.
-        self.bare = linear(self._backdrop.image(None) / np.float32(255))
+        self.bare = linear(self._background.image(None) / np.float32(255))
         self._actors: dict[tuple[int, int], pv.Actor] = {}
         self._empty: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -48,16 +48,16 @@ class Room:
             actor.SetVisibility(False)
         for group, color in zip(groups, colors, strict=True):
             self._show(group, color)
-        self._stage.render()
-        seen = self._stage.picture(), self._stage.depth()
+        self._offscreen.render()
+        seen = self._offscreen.picture(), self._offscreen.depth()
         if not groups:
             self._empty = seen
         return seen
 
     def base(self, groups: list[Group]) -> np.ndarray:
         """Return the background (h, w, 3) in amounts of light, with the shadows that particles throw on the floor."""
-        occlusion = occlusion_by(self._subject, groups, self._lamp)
-        return linear(self._backdrop.image(occlusion) / np.float32(255))
+        occlusion = occlusion_by(self._scene, groups, self._lamp)
+        return linear(self._background.image(occlusion) / np.float32(255))
 
     def _show(self, group: Group, colors: np.ndarray) -> None:
         """Let the next picture show the dots of a group."""
@@ -67,8 +67,8 @@ class Room:
         cloud["color"] = colors
         if group.key not in self._actors:
             if not self._actors:
-                self._stage.add_light()
-            self._actors[group.key] = self._stage.plotter.add_points(
+                self._offscreen.add_light()
+            self._actors[group.key] = self._offscreen.plotter.add_points(
                 cloud,
                 scalars="color",
                 rgb=True,

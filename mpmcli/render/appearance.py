@@ -11,8 +11,8 @@ Finish = Literal["water", "syrup", "translucent", "crumbly", "grains", "metal", 
 
 
 @dataclass(frozen=True)
-class Look:
-    """The look of one material.
+class Appearance:
+    """The appearance of one material.
 
     Attributes:
         name: of the preset that it is nearest to, or of its law.
@@ -29,17 +29,17 @@ class Look:
     liquid: bool = False
 
 
-LOOKS = {
-    "water": Look("water", "#3b8fd4", "#2f7fd0", "water", liquid=True),
-    "honey": Look("honey", "#e8960c", "#e88a00", "syrup", liquid=True),
-    "lava": Look("lava", "#c8321a", "#d62f1f", "syrup", liquid=True),
-    "mud": Look("mud", "#74543a", "#8a5a33", "matte", liquid=True),
-    "jelly": Look("jelly", "#58b84c", "#3fa34d", "translucent"),
-    "rubber": Look("rubber", "#5a4a8a", "#7a5fc0", "matte"),
-    "snow": Look("snow", "#f2f6fb", "#8fb8dc", "crumbly"),
-    "sand": Look("sand", "#d9b56d", "#c9a040", "grains"),
-    "clay": Look("clay", "#b8694a", "#c4704e", "matte"),
-    "metal": Look("metal", "#a4acb6", "#8a95a3", "metal"),
+APPEARANCES = {
+    "water": Appearance("water", "#3b8fd4", "#2f7fd0", "water", liquid=True),
+    "honey": Appearance("honey", "#e8960c", "#e88a00", "syrup", liquid=True),
+    "lava": Appearance("lava", "#c8321a", "#d62f1f", "syrup", liquid=True),
+    "mud": Appearance("mud", "#74543a", "#8a5a33", "matte", liquid=True),
+    "jelly": Appearance("jelly", "#58b84c", "#3fa34d", "translucent"),
+    "rubber": Appearance("rubber", "#5a4a8a", "#7a5fc0", "matte"),
+    "snow": Appearance("snow", "#f2f6fb", "#8fb8dc", "crumbly"),
+    "sand": Appearance("sand", "#d9b56d", "#c9a040", "grains"),
+    "clay": Appearance("clay", "#b8694a", "#c4704e", "matte"),
+    "metal": Appearance("metal", "#a4acb6", "#8a95a3", "metal"),
 }
 # Laws without a preset, in the order in which they come.
 OTHERS = ("#0f9d8a", "#c2569b", "#7d8a2e", "#4e6fb8", "#b0563c")
@@ -47,8 +47,8 @@ OTHERS = ("#0f9d8a", "#c2569b", "#7d8a2e", "#4e6fb8", "#b0563c")
 FAR = 1e6
 
 
-def look_of(law: str, parameters: dict[str, Any], others: int = 0) -> Look:
-    """Return the look of the nearest preset: among those of the law and of laws with the same parameters.
+def appearance_of(law: str, parameters: dict[str, Any], others: int = 0) -> Appearance:
+    """Return the appearance of the nearest preset: among those of the law and of laws with the same parameters.
 
     Args:
         parameters: those of the effective scene.
@@ -58,13 +58,13 @@ def look_of(law: str, parameters: dict[str, Any], others: int = 0) -> Look:
     known = {
         name: preset
         for name, preset in PRESETS.items()
-        if name in LOOKS and (preset.law == law or preset.parameters.keys() == names)
+        if name in APPEARANCES and (preset.law == law or preset.parameters.keys() == names)
     }
     if not known:
         color = OTHERS[others % len(OTHERS)]
-        return Look(law, color, color, "matte")
+        return Appearance(law, color, color, "matte")
     nearest = min(known, key=lambda name: _distance(known[name].parameters, parameters))
-    return LOOKS[nearest]
+    return APPEARANCES[nearest]
 
 
 def _distance(preset: dict[str, Any], parameters: dict[str, Any]) -> float:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.render.subject import Subject
+from mpmcli.render.render_scene import RenderScene
 
 # Cells along the longest side of the domain, and in all.
 CELLS_LONG, CELLS = 88, 140_000
@@ -66,7 +66,7 @@ class Occlusion:
 
 
 def occlusion_of(
-    subject: Subject, position: np.ndarray, volumes: np.ndarray, opacity: np.ndarray, lamp: np.ndarray
+    scene: RenderScene, position: np.ndarray, volumes: np.ndarray, opacity: np.ndarray, lamp: np.ndarray
 ) -> Occlusion:
     """Cast light through particles, layer by layer from the top.
 
@@ -79,10 +79,10 @@ def occlusion_of(
         opacity: (n,) from 0, clear, to 1.
         lamp: direction (3,) towards the lamp, above the horizon.
     """
-    axis = int(np.argmax(np.abs(subject.up)))
+    axis = int(np.argmax(np.abs(scene.up)))
     axes = (*(i for i in range(3) if i != axis), axis)
-    flip = subject.up[axis] < 0
-    ends = np.array([subject.lower, subject.upper])[:, list(axes)]
+    flip = scene.up[axis] < 0
+    ends = np.array([scene.lower, scene.upper])[:, list(axes)]
     if flip:
         ends[:, 2] = -ends[::-1, 2]
     low, size = ends[0], ends[1] - ends[0]

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
 
 
-class Stage:
-    """A window of the size of a view, with the room around a 3D scene in it.
+class OffscreenRenderer:
+    """A window of the size of a view, with the edges of the domain in it.
 
     Args:
         samples: pixels along each axis that are averaged to one.
