@@ -8,9 +8,9 @@ import taichi as ti
 from solver_state import scene_of
 
 from mpmcli.solver import kernels
-from mpmcli.solver.grid import PAD
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.solver import Solver
+from mpmcli.solver.splines import PAD
 
 CELLS, FROM = 16, 8
 

@@ -12,8 +12,8 @@ from mpmcli.errors import InputError
 from mpmcli.scene import Scene
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.grid import PAD
 from mpmcli.solver.solver import Solver
+from mpmcli.solver.splines import PAD
 
 # As in test_solver_paths.
 TOLERANCE = {"f32": 1e-6, "f64": 1e-12}

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from mpmcli.solver.grid import PAD
-from mpmcli.solver.splines import SPLINES
+from mpmcli.solver.splines import PAD, SPLINES
 
 CELLS = 40
 SPACING = 0.025

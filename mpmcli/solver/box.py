@@ -5,8 +5,9 @@ from collections.abc import Callable, Sequence
 import taichi as ti
 
 from mpmcli.boundaries.walls import REACH
-from mpmcli.solver.grid import PAD, Grid
+from mpmcli.solver.grid import Grid
 from mpmcli.solver.ordering import TileOrder
+from mpmcli.solver.splines import PAD
 
 
 def build_box_search(grid: Grid, orders: Sequence[TileOrder], drift: int) -> Callable[[], None]:

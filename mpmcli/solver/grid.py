@@ -3,16 +3,13 @@
 import math
 from collections.abc import Sequence
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 
-if TYPE_CHECKING:
-    from mpmcli.solver.transfer_scheme import TransferScheme
+from mpmcli.solver.splines import PAD
+from mpmcli.solver.transfer_scheme import TransferScheme
 
-# Nodes beyond each wall: ghost nodes that the wall folds, and the reach of the kernel.
-PAD = 3
 # Cells that a particle may drift out of the tile that it was sorted into. A little less than one leaves room for the
 # rounding of positions.
 DRIFT = 0.98
@@ -56,7 +53,7 @@ class Grid:
     """
 
     def __init__(
-        self, dimension: int, spacing: float, cells: tuple[int, ...], width: int, scheme: "TransferScheme"
+        self, dimension: int, spacing: float, cells: tuple[int, ...], width: int, scheme: TransferScheme
     ) -> None:
         self.dimension = dimension
         self.width = width

@@ -2,8 +2,10 @@
 
 import taichi as ti
 
-from mpmcli.solver.grid import PAD
 from mpmcli.stability.transfer_factors import INVERSE_MOMENT
+
+# Nodes beyond each wall: ghost nodes that the wall folds, and the reach of a stencil.
+PAD = 3
 
 
 @ti.data_oriented
