@@ -45,6 +45,7 @@ SLOW = {
     "mpmcli bench --materials --json > results/materials.json",
     ".venv/bin/python scripts/materials_table results/materials.json",
     "mpmcli validate bar_fixed_free --levels coarse -o results/bar",
+    "mpmcli validate conservation --levels coarse",
 }
 
 
