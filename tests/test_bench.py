@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mpmcli.bench import ours, peers, worker
+from mpmcli.bench import contestant, ours, peers
 from mpmcli.bench.cases import CASES, DENSITY, EDGE, GRAVITY, SPEED, BenchCase
 from mpmcli.bench.compare import Setting, run_bench, start_worker
 from mpmcli.bench.report import BenchReport, CaseResult, ContestantResult
@@ -133,15 +133,15 @@ class Clock:
 class TestWorker:
     def test_block_lasts_as_long_as_asked(self, monkeypatch: pytest.MonkeyPatch) -> None:
         clock = Clock()
-        monkeypatch.setattr(worker.time, "perf_counter", lambda: clock.now)
-        steps, seconds = worker.run_block(clock, 1.0)
+        monkeypatch.setattr(contestant.time, "perf_counter", lambda: clock.now)
+        steps, seconds = contestant.run_block(clock, 1.0)
         assert seconds == pytest.approx(steps * 0.01)
         assert 1.0 <= seconds <= 1.02
 
     def test_commands_are_answered_line_by_line(self, monkeypatch: pytest.MonkeyPatch) -> None:
         clock, answers = Clock(), io.StringIO()
-        monkeypatch.setattr(worker.time, "perf_counter", lambda: clock.now)
-        assert worker.serve(lambda: clock, ["first\n", "run 0.1\n", "finish\n"], answers) == 0
+        monkeypatch.setattr(contestant.time, "perf_counter", lambda: clock.now)
+        assert contestant.serve(lambda: clock, ["first\n", "run 0.1\n", "finish\n"], answers) == 0
         ready, first, block, end = map(json.loads, answers.getvalue().splitlines())
         assert ready == {"particles": 7, "bytes_per_particle": 64}
         assert first == {"seconds": pytest.approx(0.01)}
@@ -155,7 +155,7 @@ class TestWorker:
             raise RunError("There is no such example.")
 
         answers = io.StringIO()
-        assert worker.serve(fail, [], answers) == 1
+        assert contestant.serve(fail, [], answers) == 1
         assert json.loads(answers.getvalue()) == {"error": "There is no such example."}
 
     def test_a_peer_runs_in_its_own_process(self) -> None:

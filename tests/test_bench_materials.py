@@ -12,7 +12,7 @@ import pytest
 from command import run_here
 from pydantic import Field
 
-from mpmcli.bench import materials, worker
+from mpmcli.bench import contestant, materials
 from mpmcli.bench.cases import BenchCase
 from mpmcli.bench.compare import Setting, start_worker
 from mpmcli.bench.cost_report import CostReport, CostResult
@@ -136,9 +136,9 @@ class TestWorker:
         """Steps 4, 5 and 6 take 0.15 s, so that a block of 0.4 s has three times these."""
         spring, answers = Spring(), io.StringIO()
         for clock in ("perf_counter", "process_time"):
-            monkeypatch.setattr(worker.time, clock, lambda: spring.now)
+            monkeypatch.setattr(contestant.time, clock, lambda: spring.now)
         commands = ["first\n", "keep 2\n", "repeat 3 0.4\n", "repeat 3 0\n", "flowing\n", "finish\n"]
-        assert worker.serve(lambda: spring, commands, answers) == 0
+        assert contestant.serve(lambda: spring, commands, answers) == 0
         _, _, kept, *blocks, flowing, _ = map(json.loads, answers.getvalue().splitlines())
         assert kept == {}
         for block, times in zip(blocks, (3, 1), strict=True):

@@ -11,11 +11,11 @@ import pytest
 from asked_process import CRASH, HANG, SILENCE, answering, running
 from command import ROOT, run_here
 
-from mpmcli.child_process import Reply
 from mpmcli.doctor import backends, drawing, examination, files, finding, interpreter, machine
 from mpmcli.doctor.examination import EXAMINATIONS, Examination, attempt, examine, judge
 from mpmcli.doctor.finding import Finding
 from mpmcli.errors import RunError
+from mpmcli.processes.questions import Reply
 
 WELL = Finding("ok", "works")
 FINE = answering('{"status": "ok", "detail": "works", "remedy": ""}')

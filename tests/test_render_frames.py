@@ -11,8 +11,8 @@ import pytest
 from frame_jobs import WritingJob
 
 from mpmcli.errors import InputError, RunError
-from mpmcli.render import frame_workers
-from mpmcli.render.frame_workers import available_cores, render_frames
+from mpmcli.processes import pool
+from mpmcli.processes.pool import available_cores, render_frames
 
 FRAMES = [0, 2, 4, 6, 8, 9]
 # Seconds that anything here may take.
@@ -103,7 +103,7 @@ def test_an_error_is_the_same_in_this_process(tmp_path):
 @pytest.mark.parametrize("trouble", ["sleep", "deaf"])
 def test_a_stop_ends_all_processes_and_keeps_what_is_done(tmp_path, monkeypatch, trouble):
     """Frame 3 takes a minute; it cleans up behind itself, unless it hears nothing and is killed."""
-    monkeypatch.setattr(frame_workers, "GRACE", 0.2 if trouble == "deaf" else PATIENCE)
+    monkeypatch.setattr(pool, "GRACE", 0.2 if trouble == "deaf" else PATIENCE)
     unfinished, began = tmp_path / "unfinished.tmp", time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         render_frames(WritingJob(tmp_path, trouble), [0, 1, 2, 3], 2, stop=unfinished.exists)
@@ -129,7 +129,7 @@ def test_no_process_outlives_the_one_that_was_killed(tmp_path):
     code = (
         f"import sys; sys.path[:] = {sys.path!r}\n"
         "from pathlib import Path; from frame_jobs import WritingJob\n"
-        "from mpmcli.render.frame_workers import render_frames\n"
+        "from mpmcli.processes.pool import render_frames\n"
         f"render_frames(WritingJob(Path({str(tmp_path)!r})), range(10**6), 2)"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL) as process:

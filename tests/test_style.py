@@ -28,7 +28,7 @@ LEVELS = {
     **dict.fromkeys(("boundaries", "materials", "stability"), 3),
     "frames": 2,
     "scene": 1,
-    **dict.fromkeys(("processes", "child_process", "cores", "errors", "plain_json", "plain_text", "__init__"), 0),
+    **dict.fromkeys(("processes", "cores", "errors", "plain_json", "plain_text", "__init__"), 0),
 }
 TAICHI_ROOMS = {"solver", "materials", "boundaries"}
 # These know frames and files, never the device state; the solver knows no store.
@@ -184,7 +184,7 @@ def test_nothing_below_the_command_line_prints_or_exits() -> None:
 
     def speaks(path: Path) -> Iterator[int]:
         # What runs as a process of its own answers on stdout.
-        if room_of(path) in {"cli", "__main__", "processes"} or path == PACKAGE / "bench" / "worker.py":
+        if room_of(path) in {"cli", "__main__", "processes"} or path == PACKAGE / "bench" / "contestant.py":
             return
         yield from (line for name, line in calls(path) if name in banned)
         for node in ast.walk(tree(path)):

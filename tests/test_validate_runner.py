@@ -25,7 +25,7 @@ from mpmcli.validation.journal import Journal
 from mpmcli.validation.matrix import Run, runs_of
 from mpmcli.validation.registry import all_cases
 from mpmcli.validation.run_result import RunResult, failure
-from mpmcli.validation.runner import carry_out_all, worker_command
+from mpmcli.validation.runner import carry_out_all, case_command
 from mpmcli.validation.setting import Setting
 
 RUNS = runs_of(CASE, "coarse")
@@ -49,10 +49,10 @@ def test_every_run_comes_back_with_its_result() -> None:
 @pytest.mark.parametrize(
     ("code", "words"),
     [
-        ("import sys; sys.exit('no memory left')", "The process of the run ended with status 1. no memory left"),
-        ("import os; os.kill(os.getpid(), 9)", "The process of the run ended with status -9."),
-        ("print('{}')", "The process of the run ended with status 0."),
-        ("print('[')", "The process of the run ended with status 0."),
+        ("import sys; sys.exit('no memory left')", "The process of the run exited with 1. no memory left"),
+        ("import os; os.kill(os.getpid(), 9)", "The process of the run died by SIGKILL."),
+        ("print('{}')", "The process of the run gave no answer."),
+        ("print('[')", "The process of the run gave no answer."),
     ],
     ids=["exit", "kill", "wrong", "garbage"],
 )
@@ -66,7 +66,7 @@ def test_a_process_that_dies_or_babbles_is_a_failure(code: str, words: str) -> N
 def test_a_run_that_takes_too_long_is_ended(tmp_path: Path) -> None:
     code = f"open({str(tmp_path / 'pid')!r}, 'w').write(str(__import__('os').getpid()))\nimport time\ntime.sleep(600)"
     ((_, found),) = carry_out_all(RUNS[:1], workers=1, timeout=2.0, command=python(code))
-    assert found == failure("It took longer than 2 s, and was ended.")
+    assert found == failure("The process of the run took longer than 2 s.")
     assert_gone(int((tmp_path / "pid").read_text()))
 
 
@@ -115,7 +115,7 @@ def test_no_process_is_left_when_it_is_stopped(tmp_path: Path, how: str) -> None
 
 def test_the_worker_ends_with_its_parent() -> None:
     """Its input is closed when its parent is gone, even killed; so it does not go on for itself."""
-    with subprocess.Popen(worker_command(BAR_RUN), stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+    with subprocess.Popen(case_command(BAR_RUN), stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         process.stdin.close()
         assert process.wait(timeout=120) == -signal.SIGTERM
         assert process.stdout.read() == b""
@@ -263,7 +263,7 @@ def test_a_study_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Monkey
                 "coarse",
                 1,
                 journal=journal,
-                watch=watch,
+                on_run=watch,
                 resumed=lambda count, total: kept.append(count),
                 stop=lambda: stop() and bool(counts),
                 command=command,

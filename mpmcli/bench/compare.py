@@ -22,7 +22,7 @@ WARM_UP = 0.3
 
 
 class Worker:
-    """A process of `mpmcli.bench.worker` and the line to it.
+    """A process of `mpmcli.bench.contestant` and the line to it.
 
     Attributes:
         ready: its first answer.
@@ -37,7 +37,7 @@ class Worker:
         self._stderr = tempfile.TemporaryFile(mode="w+", encoding="utf-8", errors="replace")  # noqa: SIM115
         begin = time.perf_counter()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "mpmcli.bench.worker", *arguments],
+            [sys.executable, "-m", "mpmcli.bench.contestant", *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._stderr,

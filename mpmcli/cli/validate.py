@@ -177,7 +177,7 @@ def _run(
                 workers,
                 journal=journal,
                 timeout=timeout,
-                watch=progress.advance,
+                on_run=progress.advance,
                 resumed=progress.resumed,
                 stop=interrupt_came,
             )

@@ -3,10 +3,10 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from mpmcli.child_process import Question, Reply, ask_each, module_command
 from mpmcli.doctor import backends, drawing, files, interpreter, machine
 from mpmcli.doctor.finding import STATUSES, Finding, library_remedy, package_remedy
 from mpmcli.errors import MpmcliError
+from mpmcli.processes.questions import Question, Reply, ask_each, module_command
 
 # Processes at a time: each of them loads libraries, and then waits little.
 AT_ONCE = 2
@@ -64,7 +64,7 @@ EXAMINATIONS = (
 
 def examine(examinations: Sequence[Examination] = EXAMINATIONS) -> Iterator[tuple[str, Finding]]:
     """Yield (name, finding) of every examination, in order, as they end."""
-    command = module_command("mpmcli.doctor.worker")
+    command = module_command("mpmcli.doctor.probe_process")
     questions = [Question([*command, each.name], each.timeout, leads_a_group=True) for each in examinations]
     for each, reply in zip(examinations, ask_each(questions, AT_ONCE), strict=True):
         yield each.name, judge(each, reply)

@@ -65,7 +65,7 @@ def drawing(size: tuple[int, int], theme: Theme) -> "Iterator[Figure]":
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_settings(theme))
-        # A hundredth of a pixel more, since the layout rounds down.
+        # A hundredth of a pixel more, since the canvas rounds down.
         figure = Figure(figsize=((size[0] + 0.01) / dpi, (size[1] + 0.01) / dpi), dpi=dpi, layout="constrained")
         figure.get_layout_engine().set(w_pad=0.09, h_pad=0.07)  # type: ignore[union-attr]
         FigureCanvasAgg(figure)
@@ -77,8 +77,8 @@ def pixels(figure: "Figure") -> np.ndarray:
     with warnings.catch_warnings():
         # A letter that the font has not is a box in the picture, which says enough.
         warnings.filterwarnings("ignore", "Glyph", UserWarning)
-        figure.layout.draw()
-    return np.asarray(figure.layout.buffer_rgba())[:, :, :3].copy()  # type: ignore[attr-defined]
+        figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[:, :, :3].copy()  # type: ignore[attr-defined]
 
 
 def _settings(theme: Theme) -> dict[str, object]:

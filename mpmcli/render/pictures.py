@@ -10,9 +10,9 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.output.result import Result, open_result
+from mpmcli.processes.pool import render_frames
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.files.picture_file import digest_of, settings_digest, write_picture
-from mpmcli.render.frame_workers import render_frames
 from mpmcli.render.labels import time_text
 from mpmcli.render.painter import Painter, RenderSetup, expected_times, set_up
 from mpmcli.render.settings import Settings

@@ -13,8 +13,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 
-from mpmcli.child_process import Question, ask, module_command
 from mpmcli.errors import InputError
+from mpmcli.processes.questions import Question, ask, module_command
 from mpmcli.render.window_probe import NO_VTK
 
 # Where VTK reads the class of its windows.

@@ -8,7 +8,7 @@ where another class than CLASS came. VTK_DEFAULT_OPENGL_WINDOW says which one VT
 
 import sys
 
-from mpmcli.child_process import answering
+from mpmcli.processes.questions import answering
 
 SIZE = 32
 POINT_SIZE = 9

@@ -3,8 +3,8 @@
 A jump (floor, ceil, sign, step, comparisons) has slope zero, and a kink (abs, min, max, clamp) the slope of one side.
 
 Central differences with a step of cbrt(eps) m would replace this module but for two cases. At a particle on a jump of
-1 m/s they give C = 8e4 1/s, where the slope is zero. An infinite slope, which is refused (sqrt(X) at 0), becomes a finite
-one. Elsewhere their error is 1e-11 to 2e-7 of C.
+1 m/s they give C = 8e4 1/s, where the slope is zero. An infinite slope, which is refused (sqrt(X) at 0), becomes a
+finite one. Elsewhere their error is 1e-11 to 2e-7 of C.
 """
 
 import math

@@ -20,7 +20,7 @@ from mpmcli.validation.matrix import Run
 PACKAGE = Path(__file__).resolve().parent.parent
 # Everything in these computes; of the validation itself only what a run imports does.
 ROOMS = ("scene", "materials", "boundaries", "stability", "solver", "output")
-WORKER = PACKAGE / "validation" / "worker.py"
+CASE_PROCESS = PACKAGE / "validation" / "case_process.py"
 
 
 def run_key(case: Case, run: Run, machine: str) -> str:
@@ -58,7 +58,7 @@ def code_digest(files: tuple[Path, ...]) -> str:
     rooms = [path for room in ROOMS for path in (PACKAGE / room).rglob("*.py")]
     data = [path for path in (PACKAGE / "validation" / "data").rglob("*") if path.is_file()]
     sources = {*rooms, *data, PACKAGE / "__init__.py", PACKAGE / "errors.py"}
-    waiting = [WORKER, *files]
+    waiting = [CASE_PROCESS, *files]
     while waiting:
         path = waiting.pop()
         if path not in sources:

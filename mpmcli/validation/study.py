@@ -10,10 +10,10 @@ from mpmcli.validation.journal import Journal
 from mpmcli.validation.matrix import Run, matrix
 from mpmcli.validation.report import Report
 from mpmcli.validation.run_result import RunResult
-from mpmcli.validation.runner import TIMEOUT, carry_out_all, worker_command
+from mpmcli.validation.runner import TIMEOUT, carry_out_all, case_command
 
 # Told of each run as it ends, and how many of how many have.
-Watch = Callable[[Run, RunResult, int, int], None]
+OnRun = Callable[[Run, RunResult, int, int], None]
 
 
 def study(
@@ -23,10 +23,10 @@ def study(
     *,
     journal: Journal | None = None,
     timeout: float = TIMEOUT,
-    watch: Watch = lambda run, result, done, total: None,
+    on_run: OnRun = lambda run, result, done, total: None,
     resumed: Callable[[int, int], None] = lambda kept, total: None,
     stop: Callable[[], bool] = lambda: False,
-    command: Callable[[Run], list[str]] = worker_command,
+    command: Callable[[Run], list[str]] = case_command,
 ) -> Report:
     """Run the cases at a level and return the report.
 
@@ -34,7 +34,7 @@ def study(
         workers: runs at a time, of one thread each.
         journal: keeps every result, and has those that are not computed again; None keeps nothing.
         timeout: seconds that a run may take.
-        watch: see `Watch`; resumed: told how many of all runs are taken from the journal.
+        on_run: see `OnRun`; resumed: told how many of all runs are taken from the journal.
         stop: asked again and again whether to end; command: see `carry_out_all`.
 
     Raises:
@@ -62,5 +62,5 @@ def study(
         done[run] = result
         if journal is not None:
             journal.keep(run, keys[run], result)
-        watch(run, result, len(done), len(runs))
+        on_run(run, result, len(done), len(runs))
     return Report(level, environment, tuple(cases), {run: done[run] for run in runs})

@@ -13,7 +13,7 @@ from mpmcli.errors import InputError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.output.durable import sealed, write_text
 from mpmcli.output.result import Result, open_result
-from mpmcli.render.frame_workers import render_frames
+from mpmcli.processes.pool import render_frames
 from mpmcli.render.render_scene import RenderScene, render_scene_of
 from mpmcli.render.shading.material_groups import Group, groups_of
 from mpmcli.render.surfaces.coverage import FINENESS, cover_of, grid_over

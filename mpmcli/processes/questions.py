@@ -1,4 +1,4 @@
-"""Asks a question of a process of its own, which may crash, hang or talk nonsense, and says what came of it."""
+"""Questions to processes: each process answers once, in JSON, and may crash or hang."""
 
 import json
 import os
@@ -6,8 +6,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import IO
@@ -28,12 +29,15 @@ class Question:
         timeout: seconds after which it is ended.
         environment: variables added to those of this process; None takes one away.
         leads_a_group: whether it is ended together with the processes that it has started.
+        follows: whether its stdin is a pipe from this process, by which `end_with_parent` works. Ctrl-C at the
+            terminal does not reach it.
     """
 
     command: Sequence[str]
     timeout: float
     environment: Mapping[str, str | None] = field(default_factory=dict)
     leads_a_group: bool = False
+    follows: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,27 +66,51 @@ def ask(question: Question) -> Reply:
 
 
 def ask_each(questions: Sequence[Question], at_once: int) -> Iterator[Reply]:
-    """Ask each process, so many at a time, and yield the replies in order; processes left over are ended."""
-    going: dict[int, _Child] = {}
+    """Ask each process, at most `at_once` at a time, and yield the replies in the order of the questions."""
     replies: dict[int, Reply] = {}
-    started = 0
+    following = 0
+    for number, reply in ask_as_ended(questions, at_once):
+        replies[number] = reply
+        while following in replies:
+            yield replies.pop(following)
+            following += 1
+
+
+def ask_as_ended(
+    questions: Iterable[Question], at_once: int, stop: Callable[[], bool] = lambda: False
+) -> Iterator[tuple[int, Reply]]:
+    """Ask each process, at most `at_once` at a time, and yield (number of the question, reply) as they end.
+
+    Args:
+        questions: each is taken when its process starts.
+        stop: called again and again; returns whether to end all processes.
+
+    Raises:
+        KeyboardInterrupt: `stop` returned True. No process is left then, nor after any other end.
+    """
+    going: dict[int, _Child] = {}
+    waiting = enumerate(questions)
+    more = True
     try:
-        for wanted in range(len(questions)):
-            while wanted not in replies:
-                while started < len(questions) and len(going) < at_once:
-                    try:
-                        going[started] = _Child(questions[started])
-                    except OSError as error:
-                        replies[started] = Reply({}, f"could not be started: {error}", "")
-                    started += 1
-                for number in list(going):
-                    if going[number].has_ended():
-                        child = going.pop(number)
-                        replies[number] = child.reply()
-                        child.close()
-                if wanted not in replies:
-                    time.sleep(PAUSE)
-            yield replies[wanted]
+        while more or going:
+            while more and len(going) < at_once:
+                number, question = next(waiting, (-1, None))
+                more = question is not None
+                try:
+                    if more:
+                        going[number] = _Child(question)
+                except OSError as error:
+                    yield number, Reply({}, f"could not be started: {error}", "")
+            if stop():
+                raise KeyboardInterrupt
+            ended = [number for number in going if going[number].has_ended()]
+            for number in ended:
+                child = going.pop(number)
+                reply = child.reply()
+                child.close()
+                yield number, reply
+            if not ended:
+                time.sleep(PAUSE)
     finally:
         for child in going.values():
             child.close()
@@ -100,6 +128,17 @@ def answering() -> Iterator[Callable[..., None]]:
             answers.flush()
 
         yield answer
+
+
+def end_with_parent() -> None:
+    """Let this process end when the one that started it is gone, which closes its standard input."""
+
+    def wait() -> None:
+        while os.read(0, 1024):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _leave_no_core() -> None:
@@ -127,10 +166,11 @@ class _Child:
         try:
             self._process = subprocess.Popen(
                 list(question.command),
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE if question.follows else subprocess.DEVNULL,
                 stdout=self._said,
                 stderr=self._complained,
                 env=environment,
+                start_new_session=question.follows,
                 **({"process_group": 0} if self._grouped else {}),
             )
         except BaseException:
@@ -165,8 +205,9 @@ class _Child:
         """End it, whatever it is doing, and let its files go."""
         if self._process.poll() is None:
             self._end()
-        self._said.close()
-        self._complained.close()
+        for stream in (self._said, self._complained, self._process.stdin):
+            if stream is not None:
+                stream.close()
 
     def _end(self) -> None:
         try:

@@ -1,10 +1,10 @@
-"""One examination in a process of its own: `python -m mpmcli.doctor.worker NAME` answers with its finding."""
+"""One examination in a process of its own: `python -m mpmcli.doctor.probe_process NAME` answers with its finding."""
 
 import sys
 from dataclasses import asdict
 
-from mpmcli.child_process import answering
 from mpmcli.doctor.examination import EXAMINATIONS, attempt
+from mpmcli.processes.questions import answering
 
 if __name__ == "__main__":
     with answering() as answer:

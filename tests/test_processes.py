@@ -9,7 +9,7 @@ import psutil
 import pytest
 from asked_process import CRASH, HANG, SILENCE, answering, running
 
-from mpmcli.child_process import Question, Reply, ask, ask_each, module_command
+from mpmcli.processes.questions import Question, Reply, ask, ask_each, module_command
 
 # Seconds; what is to end in time ends in a small part of it, what is to be late never does.
 LONG, SHORT = 60.0, 0.3
@@ -111,7 +111,7 @@ def test_processes_are_ended_with_those_that_they_started_when_nobody_asks_any_m
 def test_one_of_ours_leaves_no_core_and_keeps_stdout_to_itself():
     code = (
         "import os, resource\n"
-        "from mpmcli.child_process import answering\n"
+        "from mpmcli.processes.questions import answering\n"
         "hard = resource.getrlimit(resource.RLIMIT_CORE)[1]\n"
         "resource.setrlimit(resource.RLIMIT_CORE, (hard, hard))\n"
         "with answering() as answer:\n"

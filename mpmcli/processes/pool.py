@@ -1,4 +1,4 @@
-"""Renders many frames in several processes at once."""
+"""Carries out many tasks of one job, such as the frames of a film, in several processes at once."""
 
 import os
 import pickle
@@ -20,8 +20,8 @@ from mpmcli.errors import RunError
 PAUSE = 0.05
 # Seconds in which a process may clean up before it is killed.
 GRACE = 2.0
-# Lines of what a dead process said that are told.
-LAST_WORDS = 2
+# Lines of stderr that are quoted on failure.
+QUOTED = 2
 # How many threads the software renderer, numpy, splashsurf and VTK take.
 THREADS = (
     "LP_NUM_THREADS",
@@ -31,7 +31,7 @@ THREADS = (
     "RAYON_NUM_THREADS",
     "VTK_SMP_MAX_THREADS",
 )
-CODE = "import sys; sys.path[:] = {path!r}\nfrom mpmcli.render.frame_worker import main; main()"
+CODE = "import sys; sys.path[:] = {path!r}\nfrom mpmcli.processes.pool_process import main; main()"
 
 
 class Job(Protocol):
@@ -157,7 +157,7 @@ class _Worker:
         status = self.process.wait()
         how = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
         self._complained.seek(0)
-        words = self._complained.read().decode("utf-8", errors="replace").strip().splitlines()[-LAST_WORDS:]
+        words = self._complained.read().decode("utf-8", errors="replace").strip().splitlines()[-QUOTED:]
         said = f", after saying: {' '.join(words).rstrip('.')}" if words else ""
         return RunError(
             f"The process that rendered frame {self.frame} {how}{said}; frames that are done are kept, and fewer "

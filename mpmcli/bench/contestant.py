@@ -1,6 +1,6 @@
 """One contestant in a process of its own, told what to do line by line.
 
-    python -m mpmcli.bench.worker ours|peer|LAW,LAW,... --dimension 3 --cells 128 --particles 524288 --step 8e-5
+    python -m mpmcli.bench.contestant ours|peer|LAW,LAW,... --dimension 3 --cells 128 --particles 524288 --step 8e-5
                                   [--threads 2] [--precision f32] [--arch cpu]
 
 It answers on stdout, one JSON object per line, and waits for commands on stdin without using the processor:
@@ -178,7 +178,7 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m mpmcli.bench.worker")
+    parser = argparse.ArgumentParser(prog="python -m mpmcli.bench.contestant")
     parser.add_argument("who", help="ours, peer, or the names of laws, with commas between them")
     parser.add_argument("--dimension", type=int, choices=[2, 3], required=True)
     parser.add_argument("--cells", type=int, required=True)
