@@ -31,7 +31,7 @@ def scene(
     precision: str = "f32",
     fields: Sequence[str] = ("velocity",),
 ) -> Scene:
-    """Return a scene on so many cells."""
+    """Return a scene with a number of cells."""
     domain = {"size": [n * spacing for n in cells], "spacing": spacing, "walls": walls}
     if len(gravity) > 0:
         domain["gravity"] = [float(g) for g in gravity]

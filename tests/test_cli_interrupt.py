@@ -12,7 +12,7 @@ from command import SCENE, run_here, started
 from mpmcli.cli.interrupt import catch_interrupts, interrupt_came, interrupts_wait
 from mpmcli.output import open_result
 
-# So many frames that no machine comes to the end of it before the signal does.
+# The run is longer than any machine needs until the signal comes.
 LONG = SCENE.replace("end = 0.05", "end = 50.0").replace("frames = 4", "frames = 40000")
 FRAMES_BEFORE = 3
 PATIENCE = 120  # s

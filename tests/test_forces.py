@@ -47,7 +47,7 @@ def backend(precision, backend_of):
 
 @pytest.fixture(scope="module")
 def rounding(precision):
-    """Of a sum over some hundred steps."""
+    """Rounding of a sum over some hundred steps."""
     return 1e-13 if precision == "f64" else 2e-6
 
 

@@ -172,7 +172,7 @@ def test_compression_saves_what_is_constant(tmp_path):
         fill(directory, frames, compress=compress)
         sizes.append((directory / "particles.vtkhdf").stat().st_size)
         assert_same_frame(open_result(directory).frame(2), frames[2])
-    # Of 44 bytes per particle, 24 are random; ids, and random numbers below 3, shrink to little.
+    # 24 of the 44 bytes per particle are random; ids, and random numbers below 3, compress well.
     assert sizes[1] < 0.65 * sizes[0]
     assert sizes[0] < 3 * 20_000 * 44 + 20_000 * 8 + 30_000
 

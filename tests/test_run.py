@@ -104,7 +104,7 @@ def test_an_unstable_run_keeps_its_frames_and_says_where_it_failed(tmp_path):
 
 
 class FakeSolver:
-    """Gives three frames of one particle without a device, and raises what it is told to before the last."""
+    """Gives three frames of one particle without a device, and raises its fault before the last."""
 
     fault: BaseException | None = None
 

@@ -57,7 +57,7 @@ def test_every_run_comes_back_with_its_result() -> None:
     ids=["exit", "kill", "wrong", "garbage"],
 )
 def test_a_process_that_dies_or_babbles_is_a_failure(code: str, words: str) -> None:
-    """Of two runs the one at n = 16 fails, and does no harm to the other."""
+    """The run at n = 16 fails, and does no harm to the other."""
     code = f"if n == 16:\n    {code}\nelse:\n    {ANSWER}"
     found = dict(carry_out_all(RUNS[:2], workers=2, command=python(code)))
     assert found == {RUNS[0]: result(0.5), RUNS[1]: failure(words)}

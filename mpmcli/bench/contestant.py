@@ -10,14 +10,14 @@ It answers on stdout, one JSON object per line, and waits for commands on stdin 
     run SECONDS    {"steps": 31, "seconds": 1.02}                              steps for about that long
     finish         {"sound": true, "smallest_step": 8e-5, "peak_memory": 219152384}    and ends
 
-Of laws, the contestant is the column of `mpmcli.bench.materials`, which obeys three commands more:
+For laws, the contestant is the column of `mpmcli.bench.materials`, which has three more commands:
 
-    keep STEPS              {}                       so many steps, and remembers the state
+    keep STEPS              {}                       takes STEPS steps and saves the state
     repeat STEPS SECONDS    {"steps": 400, "seconds": 1.1, "processor_seconds": 1.05}
-                                                     so many steps from that state, again until the time is up
+                                                     takes STEPS steps from that state, repeated until the time is up
     flowing                 {"share": 0.93}          of the particles
 
-What cannot go on is told as {"error": "a sentence"} and ends the process with status 1.
+A failure is answered by {"error": "a sentence"} and ends the process with status 1.
 """
 
 import argparse

@@ -201,7 +201,7 @@ def _state_text(bound: StateBound) -> str:
 def smallest(limits: Sequence[SceneLimit], *, at_rest: bool = False) -> SceneLimit:
     """Return the smallest limit, in any state or at the start.
 
-    Of equal limits, that at rest is returned.
+    Where two are equal, the one at rest is returned.
     """
     chosen = [limit for limit in limits if limit.state == "rest" or not at_rest]
     return min(chosen, key=lambda limit: limit.value)

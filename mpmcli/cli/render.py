@@ -50,7 +50,7 @@ THEMES = ("light", "dark")
 )
 @click.option("--movie", type=click.Path(path_type=Path), metavar="FILE", help="Make a film: .mp4 or .gif.")
 @click.option("--fps", type=float, help="Frames of the film per second, 30 by default.")
-@click.option("--montage", metavar="CxR", help="One picture of evenly spaced frames, in so many columns and rows.")
+@click.option("--montage", metavar="CxR", help="One picture of evenly spaced frames, in C columns and R rows.")
 @click.option(
     "--save-surface",
     type=click.Path(path_type=Path),

@@ -14,7 +14,7 @@ COLUMNS = tuple(f.name for f in fields(LedgerRow))
 VECTORS = ("linear_momentum", "angular_momentum")
 INTEGERS = ("steps",)
 TEXT = "limit"
-# Of each frame, in the CSV: its number, time steps since the start, particles.
+# Columns of each frame in the CSV: its number, time steps since the start, particles.
 FRAME_COLUMNS = ("frame", "step", "particles")
 
 

@@ -53,7 +53,7 @@ THEMES: dict[ThemeName, Theme] = {"light": LIGHT, "dark": DARK}
 
 @contextmanager
 def drawing(size: tuple[int, int], theme: Theme) -> "Iterator[Figure]":
-    """Give an empty figure of so many pixels, wide and high, to draw; what the user has set for matplotlib is left out.
+    """Give an empty figure of a size in pixels, (width, height), to draw on, without the user's settings of matplotlib.
 
     Text grows with the picture, so that all sizes of one shape look alike.
     """

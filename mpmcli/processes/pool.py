@@ -52,15 +52,15 @@ def render_frames(
 ) -> None:
     """Render frames, in this process where one is asked for or one frame is left, and otherwise in others.
 
-    The other processes share the cores, by the variables in THREADS where the environment does not set them already.
+    The processes share the cores: each gets its part in the variables of THREADS that the environment does not set.
     Ctrl-C at the terminal does not reach them. None is left when this returns or raises; frames that are done stay.
 
     Args:
         job: see `Job`.
         ks: the frames, begun in this order.
         workers: processes at a time, each with one frame.
-        watch: told of each frame as it is done, and what the job returned for it, which can be pickled.
-        stop: asked again and again whether to end.
+        watch: called with each frame as it is done, and what the job returned for it, which can be pickled.
+        stop: called again and again; returns whether to end.
 
     Raises:
         KeyboardInterrupt: `stop` said so.
@@ -153,7 +153,7 @@ class _Worker:
             self.process.stdin.close()  # type: ignore[union-attr]
 
     def death(self) -> RunError:
-        """Return what is to be said when it has ended by itself."""
+        """Return the error to raise when it has ended by itself."""
         status = self.process.wait()
         how = f"was ended by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
         self._complained.seek(0)
@@ -165,7 +165,7 @@ class _Worker:
         )
 
     def close(self, patience: float) -> None:
-        """Let it end, and end it where it takes longer than so many seconds."""
+        """Wait `patience` seconds for it to end, then kill it."""
         try:
             with suppress(subprocess.TimeoutExpired):
                 self.process.wait(patience)

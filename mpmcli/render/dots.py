@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 OVERLAP = 1.15
 # Pixels: smaller dots would vanish, so that a single particle is seen.
 SMALLEST = 1.5
-# Up to so many particles each pixel is averaged of four, which makes round edges smooth.
+# Up to this number of particles, each pixel is the average of four, which makes round edges smooth.
 SMOOTHED = 400_000
 # Pixels across a dot; larger ones are drawn as large as this.
 DOT_MAX = 255
@@ -151,6 +151,6 @@ class DotsPainter:
 
 
 def samples_of(size: tuple[int, int], count: int, largest: float) -> int:
-    """Return how many pixels along each axis are drawn for one of a picture, with so many dots, the largest so wide."""
+    """Return the samples along each axis of a pixel, by the number of dots and the widest one."""
     possible = 2 * max(size) <= SIDE_MAX and 4 * size[0] * size[1] <= PIXELS_MAX and 2 * largest <= DOT_MAX
     return 2 if possible and count <= SMOOTHED else 1

@@ -43,7 +43,7 @@ def choose_frames(text: str, result: Result) -> list[int]:
 
 
 def evenly_spaced(ks: list[int], count: int) -> list[int]:
-    """Return at most so many of some frames, evenly spaced, the first and the last among them."""
+    """Return some of the frames, evenly spaced, the first and the last among them."""
     if count == 1:
         return ks[-1:]
     places = np.unique(np.linspace(0, len(ks) - 1, count).round().astype(int))

@@ -22,7 +22,7 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @cache
 def ticks_of(colors: Coloring, most: int) -> tuple[list[float], list[str], str]:
-    """Return places, texts, and the unit with what the texts are to be multiplied by; there are about so many."""
+    """Return places and texts of up to `most` ticks, and the unit with the power of ten of the texts."""
     from matplotlib.ticker import MaxNLocator
 
     low, high = colors.limits

@@ -97,7 +97,7 @@ class PictureLayout:
         return np.asarray(layout)
 
     def height_for(self, aspect: float) -> int:
-        """Return the height of the whole picture at which those of the scene are so many times as high as wide."""
+        """Return the height of the whole picture at which those of the scene have this ratio of height to width."""
         rows = self.grid[1]
         viewport = round(self.viewport_size[0] * aspect) + self._label
         return self._px(TOP) + self._bottom + rows * viewport + (rows - 1) * self._px(GAP)

@@ -73,7 +73,7 @@ def choose_window() -> str:
 
 
 def try_windows(timeout: float = TIMEOUT) -> Iterator[Attempt]:
-    """Try each window that may do, in a process of its own of so many seconds, and stop at the first that draws."""
+    """Try each window that may do, in a process of its own with a time limit, and stop at the first that draws."""
     command = module_command("mpmcli.render.window_probe")
     given = users_setting()
     for setting in [given] if given else _candidates():

@@ -25,7 +25,7 @@ def scene_bounds(scene: Scene) -> SceneBounds:
     highest matter above the lowest point of the domain, both measured against gravity; v0 alone where
     there is no gravity. height = H, or the largest extent of the matter where there is no gravity.
 
-    Of a gravity that depends on time the strongest counts, and the largest H of any instant. Forces of magnitude a add
+    For gravity that depends on time, the strongest counts, and the largest H of any instant. Forces of magnitude a add
     min(2 a L, (a T)^2) to the square of the speed, L the largest extent of the domain and T the end of the run, and a
     to the gravity that presses. Both are found at sampled instants and places.
     """
@@ -93,7 +93,7 @@ def _magnitude(scene: Scene, body: Body, force: Force) -> float:
 def highest_speed(body: Body) -> float:
     """Return a bound on the initial speed of a body, m/s: that at the corners of its bounding box.
 
-    Of a velocity that is an expression it is the largest of many points of the body.
+    For a velocity that is an expression, it is the largest over a lattice of points of the body.
     """
     if moves_unevenly(body):
         speeds = np.linalg.norm(initial_motion(body, body_points(body))[0], axis=1)

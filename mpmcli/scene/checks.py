@@ -27,7 +27,7 @@ _MOST_SEARCHED = 1_000_000
 def problems_in(scene: Scene) -> list[Problem]:
     """Return everything that is wrong with a scene whose tables are valid, one by one."""
     outside = list(_outside(scene))
-    # A body that is much too large is told so, not filled.
+    # A body that is much too large is reported, and not filled.
     empty = [] if outside else list(_empty(scene))
     unstarted = [] if outside or empty else list(_initial(scene))
     where = [*_repeated_names(scene), *outside, *_overlaps(scene), *empty]

@@ -185,7 +185,7 @@ def _only_with_aflip(flip: float | None, info: ValidationInfo) -> float | None:
 
 
 class SolverSettings(Table):
-    """How the scene is computed. Of what is not chosen nothing is in the compiled step."""
+    """How the scene is computed. What is not chosen is not in the compiled step."""
 
     precision: Annotated[
         Literal["f32", "f64"], Field(description="Floating-point numbers of the solver: 32 or 64 bits.")

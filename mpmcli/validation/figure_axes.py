@@ -18,7 +18,7 @@ LOWEST = 1e-17
 STRIP = 0.08
 # A logarithmic axis spans no less than this: a flat curve shall look flat.
 LEAST_SPAN = 16.0
-# Ticks are written at most at so many powers of ten.
+# Largest number of powers of ten with a label.
 MOST_TICKS = 7
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

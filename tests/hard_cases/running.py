@@ -35,7 +35,7 @@ def scene(
     origin: float = 0.0,
     fields: Sequence[str] = ("velocity", "volume_ratio", "affine"),
 ) -> Scene:
-    """Return a scene on so many cells, with gravity (m/s^2) downwards and the lower corner at `origin` on each axis."""
+    """Return a scene of these cells, gravity (m/s^2) downwards and the lower corner at `origin` on each axis."""
     d = len(cells)
     return parse_scene(
         {

@@ -12,13 +12,13 @@ import numpy as np
 
 from mpmcli.errors import InputError, RunError
 
-# Of H.264: 18 is hardly told from the original, 23 is ffmpeg's default.
+# Constant rate factor of H.264: 18 is visually near-lossless, 23 is ffmpeg's default.
 QUALITY = 18
 # Three times as fast as "medium" for films of the same size, and not to be told from it.
 PRESET = "veryfast"
 # How the encoder shares its work is seen in the bytes, so it does not follow the machine's number of cores.
 THREADS = 2
-# Lines of what ffmpeg said that are told.
+# Lines of ffmpeg's stderr that are quoted on failure.
 LAST_WORDS = 2
 # Players take the colours of a large picture for BT.709, and ffmpeg would write BT.601.
 COLOURS = (

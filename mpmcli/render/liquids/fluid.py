@@ -62,7 +62,7 @@ class FluidPainter:
     def __init__(self, scene: RenderScene, view: View, theme: Theme) -> None:
         self._scene, self._view = scene, view
         extent = np.subtract(scene.upper, scene.lower)
-        # What a liquid takes of the light is told by the size of the scene: a beaker and a reservoir look alike.
+        # Absorption scales with the size of the scene: a beaker and a reservoir look alike.
         self._length = float(np.cbrt(np.prod(np.maximum(extent, 1e-3 * extent.max()))))
         lamp = lights_of(scene, view, theme).lamp
         self._background = FluidBackground(scene, view, theme, lamp)

@@ -7,7 +7,7 @@ import numpy as np
 from mpmcli.render.appearance import Appearance, Finish
 from mpmcli.render.theme import Theme, rgb
 
-# Of the light that meets a surface of water head-on, the share that it reflects: ((n - 1) / (n + 1))^2, n = 1.33.
+# Reflectance of water at normal incidence: ((n - 1) / (n + 1))^2, n = 1.33.
 HEAD_ON = 0.02
 # A skin of this thickness, in lengths of the scene, is added to every liquid: a film of it is seen.
 SKIN = 0.05

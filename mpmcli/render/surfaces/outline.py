@@ -237,13 +237,13 @@ def _coarseness(distance: float, grid: Grid) -> int:
 
 
 def _coarser(grid: Grid, step: int) -> Grid:
-    """Return the grid of every so many nodes, that reaches over the whole."""
+    """Return the coarse grid of nodes that spans the whole."""
     rows, columns = (-(-(size - 1) // step) + 1 for size in grid.shape)
     return Grid(grid.corner, grid.edge * step, (rows, columns))
 
 
 def _finer(values: np.ndarray, step: int, shape: tuple[int, int]) -> np.ndarray:
-    """Interpolate values at every so many nodes to all of them, (h, w)."""
+    """Interpolate values at the coarse nodes to all nodes, (h, w)."""
     if step == 1:
         return values[: shape[0], : shape[1]]
     for axis in range(2):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-# Of splashsurf, in particle radii: reach of the kernel's smoothing, and edge of a marching cube.
+# Parameters of splashsurf, in particle radii: smoothing length of the kernel, and edge of a marching cube.
 SMOOTHING_LENGTH, CUBE = 2.5, 1.1
 # Share of the full density at which the surface lies.
 THRESHOLD = 0.5

@@ -19,7 +19,7 @@ PERIODS = 5
 # With this many, just under two steps of 0.8 of the limit fit between two frames of the coarsest bar, just under four
 # of the next: steps are hardly smaller than the setting asks for.
 FRAMES_PER_PERIOD = 17
-# Of a free end: what 13, 26 and 52 cells lose in a step beyond the wave, over the loss of the wave, is 5.8 / n.
+# Loss at a free end, over that of the wave: 5.8 / n, from 13, 26 and 52 cells.
 END_LOSS = 5.8
 
 

@@ -19,7 +19,7 @@ SPREAD = 0.1
 PERIOD = 2 * math.pi / 3.516 * LENGTH * SLENDERNESS * math.sqrt(12 * DENSITY / YOUNG)
 # In first periods: how long the load takes to come on, and how long the mean is taken after that.
 RAMP, WINDOW, FRAMES_PER_PERIOD = 3, 2, 24
-# Of the domain, m; the beam lies from 0 to its thickness, and its tip sinks by 1.5 m.
+# Extent of the domain beyond the beam, m; the beam lies from 0 to its thickness, and its tip sinks by 1.5 m.
 RIGHT, BELOW, ABOVE = 1.0, 3.0, 1.0
 
 

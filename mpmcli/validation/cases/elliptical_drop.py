@@ -87,7 +87,7 @@ class EllipticalDrop(Case):
             x, X = frame.position.astype(np.float64), frame.fields["initial_position"].astype(np.float64)
         a = half_axis(END)
         exact = X * [a, 1 / a]
-        # Of these particles: a lattice in a disc has not quite the second moments of the disc.
+        # From these particles, as a lattice in a disc does not have exactly the second moments of the disc.
         axes = np.sqrt((x**2).mean(0) / (exact**2).mean(0)) - 1
         return {
             "position error": float(np.sqrt(((x - exact) ** 2).sum(1).mean())),

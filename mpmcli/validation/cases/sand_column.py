@@ -13,7 +13,7 @@ GRAVITY, DENSITY, FRICTION, NU = 9.81, 1600.0, 30.0, 0.3
 L0 = 0.2
 # Bulk modulus of the plane over density g H0: compressed by two thousandths at the base.
 STIFFNESS = 500.0
-# After so many sqrt(H0 / g) nothing moves any more.
+# End of the run, in sqrt(H0 / g): nothing moves any more.
 UNITS = 5.0
 
 

@@ -13,7 +13,7 @@ from mpmcli.validation.transfer_loss import apic_factor
 # L = 1 m, U = 1 m/s, density 1 kg/m^3.
 VISCOSITY, SOUND, PRESSURE, END, FRAMES = 0.01, 20.0, 1.0, 1.0, 20
 K = math.pi
-# Of kinetic energy, 1/s.
+# Decay rate of kinetic energy, 1/s.
 DECAY = 4 * VISCOSITY * K**2
 
 
