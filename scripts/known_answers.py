@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from mpmcli.output.result import Result
-from mpmcli.validation.drop_motion import half_axis
+from mpmcli.validation.cases.elliptical_drop import half_axis
 from mpmcli.validation.martin_moyce import N_SQUARED, mean_error, measured
 
 # How much later than assumed the column may have been free to move, in T: the gate takes its time.

@@ -11,13 +11,13 @@ import pytest
 from asked_process import CRASH, HANG, SILENCE, answering, running
 from command import ROOT, run_here
 
-from mpmcli.doctor import backends, drawing, examination, files, finding, interpreter, machine
+from mpmcli.doctor import backends, drawing, examination, files, interpreter, machine, probe_result
 from mpmcli.doctor.examination import EXAMINATIONS, Examination, attempt, examine, judge
-from mpmcli.doctor.finding import Finding
+from mpmcli.doctor.probe_result import ProbeResult
 from mpmcli.errors import RunError
 from mpmcli.processes.questions import Reply
 
-WELL = Finding("ok", "works")
+WELL = ProbeResult("ok", "works")
 FINE = answering('{"status": "ok", "detail": "works", "remedy": ""}')
 
 
@@ -81,7 +81,7 @@ def test_crash_hang_and_silence_are_told_apart(trials):
     assert found["one"].remedy.startswith("install it again by `python -m pip install --force-reinstall ")
 
 
-def cheap() -> Finding:
+def cheap() -> ProbeResult:
     return WELL
 
 
@@ -95,8 +95,8 @@ def test_what_is_not_needed_cannot_fail_the_report():
     assert "--arch cpu" in judge(cuda, crash).remedy
 
 
-def raising(error: Exception) -> Callable[[], Finding]:
-    def examine_it() -> Finding:
+def raising(error: Exception) -> Callable[[], ProbeResult]:
+    def examine_it() -> ProbeResult:
         raise error
 
     return examine_it
@@ -130,7 +130,7 @@ def test_a_library_that_the_system_lacks_is_named_with_its_package():
         "install the system's package of libX11.so.6, on Debian and Ubuntu by `apt-get install libx11-6`"
     )
     unknown = "/usr/lib/libfoo-1.2.so.3: file too short"
-    assert finding.library_remedy(unknown) == "install the system's package of libfoo-1.2.so.3"
+    assert probe_result.library_remedy(unknown) == "install the system's package of libfoo-1.2.so.3"
 
 
 def test_a_command_that_cannot_be_loaded_sends_to_the_doctor(monkeypatch):
@@ -151,16 +151,16 @@ def test_a_part_of_mpmcli_that_is_missing_is_no_case_for_the_doctor(monkeypatch)
 
 def test_a_remedy_names_the_version_that_is_wanted(monkeypatch):
     listed = ["h5py>=3.11", "h5py-other>=1", "pytest>=8; extra == 'test'"]
-    monkeypatch.setattr(finding.importlib.metadata, "requires", lambda name: listed)
-    assert finding.package_remedy("h5py") == 'install it by `python -m pip install "h5py>=3.11"`'
-    assert finding.package_remedy("pytest") == 'install it by `python -m pip install "pytest"`'
+    monkeypatch.setattr(probe_result.importlib.metadata, "requires", lambda name: listed)
+    assert probe_result.package_remedy("h5py") == 'install it by `python -m pip install "h5py>=3.11"`'
+    assert probe_result.package_remedy("pytest") == 'install it by `python -m pip install "pytest"`'
 
 
 def test_gpus_are_not_here_where_taichi_has_none_or_is_not_here(monkeypatch):
     from mpmcli.solver import trial
 
     monkeypatch.setattr(trial, "backend_is_here", lambda arch: False)
-    assert backends.cuda() == Finding("information", "not here")
+    assert backends.cuda() == ProbeResult("information", "not here")
     # As if the module could not be loaded.
     monkeypatch.setitem(sys.modules, "mpmcli.solver.trial", None)
     assert backends.vulkan().status == "information"

@@ -9,7 +9,7 @@ import pytest
 from command import Outcome, run_here, started
 
 from mpmcli.output import open_result
-from mpmcli.validation.registry import all_cases
+from mpmcli.validation.cases import all_cases
 
 BAR = "bar_fixed_free"
 PATIENCE = 120  # s

@@ -20,10 +20,10 @@ from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError
 from mpmcli.validation import fingerprint, study
 from mpmcli.validation.carry_out import carry_out
 from mpmcli.validation.case import Measure
+from mpmcli.validation.cases import all_cases
 from mpmcli.validation.fingerprint import case_files, code_digest, run_key
 from mpmcli.validation.journal import Journal
 from mpmcli.validation.matrix import Run, runs_of
-from mpmcli.validation.registry import all_cases
 from mpmcli.validation.run_result import RunResult, failure
 from mpmcli.validation.runner import carry_out_all, case_command
 from mpmcli.validation.setting import Setting
@@ -219,8 +219,12 @@ def lost() -> dict:
 @pytest.mark.parametrize(
     ("found", "status", "message"),
     [
-        (lambda: {"period error": math.nan, "energy loss": 1.0}, "failed", "came to its end, but period error is nan."),
-        (lambda: {"period error": 1.0}, "failed", "The case measured no energy loss."),
+        (
+            lambda: {"period error": math.nan, "energy loss": 1.0},
+            "failed",
+            "The run finished, but period error is nan.",
+        ),
+        (lambda: {"period error": 1.0}, "failed", "The case returned no energy loss."),
         (lambda: {"period error": 1 / 0}, "failed", "The frames cannot be measured: division by zero."),
         (lost, "unstable", 'at step 12, t = 0.5 s: particle 3 of body "bar"'),
     ],
@@ -254,7 +258,7 @@ def test_a_study_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Monkey
         kept: list[int] = []
         counts: list[int] = []
 
-        def watch(run: Run, entry: RunResult, done: int, total: int) -> None:
+        def on_run(run: Run, entry: RunResult, done: int, total: int) -> None:
             counts.append(done)
 
         try:
@@ -263,7 +267,7 @@ def test_a_study_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.Monkey
                 "coarse",
                 1,
                 journal=journal,
-                on_run=watch,
+                on_run=on_run,
                 resumed=lambda count, total: kept.append(count),
                 stop=lambda: stop() and bool(counts),
                 command=command,

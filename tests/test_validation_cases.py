@@ -13,9 +13,9 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import parse_scene, scene_to_toml
 from mpmcli.validation.carry_out import carry_out, scene_of
+from mpmcli.validation.cases import all_cases
 from mpmcli.validation.convergence import ROUND_OFF
 from mpmcli.validation.matrix import KNOBS, Run
-from mpmcli.validation.registry import all_cases
 from mpmcli.validation.run_result import RunResult
 from mpmcli.validation.setting import Setting
 from mpmcli.validation.verdict import judge

@@ -4,8 +4,8 @@ import mpm_reference as reference
 import numpy as np
 import pytest
 
-from mpmcli.validation.drop_motion import half_axis
-from mpmcli.validation.standing_wave import standing_wave_frequency
+from mpmcli.validation.cases.elliptical_drop import half_axis
+from mpmcli.validation.cases.sloshing import standing_wave_frequency
 from mpmcli.validation.transfer_loss import apic_factor
 
 

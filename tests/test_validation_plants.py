@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from mpmcli.validation.registry import all_cases
+from mpmcli.validation.cases import all_cases
 
 ROOT = Path(__file__).resolve().parent.parent
 FEWEST = 10

@@ -8,8 +8,8 @@ import pytest
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import parse_scene
 from mpmcli.solver.solver import Solver
+from mpmcli.validation.cases import all_cases
 from mpmcli.validation.cases.snow_oedometer import DENSITY, DEPTH, PULL, confined_height, confined_stress
-from mpmcli.validation.registry import all_cases
 from mpmcli.validation.setting import Setting
 
 

@@ -88,10 +88,10 @@ def command(
 
 
 def _chosen(names: Sequence[str]) -> list["Case"]:
-    """Return the cases of some names, in the order of the registry."""
+    """Return the cases of some names, in the order of `all_cases`."""
     from mpmcli.errors import InputError
     from mpmcli.scene.sentences import listed, nearest
-    from mpmcli.validation.registry import all_cases
+    from mpmcli.validation.cases import all_cases
 
     known = all_cases()
     found = set()

@@ -2,45 +2,45 @@
 
 import importlib.metadata
 
-from mpmcli.doctor.finding import Finding
+from mpmcli.doctor.probe_result import ProbeResult
 
 
-def cpu() -> Finding:
+def cpu() -> ProbeResult:
     """Examine the backend that always has to work."""
     from mpmcli.solver.trial import try_backend
 
     started = try_backend("cpu")
     threads = f"{started.threads} thread{'s' if started.threads > 1 else ''}"
-    return Finding("ok", f"Taichi {importlib.metadata.version('taichi')}, {threads}")
+    return ProbeResult("ok", f"Taichi {importlib.metadata.version('taichi')}, {threads}")
 
 
-def cuda() -> Finding:
+def cuda() -> ProbeResult:
     """Examine NVIDIA's GPUs, which --arch auto takes where there are any."""
     return _gpu("cuda")
 
 
-def vulkan() -> Finding:
+def vulkan() -> ProbeResult:
     """Examine Vulkan, whose device may be software."""
     return _gpu("vulkan")
 
 
-def metal() -> Finding:
+def metal() -> ProbeResult:
     """Examine Apple's GPUs, which --arch auto takes where there are any."""
     return _gpu("metal")
 
 
-def _gpu(arch: str) -> Finding:
+def _gpu(arch: str) -> ProbeResult:
     try:
         from mpmcli.solver.trial import backend_is_here, try_backend
     except ImportError as error:
-        return Finding("information", f"not tried, since Taichi cannot be loaded ({error})")
+        return ProbeResult("information", f"not tried, since Taichi cannot be loaded ({error})")
     if not backend_is_here(arch):
-        return Finding("information", "not here")
+        return ProbeResult("information", "not here")
     try_backend(arch)
     from mpmcli.doctor.devices import device_names
 
     devices = device_names(arch)
     names = ", ".join(device.name for device in devices) or "device of unknown name"
     if devices and all(device.is_software for device in devices):
-        return Finding("information", f"software only: {names}", "--arch cpu uses the processor directly")
-    return Finding("ok", names)
+        return ProbeResult("information", f"software only: {names}", "--arch cpu uses the processor directly")
+    return ProbeResult("ok", names)

@@ -2,10 +2,10 @@
 
 import importlib.metadata
 
-from mpmcli.doctor.finding import Finding
+from mpmcli.doctor.probe_result import ProbeResult
 
 
-def vtk() -> Finding:
+def vtk() -> ProbeResult:
     """Examine VTK by letting it draw, which ends the process where its window is missing; so that has its own."""
     from vtkmodules.vtkCommonCore import vtkVersion
 
@@ -15,18 +15,18 @@ def vtk() -> Finding:
     attempts = list(try_windows())
     window = attempts[-1].window
     if window is None:
-        return Finding("missing", f"{version}, no OpenGL window opens ({why_none(attempts)})", remedy(attempts))
-    return Finding("ok", f"{version}, {window.name} on {window.renderer}, OpenGL {window.version}")
+        return ProbeResult("missing", f"{version}, no OpenGL window opens ({why_none(attempts)})", remedy(attempts))
+    return ProbeResult("ok", f"{version}, {window.name} on {window.renderer}, OpenGL {window.version}")
 
 
-def pyvista() -> Finding:
+def pyvista() -> ProbeResult:
     """Examine PyVista by loading it."""
     import pyvista
 
-    return Finding("ok", pyvista.__version__)
+    return ProbeResult("ok", pyvista.__version__)
 
 
-def pysplashsurf() -> Finding:
+def pysplashsurf() -> ProbeResult:
     """Examine the reconstruction of surfaces on a cube of particles."""
     import numpy as np
     import pysplashsurf
@@ -38,21 +38,21 @@ def pysplashsurf() -> Finding:
     )
     version = importlib.metadata.version("pysplashsurf")
     if not surface.ncells:
-        return Finding("broken", f"{version}, finds no surface around a cube of particles")
-    return Finding("ok", version)
+        return ProbeResult("broken", f"{version}, finds no surface around a cube of particles")
+    return ProbeResult("ok", version)
 
 
-def matplotlib() -> Finding:
+def matplotlib() -> ProbeResult:
     """Examine matplotlib by loading it."""
     import matplotlib
 
-    return Finding("ok", matplotlib.__version__)
+    return ProbeResult("ok", matplotlib.__version__)
 
 
-def pillow() -> Finding:
+def pillow() -> ProbeResult:
     """Examine Pillow by letting it write a letter."""
     import PIL
     from PIL import Image, ImageDraw
 
     ImageDraw.Draw(Image.new("RGB", (16, 16))).text((0, 0), "a")
-    return Finding("ok", PIL.__version__)
+    return ProbeResult("ok", PIL.__version__)

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from mpmcli.doctor import backends, drawing, files, interpreter, machine
-from mpmcli.doctor.finding import STATUSES, Finding, library_remedy, package_remedy
+from mpmcli.doctor.probe_result import STATUSES, ProbeResult, library_remedy, package_remedy
 from mpmcli.errors import MpmcliError
 from mpmcli.processes.questions import Question, Reply, ask_each, module_command
 
@@ -32,7 +32,7 @@ class Examination:
     """
 
     name: str
-    examine: Callable[[], Finding]
+    examine: Callable[[], ProbeResult]
     package: str = ""
     remedy: str = ""
     needed: bool = True
@@ -62,7 +62,7 @@ EXAMINATIONS = (
 )
 
 
-def examine(examinations: Sequence[Examination] = EXAMINATIONS) -> Iterator[tuple[str, Finding]]:
+def examine(examinations: Sequence[Examination] = EXAMINATIONS) -> Iterator[tuple[str, ProbeResult]]:
     """Yield (name, finding) of every examination, in order, as they end."""
     command = module_command("mpmcli.doctor.probe_process")
     questions = [Question([*command, each.name], each.timeout, leads_a_group=True) for each in examinations]
@@ -70,7 +70,7 @@ def examine(examinations: Sequence[Examination] = EXAMINATIONS) -> Iterator[tupl
         yield each.name, judge(each, reply)
 
 
-def attempt(each: Examination) -> Finding:
+def attempt(each: Examination) -> ProbeResult:
     """Examine in this process; what an examination raises is a finding, too."""
     try:
         return each.examine()
@@ -85,22 +85,22 @@ def attempt(each: Examination) -> Finding:
         return _fault(each, "broken", f"{type(error).__name__}: {error}")
 
 
-def judge(each: Examination, reply: Reply) -> Finding:
+def judge(each: Examination, reply: Reply) -> ProbeResult:
     """Make a finding of what the process of an examination left."""
     if reply.answer.get("status") not in STATUSES:
         return _fault(each, "broken", f"its trial {reply.fault or 'gave no answer'}")
-    finding = Finding(**reply.answer)
+    finding = ProbeResult(**reply.answer)
     finding = replace(finding, detail=_line(finding.detail))
     if reply.fault and not finding.is_fault:
         return _fault(each, "broken", f"{finding.detail}; then its trial {reply.fault}")
     return finding
 
 
-def _fault(each: Examination, status: str, detail: str) -> Finding:
+def _fault(each: Examination, status: str, detail: str) -> ProbeResult:
     remedy = library_remedy(detail) or each.remedy
     if each.package and not (remedy and status == "broken"):
         remedy = package_remedy(each.package, again=status == "broken")
-    return Finding(status if each.needed else "information", _line(detail), remedy)
+    return ProbeResult(status if each.needed else "information", _line(detail), remedy)
 
 
 def _line(detail: str) -> str:

@@ -3,13 +3,13 @@
 import io
 import subprocess
 
-from mpmcli.doctor.finding import Finding, package_remedy
+from mpmcli.doctor.probe_result import ProbeResult, package_remedy
 
 # Seconds; it takes a tenth of one.
 FFMPEG_TIMEOUT = 20.0
 
 
-def hdf5() -> Finding:
+def hdf5() -> ProbeResult:
     """Examine h5py by writing and reading back a file in memory, with the filters that results have."""
     import h5py
     import numpy as np
@@ -24,24 +24,24 @@ def hdf5() -> Finding:
             filters = [name for name, on in (("gzip", stored.compression == "gzip"), ("shuffle", stored.shuffle)) if on]
             intact = np.array_equal(stored[:], values)
     if not intact or len(filters) < 2:
-        return Finding("broken", f"{versions}, gzip and shuffle do not give back what was written")
-    return Finding("ok", f"{versions}, filters gzip and shuffle")
+        return ProbeResult("broken", f"{versions}, gzip and shuffle do not give back what was written")
+    return ProbeResult("ok", f"{versions}, filters gzip and shuffle")
 
 
-def ffmpeg() -> Finding:
+def ffmpeg() -> ProbeResult:
     """Examine the program that makes films by letting it encode one image."""
     import imageio_ffmpeg
 
     try:
         program = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
-        return Finding("missing", str(error).partition("\n")[0], package_remedy("imageio-ffmpeg", again=True))
+        return ProbeResult("missing", str(error).partition("\n")[0], package_remedy("imageio-ffmpeg", again=True))
     remedy = "unset IMAGEIO_FFMPEG_EXE if it is set, or " + package_remedy("imageio-ffmpeg", again=True)
     try:
         version = imageio_ffmpeg.get_ffmpeg_version()
     except (OSError, subprocess.CalledProcessError, ValueError) as error:
         reason = f"exited with {error.returncode}" if isinstance(error, subprocess.CalledProcessError) else error
-        return Finding("broken", f"{program} is no ffmpeg that runs ({reason})", remedy)
+        return ProbeResult("broken", f"{program} is no ffmpeg that runs ({reason})", remedy)
     source = ["-f", "lavfi", "-i", "color=s=16x16", "-frames:v", "1"]
     done = subprocess.run(
         [program, "-v", "error", *source, "-c:v", "libx264", "-f", "null", "-"],
@@ -53,5 +53,5 @@ def ffmpeg() -> Finding:
     )
     if done.returncode:
         first = (done.stderr.strip().splitlines() or [f"exited with {done.returncode}"])[0]
-        return Finding("broken", f"{version}, libx264 does not encode ({first}): {program}", remedy)
-    return Finding("ok", f"{version}, encoder libx264")
+        return ProbeResult("broken", f"{version}, libx264 does not encode ({first}): {program}", remedy)
+    return ProbeResult("ok", f"{version}, encoder libx264")

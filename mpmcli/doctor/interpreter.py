@@ -5,13 +5,13 @@ import sys
 from pathlib import Path
 
 from mpmcli import __version__
-from mpmcli.doctor.finding import Finding
+from mpmcli.doctor.probe_result import ProbeResult
 
 # As pyproject.toml says.
 OLDEST, NEWEST = (3, 11), (3, 13)
 
 
-def python(version: tuple[int, int] = sys.version_info[:2]) -> Finding:
+def python(version: tuple[int, int] = sys.version_info[:2]) -> ProbeResult:
     """Examine the interpreter, of this version."""
     place = (
         f"virtual environment {sys.prefix}"
@@ -20,11 +20,11 @@ def python(version: tuple[int, int] = sys.version_info[:2]) -> Finding:
     )
     detail = f"{platform.python_version()}, {place}"
     if OLDEST <= version <= NEWEST:
-        return Finding("ok", detail)
+        return ProbeResult("ok", detail)
     oldest, newest = (".".join(map(str, numbers)) for numbers in (OLDEST, NEWEST))
-    return Finding("broken", detail, f"install mpmcli into an environment of Python {oldest} to {newest}")
+    return ProbeResult("broken", detail, f"install mpmcli into an environment of Python {oldest} to {newest}")
 
 
-def mpmcli() -> Finding:
+def mpmcli() -> ProbeResult:
     """Examine the package."""
-    return Finding("ok", f"{__version__}, {Path(__file__).resolve().parent.parent}")
+    return ProbeResult("ok", f"{__version__}, {Path(__file__).resolve().parent.parent}")

@@ -5,7 +5,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
-from mpmcli.doctor.finding import Finding
+from mpmcli.doctor.probe_result import ProbeResult
 from mpmcli.plain_text import size_text
 
 # Bytes; below that a run of the size of the demo may not fit.
@@ -15,41 +15,41 @@ NO_DISK = 1e7
 CGROUP = Path("/sys/fs/cgroup")
 
 
-def current_directory() -> Finding:
+def current_directory() -> ProbeResult:
     """Examine where results are written when nothing else is said."""
     place = Path.cwd()
     elsewhere = "go to a directory of your own, or name one by -o"
     try:
         _write(place)
     except OSError as error:
-        return Finding("broken", f"{place} cannot be written ({error.strerror})", elsewhere)
+        return ProbeResult("broken", f"{place} cannot be written ({error.strerror})", elsewhere)
     free = shutil.disk_usage(place).free
     detail = f"{place}, writable, {size_text(free)} free"
     if free < NO_DISK:
-        return Finding("broken", detail, "free some space, or name another disk by -o")
+        return ProbeResult("broken", detail, "free some space, or name another disk by -o")
     if free < LITTLE_DISK:
-        return Finding("information", detail, "free some space, or name another disk by -o")
-    return Finding("ok", detail)
+        return ProbeResult("information", detail, "free some space, or name another disk by -o")
+    return ProbeResult("ok", detail)
 
 
-def kernel_cache() -> Finding:
+def kernel_cache() -> ProbeResult:
     """Examine where compiled kernels are kept for the next run, which works without."""
     place = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
     try:
         place.mkdir(parents=True, exist_ok=True)
         _write(place)
     except OSError as error:
-        return Finding(
+        return ProbeResult(
             "information",
             f"{place} cannot be written ({error.strerror}), so every run compiles its kernels anew",
             "make it writable, or let XDG_CACHE_HOME name a directory that is",
         )
     free = shutil.disk_usage(place).free
     detail = f"{place}, writable, {size_text(free)} free"
-    return Finding("ok", detail) if free >= NO_DISK else Finding("information", detail, "free some space")
+    return ProbeResult("ok", detail) if free >= NO_DISK else ProbeResult("information", detail, "free some space")
 
 
-def memory() -> Finding:
+def memory() -> ProbeResult:
     """Examine how much memory there is, and how much of it a run may take."""
     import psutil
 
@@ -60,23 +60,23 @@ def memory() -> Finding:
         free = min(free, limit)
         detail += f", the container may take {size_text(limit)}"
     if free < LITTLE_MEMORY:
-        return Finding("information", detail, "end other programs, or simulate fewer particles")
-    return Finding("ok", detail)
+        return ProbeResult("information", detail, "end other programs, or simulate fewer particles")
+    return ProbeResult("ok", detail)
 
 
-def cores() -> Finding:
+def cores() -> ProbeResult:
     """Examine how many cores a run may use."""
     there = os.cpu_count() or 1
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else there
     detail = f"{usable} of {there} usable"
     limit = processor_limit()
     if limit is not None and limit < usable:
-        return Finding(
+        return ProbeResult(
             "information",
             f"{detail}, the container may take the time of {limit:.3g}",
             f"simulate with --threads {max(1, int(limit))}",
         )
-    return Finding("ok", detail)
+    return ProbeResult("ok", detail)
 
 
 def memory_limit(root: Path = CGROUP) -> int | None:

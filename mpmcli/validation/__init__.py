@@ -1,1 +1,1 @@
-"""Problems with known answers, and hard cases."""
+"""Validation: cases with known solutions, their runs, verdicts and report."""

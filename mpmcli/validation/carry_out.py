@@ -1,4 +1,4 @@
-"""Carries out one run of a case in this process: scene, solver, measures and the clock."""
+"""Executes one run of a case in this process and measures its processor time."""
 
 import time
 from collections.abc import Iterator
@@ -21,16 +21,16 @@ def scene_of(case: Case, n: int, setting: Setting) -> Scene:
     """Return the scene of a case at resolution n.
 
     Raises:
-        InputError: the scene is not valid, as with a knob that scenes do not know.
+        InputError: the scene is not valid.
     """
     return parse_scene(case.tables(n, setting), laws=parameter_models(), source=f"<{case.name}>").scene
 
 
 def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = None) -> RunResult:
-    """Run a case and measure it; whatever stops it is told in the result.
+    """Run a case and return its measures. Errors are reported in the result.
 
     Args:
-        backend: to run on; where None, the CPU with one thread is started in the precision of the setting.
+        backend: the backend; None starts the CPU backend with one thread in the precision of the setting.
     """
     facts: dict = {}
     began = time.perf_counter()
@@ -49,7 +49,7 @@ def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = No
         message = not_finite(values)
         missing = [measure.name for measure in case.measures if measure.name not in values]
         if missing:
-            message = f"The case measured no {' and no '.join(missing)}."
+            message = f"The case returned no {' and no '.join(missing)}."
         if message:
             status, values = "failed", {}
     except UnstableRunError as error:
@@ -57,58 +57,58 @@ def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = No
     except MpmcliError as error:
         status, message = "failed", str(error)
     except (ArithmeticError, ValueError) as error:
-        # A state that makes no sense, though the solver went on, has nothing to measure.
+        # The solver did not detect the instability, but the state cannot be evaluated.
         status, message = "failed", f"The frames cannot be measured: {error}."
     return RunResult(status, message, values, **facts, **solver.facts())
 
 
 class TimedSolver(Solver):
-    """A solver that knows how much processor time its steps took: that of other programs is not in it."""
+    """A solver that measures the processor time of its steps, which excludes that of other programs."""
 
     def __init__(self, scene: Scene, backend: Backend) -> None:
         super().__init__(scene, backend)
         self._watched = self.measure_seconds
-        self._drawing = self._elsewhere = 0.0
+        self._frames_seconds = self._excluded_seconds = 0.0
 
     def timed_frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
-        """Yield the frames; what their receiver does with them is not timed."""
+        """Yield the frames. The time that the caller spends on them is not counted."""
         frames = self.frames()
         while True:
             began = time.process_time()
             try:
                 found = next(frames, None)
             finally:
-                self._drawing += time.process_time() - began
+                self._frames_seconds += time.process_time() - began
             if found is None:
                 return
             yield found
 
     def step(self, dt: float) -> None:
-        """Advance by dt, s; the first step compiles, and is booked apart."""
+        """Advance by dt, s. The first step compiles the kernels and is not counted."""
         if self.step_count:
             super().step(dt)
         else:
-            with self._booked_elsewhere():
+            with self._excluded():
                 super().step(dt)
 
     def frame(self, index: int, taken: list[tuple[float, float, str]]) -> tuple[Frame, LedgerRow]:
-        """Return a frame, which is booked apart."""
-        with self._booked_elsewhere():
+        """Return a frame. The time for building it is not counted."""
+        with self._excluded():
             return super().frame(index, taken)
 
     @contextmanager
-    def _booked_elsewhere(self) -> Iterator[None]:
+    def _excluded(self) -> Iterator[None]:
         began = time.process_time()
         try:
             yield
         finally:
-            self._elsewhere += time.process_time() - began
+            self._excluded_seconds += time.process_time() - began
 
     def facts(self) -> dict[str, float]:
-        """Return the counts and seconds of a result."""
+        """Return the step count and times of a `RunResult`."""
         return {
             "steps": self.step_count,
-            "seconds": max(self._drawing - self._elsewhere, 0.0),
+            "seconds": max(self._frames_seconds - self._excluded_seconds, 0.0),
             "watch_seconds": self.measure_seconds - self._watched,
             "compile_seconds": self.first_step_seconds,
             "frame_seconds": self.frame_seconds,

@@ -1,4 +1,4 @@
-"""One problem with a known answer: a scene at any resolution, and how far off its frames are."""
+"""A validation case: a problem with a known solution, its scene at any resolution, and its error measures."""
 
 import math
 from abc import ABC, abstractmethod
@@ -16,22 +16,24 @@ Frames = Iterable[tuple[Frame, LedgerRow]]
 
 
 def unbounded(n: int) -> float:
-    """Accept any error."""
+    """Return an infinite bound."""
     return math.inf
 
 
 @dataclass(frozen=True)
 class Measure:
-    """One number that a case takes from its frames.
+    """A scalar that a case computes from the frames of a run.
 
     Attributes:
-        name: in two or three words; unit: "" where it is a fraction.
-        text: what it is, in one sentence.
-        bound: (n) -> the largest |value| that is right at resolution n, with the default setting in double precision.
-        order: the smallest order that |value| must fall at between the two finest resolutions, None where it need not.
-        expected: the order that theory gives, for the report; None where there is none.
-        order_to: the finest resolution that takes part in the order, None for all: beyond it another error rules, as
-            the note of the case says.
+        name: two or three words.
+        unit: "" for a fraction.
+        text: definition, in one sentence.
+        bound: (n) -> the largest admissible |value| at resolution n, with the default setting in double precision.
+        order: the smallest admissible order of convergence of |value| between the two finest resolutions; None for no
+            requirement.
+        expected: the theoretical order, shown in the report; None if there is none.
+        order_to: the finest resolution used for the order; None for all. At finer ones another error dominates, as the
+            note of the case explains.
     """
 
     name: str
@@ -43,22 +45,23 @@ class Measure:
     order_to: int | None = None
 
     def has_order_at(self, n: int) -> bool:
-        """Return whether resolution n takes part in the order."""
+        """Return whether resolution n is used for the order."""
         return self.order_to is None or n <= self.order_to
 
 
 class Case(ABC):
-    """One problem with a known answer.
+    """A problem with a known solution.
 
     Attributes:
-        name: what the command line calls it; title: what people call it.
-        group: the chapter of the report.
-        source: where the problem and its answer come from.
+        name: identifier on the command line.
+        title: heading in the report.
+        group: chapter of the report.
+        source: reference of the problem and its solution.
         resolution: what n counts, such as "cells along the bar".
         levels: the resolutions of each level, from coarse to fine.
-        measures: what is measured; the first one is the error of the case.
-        varies: the knobs that mean something here; the report tries each of their values.
-        note: what a reader of the result must know, such as why a bound is what it is; "" where there is nothing.
+        measures: the measures; the first one is the error of the case.
+        varies: the fields of `Setting` that are varied.
+        note: remarks on the result, such as the origin of a bound; may be "".
     """
 
     name: ClassVar[str]
@@ -73,8 +76,12 @@ class Case(ABC):
 
     @abstractmethod
     def tables(self, n: int, setting: Setting) -> dict[str, Any]:
-        """Return the scene at resolution n as the tables of its TOML file."""
+        """Return the scene at resolution n, as the tables of a TOML file."""
 
     @abstractmethod
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
-        """Return the value of every measure, by its name, from the frames of a run of that scene, as they come."""
+        """Return the value of each measure by name.
+
+        Args:
+            frames: the frames and ledger rows of a run of the scene, consumed in order.
+        """

@@ -1,8 +1,9 @@
-"""One run of a case in a process of its own.
+"""Process that executes one run of a case.
 
     python -m mpmcli.validation.case_process CASE N '{"precision": "f32"}'
 
-It prints one line of JSON, the result, and ends with its parent: when its standard input is closed.
+It writes the result to stdout as one line of JSON. It exits when its standard input is closed, that is, when the
+parent process ends.
 """
 
 import argparse
@@ -11,12 +12,12 @@ import time
 
 from mpmcli.processes.questions import answering, end_with_parent
 from mpmcli.validation.carry_out import carry_out
-from mpmcli.validation.registry import all_cases
+from mpmcli.validation.cases import all_cases
 from mpmcli.validation.setting import Setting
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Carry out the run; taichi's own lines on stdout go to stderr."""
+    """Execute the run. Output of Taichi to stdout is redirected to stderr."""
     began = time.perf_counter()
     parser = argparse.ArgumentParser(prog="python -m mpmcli.validation.case_process")
     parser.add_argument("case")

@@ -1,24 +1,24 @@
-"""Says what a report speaks for: the default setting, or another one that is faster and no worse."""
+"""Decides whether a setting should replace the default one: it must be faster and no less accurate."""
 
 from collections.abc import Sequence
 
 from mpmcli.validation.comparison import Compared
 from mpmcli.validation.verdict import SINGLE
 
-# A setting would take the place of the default one if it came to equal errors in this part of its time, in the mean
-# over the cases, and were so many times as far off at equal resolution at most, in any case.
+# A setting replaces the default one if the mean ratio of times at equal error is below FASTER and no ratio of errors
+# at equal resolution exceeds WORSE.
 FASTER, WORSE = 0.9, 2.0
 
 
 def takes_its_place(entry: Compared) -> bool:
-    """Return whether a setting is so much better than the default one that it should take its place."""
+    """Return whether a setting should replace the default one."""
     if entry.error is None or entry.to_equal is None or entry.failed:
         return False
     return entry.to_equal.mean < FASTER and entry.error.high <= WORSE
 
 
 def reason(entry: Compared) -> str:
-    """Return one sentence with the numbers that speak for a setting or against it."""
+    """Return one sentence with the ratios for or against a setting."""
     if entry.error is None or entry.to_equal is None:
         return f"**{entry.label}**: no case tells."
     worst = max(entry.error.of_case, key=entry.error.of_case.__getitem__)
@@ -34,7 +34,7 @@ def reason(entry: Compared) -> str:
 
 
 def outcome(compared: Sequence[Compared]) -> str:
-    """Return what follows for the default setting, in a sentence."""
+    """Return the rule of replacement and the settings that satisfy it, as text of the report."""
     better = [entry.label for entry in compared if entry.setting != SINGLE and takes_its_place(entry)]
     rule = (
         f"A setting would take the place of the default one if it came to an equal error in less than {FASTER:g} of "

@@ -1,4 +1,4 @@
-"""Which setting is worth its cost: the cheapest way to 1 %, and every setting against the default one."""
+"""Comparison of settings: the cheapest one for an error of 1 %, and each one against the default."""
 
 import math
 from collections.abc import Sequence
@@ -11,14 +11,14 @@ from mpmcli.validation.run_result import RunResult
 from mpmcli.validation.setting import Setting
 from mpmcli.validation.verdict import Results
 
-# The error that the cheapest setting must reach.
+# Target error of the cheapest setting.
 TARGET = 0.01
-# Another setting must save this share of the time to be called cheaper than the default one: clocks are noisy.
+# Smallest relative saving of time over the default setting that counts, given the noise of timings.
 MARGIN = 0.1
 
 
 def series_of(case: Case, results: Results) -> dict[Setting, list[tuple[Run, RunResult]]]:
-    """Return the runs of a case by their setting, each from coarse to fine."""
+    """Return the runs of a case by setting, each list from coarse to fine."""
     series: dict[Setting, list[tuple[Run, RunResult]]] = {}
     for run, result in results.items():
         if run.case == case.name:
@@ -27,7 +27,7 @@ def series_of(case: Case, results: Results) -> dict[Setting, list[tuple[Run, Run
 
 
 def points_of(case: Case, runs: Sequence[tuple[Run, RunResult]]) -> list[Point]:
-    """Return error and cost of those runs of a setting that finished."""
+    """Return error and cost of the finished runs of a setting."""
     name = case.measures[0].name
     return [
         Point(run.n, result.error(name), result.seconds, result.particle_steps)
@@ -38,21 +38,21 @@ def points_of(case: Case, runs: Sequence[tuple[Run, RunResult]]) -> list[Point]:
 
 @dataclass(frozen=True)
 class Cheapest:
-    """The setting that reaches the target in the least time, and what that costs."""
+    """The setting that reaches the target error in the least time, and its cost."""
 
     setting: Setting
     cost: Cost
 
     @property
     def label(self) -> str:
-        """What people call the setting."""
+        """Label of the setting."""
         return label_of(self.setting)
 
 
 def cheapest(case: Case, results: Results, target: float = TARGET) -> Cheapest | None:
-    """Return the setting that reaches an error in the least time, None where none does, or errors are no fractions.
+    """Return the setting that reaches the target error in the least time; None if none does or the error has a unit.
 
-    The default setting is kept where it takes hardly longer.
+    The default setting is preferred if another one saves less than MARGIN of its time.
     """
     if case.measures[0].unit:
         return None
@@ -72,7 +72,7 @@ def cheapest(case: Case, results: Results, target: float = TARGET) -> Cheapest |
 
 @dataclass(frozen=True)
 class Ratios:
-    """A ratio in every case that has it, by the name of the case."""
+    """Ratios by the name of the case."""
 
     of_case: dict[str, float]
 
@@ -83,25 +83,26 @@ class Ratios:
 
     @property
     def low(self) -> float:
-        """The smallest one."""
+        """Smallest ratio."""
         return min(self.of_case.values())
 
     @property
     def high(self) -> float:
-        """The largest one."""
+        """Largest ratio."""
         return max(self.of_case.values())
 
 
 @dataclass(frozen=True)
 class Compared:
-    """A setting against the default one, over all cases that tried it; a ratio below 1 is better than the default.
+    """Ratios of a setting to the default one over all cases; a ratio below 1 is an improvement.
 
     Attributes:
-        setting: which.
-        error: of errors at equal resolution.
-        seconds: of times at equal resolution.
-        to_equal: of the times to the smallest error that both reach.
-        failed, runs: runs that did not finish, and all.
+        setting: the setting compared.
+        error: ratios of errors at equal resolution.
+        seconds: ratios of times at equal resolution.
+        to_equal: ratios of the times to the smallest error that both reach.
+        failed: number of runs that did not finish.
+        runs: number of runs.
     """
 
     setting: Setting
@@ -113,12 +114,12 @@ class Compared:
 
     @property
     def label(self) -> str:
-        """What people call the setting."""
+        """Label of the setting."""
         return label_of(self.setting)
 
 
 def compare_settings(cases: Sequence[Case], results: Results) -> list[Compared]:
-    """Compare every setting that was tried with the default one, case by case."""
+    """Compare every setting with the default one, case by case."""
     settings = dict.fromkeys(run.setting for run in results if run.setting != Setting())
     return [_compare(setting, cases, results) for setting in settings]
 
@@ -128,7 +129,7 @@ def _compare(setting: Setting, cases: Sequence[Case], results: Results) -> Compa
     for case in cases:
         series = series_of(case, results)
         usual, other = (points_of(case, series.get(key, [])) for key in (Setting(), setting))
-        # Where round-off is all there is, ratios say nothing.
+        # Ratios of round-off errors are meaningless.
         usual, other = ([point for point in points if point.error > ROUND_OFF] for points in (usual, other))
         by_n = {point.n: point for point in usual}
         pairs = [(point, by_n[point.n]) for point in other if point.n in by_n]

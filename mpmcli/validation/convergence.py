@@ -1,17 +1,17 @@
-"""How an error falls with resolution and with cost: observed order, and the cost of a given error."""
+"""Observed order of convergence, and the cost of reaching a given error."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-# Below this, what is left of an error is round-off of double precision, and has no order.
+# Errors below this are round-off of double precision, and have no order.
 ROUND_OFF = 1e-10
-# Stands for an error of nothing where a logarithm is taken.
+# Replaces a zero error in logarithms.
 NOTHING = 1e-18
 
 
 def observed_order(coarse: tuple[float, float], fine: tuple[float, float]) -> float | None:
-    """Return log(e1 / e2) / log(n2 / n1) of two (n, error); None where round-off rules, or n is the same."""
+    """Return log(e1 / e2) / log(n2 / n1) of two pairs (n, error); None for equal n or round-off."""
     (n1, e1), (n2, e2) = coarse, fine
     if n1 == n2 or not min(e1, e2) > ROUND_OFF:
         return None
@@ -20,12 +20,12 @@ def observed_order(coarse: tuple[float, float], fine: tuple[float, float]) -> fl
 
 @dataclass(frozen=True)
 class Cost:
-    """What it costs to reach some error.
+    """The cost of reaching a given error.
 
     Attributes:
-        n: the resolution that it takes, between those that were run.
-        seconds, particle_steps: the cost there.
-        at_most: whether the coarsest run is better than asked for already, so that less might do.
+        n: resolution, interpolated between those that were run.
+        seconds, particle_steps: cost at that resolution.
+        at_most: whether the error of the coarsest run is already smaller; the cost is then an upper bound.
     """
 
     n: float
@@ -45,12 +45,12 @@ class Point:
 
 
 def cost_to_reach(points: Sequence[Point], target: float) -> Cost | None:
-    """Return the cost at which an error falls to `target`, None where it never does.
+    """Return the cost at which the error falls to `target`; None if it stays above.
 
-    Between two runs logarithms are interpolated linearly: errors and costs are powers of the resolution.
+    The logarithms of n, cost and error are interpolated linearly, since errors and costs are powers of n.
 
     Args:
-        points: from coarse to fine.
+        points: runs from coarse to fine.
     """
     for i, point in enumerate(points):
         if point.error > target:
@@ -69,5 +69,5 @@ def cost_to_reach(points: Sequence[Point], target: float) -> Cost | None:
 
 
 def _between(a: float, b: float, share: float) -> float:
-    """Interpolate logarithms; a cost too small to be timed has none."""
+    """Interpolate logarithmically, or linearly if a cost is zero."""
     return a * (b / a) ** share if min(a, b) > 0 else a + share * (b - a)

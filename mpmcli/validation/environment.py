@@ -1,4 +1,4 @@
-"""What the figures of a report depend on: machine, versions, commit, date."""
+"""The environment of a report: machine, versions, commit, date."""
 
 import subprocess
 from datetime import UTC, datetime
@@ -10,10 +10,10 @@ PACKAGE = Path(__file__).resolve().parent.parent
 
 
 def describe_environment(workers: int) -> dict:
-    """Return it by name.
+    """Return the environment as a dictionary.
 
     Args:
-        workers: how many runs went on at a time, one thread each.
+        workers: number of concurrent runs, of one thread each.
     """
     return {
         **describe_machine(),
@@ -26,7 +26,7 @@ def describe_environment(workers: int) -> dict:
 
 
 def commit() -> str | None:
-    """Return the commit that the package is of, with a + where files differ; None where git does not hold it."""
+    """Return the commit of the package, with "+" if files are modified; None outside a git repository of mpmcli."""
 
     def git(*words: str) -> str | None:
         try:
@@ -35,7 +35,7 @@ def commit() -> str | None:
             return None
         return done.stdout.strip() if done.returncode == 0 else None
 
-    # It may be installed below somebody else's repository.
+    # The package may be installed within another repository.
     if git("ls-files", "--error-unmatch", "__init__.py") is None:
         return None
     head = git("rev-parse", "--short=12", "HEAD")

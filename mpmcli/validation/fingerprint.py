@@ -1,4 +1,4 @@
-"""The key of a run: equal keys mean the same scene, computed and measured by the same program."""
+"""Keys of runs: runs with equal keys have the same scene, code and processor, so their results can be reused."""
 
 import ast
 import hashlib
@@ -18,7 +18,7 @@ from mpmcli.validation.case import Case
 from mpmcli.validation.matrix import Run
 
 PACKAGE = Path(__file__).resolve().parent.parent
-# Everything in these computes; of the validation itself only what a run imports does.
+# Packages hashed in full. Of mpmcli.validation only the files that a run imports are hashed.
 ROOMS = ("scene", "materials", "boundaries", "stability", "solver", "output")
 CASE_PROCESS = PACKAGE / "validation" / "case_process.py"
 
@@ -27,7 +27,7 @@ def run_key(case: Case, run: Run, machine: str) -> str:
     """Return the key of a run: 64 hexadecimal digits.
 
     Args:
-        machine: what seconds depend on, such as the name of the processor.
+        machine: name of the processor, on which times depend.
 
     Raises:
         InputError: the scene is not valid.
@@ -46,7 +46,7 @@ def run_key(case: Case, run: Run, machine: str) -> str:
 
 
 def case_files(case: Case) -> tuple[Path, ...]:
-    """Return the files that hold a case and the classes that it extends."""
+    """Return the source files of the class of a case and of its base classes."""
     ours = [kind for kind in type(case).__mro__ if kind.__module__.partition(".")[0] not in sys.stdlib_module_names]
     found = {inspect.getsourcefile(kind) for kind in ours}
     return tuple(sorted(Path(name) for name in found if name))
@@ -54,7 +54,11 @@ def case_files(case: Case) -> tuple[Path, ...]:
 
 @cache
 def code_digest(files: tuple[Path, ...]) -> str:
-    """Return a digest of all code and data that a run of a case depends on, the case being held by `files`."""
+    """Return the SHA-256 digest of all code and data that a run depends on.
+
+    Args:
+        files: source files of the case, see `case_files`.
+    """
     rooms = [path for room in ROOMS for path in (PACKAGE / room).rglob("*.py")]
     data = [path for path in (PACKAGE / "validation" / "data").rglob("*") if path.is_file()]
     sources = {*rooms, *data, PACKAGE / "__init__.py", PACKAGE / "errors.py"}
@@ -71,7 +75,7 @@ def code_digest(files: tuple[Path, ...]) -> str:
 
 
 def _imported(path: Path) -> Iterator[Path]:
-    """Yield the files of the validation that a module imports; the registry finds the cases in another way."""
+    """Yield the files of mpmcli.validation that a module imports; cases are found by `all_cases` and not imported."""
     names = []
     for node in ast.walk(ast.parse(path.read_bytes())):
         if isinstance(node, ast.Import):

@@ -1,4 +1,4 @@
-"""The results of a report's runs, one small file each: what is done is done, however the rest ends."""
+"""The results of finished runs, one file each, so that an interrupted study can be resumed."""
 
 import json
 from pathlib import Path
@@ -18,17 +18,18 @@ class Journal:
     """The directory of a report.
 
     Attributes:
-        directory: where the report goes; its runs/ holds what is done.
+        directory: directory of the report; runs/ contains the results.
     """
 
     def __init__(self, directory: Path, *, resume: bool, overwrite: bool) -> None:
-        """Make the directory, or take up or clear what an earlier call left in it.
+        """Create the directory, or reuse or clear an existing one.
 
         Args:
-            resume: keep results that still hold; overwrite: remove them all, and the report.
+            resume: reuse results that are still valid.
+            overwrite: remove all results and the report.
 
         Raises:
-            InputError: something is in the way and neither was asked for, or the directory cannot be written.
+            InputError: the directory is not empty and neither option is set, or it cannot be written.
         """
         self.directory = Path(directory)
         check_directory(self.directory, overwrite=True)
@@ -46,9 +47,9 @@ class Journal:
             raise InputError(f"{self.directory} cannot be used ({reason}): give another place with -o.") from error
 
     def find(self, run: Run, key: str) -> RunResult | None:
-        """Return what came of a run, None where nothing did yet, or of another program or scene.
+        """Return the stored result of a run; None if there is none with this key.
 
-        A run that failed is never found: its time may have run out, or its machine's memory.
+        Failed runs are repeated, since time or memory may have run out.
         """
         try:
             content = json.loads(self._file(run).read_text(encoding="utf-8"))
@@ -58,10 +59,10 @@ class Journal:
         return result if content.get("key") == key and result.status != "failed" else None
 
     def keep(self, run: Run, key: str, result: RunResult) -> None:
-        """Write what came of a run, in one durable step.
+        """Write the result of a run atomically.
 
         Raises:
-            RunError: the disk is full or refuses.
+            RunError: the file cannot be written.
         """
         text = json.dumps({"key": key, "result": result.as_dict()}, indent=1, ensure_ascii=False)
         try:
@@ -73,7 +74,7 @@ class Journal:
         return self.directory / RUNS / f"{run.name}.json"
 
     def _clear(self) -> None:
-        """Remove what a report consists of, and nothing else."""
+        """Remove the files of a report and no others."""
         ours = [self.directory / name for name in REPORTS]
         for folder, suffix in ((RUNS, ".json"), (FIGURES, ".svg")):
             ours += [*(self.directory / folder).glob(f"*{suffix}")]

@@ -1,4 +1,4 @@
-"""Which runs a level means: every case at its resolutions, and what each knob does to it."""
+"""The runs of a level: every case at its resolutions, with the default setting and its variants."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from mpmcli.validation.case import Case, Level
 from mpmcli.validation.setting import Setting
 
-# Every value of a knob that is tried, and what people call it.
+# The values of each field of `Setting` that are tried, and their labels.
 KNOBS: dict[str, dict[object, str]] = {
     "precision": {"f64": "f64", "f32": "f32"},
     "kernel": {"quadratic": "quadratic kernel", "cubic": "cubic kernel"},
@@ -28,26 +28,26 @@ class Run:
 
     @property
     def name(self) -> str:
-        """What its files are called."""
+        """File name of the result, without suffix."""
         words = [f"{knob}-{value}" for knob, value in self.setting.changed_from(Setting()).items()]
         return "_".join([self.case, f"n{self.n}", *(words or [DEFAULT])])
 
 
 def label_of(setting: Setting) -> str:
-    """Return what people call a setting: what it changes of the default one."""
+    """Return the label of a setting: its differences from the default one."""
     changed = setting.changed_from(Setting())
     words = [KNOBS[knob].get(value, f"{knob} {value}") for knob, value in changed.items()]
     return ", ".join(words) or DEFAULT
 
 
 def variants(knob: str) -> list[Setting]:
-    """Return the default setting with each other value of one knob."""
+    """Return the settings that differ from the default one in one field."""
     usual = getattr(Setting(), knob)
     return [Setting(**{knob: value}) for value in KNOBS[knob] if value != usual]
 
 
 def sweep_resolution(case: Case, level: Level) -> int:
-    """Return the resolution at which the Courant fraction is varied: a middle one, the lower of two."""
+    """Return the resolution at which the Courant fraction is varied, the (lower) median."""
     resolutions = sorted(case.levels[level])
     return resolutions[(len(resolutions) - 1) // 2]
 
@@ -55,8 +55,8 @@ def sweep_resolution(case: Case, level: Level) -> int:
 def runs_of(case: Case, level: Level) -> list[Run]:
     """Return the runs of a case at a level, the default setting first, each setting from coarse to fine.
 
-    The level "coarse" is the default setting, and f32 at the finest resolution. Further levels try every knob in
-    `case.varies`, all of them at every resolution but the Courant fraction, which varies at a middle one.
+    The level "coarse" has the default setting, and f32 at the finest resolution. Other levels vary every field in
+    `case.varies` at every resolution, except for the Courant fraction, which is varied at one resolution.
     """
     resolutions = sorted(case.levels[level])
     runs = [Run(case.name, n, Setting()) for n in resolutions]

@@ -1,4 +1,4 @@
-"""What came of one run of a case."""
+"""The result of one run of a case."""
 
 import math
 from dataclasses import asdict, dataclass, field, fields
@@ -9,18 +9,21 @@ Status = Literal["finished", "unstable", "failed"]
 
 @dataclass(frozen=True)
 class RunResult:
-    """How a run ended, what it measured and what that cost.
+    """Outcome, measures and cost of a run.
 
     Attributes:
-        status: "finished", "unstable" (the solver stopped it) or "failed" (anything else); message: why, in a sentence.
-        values: every measure of the case, by its name; empty where the run did not finish.
+        status: "finished", "unstable" (stopped by the solver) or "failed" (any other error).
+        message: the reason, in one sentence; "" if the run finished.
+        values: the measures of the case by name; empty if the run did not finish.
         particles, steps: counts.
-        seconds: processor time of stepping, without the first step, which compiles, and without building frames: on
-            one thread the time that it takes where nothing else runs.
-        watch_seconds: of measuring the state for the limits, a part of stepping.
-        compile_seconds: the first step; frame_seconds: building frames and ledger rows.
-        start_seconds: reading the scene, sampling and allocating; wall_seconds: of the whole process.
-        arch, precision, threads: what it ran on.
+        seconds: processor time of the time steps, s. Excluded are the first step, which compiles the kernels, and the
+            construction of frames.
+        watch_seconds: part of `seconds` spent on measuring the state for the step limits, s.
+        compile_seconds: duration of the first step, s.
+        frame_seconds: time for building frames and ledger rows, s.
+        start_seconds: time for reading the scene, sampling and allocation, s.
+        wall_seconds: wall-clock time of the process, s.
+        arch, precision, threads: backend of the run.
     """
 
     status: Status
@@ -40,7 +43,7 @@ class RunResult:
 
     @property
     def finished(self) -> bool:
-        """Whether there are values."""
+        """Whether the run finished; only then are there values."""
         return self.status == "finished"
 
     @property
@@ -50,33 +53,33 @@ class RunResult:
 
     @property
     def rate(self) -> float:
-        """Particle-steps per second of stepping; 0 where nothing was timed."""
+        """Particle-steps per second, without the first step; 0 if nothing was timed."""
         return self.particles * max(self.steps - 1, 0) / self.seconds if self.seconds > 0 else 0.0
 
     def error(self, measure: str) -> float | None:
-        """Return the size of a measure, None where the run did not finish."""
+        """Return the absolute value of a measure; None if the run did not finish."""
         return abs(self.values[measure]) if self.finished else None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON can hold it."""
+        """Return the result as a dictionary for JSON."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "RunResult":
-        """Make one of what `as_dict` returned.
+        """Return the result from the dictionary of `as_dict`.
 
         Raises:
-            TypeError, KeyError: it is not that.
+            TypeError, KeyError: `data` does not have the fields of a result.
         """
         return cls(**{entry.name: data[entry.name] for entry in fields(cls)})
 
 
 def failure(message: str, status: Status = "failed", **facts: Any) -> RunResult:
-    """Return the result of a run that has no values."""
+    """Return the result of a run without values."""
     return RunResult(status, message, **facts)
 
 
 def not_finite(values: dict[str, float]) -> str:
-    """Return a sentence about the measures that are no finite numbers, "" where all are."""
+    """Return a message that lists the non-finite measures; "" if all are finite."""
     odd = [f"{name} is {value}" for name, value in values.items() if not math.isfinite(value)]
-    return f"The run came to its end, but {' and '.join(odd)}." if odd else ""
+    return f"The run finished, but {' and '.join(odd)}." if odd else ""

@@ -1,4 +1,4 @@
-"""Runs many cases side by side, each in a process of its own, so that none can harm another."""
+"""Executes runs concurrently, each in a separate process, so that the failure of one does not affect the others."""
 
 import json
 import os
@@ -10,16 +10,16 @@ from mpmcli.validation.matrix import Run
 from mpmcli.validation.run_result import RunResult, failure
 from mpmcli.validation.setting import Setting
 
-# Seconds that a run may take.
+# Default time limit of a run, s.
 TIMEOUT = 1800.0
-# Lines of stderr that are quoted on failure.
+# Number of lines of stderr that the message of a failed process contains.
 QUOTED = 3
-# One thread each: numpy's own would compete.
+# Environment that restricts numpy to one thread, so that concurrent processes do not compete for cores.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 def case_command(run: Run) -> list[str]:
-    """Return the command line that carries out a run."""
+    """Return the command line of the process that executes a run."""
     setting = json.dumps(run.setting.changed_from(Setting()))
     return [sys.executable, "-m", "mpmcli.validation.case_process", run.case, str(run.n), setting]
 
@@ -31,17 +31,18 @@ def carry_out_all(
     stop: Callable[[], bool] = lambda: False,
     command: Callable[[Run], list[str]] = case_command,
 ) -> Iterator[tuple[Run, RunResult]]:
-    """Yield each run with what came of it, as they end; a run that fails says so in its result.
+    """Yield (run, result) in the order in which the runs end. A failure is reported in the result.
 
     Args:
-        workers: how many run at a time; timeout: seconds that each may take.
-        stop: asked again and again whether to end all.
-        command: the command line of a run; tests replace it.
+        workers: number of concurrent processes.
+        timeout: time limit of a run, s.
+        stop: polled while runs are in progress; True ends all of them.
+        command: returns the command line of a run; tests replace it.
 
     Raises:
-        KeyboardInterrupt: `stop` said so. No process is left then, nor after any other end.
+        KeyboardInterrupt: `stop` returned True. No process is left running.
     """
-    # Settings of taichi from outside would change what is measured.
+    # Taichi reads settings from variables TI_*, which would affect the result.
     environment = {**dict.fromkeys(name for name in os.environ if name.startswith("TI_")), **ONE_THREAD}
     questions = (Question(command(run), timeout, environment, follows=True) for run in runs)
     for number, reply in ask_as_ended(questions, workers, stop):
@@ -49,7 +50,7 @@ def carry_out_all(
 
 
 def _result(reply: Reply) -> RunResult:
-    """Return what a process answered, or why it did not."""
+    """Return the result that a process wrote, or a failure if it wrote none."""
     try:
         if not reply.fault:
             return RunResult.from_dict(reply.answer)

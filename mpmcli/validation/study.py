@@ -1,4 +1,4 @@
-"""Carries out the matrix of a level, keeping and taking up what is done, and reports what was found."""
+"""Runs the matrix of a level and returns its report. Results in the journal are reused."""
 
 from collections.abc import Callable, Sequence
 
@@ -12,7 +12,7 @@ from mpmcli.validation.report import Report
 from mpmcli.validation.run_result import RunResult
 from mpmcli.validation.runner import TIMEOUT, carry_out_all, case_command
 
-# Told of each run as it ends, and how many of how many have.
+# Called with each finished run, its result, the number of finished runs and the number of all runs.
 OnRun = Callable[[Run, RunResult, int, int], None]
 
 
@@ -31,14 +31,16 @@ def study(
     """Run the cases at a level and return the report.
 
     Args:
-        workers: runs at a time, of one thread each.
-        journal: keeps every result, and has those that are not computed again; None keeps nothing.
-        timeout: seconds that a run may take.
-        on_run: see `OnRun`; resumed: told how many of all runs are taken from the journal.
-        stop: asked again and again whether to end; command: see `carry_out_all`.
+        workers: number of concurrent runs, of one thread each.
+        journal: stores every result, and provides results of earlier calls. None stores nothing.
+        timeout: time limit of a run, s.
+        on_run: called after each run, see `OnRun`.
+        resumed: called once with the number of runs taken from the journal and the number of all runs.
+        stop: polled while runs are in progress; True ends them.
+        command: command line of a run, see `carry_out_all`.
 
     Raises:
-        KeyboardInterrupt: `stop` said so; what is done is in the journal.
+        KeyboardInterrupt: `stop` returned True. The journal holds the results of finished runs.
     """
     environment = describe_environment(workers)
     runs = matrix(cases, level)
@@ -50,7 +52,7 @@ def study(
         try:
             keys[run] = run_key(named[run.case], run, environment["processor"])
         except InputError:
-            # It will say so itself, and is no result to be kept for another program.
+            # The run itself reports the error. Without a key its result is never reused.
             keys[run] = ""
         found = journal.find(run, keys[run])
         if found is not None:

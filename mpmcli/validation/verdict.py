@@ -1,4 +1,4 @@
-"""Whether a case came out as it should: bounds, orders, and single against double precision."""
+"""Verdict on a case: bounds of errors, orders of convergence, and single against double precision."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -9,7 +9,7 @@ from mpmcli.validation.matrix import Run, label_of
 from mpmcli.validation.run_result import RunResult
 from mpmcli.validation.setting import Setting
 
-# Single precision may have so much more error, where the error is above what rounding makes of it.
+# Largest ratio of f32 to f64 errors. It is checked for f64 errors above SINGLE_FLOOR, where rounding is negligible.
 SINGLE_RATIO = 1.2
 SINGLE_FLOOR = 1e-4
 
@@ -20,13 +20,16 @@ Results = Mapping[Run, RunResult]
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that must hold.
+    """One criterion and its outcome.
 
     Attributes:
-        subject: of what, such as "period error".
-        setting: of whose runs; n: at which resolution, None where it is about several.
-        figure: what was found, bound: what is right, as text; None where there is no figure.
-        passed: whether it holds; sentence: why, or why not.
+        subject: quantity, such as "period error".
+        setting: setting of the runs.
+        n: resolution; None if the check concerns several.
+        figure: value found; None if there is none.
+        bound: admissible values, as text.
+        passed: whether the criterion holds.
+        sentence: the outcome, in one sentence.
     """
 
     subject: str
@@ -40,30 +43,30 @@ class Check:
 
 @dataclass(frozen=True)
 class Verdict:
-    """All checks of a case, and what failed."""
+    """All checks of a case."""
 
     checks: tuple[Check, ...]
 
     @property
     def passed(self) -> bool:
-        """Whether everything holds."""
+        """Whether all checks passed."""
         return all(check.passed for check in self.checks)
 
     @property
     def word(self) -> str:
-        """It in a word."""
+        """Return "pass" or "fail"."""
         return "pass" if self.passed else "fail"
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """What does not hold, in sentences."""
+        """Sentences of the failed checks."""
         return tuple(check.sentence for check in self.checks if not check.passed)
 
 
 def judge(case: Case, results: Results) -> Verdict:
-    """Judge the runs of a case: those of the default setting by its bounds, f32 by those of f64.
+    """Check the default setting against the bounds of the case, and f32 against f64.
 
-    Other settings are there to be compared, and have no bounds.
+    Other settings have no bounds.
     """
     default = default_results(case, results)
     checks = [check for n, result in default.items() for check in _bound_checks(case, n, result)]
@@ -75,13 +78,13 @@ def judge(case: Case, results: Results) -> Verdict:
 
 
 def default_results(case: Case, results: Results) -> dict[int, RunResult]:
-    """Return the runs of a case with the default setting by their resolution, from coarse to fine."""
+    """Return the results of the default setting by resolution, from coarse to fine."""
     found = {run.n: result for run, result in results.items() if run.case == case.name and run.setting == Setting()}
     return dict(sorted(found.items()))
 
 
 def verdict_of_run(verdict: Verdict, run: Run) -> str | None:
-    """Return "pass" or "fail" of one run; None of a run that nothing is asked of."""
+    """Return "pass" or "fail" for one run; None if no check concerns it."""
     mine = [check for check in verdict.checks if check.n == run.n and check.setting == run.setting]
     return None if not mine else "pass" if all(check.passed for check in mine) else "fail"
 

@@ -9,7 +9,24 @@ from mpmcli.scene import Scene
 from mpmcli.validation.case import Case, Frames, Measure
 from mpmcli.validation.oscillation import fit_oscillation
 from mpmcli.validation.setting import Setting
-from mpmcli.validation.standing_wave import standing_wave_frequency
+
+
+def standing_wave_frequency(gravity: float, wave_number: float, depth: float, amplitude: float = 0.0) -> float:
+    """Return the angular frequency of a standing wave in water of finite depth, rad/s, to third order in its steepness.
+
+    For small waves w^2 = g k tanh(k d). In general w / sqrt(g k) = w0 + (a k)^2/2 w2, with w0^2 = tanh(k d) and
+    w2 = (9 w0^-7 - 12 w0^-3 - 3 w0 - 2 w0^5)/32 (Tadjbakhsh and Keller 1960, JFM 8:442).
+
+    Args:
+        gravity: m/s^2.
+        wave_number: 1/m.
+        depth: m.
+        amplitude: m.
+    """
+    w = math.sqrt(math.tanh(wave_number * depth))
+    curvature = (9 * w**-7 - 12 * w**-3 - 3 * w - 2 * w**5) / 32
+    return math.sqrt(gravity * wave_number) * (w + (amplitude * wave_number) ** 2 / 2 * curvature)
+
 
 LENGTH, DEPTH, AMPLITUDE, GRAVITY, DENSITY = 1.0, 0.5, 0.02, 9.81, 1000.0
 # Sound ten times as fast as what falls from the surface to the floor.

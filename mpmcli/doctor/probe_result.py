@@ -21,7 +21,7 @@ STATUSES: tuple[Status, ...] = ("ok", "information", "missing", "broken")
 
 
 @dataclass(frozen=True)
-class Finding:
+class ProbeResult:
     """One line of the report.
 
     Attributes:
