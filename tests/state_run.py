@@ -27,7 +27,7 @@ MATERIALS = {
     "sand": {"law": "sand", "density": 1600.0, "youngs_modulus": 3e5, "poissons_ratio": 0.3, "friction_angle": 30.0},
     "von_mises": {"law": "von_mises", **SOFT, "yield_stress": 500.0},
 }
-# Of the name of each scene: the materials of its bodies, its dimension, and further tables.
+# By the name of each scene: the materials of its bodies, its dimension, and further tables.
 SCENES = {name: ((name,), 2, {}) for name in MATERIALS} | {
     "3D": (("fluid",), 3, {}),
     "several bodies, FLIP": (("fluid", "fluid"), 2, {"solver": {"transfer": "aflip", "flip": 0.9}}),
@@ -109,4 +109,4 @@ def outcome(name: str, threads: int) -> dict[str, list[str]]:
 
 
 if __name__ == "__main__":
-    print(json.dumps({name: outcome(name, int(sys.argv[1])) for name in NAMES}))
+    print(json.dumps({name: outcome(name, int(sys.argv[1])) for name in sys.argv[2:] or NAMES}))
