@@ -1,4 +1,4 @@
-"""The problems that are measured: one block of fluid, moving down and splashing, at several sizes."""
+"""The benchmark cases: a falling block of fluid at several sizes."""
 
 from dataclasses import dataclass
 
@@ -43,11 +43,11 @@ class BenchCase:
         return "mpm3d" if self.dimension == 3 else "mpm88"
 
     def positions(self) -> np.ndarray:
-        """Return the positions that both start from, (particles, dimension) float64: uniform in the block."""
+        """Return the initial positions, (particles, dimension) float64: uniform in the block."""
         return CORNER + EDGE * np.random.default_rng(0).random((self.particles, self.dimension))
 
     def velocity(self) -> np.ndarray:
-        """Return the velocity of every particle at the start, (dimension,) float64, m/s."""
+        """Return the initial velocity, (dimension,) float64, m/s."""
         return np.array([0.0, -SPEED, 0.0][: self.dimension])
 
 

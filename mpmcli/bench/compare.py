@@ -1,4 +1,4 @@
-"""The comparison: both contestants alive, measured in turn, so that a busy machine slows both."""
+"""The comparison: both processes run at once and are measured alternately, so that other load affects both equally."""
 
 import json
 import os
@@ -17,12 +17,12 @@ from mpmcli.errors import RunError
 
 # Measured blocks of each contestant.
 BLOCKS = 5
-# A block of this many seconds comes first: caches and clocks settle, the later kernels compile.
+# Duration of the first block, s, which is not measured: the remaining kernels compile.
 WARM_UP = 0.3
 
 
 class Worker:
-    """A process of `mpmcli.bench.contestant` and the line to it.
+    """A process of `mpmcli.bench.contestant` and the pipe to it.
 
     Attributes:
         ready: its first answer.
@@ -66,7 +66,7 @@ class Worker:
         return self._answer()
 
     def close(self) -> None:
-        """End the process, whatever it is doing."""
+        """Kill the process if it is still running, and close its streams."""
         if self._process.poll() is None:
             self._process.kill()
         self._process.wait()
@@ -98,7 +98,7 @@ class Worker:
 
 @dataclass(frozen=True)
 class Setting:
-    """What both contestants run with.
+    """Settings of both contestants.
 
     Attributes:
         threads: of the processor.
@@ -135,14 +135,14 @@ def run_bench(
         cases: sizes to measure, of mpmcli.bench.cases.
         threads: of the processor, for both.
         seconds: length of one block.
-        progress: told one line of text as each case starts and each pair of blocks is done.
+        progress: called with a line of text for each case and each pair of blocks.
         blocks: measured blocks of each contestant.
         precision: "f32" or "f64", for both.
         arch: device, for both.
         start: makes the process of a contestant; tests replace it.
 
     Raises:
-        RunError: a contestant could not start, or broke down.
+        RunError: a contestant could not start or failed.
     """
     setting = Setting(threads, precision, arch)
     tell = progress or (lambda line: None)
@@ -191,7 +191,7 @@ def _contestant_result(worker: Worker, rates: list[float], first: float) -> Cont
     return ContestantResult(
         rates=tuple(rates),
         start_seconds=worker.start_seconds,
-        # What the first step took beyond a step's usual time.
+        # Time of the first step beyond that of a usual step.
         compile_seconds=max(0.0, first - typical),
         peak_memory=end["peak_memory"],
         bytes_per_particle=worker.ready["bytes_per_particle"],

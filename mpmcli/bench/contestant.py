@@ -1,4 +1,4 @@
-"""One contestant in a process of its own, told what to do line by line.
+"""Process of one contestant, controlled by commands on stdin, one per line.
 
     python -m mpmcli.bench.contestant ours|peer|LAW,LAW,... --dimension 3 --cells 128 --particles 524288 --step 8e-5
                                   [--threads 2] [--precision f32] [--arch cpu]
@@ -34,7 +34,7 @@ from mpmcli.errors import MpmcliError
 
 
 class Contestant(Protocol):
-    """What a worker measures: a simulation, ready to step."""
+    """A simulation that can be measured."""
 
     particles: int
     bytes_per_particle: int | None

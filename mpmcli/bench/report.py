@@ -1,4 +1,4 @@
-"""What a comparison found, as a table for people and as a dictionary for JSON."""
+"""The report of a comparison, as a text table and as a dictionary for JSON."""
 
 import importlib.metadata
 import os
@@ -93,7 +93,7 @@ class CaseResult:
 
 
 def describe_machine() -> dict:
-    """Return what the figures depend on: processor, system and versions."""
+    """Return processor, system and versions."""
     return {
         "processor": _processor_name(),
         "logical_processors": os.cpu_count(),
@@ -114,7 +114,7 @@ def _processor_name() -> str:
 
 
 def heading(machine: dict, arch: str, threads: int, precision: str) -> str:
-    """Return the line above a table that says what it was measured on."""
+    """Return the line above a table: machine, threads and precision."""
     count = f"{threads} {'thread' if threads == 1 else 'threads'}"
     return f"{machine['processor']}, {arch}, {count}, {precision}, taichi {machine['taichi']}"
 

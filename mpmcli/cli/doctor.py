@@ -19,16 +19,16 @@ def command(as_json: bool) -> int:
 
     width = max(len(each.name) for each in EXAMINATIONS)
     found = []
-    for name, finding in examine(EXAMINATIONS):
-        found.append((name, finding))
+    for name, result in examine(EXAMINATIONS):
+        found.append((name, result))
         if not as_json:
-            remedy = f"; {finding.remedy}" if finding.remedy else ""
-            print_text(f"{finding.status:<11}  {name:<{width}}  {finding.detail}{remedy}")
-    faults = [name for name, finding in found if finding.is_fault]
+            remedy = f"; {result.remedy}" if result.remedy else ""
+            print_text(f"{result.status:<11}  {name:<{width}}  {result.detail}{remedy}")
+    faults = [name for name, result in found if result.is_fault]
     if as_json:
         checks = [
-            {"name": name, "status": finding.status, "detail": finding.detail, "remedy": finding.remedy}
-            for name, finding in found
+            {"name": name, "status": result.status, "detail": result.detail, "remedy": result.remedy}
+            for name, result in found
         ]
         print_json({"ok": not faults, "checks": checks})
     elif faults:

@@ -1,4 +1,4 @@
-"""Progress of a long command for people, on stderr: a bar on a terminal, plain lines elsewhere."""
+"""Progress of a long command on stderr: a bar on a terminal, else plain lines."""
 
 import time
 from types import TracebackType
@@ -8,14 +8,14 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 
 class ProgressBar:
-    """Counts what is done, and says lines beside it; use it as a context around the work.
+    """A progress bar and messages beside it; use it as a context around the work.
 
     Args:
-        total: what the count ends at.
+        total: final count.
         unit: what is counted, in the plural ("frames").
         quiet: print nothing.
-        pause: seconds between two plain lines of `show`.
-        steady: whether all parts take about as long, so that the bar can tell the time left; else the time taken.
+        pause: least time between two plain lines of `show`, s.
+        steady: whether all units take about the same time. Then the bar shows the time left, else the time elapsed.
     """
 
     def __init__(self, total: int, unit: str, *, quiet: bool, pause: float = 5.0, steady: bool = True) -> None:
@@ -37,7 +37,7 @@ class ProgressBar:
 
     @property
     def drawn(self) -> bool:
-        """Whether there is a bar, and no plain line for each `show`."""
+        """Whether a bar is drawn; else `show` prints plain lines."""
         return self._task is not None
 
     def __enter__(self) -> "ProgressBar":
@@ -53,7 +53,7 @@ class ProgressBar:
             self._bar.stop()
 
     def show(self, done: int, text: str = "", more: str = "") -> None:
-        """Show how many are done, and what is on now; `more` stands in plain lines only."""
+        """Show the count and the current unit; `more` appears in plain lines only."""
         if self._task is not None:
             self._bar.update(self._task, completed=done, description=text)
         elif time.perf_counter() - self._spoke >= self._pause:
@@ -68,5 +68,5 @@ class ProgressBar:
         try:
             self._console.print(line, markup=False, highlight=False, soft_wrap=whole or not self._console.is_terminal)
         except (OSError, SystemExit):
-            # Nobody reads along any more (rich exits on a broken pipe): no reason to end the work.
+            # stderr is closed (rich exits on a broken pipe). The work continues.
             self._quiet = True

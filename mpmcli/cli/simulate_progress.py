@@ -1,4 +1,4 @@
-"""Progress of a run for people: its frames, and at the end how it went."""
+"""Progress of a run on stderr."""
 
 from contextlib import suppress
 from types import TracebackType
@@ -15,7 +15,7 @@ class SimulateProgress:
 
     Args:
         end: simulated time of the run, s.
-        frames: frames that it will store.
+        frames: number of frames to store.
         quiet: print nothing.
     """
 
@@ -36,7 +36,7 @@ class SimulateProgress:
         self._bar.__exit__(kind, error, trace)
 
     def start(self, summary: RunSummary) -> None:
-        """Print what was chosen for the user, what the check warns of, and the size of the run."""
+        """Print automatic choices, warnings of the check, and the size of the run."""
         for note in summary.notes:
             self._bar.say(note)
         backend, plan = summary.backend, summary.plan

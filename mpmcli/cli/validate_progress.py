@@ -1,4 +1,4 @@
-"""Progress of a validation for people: a line per run where there is no terminal."""
+"""Progress of a validation on stderr: a bar on a terminal, else a line per run."""
 
 from collections.abc import Sequence
 from types import TracebackType
@@ -13,7 +13,8 @@ class ValidateProgress:
     """Follows the runs of some cases; use it as a context around them.
 
     Args:
-        total: number of runs; workers: how many go on at a time.
+        total: number of runs.
+        workers: number of concurrent runs.
         quiet: print nothing.
     """
 
@@ -37,7 +38,7 @@ class ValidateProgress:
         self._bar.__exit__(kind, error, trace)
 
     def resumed(self, kept: int, total: int) -> None:
-        """Say how many runs were done before."""
+        """Print the number of runs taken from the journal."""
         self._bar.say(f"{kept} of {total} runs are done already, by the same program")
         if self._bar.drawn:
             self._bar.show(kept)

@@ -1,4 +1,4 @@
-"""Taichi on each of its backends, by really starting it."""
+"""Examines the backends of Taichi by starting them."""
 
 import importlib.metadata
 
@@ -6,7 +6,7 @@ from mpmcli.doctor.probe_result import ProbeResult
 
 
 def cpu() -> ProbeResult:
-    """Examine the backend that always has to work."""
+    """Examine the CPU backend, which is required."""
     from mpmcli.solver.trial import try_backend
 
     started = try_backend("cpu")
@@ -15,17 +15,17 @@ def cpu() -> ProbeResult:
 
 
 def cuda() -> ProbeResult:
-    """Examine NVIDIA's GPUs, which --arch auto takes where there are any."""
+    """Examine CUDA, which --arch auto selects on NVIDIA GPUs."""
     return _gpu("cuda")
 
 
 def vulkan() -> ProbeResult:
-    """Examine Vulkan, whose device may be software."""
+    """Examine Vulkan, whose device may be a software renderer."""
     return _gpu("vulkan")
 
 
 def metal() -> ProbeResult:
-    """Examine Apple's GPUs, which --arch auto takes where there are any."""
+    """Examine Metal, which --arch auto selects on Apple GPUs."""
     return _gpu("metal")
 
 

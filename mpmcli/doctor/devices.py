@@ -1,11 +1,11 @@
-"""The names of GPUs, asked of their drivers, as Taichi does not say them."""
+"""Names of GPUs, queried from their drivers, since Taichi does not provide them."""
 
 import ctypes
 import sys
 from dataclasses import dataclass
 
 NAME_LENGTH = 256
-# Of VkPhysicalDeviceProperties: where type and name lie, and more than its size; the type of a processor.
+# VkPhysicalDeviceProperties: offsets of deviceType and deviceName, an upper bound of its size, and the type of a CPU.
 VULKAN_TYPE, VULKAN_NAME, VULKAN_SIZE, VULKAN_CPU = 16, 20, 4096, 4
 VULKAN_LIBRARIES = {"linux": "libvulkan.so.1", "win32": "vulkan-1.dll", "darwin": "libvulkan.1.dylib"}
 CUDA_LIBRARIES = {"linux": "libcuda.so.1", "win32": "nvcuda.dll"}
@@ -13,14 +13,14 @@ CUDA_LIBRARIES = {"linux": "libcuda.so.1", "win32": "nvcuda.dll"}
 
 @dataclass(frozen=True)
 class Device:
-    """A device by its driver's name; `is_software` where the processor plays it."""
+    """A device: its name, and whether it is emulated by the CPU."""
 
     name: str
     is_software: bool = False
 
 
 def device_names(arch: str) -> list[Device]:
-    """Return the devices of a backend; none where the driver does not say."""
+    """Return the devices of a backend; empty if the driver cannot be queried."""
     asked = {"cuda": (_cuda, CUDA_LIBRARIES), "vulkan": (_vulkan, VULKAN_LIBRARIES)}
     if arch not in asked:
         return []
@@ -46,7 +46,7 @@ def _cuda(driver: ctypes.CDLL) -> list[Device]:
 
 
 class _InstanceInfo(ctypes.Structure):
-    """VkInstanceCreateInfo; sType is 1, everything else may be nothing."""
+    """VkInstanceCreateInfo; sType is 1, all other members may be zero."""
 
     _fields_ = (
         ("sType", ctypes.c_int),

@@ -1,4 +1,4 @@
-"""What draws: VTK's window, PyVista, the surface of particles, matplotlib and Pillow."""
+"""Examines graphics libraries: VTK and its window, PyVista, pysplashsurf, matplotlib, Pillow."""
 
 import importlib.metadata
 
@@ -6,7 +6,7 @@ from mpmcli.doctor.probe_result import ProbeResult
 
 
 def vtk() -> ProbeResult:
-    """Examine VTK by letting it draw, which ends the process where its window is missing; so that has its own."""
+    """Examine VTK by drawing. A missing window may abort the process, so each window is tried in a separate one."""
     from vtkmodules.vtkCommonCore import vtkVersion
 
     from mpmcli.render.window import remedy, try_windows, why_none
@@ -20,14 +20,14 @@ def vtk() -> ProbeResult:
 
 
 def pyvista() -> ProbeResult:
-    """Examine PyVista by loading it."""
+    """Examine PyVista by importing it."""
     import pyvista
 
     return ProbeResult("ok", pyvista.__version__)
 
 
 def pysplashsurf() -> ProbeResult:
-    """Examine the reconstruction of surfaces on a cube of particles."""
+    """Examine pysplashsurf by reconstructing the surface of a cube of particles."""
     import numpy as np
     import pysplashsurf
 
@@ -43,14 +43,14 @@ def pysplashsurf() -> ProbeResult:
 
 
 def matplotlib() -> ProbeResult:
-    """Examine matplotlib by loading it."""
+    """Examine matplotlib by importing it."""
     import matplotlib
 
     return ProbeResult("ok", matplotlib.__version__)
 
 
 def pillow() -> ProbeResult:
-    """Examine Pillow by letting it write a letter."""
+    """Examine Pillow by drawing a letter."""
     import PIL
     from PIL import Image, ImageDraw
 

@@ -1,4 +1,4 @@
-"""Runs every examination in a process of its own, so that none can stop the others, and reports in order."""
+"""Runs every examination in a separate process, so that a crash affects only one, and reports in order."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -8,27 +8,27 @@ from mpmcli.doctor.probe_result import STATUSES, ProbeResult, library_remedy, pa
 from mpmcli.errors import MpmcliError
 from mpmcli.processes.questions import Question, Reply, ask_each, module_command
 
-# Processes at a time: each of them loads libraries, and then waits little.
+# Number of concurrent processes. They mostly load libraries.
 AT_ONCE = 2
-# Seconds; a cold disk may need most of them for a large library.
+# Time limit, s. Loading a large library from a cold disk may take most of it.
 TIMEOUT = 60.0
-# Three windows may be tried, each as long as the first picture may wait.
+# Time limit for three window types, s.
 WINDOW_TIMEOUT = 400.0
-# Characters of a detail.
+# Maximum length of a detail, characters.
 LONGEST = 300
 
 
 @dataclass(frozen=True)
 class Examination:
-    """What is examined.
+    """One component to examine.
 
     Attributes:
-        name: what the report calls it.
-        examine: finds out; loads what it needs itself.
-        package: the distribution that it is about, "" for none.
-        remedy: what to do where it is broken, if not install the package again.
-        needed: whether mpmcli is less than whole without it.
-        timeout: seconds.
+        name: name in the report.
+        examine: examines the component; imports the libraries it needs.
+        package: distribution that provides the component; "" for none.
+        remedy: remedy for a broken component; "" for reinstalling the package.
+        needed: whether mpmcli requires the component.
+        timeout: time limit, s.
     """
 
     name: str
@@ -44,7 +44,7 @@ EXAMINATIONS = (
     Examination("python", interpreter.python),
     Examination("mpmcli", interpreter.mpmcli, "mpmcli"),
     Examination("taichi cpu", backends.cpu, "taichi"),
-    # Where it is there, --arch auto takes it.
+    # --arch auto selects CUDA if it is available.
     Examination("taichi cuda", backends.cuda, "taichi", DRIVER),
     Examination("taichi vulkan", backends.vulkan, "taichi", DRIVER, needed=False),
     Examination("taichi metal", backends.metal, "taichi", DRIVER),
@@ -63,7 +63,7 @@ EXAMINATIONS = (
 
 
 def examine(examinations: Sequence[Examination] = EXAMINATIONS) -> Iterator[tuple[str, ProbeResult]]:
-    """Yield (name, finding) of every examination, in order, as they end."""
+    """Yield (name, result) of every examination, in order."""
     command = module_command("mpmcli.doctor.probe_process")
     questions = [Question([*command, each.name], each.timeout, leads_a_group=True) for each in examinations]
     for each, reply in zip(examinations, ask_each(questions, AT_ONCE), strict=True):
@@ -71,11 +71,11 @@ def examine(examinations: Sequence[Examination] = EXAMINATIONS) -> Iterator[tupl
 
 
 def attempt(each: Examination) -> ProbeResult:
-    """Examine in this process; what an examination raises is a finding, too."""
+    """Examine in this process. Exceptions become faults."""
     try:
         return each.examine()
     except ModuleNotFoundError as error:
-        # A package that does not find a part of its own is broken.
+        # A package that lacks one of its own modules is broken.
         if error.name and "." not in error.name:
             return _fault(each, "missing", f"the package {error.name} is not installed")
         return _fault(each, "broken", f"{type(error).__name__}: {error}")
@@ -86,14 +86,14 @@ def attempt(each: Examination) -> ProbeResult:
 
 
 def judge(each: Examination, reply: Reply) -> ProbeResult:
-    """Make a finding of what the process of an examination left."""
+    """Return the result from the reply of the process of an examination."""
     if reply.answer.get("status") not in STATUSES:
         return _fault(each, "broken", f"its trial {reply.fault or 'gave no answer'}")
-    finding = ProbeResult(**reply.answer)
-    finding = replace(finding, detail=_line(finding.detail))
-    if reply.fault and not finding.is_fault:
-        return _fault(each, "broken", f"{finding.detail}; then its trial {reply.fault}")
-    return finding
+    result = ProbeResult(**reply.answer)
+    result = replace(result, detail=_line(result.detail))
+    if reply.fault and not result.is_fault:
+        return _fault(each, "broken", f"{result.detail}; then its trial {reply.fault}")
+    return result
 
 
 def _fault(each: Examination, status: str, detail: str) -> ProbeResult:
@@ -104,6 +104,6 @@ def _fault(each: Examination, status: str, detail: str) -> ProbeResult:
 
 
 def _line(detail: str) -> str:
-    """Return a detail as one line that is not too long: of a sermon, how it begins and how it ends."""
+    """Return a detail as one line. A long one is shortened in the middle."""
     line = " ".join(detail.split())
     return line if len(line) <= LONGEST else f"{line[: LONGEST // 3]} ... {line[-2 * LONGEST // 3 :]}"

@@ -1,16 +1,16 @@
-"""What writes files: HDF5 with its filters, and ffmpeg with its encoder."""
+"""Examines the libraries that write files: HDF5 with its filters, and ffmpeg with its encoder."""
 
 import io
 import subprocess
 
 from mpmcli.doctor.probe_result import ProbeResult, package_remedy
 
-# Seconds; it takes a tenth of one.
+# Time limit, s. It usually takes 0.1 s.
 FFMPEG_TIMEOUT = 20.0
 
 
 def hdf5() -> ProbeResult:
-    """Examine h5py by writing and reading back a file in memory, with the filters that results have."""
+    """Examine h5py by writing and reading back a file in memory, with the filters of results."""
     import h5py
     import numpy as np
 
@@ -29,7 +29,7 @@ def hdf5() -> ProbeResult:
 
 
 def ffmpeg() -> ProbeResult:
-    """Examine the program that makes films by letting it encode one image."""
+    """Examine ffmpeg, which encodes films, by encoding one image."""
     import imageio_ffmpeg
 
     try:

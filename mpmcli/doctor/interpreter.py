@@ -1,4 +1,4 @@
-"""Python and mpmcli themselves."""
+"""Examines the Python interpreter and the mpmcli package."""
 
 import platform
 import sys
@@ -7,12 +7,12 @@ from pathlib import Path
 from mpmcli import __version__
 from mpmcli.doctor.probe_result import ProbeResult
 
-# As pyproject.toml says.
+# As in pyproject.toml.
 OLDEST, NEWEST = (3, 11), (3, 13)
 
 
 def python(version: tuple[int, int] = sys.version_info[:2]) -> ProbeResult:
-    """Examine the interpreter, of this version."""
+    """Examine the version of the interpreter."""
     place = (
         f"virtual environment {sys.prefix}"
         if sys.prefix != sys.base_prefix

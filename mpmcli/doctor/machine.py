@@ -1,4 +1,4 @@
-"""Disk, memory and processor."""
+"""Examines disk, memory and processor."""
 
 import os
 import shutil
@@ -8,15 +8,15 @@ from pathlib import Path
 from mpmcli.doctor.probe_result import ProbeResult
 from mpmcli.plain_text import size_text
 
-# Bytes; below that a run of the size of the demo may not fit.
+# Bytes. Below this a run of the size of the demo may not fit.
 LITTLE_DISK = LITTLE_MEMORY = 1e9
-# Bytes; below that nothing useful can be written.
+# Bytes. Below this nothing useful can be written.
 NO_DISK = 1e7
 CGROUP = Path("/sys/fs/cgroup")
 
 
 def current_directory() -> ProbeResult:
-    """Examine where results are written when nothing else is said."""
+    """Examine the current directory, the default place of results."""
     place = Path.cwd()
     elsewhere = "go to a directory of your own, or name one by -o"
     try:
@@ -33,7 +33,7 @@ def current_directory() -> ProbeResult:
 
 
 def kernel_cache() -> ProbeResult:
-    """Examine where compiled kernels are kept for the next run, which works without."""
+    """Examine the cache of compiled kernels, which is optional."""
     place = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
     try:
         place.mkdir(parents=True, exist_ok=True)
@@ -50,7 +50,7 @@ def kernel_cache() -> ProbeResult:
 
 
 def memory() -> ProbeResult:
-    """Examine how much memory there is, and how much of it a run may take."""
+    """Examine the memory available to a run."""
     import psutil
 
     whole = psutil.virtual_memory()
@@ -65,7 +65,7 @@ def memory() -> ProbeResult:
 
 
 def cores() -> ProbeResult:
-    """Examine how many cores a run may use."""
+    """Examine the number of cores available to a run."""
     there = os.cpu_count() or 1
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else there
     detail = f"{usable} of {there} usable"
@@ -80,13 +80,13 @@ def cores() -> ProbeResult:
 
 
 def memory_limit(root: Path = CGROUP) -> int | None:
-    """Return the bytes that the container may take, None without a limit; both versions of Linux' control groups."""
+    """Return the memory limit of the container, bytes, from Linux control groups v2 or v1; None without a limit."""
     words = _words(root / "memory.max") or _words(root / "memory" / "memory.limit_in_bytes")
     return int(words[0]) if words and words[0].isdigit() else None
 
 
 def processor_limit(root: Path = CGROUP) -> float | None:
-    """Return the cores whose time the container may take, None without a limit."""
+    """Return the processor limit of the container, in cores; None without a limit."""
     words = _words(root / "cpu.max") or [
         word for name in ("cpu.cfs_quota_us", "cpu.cfs_period_us") for word in _words(root / "cpu" / name)
     ]

@@ -1,13 +1,13 @@
-"""What an examination found."""
+"""Results of the probes of `mpmcli doctor`, and remedies."""
 
 import importlib.metadata
 import re
 from dataclasses import dataclass
 from typing import Literal
 
-# "missing" and "broken" are faults: something that mpmcli needs is not there, or does not work.
+# "missing" and "broken" are faults: a required component is absent or does not work.
 Status = Literal["ok", "information", "missing", "broken"]
-# Libraries of the system that the wheels of our packages load, and who brings them on Debian and Ubuntu.
+# System libraries that the wheels of required packages load, and their Debian and Ubuntu packages.
 SYSTEM_PACKAGES = {
     "libX11.so.6": "libx11-6",
     "libXrender.so.1": "libxrender1",
@@ -26,8 +26,8 @@ class ProbeResult:
 
     Attributes:
         status: "ok", "information", "missing" or "broken".
-        detail: what was found, in a line.
-        remedy: what the user can do about it, "" where there is nothing to do.
+        detail: the result, in one line.
+        remedy: what the user can do; "" if nothing is required.
     """
 
     status: Status
@@ -36,17 +36,21 @@ class ProbeResult:
 
     @property
     def is_fault(self) -> bool:
-        """Whether something that mpmcli needs does not work."""
+        """Whether a required component is missing or broken."""
         return self.status in ("missing", "broken")
 
 
 def package_remedy(package: str, *, again: bool = False) -> str:
-    """Return the command that installs a package in the version that mpmcli asks for."""
+    """Return the command that installs a package in the version that mpmcli requires.
+
+    Args:
+        again: reinstall the package.
+    """
     return f"{'install it again' if again else 'install it'} by `python -m pip install {_requirement(package, again)}`"
 
 
 def library_remedy(complaint: str) -> str:
-    """Return how to install the library of the system that the dynamic linker misses; "" where it misses none."""
+    """Return how to install the system library that the dynamic linker did not find; "" if none is named."""
     missed = re.search(r"(lib[\w.+-]*\.so[\d.]*): (?:cannot open shared object|file too short)", complaint)
     if missed is None:
         return ""

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from typing import IO
 
 PAUSE = 0.01
-# Seconds to wait for a killed process; one that the system cannot end is left behind.
+# Time to wait for a killed process, s.
 LAST_WAIT = 5.0
-# Characters of its messages that are kept, from the end.
+# Number of characters of stderr that are kept, from the end.
 COMPLAINT_LENGTH = 2000
 
 
@@ -26,8 +26,8 @@ class Question:
 
     Attributes:
         command: program and arguments.
-        timeout: seconds after which it is ended.
-        environment: variables added to those of this process; None takes one away.
+        timeout: time limit, s.
+        environment: variables added to those of this process; None removes one.
         leads_a_group: whether it is ended together with the processes that it has started.
         follows: whether its stdin is a pipe from this process, by which `end_with_parent` works. Ctrl-C at the
             terminal does not reach it.
@@ -42,11 +42,11 @@ class Question:
 
 @dataclass(frozen=True)
 class Reply:
-    """What a process left.
+    """The outcome of a process.
 
     Attributes:
-        answer: its JSON objects, joined; empty where there were none.
-        fault: "" where it answered and ended well; else what happened, as in "died by SIGSEGV".
+        answer: its JSON objects, merged; empty if there were none.
+        fault: "" if it answered and exited with 0; else the reason, such as "died by SIGSEGV".
         complaint: the end of what it wrote on stderr.
     """
 
@@ -83,10 +83,10 @@ def ask_as_ended(
 
     Args:
         questions: each is taken when its process starts.
-        stop: called again and again; returns whether to end all processes.
+        stop: polled while processes are running; True ends all of them.
 
     Raises:
-        KeyboardInterrupt: `stop` returned True. No process is left then, nor after any other end.
+        KeyboardInterrupt: `stop` returned True. No process is left running.
     """
     going: dict[int, _Child] = {}
     waiting = enumerate(questions)

@@ -1,4 +1,4 @@
-"""Clamped beams that a load of fixed direction bends far: Reissner's beam, and the elastica as its thin limit."""
+"""Large deflection of clamped beams under a load of fixed direction: Reissner's beam, and the elastica as its limit."""
 
 import math
 from dataclasses import dataclass
@@ -14,9 +14,10 @@ class Beam:
     """A beam of length 1 and bending stiffness EI = 1, straight along x and clamped at 0, with a load along y.
 
     Attributes:
-        load: P L^2 / EI, all of it together.
-        spread: part of the length, from the free end on, over which the load is spread evenly.
-        axial: EA L^2 / EI; shear: k G A L^2 / EI. Both are infinite in the elastica.
+        load: total load, P L^2 / EI.
+        spread: fraction of the length, at the free end, over which the load is uniformly distributed.
+        axial: EA L^2 / EI; infinite for the elastica.
+        shear: k G A L^2 / EI; infinite for the elastica.
     """
 
     load: float
@@ -25,7 +26,7 @@ class Beam:
     shear: float = math.inf
 
     def bent(self) -> "BentLine":
-        """Return the centre line at rest, by shooting: the moment at the clamp for which that at the tip vanishes.
+        """Return the centre line in equilibrium, by shooting for the moment at the clamp with zero tip moment.
 
         theta' = M, M' = -x' f, (x, y)' = (1 + N/EA) (cos, sin) theta + V/kGA (-sin, cos) theta with N = f sin theta,
         V = f cos theta, and f the part of the load that acts beyond s (Reissner 1972).
@@ -34,7 +35,7 @@ class Beam:
         s = np.linspace(0.0, bend, STEPS + 1)
         if self.spread:
             s = np.concatenate([s, np.linspace(bend, 1.0, STEPS + 1)[1:]])
-        # Above it the moment of an elastica never vanishes: M^2 / 2 + load sin theta is the same all along.
+        # Upper bound for an elastica, for which M^2 / 2 + load sin theta is constant along the beam.
         low, high = 0.0, 1.2 * math.sqrt(2 * self.load)
         for _ in range(BISECTIONS):
             moment = (low + high) / 2
@@ -52,7 +53,7 @@ class Beam:
         return np.array([x, along * d + across * c, moment, -x * f])
 
     def _shoot(self, s: np.ndarray, moment: float) -> np.ndarray:
-        """Return (x, y, theta, M) at places s, (n, 4), by the method of Runge and Kutta from the clamp on."""
+        """Return (x, y, theta, M) at places s, (n, 4), by the classical Runge-Kutta method from the clamp."""
         states = np.empty((len(s), 4))
         states[0] = state = np.array([0.0, 0.0, 0.0, moment])
         for k, (a, b) in enumerate(pairwise(s)):
@@ -84,7 +85,7 @@ class BentLine:
         return float(self.states[-1, 2])
 
     def at(self, place: float) -> np.ndarray:
-        """Return (x, y) at a place from 0 to 1, by the cubic through two states and their slopes."""
+        """Return (x, y) at a place from 0 to 1, by cubic Hermite interpolation."""
         k = int(np.clip(np.searchsorted(self.s, place) - 1, 0, len(self.s) - 2))
         h = self.s[k + 1] - self.s[k]
         r = (place - self.s[k]) / h

@@ -1,4 +1,4 @@
-"""Axes of the figures: logarithms with few plain ticks, names of points, and crosses for runs that failed."""
+"""Axes of the figures: logarithmic ticks, labels of points, and crosses for failed runs."""
 
 import math
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
 
-# An error of nothing is drawn here.
+# Ordinate of a zero error.
 LOWEST = 1e-17
-# Share of the width of a panel that is kept for crosses.
+# Fraction of the panel width reserved for crosses.
 STRIP = 0.08
-# A logarithmic axis spans no less than this: a flat curve shall look flat.
+# Minimum ratio of the limits of a logarithmic axis, so that a flat curve looks flat.
 LEAST_SPAN = 16.0
 # Largest number of powers of ten with a label.
 MOST_TICKS = 7
@@ -29,13 +29,13 @@ def shown(error: float) -> float:
 
 
 def label_axes(axes: "Axes", measure: Measure, what: str) -> None:
-    """Name both axes: an error over something."""
+    """Label both axes; the ordinate is the error."""
     axes.set_xlabel(what)
     axes.set_ylabel(measure.name + (f" ({measure.unit})" if measure.unit else ""))
 
 
 def logarithmic_x(axes: "Axes", values: Sequence[float]) -> None:
-    """Let the x axis show positive values, with room for names on the left and for crosses on the right."""
+    """Make the x axis logarithmic, with margins for labels on the left and crosses on the right."""
     axes.set_xscale("log")
     low, high = _limits(values)
     axes.set_xlim(low / (high / low) ** 0.08, high * (high / low) ** STRIP)
@@ -43,7 +43,7 @@ def logarithmic_x(axes: "Axes", values: Sequence[float]) -> None:
 
 
 def logarithmic_y(axes: "Axes", errors: Sequence[float]) -> None:
-    """Let the y axis show errors, with some room around."""
+    """Make the y axis logarithmic, with margins around the errors."""
     axes.set_yscale("log")
     axes.set_ylim(*_limits([shown(error) for error in errors]))
     _ticks(axes.yaxis, *axes.get_ylim())
@@ -69,7 +69,7 @@ def _ticks(axis: "Axis", low: float, high: float) -> None:
 
 
 def number_text(value: float) -> str:
-    """Write a round number: plainly where it is short, or else as a power of ten."""
+    """Return a round number as text, as a decimal or a power of ten."""
     if 0.999e-3 <= value < 1e4:
         return f"{value:.3g}"
     power = math.floor(math.log10(value) + 1e-9)
@@ -78,7 +78,7 @@ def number_text(value: float) -> str:
 
 
 def number_ticks(axes: "Axes", places: Sequence[float], *, logarithmic: bool) -> None:
-    """Let the x axis have ticks at these places only, written as plain numbers."""
+    """Set ticks of the x axis at the given places, labelled with plain numbers."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
     low, high = min(places), max(places)
@@ -95,14 +95,14 @@ def number_ticks(axes: "Axes", places: Sequence[float], *, logarithmic: bool) ->
 
 
 def name_points(axes: "Axes", points: Sequence[tuple[float, float, int]]) -> None:
-    """Write the resolution beside (x, y, n)."""
+    """Label points (x, y, n) with their resolution n."""
     for x, y, n in points:
         text = f"n = {n}" if n == points[0][2] else f"{n}"
         axes.annotate(text, (x, y), xytext=(-5, -13), textcoords="offset points", ha="right", fontsize=8.5, zorder=6)
 
 
 def mark_target(axes: "Axes", target: float) -> None:
-    """Draw the line of an error, where it is within what is shown."""
+    """Draw a horizontal line at an error, if it is within the limits of the axis."""
     low, high = axes.get_ylim()
     if low < target < high:
         axes.axhline(target, color="#999999", linewidth=1.0, linestyle=(0, (1, 2)), zorder=1)
@@ -111,7 +111,7 @@ def mark_target(axes: "Axes", target: float) -> None:
 
 
 def mark_failures(axes: "Axes", failed: Sequence[Run]) -> None:
-    """Put a cross at the right edge for every run without a result: whatever it is given, it gets nowhere."""
+    """Draw a cross at the right edge for every failed run."""
     from matplotlib.patches import Rectangle
 
     failed = list(dict.fromkeys(failed))
@@ -128,9 +128,9 @@ def mark_failures(axes: "Axes", failed: Sequence[Run]) -> None:
 
 
 def crosses_on_top(axes: "Axes", failed: Sequence[tuple[float, Run]]) -> None:
-    """Put a cross at the top for every (x, run without a result), below each other where they share an x."""
+    """Draw a cross at the top for every failed run (x, run), stacked at equal x."""
     heights: dict[float, int] = {}
-    # Room for them above everything else.
+    # Extend the axis to make room for the crosses.
     most = max((sum(x == other for other, _ in failed) for x, _ in failed), default=0)
     low, high = axes.get_ylim()
     axes.set_ylim(low, low * (high / low) ** (1 / (1 - min(0.055 * most, 0.5))))

@@ -1,4 +1,4 @@
-"""The figure of all settings: what each does to error and time, in every case and on average."""
+"""The figure of all settings: ratios of error and time in every case, and their means."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ from mpmcli.validation.figures import Format, drawing, saved
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Inches: of a setting, and of what is around.
+# Height of a row and of the margins, inches.
 ROW, AROUND = 0.36, 1.5
 
 
@@ -54,7 +54,7 @@ def _draw_row(axes: "Axes", row: int, entry: Compared, ratio: Ratios | None) -> 
 
 
 def _mark_failed(axes: "Axes", row: int, entry: Compared) -> None:
-    """Write on the right of a row how many of its runs failed."""
+    """Write the number of failed runs to the right of a row."""
     if entry.failed:
         place, color = axes.get_yaxis_transform(), style_of(entry.setting).color
         cross = {"color": color, "markersize": 7, "markeredgewidth": 2, "clip_on": False}

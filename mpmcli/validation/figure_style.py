@@ -1,4 +1,4 @@
-"""The same colour and marker for one setting in every figure."""
+"""Colours and markers of settings, the same in every figure."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +8,7 @@ from mpmcli.validation.setting import Setting
 
 @dataclass(frozen=True)
 class Style:
-    """How a setting is drawn: colours that are told apart by colour-blind people too, and markers besides."""
+    """Line and marker style of a setting. The colours suit colour-blind readers."""
 
     color: str
     marker: str
@@ -19,7 +19,7 @@ class Style:
     above: int = 3
 
     def keywords(self) -> dict[str, Any]:
-        """Return it as keywords of matplotlib's `plot`."""
+        """Return keyword arguments for matplotlib's `plot`."""
         return {
             "color": self.color,
             "marker": self.marker,
@@ -34,7 +34,7 @@ class Style:
 
 
 DEFAULT = Style("#000000", "o", size=6.5, width=2.2, above=5)
-# Single precision lies on top of double: open and dashed, it leaves the line below to be seen.
+# Single precision usually coincides with double, so it is dashed with open markers.
 STYLES: dict[tuple[str, object], Style] = {
     ("precision", "f32"): Style("#0072b2", "s", size=9.5, dashes=(3.0, 2.0), filled=False, above=4),
     ("kernel", "quadratic"): Style("#117733", "<"),
@@ -48,7 +48,7 @@ STYLES: dict[tuple[str, object], Style] = {
     ("per_axis", 2): Style("#332288", "8"),
     ("per_axis", 3): Style("#5e3c99", ">", size=7.0),
 }
-# All values of the Courant fraction are one series.
+# Style of the series over the Courant fraction.
 SWEEP = Style("#777777", "d", size=5.5, width=1.0, dashes=(1.0, 1.5), above=2)
 OTHER = Style("#aaaaaa", ".")
 

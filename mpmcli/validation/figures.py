@@ -1,4 +1,4 @@
-"""The figure of a case: error against cost, resolution and Courant fraction, as an SVG that is always the same."""
+"""The figure of a case: error against cost, resolution and Courant fraction, as a reproducible SVG."""
 
 import io
 import re
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Text stays text: small files, and words that can be searched. Ids come from the content, not from chance.
+# Text is stored as text, which keeps files small and searchable. Ids are derived from the content.
 RC = {
     "svg.fonttype": "none",
     "svg.hashsalt": "mpmcli",
@@ -49,7 +49,7 @@ RC = {
     "legend.frameon": False,
 }
 SIZE = (10.0, 8.4)
-# The line of the expected slope runs so much below the finest error.
+# Offset of the line of the expected slope, as a factor of the finest error.
 SLOPE_BELOW = 0.5
 
 Series = Sequence[tuple[Run, RunResult]]
@@ -62,7 +62,7 @@ def draw_case(report: CaseReport, form: Format = "svg") -> bytes:
     """Return the figure of a case.
 
     Args:
-        form: "svg", or "png" to look at it.
+        form: "svg" or "png".
     """
     with drawing(SIZE) as figure:
         panels = figure.subplots(2, 2)
@@ -82,7 +82,11 @@ def draw_case(report: CaseReport, form: Format = "svg") -> bytes:
 
 @contextmanager
 def drawing(size: tuple[float, float]) -> "Iterator[Figure]":
-    """Give an empty figure of some inches to draw, in the style of all figures."""
+    """Provide an empty figure in the common style.
+
+    Args:
+        size: width and height, inches.
+    """
     import matplotlib
     from matplotlib.figure import Figure
 
@@ -93,7 +97,7 @@ def drawing(size: tuple[float, float]) -> "Iterator[Figure]":
 
 
 def saved(figure: "Figure", form: Format) -> bytes:
-    """Return a figure as a file; the same drawing gives the same bytes."""
+    """Return a figure as the bytes of a file. Equal figures give equal bytes."""
     content = io.BytesIO()
     unsaid = {"Date": None, "Creator": None} if form == "svg" else {"Software": None}
     figure.savefig(content, format=form, metadata=unsaid, dpi=90)
@@ -101,11 +105,11 @@ def saved(figure: "Figure", form: Format) -> bytes:
 
 
 def _compact(svg: str) -> str:
-    """Leave out of an SVG what nobody sees: comments, indentation, names of groups, digits beyond a hundredth."""
+    """Return an SVG without comments, indentation and names of groups, with coordinates rounded to 0.01."""
     svg = re.sub(r"<!-- .*? -->\n?", "", svg)
     svg = re.sub(r' id="[A-Za-z0-9.]+_\d+"', "", svg)
     svg = re.sub(r' transform="rotate\(-0 [^)]*\)"', "", svg)
-    # The font of all texts is said once.
+    # A common font is stated once.
     fonts = set(re.findall(r"font-family: [^;\"]*", svg))
     if len(fonts) == 1:
         svg = re.sub(r" *font-family: [^;\"]*;?", "", svg).replace("</style>", f"text{{{fonts.pop()}}}</style>", 1)

@@ -1,20 +1,20 @@
-"""What one step of the scheme does to a small elastic wave, by von Neumann's analysis (docs/theory.md, 2.4)."""
+"""Dispersion and dissipation of a small elastic wave by the scheme, from von Neumann analysis (docs/theory.md, 2.4)."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-# Cells around a particle, or particles around a node, that a quadratic B-spline can reach.
+# Offsets of cells within the support of a quadratic B-spline.
 NEIGHBOURS = range(-3, 4)
 
 
 @dataclass(frozen=True)
 class DiscreteWave:
-    """What becomes of a wave e^(i(kx - wt)) with w = c k.
+    """Numerical errors of a wave e^(i(kx - wt)) with w = c k.
 
     Attributes:
-        period_error: its period over the exact one, less 1.
-        loss_per_step: of its energy.
+        period_error: period over the exact one, minus 1.
+        loss_per_step: fraction of the energy lost in a step.
     """
 
     period_error: float
@@ -22,7 +22,7 @@ class DiscreteWave:
 
 
 def discrete_wave(kh: float, courant: float, per_axis: int) -> DiscreteWave:
-    """Return what MLS-MPM with APIC, quadratic B-splines and leapfrog makes of a wave along an axis.
+    """Return the errors of MLS-MPM with APIC, quadratic B-splines and leapfrog for a wave along an axis.
 
     Each particle of a cell has the amplitudes v, C and the strain e, in units of h and c: the nodes take
     sum_p w (v + (x_i - x_p)(C - 4 C_0 e)) / sum_p w with the Courant number C_0, the particles gather v and C from

@@ -1,4 +1,4 @@
-"""The dam breaks that Martin and Moyce measured in 1952, and how far a computed one is from them."""
+"""Dam breaks measured by Martin and Moyce (1952), and the deviation of computed ones."""
 
 import math
 import tomllib
@@ -10,11 +10,11 @@ from typing import Literal
 
 import numpy as np
 
-# Where they are compared: before, the column hardly moves; after, the tongue is a film that friction holds back.
+# Range of T that is compared. Earlier the column hardly moves; later friction slows the thin front.
 FIRST, LAST = 1.0, 4.0
 # Height over width of the columns.
 N_SQUARED = 2.0
-# The time shifts that are tried, in T.
+# Candidate time shifts, in units of T.
 SHIFTS = np.linspace(0.0, 0.6, 121)
 
 
@@ -23,10 +23,12 @@ class Series:
     """One measured curve.
 
     Attributes:
-        name: "i", "ii" or "iii"; quantity: "front" or "height".
-        width: a, of the column, m.
-        source: where the numbers were read.
-        T: (n,) times n t sqrt(g / a); value: (n,) the front over a, or the height over n^2 a.
+        name: "i", "ii" or "iii".
+        quantity: "front" or "height".
+        width: width a of the column, m.
+        source: reference of the data.
+        T: (n,), dimensionless times n t sqrt(g / a).
+        value: (n,), front position over a, or height over n^2 a.
     """
 
     name: str
@@ -61,17 +63,17 @@ def measured(quantity: Literal["front", "height"]) -> tuple[Series, ...]:
 
 
 def mean_error(series: Series, T: np.ndarray, value: np.ndarray, shift: float = 0.0) -> float:
-    """Return the mean of |value - measured| / measured, for a gate that lets go `shift` late.
+    """Return the mean of |value - measured| / measured, for a gate that opens `shift` late.
 
     Args:
-        T, value: (m,) the computed curve, up to T = LAST at least.
+        T, value: (m,), computed curve; must extend to T = LAST.
     """
     times, known = series.compared()
     return float(np.mean(np.abs(np.interp(times - shift, T, value) - known) / known))
 
 
 def best_shift(curves: Sequence[Series], T: np.ndarray, value: np.ndarray) -> tuple[float, float]:
-    """Return the one time shift with which the curves agree best on average, in T, and the mean error left."""
+    """Return the time shift, in units of T, that minimizes the mean error over the curves, and that error."""
     errors = [np.mean([mean_error(series, T, value, shift) for series in curves]) for shift in SHIFTS]
     best = int(np.argmin(errors))
     return float(SHIFTS[best]), float(errors[best])

@@ -1,4 +1,4 @@
-"""Fits a damped oscillation to a signal: its frequency and its decay."""
+"""Least-squares fit of a damped oscillation to a signal."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ import numpy as np
 
 STEPS = 50
 LARGEST_EXPONENT = 200.0
-# Frequencies that a fit may start from, over the guess.
+# Initial frequencies of the fit, over the guess.
 STARTS = np.linspace(0.5, 2.0, 61)
 
 
@@ -25,16 +25,17 @@ NOT_FOUND = Oscillation(math.nan, math.nan, math.nan, math.nan)
 
 
 def fit_oscillation(times: np.ndarray, signal: np.ndarray, frequency: float) -> Oscillation:
-    """Fit a damped oscillation by least squares, with Gauss and Newton's method.
+    """Fit a damped oscillation by least squares with the Gauss-Newton method.
 
-    It starts from the frequency near a guess, 0.5 to 2 times as high, whose undamped oscillation fits best.
+    The initial frequency, 0.5 to 2 times the guess, is that of the best undamped fit.
 
     Args:
-        times, signal: (n,), some periods of it, s and any unit.
+        times: (n,), s; several periods.
+        signal: (n,), any unit.
         frequency: the guess, rad/s.
 
     Returns:
-        The oscillation: all NaN where none is found.
+        The oscillation; all NaN if the fit fails.
     """
     if not np.isfinite(signal).all():
         return NOT_FOUND
@@ -47,11 +48,11 @@ def fit_oscillation(times: np.ndarray, signal: np.ndarray, frequency: float) -> 
         basis[:] = np.stack([cosine, sine, np.ones_like(times)], axis=1)
         (a, b, offset), *_ = np.linalg.lstsq(basis, signal, rcond=None)
         model = a * cosine + b * sine
-        # Derivatives by w and by the decay join the linear ones: one step of Gauss and Newton.
+        # Gauss-Newton step: derivatives with respect to w and the decay extend the linear basis.
         slopes = np.stack([times * (b * cosine - a * sine), -times * model], axis=1)
         change, *_ = np.linalg.lstsq(np.hstack([basis, slopes]), signal - basis @ [a, b, offset], rcond=None)
         w, decay = w + change[3], decay + change[4]
-        # Further off than any oscillation that could have been meant, or an exponential that overflows.
+        # The fit has diverged, or the exponential would overflow.
         if not (0.1 * frequency < w < 10 * frequency and abs(decay) < LARGEST_EXPONENT / np.ptp(times)):
             return NOT_FOUND
         if (abs(change[3]) <= 1e-14 * abs(w) and abs(change[4]) <= 1e-14 * abs(w)) or scale == 0:
@@ -60,7 +61,7 @@ def fit_oscillation(times: np.ndarray, signal: np.ndarray, frequency: float) -> 
 
 
 def _misfit(times: np.ndarray, signal: np.ndarray, frequency: float) -> float:
-    """Return what an undamped oscillation of that frequency leaves of a signal."""
+    """Return the residual norm of the best undamped oscillation of that frequency."""
     basis = np.stack([np.cos(frequency * times), np.sin(frequency * times), np.ones_like(times)], axis=1)
     found, *_ = np.linalg.lstsq(basis, signal, rcond=None)
     return float(np.linalg.norm(signal - basis @ found))

@@ -1,15 +1,15 @@
-"""The blocks of a page, as Markdown."""
+"""Markdown blocks of a report."""
 
 from collections.abc import Collection, Iterable, Sequence
 
 
 def heading(level: int, text: str, anchor: str = "") -> str:
-    """Return a heading of level 1, 2 or 3, and the anchor that links to it name."""
+    """Return a heading of level 1, 2 or 3, preceded by an HTML anchor if one is given."""
     return (f'<a id="{anchor}"></a>\n\n' if anchor else "") + f"{'#' * level} {text}"
 
 
 def bullets(lines: Iterable[str]) -> str:
-    """Return a list of lines."""
+    """Return a bullet list."""
     return "\n".join(f"* {line}" for line in lines)
 
 
@@ -17,7 +17,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], right: Collection[
     """Return a table; the columns numbered in `right` are aligned to the right.
 
     Args:
-        folded: summary of a table that is hidden until it is opened; "" where it is not.
+        folded: summary of a collapsed table; "" for a visible one.
     """
     rule = ["---:" if column in right else "---" for column in range(len(head))]
     lines = (" | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in row) for row in (head, rule, *rows))

@@ -1,4 +1,4 @@
-"""A page in Markdown as one HTML file that needs nothing else."""
+"""Conversion of a Markdown page to a self-contained HTML file."""
 
 import base64
 import html
@@ -23,7 +23,7 @@ code { font-size: .9em; background: #f3f3f3; padding: .05em .25em; border-radius
 summary { cursor: pointer; color: #0b57a4; }
 a { color: #0b57a4; }
 """
-# What becomes of the tags of `page.heading` and `page.table`.
+# Escaped tags of `page.heading` and `page.table`, and their HTML.
 TAGS = {
     r"<p>&lt;a id=&quot;(\w+)&quot;&gt;&lt;/a&gt;</p>": r'<a id="\1"></a>',
     r"<p>&lt;details&gt;\n&lt;summary&gt;(.*)&lt;/summary&gt;</p>": r"<details>\n<summary>\1</summary>",
@@ -32,13 +32,14 @@ TAGS = {
 
 
 def to_html(title: str, markdown: str, pictures: Mapping[str, bytes]) -> str:
-    """Return the page as HTML, with every picture in it.
+    """Return the page as HTML with embedded pictures.
 
     Args:
+        title: title of the HTML document.
         markdown: the page.
-        pictures: SVG by the links of the page.
+        pictures: SVG files by their links in the page.
     """
-    # All tags are escaped, as texts may hold any, but for those that `page` writes.
+    # All tags are escaped except for those of `page`.
     body = MarkdownIt("commonmark", {"html": False, "xhtmlOut": False}).enable("table").render(markdown)
     for escaped, tag in TAGS.items():
         body = re.sub(escaped, tag, body)

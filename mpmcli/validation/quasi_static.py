@@ -1,4 +1,4 @@
-"""Statics with a solver of motion: a load that comes on smoothly, and the mean of what still swings after it."""
+"""Static solutions from a dynamic solver: a smooth load ramp, and a mean over residual oscillations."""
 
 import numpy as np
 
@@ -17,8 +17,8 @@ def smooth_ramp(duration: float) -> str:
 def window_weights(count: int) -> np.ndarray:
     """Return Hann's weights, (count,), of the frames of a window, first and last included; they sum to 1.
 
-    Of a swing of which the window holds m periods they leave sin(pi m) / (pi m (1 - m^2)): nothing where m is whole and
-    2 or more, and less than 0.02 beyond m = 2.4. Plain means leave sin(pi m) / (pi m).
+    An oscillation with m periods in the window is reduced by sin(pi m) / (pi m (1 - m^2)): 0 for integers m > 1
+    and less than 0.02 for m > 2.4. The factor of an unweighted mean is sin(pi m) / (pi m).
     """
     weights = np.sin(np.pi * np.arange(count) / (count - 1)) ** 2
     return weights / weights.sum()

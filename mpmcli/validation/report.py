@@ -1,4 +1,4 @@
-"""What a run of the validation found: cases, verdicts, costs, as JSON and as a table."""
+"""The report of a validation: cases, verdicts and costs, as JSON and as a table."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -20,9 +20,9 @@ class RunRow:
     """One run in the report.
 
     Attributes:
-        error: size of the first measure, None where the run did not finish.
-        order: observed between the next coarser run of the same setting and this one, None where there is none.
-        verdict: "pass", "fail", or None where nothing is asked of it.
+        error: absolute value of the first measure; None if the run did not finish.
+        order: observed order relative to the next coarser run of the setting; None if there is none.
+        verdict: "pass", "fail", or None if no check concerns the run.
     """
 
     run: Run
@@ -33,11 +33,11 @@ class RunRow:
 
     @property
     def label(self) -> str:
-        """What people call the setting."""
+        """Label of the setting."""
         return label_of(self.run.setting)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON can hold it."""
+        """Return a dictionary for JSON."""
         return {
             "n": self.run.n,
             "setting": self.label,
@@ -54,14 +54,14 @@ class RunRow:
 
 @dataclass(frozen=True)
 class CaseReport:
-    """One case in the report: its runs and what follows from them."""
+    """One case in the report: its runs, verdict and cheapest setting."""
 
     case: Case
     results: Results
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Whether it came out as it should."""
+        """The checks of the case."""
         return judge(self.case, self.results)
 
     @cached_property
@@ -97,7 +97,7 @@ class CaseReport:
         return orders[-1] if orders else None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON can hold it."""
+        """Return a dictionary for JSON."""
         case, best = self.case, self.cheapest
         return {
             "case": case.name,
@@ -156,7 +156,7 @@ class Report:
         return all(entry.verdict.passed for entry in self.case_reports)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON can hold it."""
+        """Return a dictionary for JSON."""
         return {
             "level": self.level,
             "environment": self.environment,
@@ -176,7 +176,7 @@ class Report:
         }
 
     def table(self) -> str:
-        """Return the table for people: a line per case, and what failed below it."""
+        """Return a text table with a line per case, followed by the failed checks."""
         rows = [summary_row(entry) for entry in self.case_reports]
         failed = [f"{e.case.name}: {reason}" for e in self.case_reports for reason in e.verdict.reasons]
         count = sum(entry.verdict.passed for entry in self.case_reports)
@@ -190,12 +190,12 @@ class Report:
         )
 
 
-# Columns of the table of cases, everywhere.
+# Columns of the table of cases.
 SUMMARY = ("case", "verdict", "error", "at n", "order (expected)", "cheapest to 1 %", "seconds", "particle-steps")
 
 
 def summary_row(entry: CaseReport) -> tuple[str, ...]:
-    """Return the line of a case in the table of cases."""
+    """Return the row of a case in the table of cases."""
     measure, finest, best = entry.case.measures[0], entry.finest, entry.cheapest
     order = "" if entry.order is None else f"{entry.order:.2f}"
     if measure.expected is not None:
@@ -215,7 +215,7 @@ def summary_row(entry: CaseReport) -> tuple[str, ...]:
 
 
 def seconds_text(seconds: float) -> str:
-    """Write seconds with two digits, and no more than three decimals."""
+    """Return seconds as text with two digits and at most three decimals."""
     return f"{seconds:.3f}" if seconds < 0.1 else f"{seconds:.2g}" if seconds < 100 else f"{seconds:.0f}"
 
 

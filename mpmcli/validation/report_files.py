@@ -1,4 +1,4 @@
-"""Writes a report: report.json, report.md with its figures, and report.html, which holds them itself."""
+"""Writes a report: report.json, report.md with its figures, and report.html, in which they are embedded."""
 
 import json
 from pathlib import Path
@@ -15,10 +15,10 @@ from mpmcli.validation.report_page import SETTINGS_FIGURE, TITLE, figure_name, r
 
 
 def write_report(report: Report, directory: Path) -> None:
-    """Write the report into a directory that exists, each file in one durable step.
+    """Write the report into an existing directory, each file atomically.
 
     Raises:
-        RunError: the disk is full or refuses.
+        RunError: a file cannot be written.
     """
     pictures = {figure_name(entry): draw_case(entry) for entry in report.case_reports}
     if len(report.compared) > 1:

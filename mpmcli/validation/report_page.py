@@ -1,4 +1,4 @@
-"""The page of a report: what was found on top, then every case, with words for whoever has not read the code."""
+"""The Markdown page of a report: a summary, then every case."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from mpmcli.validation.setting import Setting
 TITLE = "Speed against error"
 GROUPS = {"solids": "Solids", "fluids": "Fluids", "plastic": "Plastic flow", "invariants": "Invariants"}
 SETTINGS_FIGURE = "settings.svg"
-# What the errors of the cases do not show, and counts all the same.
+# Properties of the settings that the errors of the cases do not show.
 BEYOND = (
     "What these errors do not show counts as well. From a Courant fraction of 0.9 on a lone droplet that bounces along "
     "a wall gains energy, at 0.8 none did. A body of one particle per cell and axis comes apart where it is stretched "
@@ -42,7 +42,7 @@ READING = (
 
 
 def report_page(report: Report) -> str:
-    """Return the whole page as Markdown; its figures are links to files in FIGURES, beside it."""
+    """Return the page as Markdown, with links to figures in the directory FIGURES."""
     blocks: list[str] = [
         heading(1, TITLE),
         INTRODUCTION,
@@ -80,7 +80,7 @@ def _picture(name: str, text: str) -> str:
 
 
 def figure_name(entry: CaseReport) -> str:
-    """Return the file of a case's figure."""
+    """Return the file name of the figure of a case."""
     return f"{entry.case.name}.svg"
 
 

@@ -1,15 +1,15 @@
-"""What APIC takes from a wave in each step: the factor of its transfers, to the grid and back (von Neumann)."""
+"""Damping of a wave by the transfers of APIC in a step, from von Neumann analysis."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-# The nodes of a stencil, from its middle one, in cells.
+# Nodes of a stencil relative to the central one, in cells.
 NODES = np.arange(-1, 2)
 
 
 def apic_factor(angles: Sequence[float], places: np.ndarray | None = None) -> float:
-    """Return what one step without forces leaves of a velocity wave exp(i k.x), with quadratic weights.
+    """Return the amplification factor of a velocity wave exp(i k.x) in a step without forces, with quadratic weights.
 
     Nodes hold one number per wave, so that a step multiplies it: with the weights w_i and the levers x_i - x_p in
     cells, by the mean over particles of |sum w_i e_i|^2 + 4 |sum w_i (x_i - x_p) e_i|^2, e_i = exp(i k.x_i). On a
@@ -18,7 +18,7 @@ def apic_factor(angles: Sequence[float], places: np.ndarray | None = None) -> fl
 
     Args:
         angles: k h along each axis.
-        places: where particles lie along each axis, in cells from the nearest node; everywhere alike by default.
+        places: positions of particles along each axis, in cells from the nearest node; uniform by default.
     """
     if places is None:
         # Polynomials of the sixth degree in the place: four points of Gauss are exact.
