@@ -2,9 +2,12 @@
 
 A jump (floor, ceil, sign, step, comparisons) has slope zero, and a kink (abs, min, max, clamp) the slope of one side.
 
-Central differences with a step of cbrt(eps) m would replace this module but for two cases. At a particle on a jump of
-1 m/s they give C = 8e4 1/s, where the slope is zero. An infinite slope, which is refused (sqrt(X) at 0), becomes a
-finite one. Elsewhere their error is 1e-11 to 2e-7 of C.
+Central differences with a step of cbrt(eps) m = 6e-6 m are not used, because of what they give within one step of a
+singular point: C = 8e4 1/s on a jump of 1 m/s, where the slope is zero; the mean of both slopes on the kink of
+max(X, 0); nan where a finite slope exists but the difference leaves the domain of the function, as for
+sqrt(X + 1e-6) at 0. Several steps away their error is 5e-12 to 3e-9 of the largest C for polynomials, sines and
+exponentials. In the initial states of the validation cases it is 5e-12 to 1.5e-9, which alters every entry of C that
+is not zero in f64, and 1 in 1,000 or fewer in f32.
 """
 
 import math

@@ -38,7 +38,7 @@ _SOFT_SOLID = "softened: nearly incompressible in truth (0.4995 or more), which 
 _STOMAKHIN = "Stomakhin et al. 2013, A material point method for snow simulation: their basic snow"
 _OBRIEN = (
     "O'Brien and Julien 1988, Laboratory analysis of mudflow properties: rounded from their Bingham fits for "
-    "natural mud with some 35 % of sediment by volume"
+    "natural mud with about 35 % of sediment by volume"
 )
 _ALUMINIUM = "aluminium 1100-O: ASM Handbook, vol. 2, and the Aluminum Association's typical values"
 
@@ -136,7 +136,7 @@ PRESETS: dict[str, Preset] = {
                 35.0, "Lambe and Whitman 1969, Soil mechanics: well-graded sand, medium dense (34 to 40)"
             ),
             "youngs_modulus": Value(
-                "auto", "softened: real sand, of some 1e7 Pa and more, flows alike, as friction alone resists"
+                "auto", "softened: real sand, of about 1e7 Pa and more, flows alike, as friction alone resists"
             ),
             "poissons_ratio": Value(
                 0.3, "Bowles 1996, Foundation analysis and design: usual values for sand are 0.3 to 0.4"

@@ -177,7 +177,7 @@ USUAL_FLIP = 0.95
 
 def _only_with_aflip(flip: float | None, info: ValidationInfo) -> float | None:
     """Fill in the share of FLIP where there is one, and refuse it where there is none."""
-    # Without a transfer that is sound, that is what is told.
+    # An invalid transfer has a message of its own, and is absent from the data.
     transfer = info.data.get("transfer", "aflip")
     if flip is not None and transfer != "aflip":
         raise flaw(f'is the share of FLIP in transfer = "aflip"; with transfer = "{transfer}" leave it out')
