@@ -82,7 +82,7 @@ def predicted(dimension: int) -> float:
     ("dimension", "steps"),
     [
         (2, 10_000),
-        (3, 10_000),
+        pytest.param(3, 10_000, marks=pytest.mark.slow),
         pytest.param(2, 100_000, marks=pytest.mark.slow),
         pytest.param(3, 100_000, marks=pytest.mark.slow),
     ],

@@ -82,7 +82,7 @@ def run(
     return bodies_of(solver)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_slip_corner_is_its_mirror_image(backend_of: Callable, dimension: int, record_property: Callable) -> None:
     """A body in each corner of a box moves as its part of 2^d mirrored bodies around a point, to 1e-10.
 
@@ -132,7 +132,7 @@ def mirrored_v(base: list[BodyParticles], name: str, signs: tuple[float, ...]) -
     return next(body for body in base if body.name == name).velocity * np.array(signs)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 4))])
 def test_a_slip_wall_mirrors_a_separating_floor_too(backend_of: Callable, seed: int, record_property: Callable) -> None:
     """Where a slip wall meets a separating floor, the half scene is still half of the mirrored one, to 1e-10.
 
