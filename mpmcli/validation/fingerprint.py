@@ -19,7 +19,7 @@ from mpmcli.validation.matrix import Run
 
 PACKAGE = Path(__file__).resolve().parent.parent
 # Packages hashed in full. Of mpmcli.validation only the files that a run imports are hashed.
-ROOMS = ("scene", "materials", "boundaries", "stability", "solver", "output")
+ROOMS = ("scene", "frames", "materials", "boundaries", "stability", "solver", "output")
 CASE_PROCESS = PACKAGE / "validation" / "case_process.py"
 
 
