@@ -1,12 +1,17 @@
 """`mpmcli validate` as people and pipelines call it."""
 
 import json
+import os
+import shutil
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import pytest
 from command import Outcome, run_here, started
+from conftest import ROOT
 
 from mpmcli.output import open_result
 from mpmcli.validation.cases import all_cases
@@ -153,3 +158,65 @@ def test_an_interrupt_keeps_what_is_done_and_ends_the_rest(tmp_path: Path) -> No
     assert [path.name for path in (tmp_path / "report").iterdir()] == ["runs"]
     for path in runs.iterdir():
         assert json.loads(path.read_text(encoding="utf-8"))["result"]["status"] == "finished"
+
+
+CASE_FILE = '''\
+"""A block that drifts through an empty box."""
+
+import numpy as np
+
+from mpmcli.validation.case import Case, Measure
+
+
+class Drift(Case):
+    """Without forces the velocity of every particle stays what it was."""
+
+    name, title, group = "drift", "A block that drifts", "invariants"
+    source, resolution = "Newton's first law", "cells along the box"
+    levels = {"coarse": (8, 16), "default": (8, 16), "fine": (8, 16)}
+    measures = (Measure("velocity error", "m/s", "Largest change of a velocity.", bound=lambda n: 1e-12),)
+
+    def tables(self, n, setting):
+        return {
+            "domain": {"size": [1.0, 1.0], "cells": [n, n]},
+            "time": {"end": 0.1, "frames": 2, "safety": setting.safety},
+            "solver": setting.solver_table(),
+            "bodies": [
+                {
+                    "name": "block",
+                    "material": {
+                        "law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5, "poissons_ratio": 0.3,
+                    },
+                    "shape": {"box": {"min": [0.25, 0.375], "max": [0.5, 0.625]}},
+                    "velocity": [1.0, 0.0],
+                    "particles_per_cell": setting.particles_per_cell(2),
+                }
+            ],
+        }
+
+    def measure(self, n, scene, frames):
+        return {"velocity error": max(float(np.abs(f.velocity - [1.0, 0.0]).max()) for f, _ in frames)}
+
+
+CASES = (Drift(),)
+'''
+
+
+def test_a_case_is_one_file_of_the_package(tmp_path: Path) -> None:
+    """A file put beside the cases of mpmcli is listed, run in its own process, judged, and written into the report."""
+    shutil.copytree(ROOT / "mpmcli", tmp_path / "mpmcli", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "mpmcli" / "validation" / "cases" / "drift.py").write_text(CASE_FILE, encoding="utf-8")
+
+    def said(*words: str) -> object:
+        command = [sys.executable, "-m", "mpmcli", "validate", *words, "--levels", "coarse", "--json"]
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=PATIENCE)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    assert {entry["case"] for entry in said("--list")} == {*all_cases(), "drift"}
+    (case,) = said("drift", "-o", "report")["cases"]
+    assert (case["verdict"], [run["n"] for run in case["runs"]]) == ("pass", [8, 16, 16])
+    assert 0 <= case["error"] <= 1e-12
+    assert "### A block that drifts" in (tmp_path / "report" / "report.md").read_text(encoding="utf-8")
+    assert (tmp_path / "report" / "figures" / "drift.svg").exists()
