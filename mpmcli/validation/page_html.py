@@ -23,7 +23,7 @@ code { font-size: .9em; background: #f3f3f3; padding: .05em .25em; border-radius
 summary { cursor: pointer; color: #0b57a4; }
 a { color: #0b57a4; }
 """
-# Escaped tags of `page.heading` and `page.table`, and their HTML.
+# Escaped tags of headings and tables in `report_page`, and their HTML.
 TAGS = {
     r"<p>&lt;a id=&quot;(\w+)&quot;&gt;&lt;/a&gt;</p>": r'<a id="\1"></a>',
     r"<p>&lt;details&gt;\n&lt;summary&gt;(.*)&lt;/summary&gt;</p>": r"<details>\n<summary>\1</summary>",
@@ -39,7 +39,7 @@ def to_html(title: str, markdown: str, pictures: Mapping[str, bytes]) -> str:
         markdown: the page.
         pictures: SVG files by their links in the page.
     """
-    # All tags are escaped except for those of `page`.
+    # All tags are escaped except for those of `report_page`.
     body = MarkdownIt("commonmark", {"html": False, "xhtmlOut": False}).enable("table").render(markdown)
     for escaped, tag in TAGS.items():
         body = re.sub(escaped, tag, body)

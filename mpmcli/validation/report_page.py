@@ -1,12 +1,11 @@
 """The Markdown page of a report: a summary, then every case."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 from mpmcli.validation.choice import outcome, reason
 from mpmcli.validation.comparison import Compared, Ratios
 from mpmcli.validation.journal import FIGURES
 from mpmcli.validation.matrix import label_of
-from mpmcli.validation.page import bullets, heading, table
 from mpmcli.validation.report import SUMMARY, CaseReport, Report, RunRow, seconds_text, summary_row
 from mpmcli.validation.setting import Setting
 
@@ -44,7 +43,7 @@ READING = (
 def report_page(report: Report) -> str:
     """Return the page as Markdown, with links to figures in the directory FIGURES."""
     blocks: list[str] = [
-        heading(1, TITLE),
+        _heading(1, TITLE),
         INTRODUCTION,
         _environment(report),
         _outcome(report),
@@ -61,7 +60,7 @@ def report_page(report: Report) -> str:
     ]
     if len(report.compared) > 1:
         blocks += _settings(report)
-    blocks += [heading(2, "How to read the figures"), bullets(READING)]
+    blocks += [_heading(2, "How to read the figures"), _bullets(READING)]
     blocks.append(
         "Scenes that break solvers of this kind have no error to measure; how they end is in `docs/hard-cases.md`, "
         "and how far the largest stable step is from the true one in `docs/stable-step.md`."
@@ -70,7 +69,7 @@ def report_page(report: Report) -> str:
     for entry in report.case_reports:
         if entry.case.group != group:
             group = entry.case.group
-            blocks.append(heading(2, GROUPS[group]))
+            blocks.append(_heading(2, GROUPS[group]))
         blocks += _case(entry)
     return "\n\n".join(blocks) + "\n"
 
@@ -117,12 +116,12 @@ def _summary(report: Report) -> str:
     for entry in report.case_reports:
         name, verdict, *rest = summary_row(entry)
         rows.append((f"[{name}](#{name})", entry.case.title, verdict if verdict == "pass" else f"**{verdict}**", *rest))
-    return table((SUMMARY[0], "problem", *SUMMARY[1:]), rows, {3, 4, 5, 7, 8})
+    return _table((SUMMARY[0], "problem", *SUMMARY[1:]), rows, {3, 4, 5, 7, 8})
 
 
 def _failures(report: Report) -> list[str]:
     lines = [f"**{e.case.name}** {reason}" for e in report.case_reports for reason in e.verdict.reasons]
-    return [heading(2, "What failed"), bullets(lines)] if lines else []
+    return [_heading(2, "What failed"), _bullets(lines)] if lines else []
 
 
 def _settings(report: Report) -> list[str]:
@@ -132,7 +131,7 @@ def _settings(report: Report) -> list[str]:
     ]
     head = ("setting", "error at equal n", "seconds at equal n", "seconds to an equal error", "runs that failed")
     return [
-        heading(2, "What each setting does"),
+        _heading(2, "What each setting does"),
         (
             "Each setting changes one thing of the default. Figures are ratios to the default setting, below 1 is "
             "better: the geometric mean over the cases, and in brackets the best and the worst case. An equal error is "
@@ -140,11 +139,11 @@ def _settings(report: Report) -> list[str]:
             "there, the true ratio is larger still. Errors of nothing but round-off are left out. The Courant "
             "fraction is varied at one resolution only. In the figure a dot is a case, the marker is the mean."
         ),
-        table(head, rows, {1, 2, 3, 4}),
+        _table(head, rows, {1, 2, 3, 4}),
         _picture(SETTINGS_FIGURE, "Ratios of error and time of every setting to those of the default one"),
-        heading(2, "Why the defaults are what they are"),
+        _heading(2, "Why the defaults are what they are"),
         outcome(report.compared),
-        bullets(reason(entry) for entry in report.compared),
+        _bullets(reason(entry) for entry in report.compared),
         BEYOND,
     ]
 
@@ -165,9 +164,9 @@ def _case(entry: CaseReport) -> list[str]:
         f"**{measure.name}**{f' ({measure.unit})' if measure.unit else ''}: {measure.text}" for measure in case.measures
     ]
     blocks: list[str] = [
-        heading(3, case.title, case.name),
+        _heading(3, case.title, case.name),
         f"`mpmcli validate {case.name}`; {entry.verdict.word}. Source: {case.source}. n counts {case.resolution}.",
-        bullets(measures),
+        _bullets(measures),
     ]
     if case.note:
         blocks.append(case.note)
@@ -179,7 +178,7 @@ def _case(entry: CaseReport) -> list[str]:
     rows = tuple(_run(row, [measure.name for measure in case.measures]) for row in entry.rows)
     right = range(1, 2 + len(named) + len(costs))
     head = ("setting", "n", *named, *costs, "outcome")
-    blocks.append(table(head, rows, right, folded=f"All {len(rows)} runs of {case.name}"))
+    blocks.append(_table(head, rows, right, folded=f"All {len(rows)} runs of {case.name}"))
     return blocks
 
 
@@ -196,7 +195,7 @@ def _checks(entry: CaseReport) -> str:
         for check in entry.verdict.checks
     ]
     head = ("measure", "setting", "n", "value", "bound", "verdict")
-    return table(head, rows, {2, 3, 4})
+    return _table(head, rows, {2, 3, 4})
 
 
 def _run(row: RunRow, measures: Sequence[str]) -> tuple[str, ...]:
@@ -214,3 +213,25 @@ def _run(row: RunRow, measures: Sequence[str]) -> tuple[str, ...]:
         f"{result.compile_seconds:.1f}" if result.compile_seconds else "",
         outcome if row.verdict is None or not result.finished else row.verdict,
     )
+
+
+def _heading(level: int, text: str, anchor: str = "") -> str:
+    """Return a heading of level 1, 2 or 3, preceded by an HTML anchor if one is given."""
+    return (f'<a id="{anchor}"></a>\n\n' if anchor else "") + f"{'#' * level} {text}"
+
+
+def _bullets(lines: Iterable[str]) -> str:
+    """Return a bullet list."""
+    return "\n".join(f"* {line}" for line in lines)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]], right: Collection[int], folded: str = "") -> str:
+    """Return a table; the columns numbered in `right` are aligned to the right.
+
+    Args:
+        folded: summary of a collapsed table; "" for a visible one.
+    """
+    rule = ["---:" if column in right else "---" for column in range(len(head))]
+    lines = (" | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in row) for row in (head, rule, *rows))
+    text = "\n".join(f"| {line} |" for line in lines)
+    return f"<details>\n<summary>{folded}</summary>\n\n{text}\n\n</details>" if folded else text
