@@ -1,6 +1,5 @@
 """Pictures of surfaces: they cover what their particles cover, and mean what their colours say."""
 
-from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
@@ -8,9 +7,10 @@ import pytest
 
 from mpmcli.frames.frame import Frame
 from mpmcli.render.appearance import APPEARANCES
+from mpmcli.render.coloring import Coloring
+from mpmcli.render.painter import Painter, surface_painter
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.shading.lighting import lights_of
-from mpmcli.render.surfaces.surface import SurfacePainter
 from mpmcli.render.theme import THEMES
 from mpmcli.render.view import View, view_of
 
@@ -21,20 +21,15 @@ DISTANCE = 0.025
 LIGHT = THEMES["light"]
 
 
-@dataclass(frozen=True)
-class ByColumn:
+def by_column(unknown: tuple[int, ...] = ()) -> Coloring:
     """Colours by x, from 0 to 1; particles in `unknown` have no number."""
 
-    fields: tuple[str, ...] = ()
-    cmap: str = "viridis"
-    limits: tuple[float, float] = (0.0, 1.0)
-    missing: str = "#ff00c8"
-    unknown: tuple[int, ...] = field(default=())
-
-    def values(self, frame: Frame) -> np.ndarray:
+    def value(frame: Frame) -> np.ndarray:
         values = frame.position[:, 0].astype(np.float64)
-        values[list(self.unknown)] = np.nan
+        values[list(unknown)] = np.nan
         return values
+
+    return Coloring("x", "m", (), value, "viridis", (0.0, 1.0), "#ff00c8")
 
 
 def subject_with(dimension: int, *names: str) -> RenderScene:
@@ -70,12 +65,12 @@ def ball(dimension: int, radius: float, middle: float = 0.5) -> np.ndarray:
 
 
 @cache
-def painter(dimension: int, names: tuple[str, ...], camera: str = "front", theme: str = "light") -> SurfacePainter:
+def painter(dimension: int, names: tuple[str, ...], camera: str = "front", theme: str = "light") -> Painter:
     scene = subject_with(dimension, *names)
-    return SurfacePainter(scene, view_of(scene, camera, SIZE), THEMES[theme])
+    return surface_painter(scene, view_of(scene, camera, SIZE), THEMES[theme])
 
 
-def mask_of(tool: SurfacePainter, frame: Frame) -> np.ndarray:
+def mask_of(tool: Painter, frame: Frame) -> np.ndarray:
     """Return the pixels (h, w) that differ from those of the empty scene; from the front no shadow is seen."""
     empty = tool.draw(frame_of(frame.position[:0])).astype(int)
     return np.abs(tool.draw(frame).astype(int) - empty).max(axis=2) > 4
@@ -167,7 +162,7 @@ def test_colours_follow_a_field(dimension: int, name: str) -> None:
     scene = subject_with(dimension, name)
     view = view_of(scene, "front", SIZE)
     position = ball(dimension, 0.4)
-    picture = SurfacePainter(scene, view, LIGHT, ByColumn()).draw(frame_of(position)).astype(float)
+    picture = surface_painter(scene, view, LIGHT, by_column()).draw(frame_of(position)).astype(float)
     x = np.linspace(0.2, 0.8, 25)
     places = np.full((len(x), dimension), 0.5)
     places[:, 0] = x
@@ -184,8 +179,8 @@ def test_values_that_are_no_numbers_have_their_own_colour(dimension: int) -> Non
     scene = subject_with(dimension, "jelly")
     view = view_of(scene, "front", SIZE)
     position = ball(dimension, 0.4)
-    colors = ByColumn(unknown=tuple(np.flatnonzero(position[:, 0] > 0.5).tolist()))
-    picture = SurfacePainter(scene, view, LIGHT, colors).draw(frame_of(position)).astype(int)
+    colors = by_column(unknown=tuple(np.flatnonzero(position[:, 0] > 0.5).tolist()))
+    picture = surface_painter(scene, view, LIGHT, colors).draw(frame_of(position)).astype(int)
     right, left = (picture[on(view, 0.5 + shift * np.eye(dimension)[:1])][0] for shift in (0.2, -0.2))
     assert right[0] > 2 * right[1]
     assert right[2] > 2 * right[1]
@@ -203,7 +198,7 @@ def test_the_same_frame_has_the_same_bytes(dimension: int) -> None:
     first.draw(frame_of(parts[0]))
     assert (first.draw(frame) == picture).all()
     scene = subject_with(dimension, *names)
-    again = SurfacePainter(scene, view_of(scene, "iso", SIZE), LIGHT)
+    again = surface_painter(scene, view_of(scene, "iso", SIZE), LIGHT)
     assert (again.draw(frame) == picture).all()
 
 

@@ -7,12 +7,12 @@ from mpmcli.render.hidden import hidden
 from mpmcli.render.liquids.screen_space import (
     NOTHING,
     blurred,
-    deposited,
     normals,
     smoothed,
     sphere_depths,
     thickness,
 )
+from mpmcli.render.particle_grid import deposited
 
 SHAPE = (60, 80)
 # Pixels to the metre.
@@ -20,7 +20,7 @@ SCALE = 100.0
 
 
 def pixels_of(points: np.ndarray) -> np.ndarray:
-    """Appearance along z at points (n, 3), m: pixels from the left and from the top, and the distance, m."""
+    """Look along z at points (n, 3), m: pixels from the left and from the top, and the distance, m."""
     return np.stack([SCALE * points[:, 0], SCALE * points[:, 1], 5.0 - points[:, 2]], axis=1)
 
 
@@ -152,7 +152,7 @@ def test_thickness_in_perspective_is_volume_over_area():
 def test_deposit_keeps_the_middle():
     pixels = np.array([[20.3, 11.8], [50.5, 40.5]])
     amounts = np.array([2.0, 3.0])
-    image = deposited(pixels, amounts, SHAPE)
+    image = deposited(pixels - 0.5, amounts, SHAPE)
     row, column = np.mgrid[:60, :80] + 0.5
     # Linear weights reproduce linear functions.
     assert (image * column).sum() == pytest.approx((amounts * pixels[:, 0]).sum(), rel=1e-6)

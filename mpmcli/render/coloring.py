@@ -7,7 +7,10 @@ from functools import cached_property
 import numpy as np
 
 from mpmcli.frames.frame import Frame
-from mpmcli.render.theme import rgb_bytes
+from mpmcli.render.theme import rgb, rgb_bytes
+
+# Steps of a colour map under light, which makes more of the differences between neighbouring colours.
+SHADES = 1024
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,18 @@ class Coloring:
         colors = self._table[np.clip(share * 255.0 + 0.5, 0, 255).astype(np.intp)]
         colors[~known] = rgb_bytes(self.missing)
         return colors
+
+    def shades(self, values: np.ndarray) -> np.ndarray:
+        """Return the colours (..., 3) float32 from 0 to 1 of values (...), in finer steps than `rgb`."""
+        import matplotlib as mpl
+
+        low, high = self.limits
+        table = mpl.colormaps[self.cmap](np.linspace(0.0, 1.0, SHADES))[:, :3].astype(np.float32)
+        known = np.isfinite(values)
+        place = (np.where(known, values, low) - low) / max(high - low, 1e-300)
+        found = table[np.clip(place * SHADES, 0, SHADES - 1).astype(int)]
+        found[~known] = rgb(self.missing)
+        return found
 
     @cached_property
     def _table(self) -> np.ndarray:

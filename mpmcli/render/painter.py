@@ -14,7 +14,8 @@ from mpmcli.render.dots import DotsPainter
 from mpmcli.render.picture_layout import PictureLayout
 from mpmcli.render.render_scene import RenderScene, render_scene_of
 from mpmcli.render.settings import Settings, require_possible
-from mpmcli.render.theme import THEMES
+from mpmcli.render.surfaces.outline import OutlinePainter
+from mpmcli.render.theme import THEMES, Theme
 from mpmcli.render.view import View, aspect_of, view_of
 
 # Pictures whose height follows from the scene are no flatter than this, height over width, and no steeper.
@@ -67,13 +68,20 @@ class RenderSetup:
 
             return FluidPainter(scene, view, theme)
         if settings.mode in ("surface", "fluid"):
-            from mpmcli.render.surfaces.surface import SurfacePainter
-
             if settings.mode == "fluid":
                 scene = _grained(scene)
-            return SurfacePainter(scene, view, theme, self.colors if isinstance(self.colors, Coloring) else None)
+            return surface_painter(scene, view, theme, self.colors if isinstance(self.colors, Coloring) else None)
         assert self.colors is not None
         return DotsPainter(scene, view, theme, self.colors, count)
+
+
+def surface_painter(scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> Painter:
+    """Return the painter of smooth bodies: by triangles in 3D, by the density of particles in 2D."""
+    if scene.dimension == 2:
+        return OutlinePainter(scene, view, theme, colors)
+    from mpmcli.render.surfaces.surface_renderer import SurfaceRenderer
+
+    return SurfaceRenderer(scene, view, theme, colors)
 
 
 def set_up(result: Result, settings: Settings) -> RenderSetup:

@@ -59,7 +59,7 @@ class PictureLayout:
     @property
     def viewport_size(self) -> tuple[int, int]:
         """Pixels of each picture of the scene, (width, height)."""
-        left, top, right, bottom = self._offscreen
+        left, top, right, bottom = self._scene_box
         columns, rows = self.grid
         gap = self._px(GAP)
         width = (right - left - (columns - 1) * gap) // columns
@@ -78,11 +78,11 @@ class PictureLayout:
         """
         from PIL import Image, ImageDraw
 
-        layout = Image.new("RGB", self.size, rgb_bytes(self.theme.ground))
-        draw = ImageDraw.Draw(layout)
+        whole = Image.new("RGB", self.size, rgb_bytes(self.theme.ground))
+        draw = ImageDraw.Draw(whole)
         for k, (picture, time) in enumerate(zip(pictures, times, strict=True)):
             x, y = self._place(k)
-            layout.paste(Image.fromarray(picture), (x, y))
+            whole.paste(Image.fromarray(picture), (x, y))
             if self._label:
                 self._time(draw, time, (x, y - self._label // 2))
             if self.walls:
@@ -94,7 +94,7 @@ class PictureLayout:
             self._color_bar(draw, self.colors, missing)
         elif self.colors is not None:
             self._legend(draw, self.colors)
-        return np.asarray(layout)
+        return np.asarray(whole)
 
     def height_for(self, aspect: float) -> int:
         """Return the height of the whole picture at which those of the scene have this ratio of height to width."""
@@ -103,8 +103,8 @@ class PictureLayout:
         return self._px(TOP) + self._bottom + rows * viewport + (rows - 1) * self._px(GAP)
 
     @property
-    def _offscreen(self) -> tuple[int, int, int, int]:
-        """Where pictures of the scene go: left, top, right, bottom, pixels."""
+    def _scene_box(self) -> tuple[int, int, int, int]:
+        """The rectangle that the pictures of the scene share: left, top, right, bottom, pixels."""
         width, height = self.size
         return 0, self._px(TOP), width - self._column, height - self._bottom
 
@@ -120,7 +120,7 @@ class PictureLayout:
     def _place(self, k: int) -> tuple[int, int]:
         """Return left and top of the k-th picture of the scene."""
         row, column = divmod(k, self.grid[0])
-        (width, height), (left, top, _, _), gap = self.viewport_size, self._offscreen, self._px(GAP)
+        (width, height), (left, top, _, _), gap = self.viewport_size, self._scene_box, self._px(GAP)
         return left + column * (width + gap), top + row * (height + self._label + gap) + self._label
 
     @property
@@ -191,10 +191,10 @@ class PictureLayout:
 
     def _legend(self, draw: "ImageDraw", colors: Categories) -> None:
         font = font_of(self._px(SMALL))
-        x = self._offscreen[2] + self._px(PAD)
+        x = self._scene_box[2] + self._px(PAD)
         room = self.size[0] - x - self._px(PAD + SWATCH + 8)
         swatch, step = self._px(SWATCH), self._px(SWATCH + 10)
-        y = self._offscreen[1] + self._px(PAD)
+        y = self._scene_box[1] + self._px(PAD)
         rows = max(1, int((self.size[1] - self._px(PAD) - swatch - y) / step) + 1)
         told = rows - 1 if len(colors.names) > rows else rows
         for name, ink in zip(colors.names[:told], colors.inks, strict=False):
@@ -223,9 +223,9 @@ class PictureLayout:
 
     def _color_bar(self, draw: "ImageDraw", colors: Coloring, missing: int) -> None:
         font = font_of(self._px(SMALL))
-        x = self._offscreen[2] + self._px(PAD)
+        x = self._scene_box[2] + self._px(PAD)
         line = self._px(SMALL + 6)
-        y = self._offscreen[1] + self._px(4)
+        y = self._scene_box[1] + self._px(4)
         for text in self._bar_heading(colors):
             draw.text((x, y), text, self.theme.text, font, anchor="lt")
             y += line

@@ -16,7 +16,7 @@ from mpmcli.render.surfaces.save_surface import save_surfaces
 
 @dataclass(frozen=True)
 class RenderSummary:
-    """What came of an plan.
+    """What carrying out a plan produced.
 
     Attributes:
         pictures: files, by frame; the one of a montage.

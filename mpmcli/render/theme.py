@@ -11,7 +11,7 @@ class Theme:
     """Colours, "#rrggbb".
 
     Attributes:
-        ground: of the layout, and behind the particles in 2D.
+        ground: background of the picture, and behind the particles in 2D.
         sky, horizon: of the background of a 3D scene, above and below.
         floor: what shadows fall on.
         text: titles and numbers; faint: what is there to be found, not to be seen.

@@ -187,7 +187,7 @@ def _view(
 ) -> View:
     axes = _axes(position - focus, up)
     depths = (position - _corners(scene)) @ axes[2]
-    # FluidBackground for shadows and for what has left the domain.
+    # A margin for shadows and for particles that have left the domain.
     spare = 0.1 * float(np.ptp(_corners(scene), axis=0).max())
     near, far = float(depths.min()) - spare, float(depths.max()) + spare
     near = max(near, 1e-3 * float(np.linalg.norm(position - focus)))

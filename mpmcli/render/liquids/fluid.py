@@ -15,7 +15,8 @@ from mpmcli.render.liquids.fluid_background import SAMPLES, FluidBackground
 from mpmcli.render.liquids.fluid_shading import displayed, fluid_lights, linear, optics_of, shaded, transmitted
 from mpmcli.render.liquids.liquid_surface import Liquid, Surface, layers_of, scale_at, surface_of, window_of
 from mpmcli.render.liquids.pixel_rays import plane
-from mpmcli.render.liquids.screen_space import NOTHING, sampled
+from mpmcli.render.liquids.screen_space import NOTHING
+from mpmcli.render.particle_grid import sampled
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.shading.lighting import lights_of
 from mpmcli.render.shading.material_groups import Group, groups_of

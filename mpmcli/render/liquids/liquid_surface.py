@@ -32,7 +32,7 @@ class Liquid:
     """The particles of one liquid.
 
     Attributes:
-        look: what it looks like.
+        appearance: of its material.
         distance: between neighbours at the start, m.
         position: (n, 3), m.
         pixels: (n, 3), from the left and from the top, and the distance from the camera, m.

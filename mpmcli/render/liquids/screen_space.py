@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from mpmcli.render.particle_grid import deposited
+
 # Depth, m, of a pixel that no liquid covers.
 NOTHING = np.float32(1e9)
 # Rows that are smoothed together: few enough to stay in the cache.
@@ -192,27 +194,6 @@ def _boxed(image: np.ndarray, deviation: float) -> np.ndarray:
     return result.astype(image.dtype)
 
 
-def deposited(pixels: np.ndarray, amounts: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return (h, w) float32, the sum of what the particles bring to each pixel, each shared among four by area.
-
-    Args:
-        pixels: (n, 2+), from the left and from the top.
-        amounts: (n,).
-        shape: rows and columns; what falls outside is dropped.
-    """
-    rows, columns = shape
-    corner = np.floor(pixels[:, :2] - 0.5).astype(np.int64)
-    right, down = (pixels[:, :2] - 0.5 - corner).T
-    total = np.zeros((rows + 2) * (columns + 2))
-    column, row = np.clip(corner.T + 1, 0, [[columns], [rows]])
-    seen = np.all((corner >= -1) & (corner < [columns, rows]), axis=1)
-    for i, across in ((0, 1 - right), (1, right)):
-        for j, along in ((0, 1 - down), (1, down)):
-            place = (row + j) * (columns + 2) + column + i
-            total += np.bincount(place, np.where(seen, amounts * across * along, 0.0), minlength=len(total))
-    return total.reshape(rows + 2, columns + 2)[1:-1, 1:-1].astype(np.float32)
-
-
 def thickness(
     pixels: np.ndarray, volumes: np.ndarray, scale: np.ndarray, deviation: float, shape: tuple[int, int]
 ) -> np.ndarray:
@@ -227,7 +208,7 @@ def thickness(
         deviation: of the Gaussian that each is spread with, pixels.
         shape: rows and columns.
     """
-    return blurred(deposited(pixels, volumes * scale**2, shape), deviation)
+    return blurred(deposited(pixels[:, :2] - 0.5, volumes * scale**2, shape).astype(np.float32), deviation)
 
 
 def normals(points: np.ndarray, covered: np.ndarray) -> np.ndarray:
@@ -270,15 +251,3 @@ def _smaller_step(points: np.ndarray, covered: np.ndarray, axis: int) -> np.ndar
     low, high = np.minimum(size_forward, size_backward), np.maximum(size_forward, size_backward)
     alike = np.isfinite(high) & (high <= 2 * low + np.float32(0.5) * pixel)
     return np.where(alike[..., None], np.float32(0.5) * (forward + backward), smaller)
-
-
-def sampled(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Return values between the pixels of an image (r, c, k), linear in between; the outermost go on outside."""
-    rows, columns = image.shape[:2]
-    row, column = np.clip(row - 0.5, 0, rows - 1.001), np.clip(column - 0.5, 0, columns - 1.001)
-    j, i = row.astype(np.int32), column.astype(np.int32)
-    v, u = (row - j)[..., None], (column - i)[..., None]
-    flat, home = image.reshape(rows * columns, -1), j * columns + i
-    upper = flat[home] * (1 - u) + flat[home + 1] * u
-    lower = flat[home + columns] * (1 - u) + flat[home + columns + 1] * u
-    return upper * (1 - v) + lower * v

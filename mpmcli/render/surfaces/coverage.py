@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpmcli.render.particle_grid import deposited, with_images
+
 # Standard deviation of the Gaussian, in distances between particles.
 SPREAD = 1.25
 # Nodes of the grid to a distance, at least.
@@ -57,41 +59,15 @@ def cover_of(
     return cover
 
 
-def with_images(
-    position: np.ndarray, reach: float, lower: Sequence[float], upper: Sequence[float]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return particles (m, 2) and their mirror images behind walls within `reach`, and whose image each is, (m,)."""
-    source = np.arange(len(position))
-    for axis in range(2):
-        images, sources = [position], [source]
-        for wall, inwards in ((lower[axis], 1.0), (upper[axis], -1.0)):
-            near = inwards * (position[:, axis] - wall) < reach
-            image = position[near].copy()
-            image[:, axis] = 2.0 * wall - image[:, axis]
-            images.append(image)
-            sources.append(source[near])
-        position, source = np.concatenate(images), np.concatenate(sources)
-    return position, source
-
-
 def spread(position: np.ndarray, weights: np.ndarray, deviation: float, grid: Grid) -> np.ndarray:
     """Return the sum (rows, columns) of Gaussians of integral `weights` (n,) about particles (n, 2), by area."""
     margin = math.ceil(REACH * deviation / grid.edge) + 1
     shape = (grid.shape[0] + 2 * margin, grid.shape[1] + 2 * margin)
     place = (position - np.array(grid.corner)) / grid.edge + margin
-    base = np.floor(place).astype(np.int64)
-    part = place - base
-    inside = (base >= 0).all(axis=1) & (base[:, 0] < shape[1] - 1) & (base[:, 1] < shape[0] - 1)
-    base, part, weights = base[inside], part[inside], weights[inside]
-    total = np.zeros(shape[0] * shape[1])
-    for right in (0, 1):
-        for up in (0, 1):
-            share = (part[:, 0] if right else 1.0 - part[:, 0]) * (part[:, 1] if up else 1.0 - part[:, 1])
-            flat = (base[:, 1] + up) * shape[1] + base[:, 0] + right
-            total += np.bincount(flat, share * weights, len(total))
+    total = deposited(place, weights, shape)
     # Sharing out between two nodes has blurred already, by a sixth of a cell squared on average.
     width = math.sqrt(max((deviation / grid.edge) ** 2 - 1.0 / 6.0, 0.0))
-    blurred = gaussian(total.reshape(shape).astype(np.float32), width)
+    blurred = gaussian(total.astype(np.float32), width)
     return blurred[margin:-margin, margin:-margin] / np.float32(grid.edge**2)
 
 

@@ -7,10 +7,10 @@ import numpy as np
 from mpmcli.frames.frame import Frame
 from mpmcli.render.appearance import Appearance
 from mpmcli.render.coloring import Coloring
+from mpmcli.render.particle_grid import with_images
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.shading.material_groups import Group, groups_of
-from mpmcli.render.surfaces.coverage import SPREAD, Grid, cover_of, disk_nodes, gaussian, spread, with_images
-from mpmcli.render.surfaces.tints import shades
+from mpmcli.render.surfaces.coverage import SPREAD, Grid, cover_of, disk_nodes, gaussian, spread
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.view import View
 
@@ -33,11 +33,16 @@ ROUGHNESS, CRUMB = 0.55, 0.75
 
 
 class OutlinePainter:
-    """Draws a 2D run as filled bodies."""
+    """Draws the materials of a 2D run as filled bodies.
+
+    Attributes:
+        fields: that are read of each frame.
+    """
 
     def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> None:
         """Find the pixels that show the domain; nothing is drawn yet."""
         self.scene, self.view, self.theme, self.colors = scene, view, theme, colors
+        self.fields = () if colors is None else colors.fields
         width, height = view.size
         # Each pixel is a node; rows of the grid run upwards.
         edge = 1.0 / view.pixels_per_metre
@@ -158,9 +163,7 @@ class OutlinePainter:
             for weight in (np.where(known, values, 0.0), known.astype(float), np.ones(len(values)))
         ]
         number = np.divide(sums[0], sums[1], out=np.full_like(sums[0], np.nan), where=sums[1] > 0.5 * sums[2])
-        return shades(_finer(number, step, self.grid.shape).astype(np.float64).ravel(), self.colors).reshape(
-            *self.grid.shape, 3
-        )
+        return self.colors.shades(_finer(number, step, self.grid.shape).astype(np.float64))
 
     def _grainy(self, group: Group, base: np.ndarray, depth: np.ndarray, lit: np.ndarray) -> np.ndarray:
         """Return colours (h, w, 3) of grains, each a disk of its own brightness, over a darker ground."""

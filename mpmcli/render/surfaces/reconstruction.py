@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mpmcli.render.particle_grid import blurred_along, with_images
+
 # Parameters of splashsurf, in particle radii: smoothing length of the kernel, and edge of a marching cube.
 SMOOTHING_LENGTH, CUBE = 2.5, 1.1
 # Share of the full density at which the surface lies.
@@ -91,7 +93,7 @@ def reconstruct(
     carried = {name: np.asarray(values, dtype=np.float32)[keep] for name, values in (attributes or {}).items()}
     if not len(particles):
         return _empty(carried)
-    points, source = _with_images(particles, low, high)
+    points, source = with_images(particles, IMAGE_REACH, low, high)
     # Its own clean-up and smoothing depend on the order in which threads end: ours come after the sorting.
     found, _ = reconstruction_pipeline(
         points,
@@ -157,21 +159,6 @@ def _area_vectors(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return np.stack([a[:, i - 2] * b[:, i - 1] - a[:, i - 1] * b[:, i - 2] for i in range(3)], axis=1)
 
 
-def _with_images(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return particles (m, 3) and their mirror images behind the walls close to them, and whose image each is (m,)."""
-    source = np.arange(len(points))
-    for axis in range(3):
-        images, sources = [points], [source]
-        for wall, inwards in ((low[axis], 1.0), (high[axis], -1.0)):
-            near = inwards * (points[:, axis] - wall) < IMAGE_REACH
-            image = points[near].copy()
-            image[:, axis] = 2.0 * wall - image[:, axis]
-            images.append(image)
-            sources.append(source[near])
-        points, source = np.concatenate(images), np.concatenate(sources)
-    return points, source
-
-
 def _pressed_flat(
     raw: np.ndarray,
     vertices: np.ndarray,
@@ -223,11 +210,7 @@ def _fullness(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     count = np.bincount(np.ravel_multi_index(tuple(cells.T), shape), minlength=int(np.prod(shape)))
     share = count.reshape(shape).astype(np.float32) * (8.0 / edge**3)
     for axis in range(3):
-        share = np.moveaxis(share, axis, 0)
-        blurred = 0.5 * share
-        blurred[1:] += 0.25 * share[:-1]
-        blurred[:-1] += 0.25 * share[1:]
-        share = np.moveaxis(blurred, 0, axis)
+        share = blurred_along(share, axis)
     at = np.clip(((vertices - low) / edge).astype(int) + 1, 0, np.array(shape) - 1)
     found = share[tuple(at.T)]
     slope = np.clip((found - ALONE) / (HALF - ALONE), 0.0, 1.0)

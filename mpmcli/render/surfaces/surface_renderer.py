@@ -1,5 +1,6 @@
 """Draws 3D surfaces in one off-screen window, its meshes replaced with every frame."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from mpmcli.frames.frame import Frame
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.offscreen import averaged, window_pixels
+from mpmcli.render.particle_grid import blurred_along, deposited, sampled
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.shading import lighting
 from mpmcli.render.shading.background import Background
@@ -14,8 +16,6 @@ from mpmcli.render.shading.material_groups import Group, groups_of
 from mpmcli.render.shading.occlusion import Occlusion
 from mpmcli.render.surfaces.grains import JITTER, grain_colors, new_grains, pose_grains
 from mpmcli.render.surfaces.reconstruction import SMOOTHING_ROUNDS, Mesh, reconstruct
-from mpmcli.render.surfaces.thickness import thickness_at
-from mpmcli.render.surfaces.tints import painted, shades, tints_of
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.view import View
 
@@ -23,16 +23,23 @@ from mpmcli.render.view import View
 FINER, LONGEST = 2, 8192
 # Rounds of smoothing, by finish; crumbs keep their lumps.
 ROUNDS = {"crumbly": 2}
+# Edge of the cells in which the thickness of a body is found, in distances between particles, and the least, pixels.
+COARSENESS, FINEST = 1.4, 3.0
 
 
 class SurfaceRenderer:
-    """Draws a 3D run as bodies against a lit background."""
+    """Draws the materials of a 3D run as bodies against a lit background.
+
+    Attributes:
+        fields: that are read of each frame.
+    """
 
     def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> None:
         """Open the window; nothing is drawn yet."""
         import pyvista as pv
 
         self.scene, self.view, self.theme, self.colors = scene, view, theme, colors
+        self.fields = () if colors is None else colors.fields
         self.background = Background(scene, view, theme)
         self.lights = lighting.lights_of(scene, view, theme)
         self.finer = FINER if FINER * max(view.size) <= LONGEST else 1
@@ -81,7 +88,9 @@ class SurfaceRenderer:
             {"rough": group.hashes} if group.appearance.finish == "crumbly" or group.appearance.name == "lava" else {}
         )
         if self.colors is not None:
-            attributes |= tints_of(group, self.colors, frame)
+            values = np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows]
+            known = np.isfinite(values)
+            attributes |= {"value": np.where(known, values, 0.0), "known": known.astype(np.float32)}
         mesh = reconstruct(
             group.position,
             group.distance,
@@ -106,7 +115,7 @@ class SurfaceRenderer:
         color = np.array(rgb(group.appearance.color))
         hashes = group.hashes
         if self.colors is not None:
-            color = shades(np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows], self.colors)
+            color = self.colors.shades(np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows])
             # A colour that means something is not varied.
             hashes = np.zeros_like(hashes)
         lamp, sky = np.ones((2, len(hashes)))
@@ -128,10 +137,13 @@ class SurfaceRenderer:
         if occlusion is not None and count:
             light[:, 0], light[:, 1] = occlusion.at(mesh.points, mesh.normals)
             if group.appearance.finish in lighting.CLEAR:
-                light[:, 2] = thickness_at(self.view, group.position, group.distance, mesh.points)
+                light[:, 2] = _thickness_at(self.view, group.position, group.distance, mesh.points)
         tint = np.broadcast_to(lighting.linear(group.appearance.color), (count, 3))
         if self.colors is not None:
-            tint = painted(mesh.attributes, self.colors)
+            value, known = mesh.attributes["value"].astype(np.float64), mesh.attributes["known"].astype(np.float64)
+            # The mean over those particles that have a number, where they are the majority.
+            mean = np.divide(value, known, out=np.full_like(value, np.nan), where=known > 0.5)
+            tint = self.colors.shades(mean) ** np.float32(2.2)
         rough = mesh.attributes.get("rough", np.zeros((count, 3), dtype=np.float32))
         carried = (light, tint, rough, mesh.normals)
         for name, values in zip(lighting.CARRIED, carried, strict=True):
@@ -181,6 +193,25 @@ class SurfaceRenderer:
             lighting=False,
         )
         walls.SetPickable(False)
+
+
+def _thickness_at(view: View, position: np.ndarray, distance: float, points: np.ndarray) -> np.ndarray:
+    """Return the length (v,) of body that a ray through each of the points (v, 3) meets, m.
+
+    Particles (n, 3) are counted in coarse cells of the picture: their volume over the area of a cell at their depth.
+    """
+    seen, wanted = view.pixels(position), view.pixels(points)
+    near = max(float(seen[:, 2].mean()), 1e-12)
+    scale = view.pixels_per_metre * (1.0 if view.parallel else view.distance / near)
+    edge = max(FINEST, COARSENESS * distance * scale)
+    shape = (math.ceil(view.size[1] / edge) + 2, math.ceil(view.size[0] / edge) + 2)
+    area = (edge / view.pixels_per_metre) ** 2
+    if not view.parallel:
+        area = area * (seen[:, 2] / view.distance) ** 2
+    total = deposited(seen[:, :2] / edge + 0.5, np.broadcast_to(distance**3 / area, len(seen)), shape)
+    for axis in (0, 1):
+        total = blurred_along(total, axis)
+    return sampled(total, wanted[:, 1] / edge + 1.0, wanted[:, 0] / edge + 1.0)[:, 0]
 
 
 def _texture() -> Any:
