@@ -65,6 +65,19 @@ def test_a_picture_of_the_last_frame_lies_beside_the_result(run: Path) -> None:
         assert picture.size == (320, 180)
 
 
+def test_stdout_gets_the_paths_that_were_asked_for(run: Path, tmp_path: Path) -> None:
+    """Counts and warnings go to stderr, so that the output can be piped."""
+    out, film, meshes = tmp_path / "out", tmp_path / "film.gif", tmp_path / "meshes"
+    words = ["--frame", "0:2", "-o", out, "--size", "64x64", "--mode", "surface"]
+    pictures = [f"{out / f'surface_{k:06d}.png'}" for k in range(2)]
+    outcome = run_here("render", run, *words, "--workers", 1)
+    assert outcome.stdout.splitlines() == pictures and outcome.stderr == "2 pictures made\n"
+    outcome = run_here("render", run, *words, "--save-surface", meshes, "--workers", 1)
+    assert outcome.stdout.splitlines() == [*pictures, str(meshes)]
+    outcome = run_here("render", run, *words, "--movie", film, "--fps", 5)
+    assert outcome.stdout == f"{film}\n" and outcome.stderr == "0 pictures made, 2 were there already\n"
+
+
 def test_matplotlib_does_not_talk_in_between(run: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Without a home it explains in several lines where it keeps its cache."""
     logging.getLogger("matplotlib").setLevel(logging.NOTSET)

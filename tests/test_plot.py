@@ -208,7 +208,7 @@ def test_a_file_that_it_did_not_make_is_replaced_only_when_asked_to(result, tmp_
         f"error: {path} is there and was not made by mpmcli plot: give another name, or --overwrite.\n"
     )
     outcome = run_here("plot", result, "-o", path, *SIZE, "--overwrite")
-    assert outcome.stdout == f"picture: {path}\n" and path.read_bytes() != before
+    assert outcome.stdout == f"{path}\n" and path.read_bytes() != before
 
 
 @pytest.mark.parametrize(

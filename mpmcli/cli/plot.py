@@ -65,7 +65,7 @@ def command(
         facts = {"path": str(path), "size": width_height, "theme": theme, "frames": opened.frame_count}
         print_json({**facts, "panels": panels, "notes": history.notes})
     elif not quiet:
-        print_text(f"picture: {path}")
+        print_text(str(path))
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -84,7 +84,8 @@ def command(
     """Draw frames of a RESULT without a screen: pictures, a film (--movie) or a montage.
 
     RESULT is a directory, particles.vtkhdf or particles.pvd, of a run that has ended or goes on. A picture that is
-    there and still right is not made again.
+    there and still right is not made again. The path of each picture, or that of the film, and the directory of the
+    surfaces are printed on stdout.
     """
     from mpmcli.cli.progress_bar import ProgressBar
     from mpmcli.output import open_result
@@ -105,6 +106,6 @@ def command(
     elif not quiet:
         kept = len(done.pictures) - done.made
         there = f", {kept} {'was' if kept == 1 else 'were'} there already" if kept else ""
-        print_text(f"{done.made} picture{'s' if done.made != 1 else ''} made{there}")
-        print_text(f"film: {done.film}" if done.film else f"pictures: {done.place}")
+        click.echo(f"{done.made} picture{'s' if done.made != 1 else ''} made{there}", err=True)
+        print_text("\n".join(map(str, done.paths)))
     return 0

@@ -22,18 +22,20 @@ class RenderSummary:
         pictures: files, by frame; the one of a montage.
         made: how many of them were made now.
         film: the film, None where none was asked for.
+        surfaces: the directory of the surfaces, None where none was asked for.
         warnings: sentences.
     """
 
     pictures: list[Path]
     made: int
     film: Path | None
+    surfaces: Path | None
     warnings: list[str]
 
     @property
-    def place(self) -> Path:
-        """The picture, or the directory of several."""
-        return self.pictures[0] if len(self.pictures) == 1 else self.pictures[0].parent
+    def paths(self) -> list[Path]:
+        """What was asked for: the film or else the pictures, and the directory of the surfaces."""
+        return [*([self.film] if self.film else self.pictures), *([self.surfaces] if self.surfaces else [])]
 
     def as_dict(self) -> dict[str, Any]:
         """Return it in the form of JSON."""
@@ -109,7 +111,9 @@ class RenderPlan:
         if self.movie is not None:
             self._put_together(self.movie, stop)
         made = sum(not planned.made for planned in self.plan)
-        return RenderSummary([planned.path for planned in self.plan], made, self.movie, self._warnings(outcomes))
+        return RenderSummary(
+            [planned.path for planned in self.plan], made, self.movie, self.save_surface, self._warnings(outcomes)
+        )
 
     def _draw_montage(self, seen: Callable[[int, Outcome], None], stop: Callable[[], bool]) -> None:
         (planned,) = self.plan
