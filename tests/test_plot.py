@@ -216,8 +216,11 @@ def test_a_file_that_it_did_not_make_is_replaced_only_when_asked_to(result, tmp_
     [
         (["nothing"], "error: nothing does not exist"),
         (["result", "-o", "picture.jpg"], "error: picture.jpg would be no picture of this command: give a name that "),
-        (["result", "--size", "12"], "error: --size 12 is not possible: give width and height in pixels, 300 to 8000"),
-        (["result", "--size", "10x10"], "error: --size 10x10 is not possible"),
+        (["result", "--size", "12"], 'error: --size "12" is no size: give width and height in pixels'),
+        (
+            ["result", "--size", "100x100"],
+            "error: --size 100x100 is not possible: each side of this picture has 300 to 8000 pixels.",
+        ),
         (["result", "--size", "300x900"], "error: --size 300x900 leaves no room for the panels: give a width of one"),
         (["result", "-o", "file/picture.png"], "error: file/picture.png cannot be written (file is no directory): "),
         (["result", "--theme", "pink"], "error: invalid value for '--theme'"),

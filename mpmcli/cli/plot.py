@@ -1,18 +1,18 @@
 """`mpmcli plot`."""
 
 import logging
-import re
 from pathlib import Path
 
 import click
 
 from mpmcli.cli.options import json_option, quiet_option
 from mpmcli.cli.streams import print_json, print_text
+from mpmcli.render.settings import parse_size
 
 DEFAULT = "ledger.png"
-# Begins what a picture of this command says of itself.
+# Prefix of the digest in a picture of this command.
 MARK = "plot "
-# Pixels along each side: below, nothing can be read; above, it is a slip of the pen.
+# Pixels along each side: smaller text is illegible, and larger pictures are taken for a typing error.
 SIZE_MIN, SIZE_MAX = 300, 8_000
 WIDEST = 3
 
@@ -45,7 +45,7 @@ def command(
     from mpmcli.plot.ledger_figure import ledger_picture
     from mpmcli.render.files.picture_file import digest_of, settings_digest, write_picture
 
-    # Without a home it tells at length where it keeps its cache.
+    # Without a home directory it warns about its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     width_height = _size(size)
     opened = open_result(result)
@@ -71,12 +71,10 @@ def command(
 def _size(text: str) -> tuple[int, int]:
     from mpmcli.errors import InputError
 
-    match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text.strip())
-    width, height = map(int, match.groups()) if match else (0, 0)
-    if not (min(width, height) >= SIZE_MIN and max(width, height) <= SIZE_MAX):
+    width, height = parse_size(text)
+    if height is None or min(width, height) < SIZE_MIN or max(width, height) > SIZE_MAX:
         raise InputError(
-            f"--size {text} is not possible: give width and height in pixels, {SIZE_MIN} to {SIZE_MAX} each, as in "
-            "1200x900."
+            f"--size {text} is not possible: each side of this picture has {SIZE_MIN} to {SIZE_MAX} pixels."
         )
     if not height <= width <= WIDEST * height:
         raise InputError(

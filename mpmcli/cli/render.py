@@ -8,9 +8,8 @@ import click
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
 from mpmcli.cli.options import json_option, quiet_option
 from mpmcli.cli.streams import print_json, print_text
-
-MODES = ("dots", "surface", "fluid", "density")
-THEMES = ("light", "dark")
+from mpmcli.render.settings import MODES
+from mpmcli.render.theme import THEMES
 
 
 @click.command("render")
@@ -46,7 +45,7 @@ THEMES = ("light", "dark")
     help="Of 3D scenes: by name, or where it stands and what it looks at, m.",
 )
 @click.option(
-    "--theme", type=click.Choice(THEMES), default="light", show_default=True, help="Colours around the particles."
+    "--theme", type=click.Choice(list(THEMES)), default="light", show_default=True, help="Colours around the particles."
 )
 @click.option("--movie", type=click.Path(path_type=Path), metavar="FILE", help="Make a film: .mp4 or .gif.")
 @click.option("--fps", type=float, help="Frames of the film per second, 30 by default.")
@@ -91,7 +90,7 @@ def command(
     from mpmcli.output import open_result
     from mpmcli.render.request import Request, plan_render
 
-    # Without a home it tells at length where it keeps its cache.
+    # Without a home directory it warns about its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     request = Request(
         output, mode, frames, color, clim, cmap, size, camera, theme, movie, fps, montage, save_surface, overwrite

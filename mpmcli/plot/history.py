@@ -1,5 +1,6 @@
 """What a figure of a result shows over time: the columns of its ledger, and how far the particles reach."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -11,6 +12,7 @@ from mpmcli.output.header import RunHeader
 from mpmcli.output.ledger_table import TEXT
 from mpmcli.output.result import Result
 from mpmcli.plain_text import one_line
+from mpmcli.render.frame_choice import evenly_spaced
 
 # Frames whose positions are read; more would not be seen in the figure.
 FRAMES_MAX = 200
@@ -80,7 +82,7 @@ def read_history(result: Result) -> History:
         broken.append(~np.isfinite(values).reshape(len(rows), -1).all(1))
     record = result.record or {}
     notes = _gaps(np.flatnonzero(np.any(broken, 0)), result.numbers)
-    chosen = np.unique(np.linspace(0, result.frame_count - 1, FRAMES_MAX).round().astype(int))
+    chosen = evenly_spaced(range(result.frame_count), FRAMES_MAX)
     if len(chosen) < result.frame_count:
         notes.append(f"The reach of the particles is read from {len(chosen)} of {result.frame_count} frames.")
     return History(
@@ -104,11 +106,11 @@ def _gaps(rows: np.ndarray, numbers: np.ndarray) -> list[str]:
     return [f"The ledger holds numbers that are not finite in {frames} {named}{more}; they are gaps in the figure."]
 
 
-def _reach(result: Result, chosen: np.ndarray) -> Reach:
+def _reach(result: Result, chosen: Sequence[int]) -> Reach:
     bodies = result.header.body_names
     apart = 1 < len(bodies) <= BODIES_MAX
     labels = range(len(bodies)) if apart else [None]
-    found = [[_extent(frame, label) for label in labels] for frame in (result.frame(int(k), ()) for k in chosen)]
+    found = [[_extent(frame, label) for label in labels] for frame in (result.frame(k, ()) for k in chosen)]
     both = np.array(found).reshape(len(chosen), len(labels), 2, result.dimension)
     names = bodies if apart else (bodies[0] if len(bodies) == 1 else "all bodies",)
     names = tuple(one_line(name) for name in names)

@@ -1,19 +1,31 @@
-"""How figures look: colours that are told apart by colour-blind people too, on light and on dark."""
+"""The style of figures: colours that colour-blind people can distinguish, on light and on dark."""
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from mpmcli.render.theme import ThemeName
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-ThemeName = Literal["light", "dark"]
 # Pixels per inch of a figure of AREA pixels; others are the same figure, larger or smaller.
 DPI, AREA = 100.0, 1200 * 900
+# Settings of matplotlib that all figures share.
+SHARED: dict[str, Any] = {
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+}
 
 
 @dataclass(frozen=True)
@@ -52,30 +64,44 @@ THEMES: dict[ThemeName, Theme] = {"light": LIGHT, "dark": DARK}
 
 
 @contextmanager
-def drawing(size: tuple[int, int], theme: Theme) -> "Iterator[Figure]":
-    """Give an empty figure of a size in pixels, (width, height), to draw on, without the user's settings of matplotlib.
+def empty_figure(
+    inches: tuple[float, float], settings: dict[str, Any], pads: tuple[float, float], dpi: float = DPI
+) -> "Iterator[Figure]":
+    """Provide an empty figure to draw on, independent of the user's settings of matplotlib.
 
-    Text grows with the picture, so that all sizes of one shape look alike.
+    Args:
+        inches: width and height.
+        settings: of matplotlib, in addition to `SHARED`.
+        pads: around panels, across and up, inches.
     """
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    dpi = DPI * (size[0] * size[1] / AREA) ** 0.5
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_settings(theme))
-        # A hundredth of a pixel more, since the canvas rounds down.
-        figure = Figure(figsize=((size[0] + 0.01) / dpi, (size[1] + 0.01) / dpi), dpi=dpi, layout="constrained")
-        figure.get_layout_engine().set(w_pad=0.09, h_pad=0.07)  # type: ignore[union-attr]
+        matplotlib.rcParams.update(SHARED | settings)
+        figure = Figure(figsize=inches, dpi=dpi, layout="constrained")
+        figure.get_layout_engine().set(w_pad=pads[0], h_pad=pads[1])  # type: ignore[union-attr]
         FigureCanvasAgg(figure)
         yield figure
 
 
+def drawing(size: tuple[int, int], theme: Theme) -> "AbstractContextManager[Figure]":
+    """Return an empty figure of a size in pixels, (width, height), as a context.
+
+    Text grows with the picture, so that all sizes of one shape look alike.
+    """
+    dpi = DPI * (size[0] * size[1] / AREA) ** 0.5
+    # A hundredth of a pixel more, since the canvas rounds down.
+    inches = (size[0] + 0.01) / dpi, (size[1] + 0.01) / dpi
+    return empty_figure(inches, _settings(theme), (0.09, 0.07), dpi)
+
+
 def pixels(figure: "Figure") -> np.ndarray:
-    """Return a figure as an image, (h, w, 3) uint8; to be called within `drawing`."""
+    """Return a figure as an image, (h, w, 3) uint8, within the context of `drawing`."""
     with warnings.catch_warnings():
-        # A letter that the font has not is a box in the picture, which says enough.
+        # A character that the font lacks is drawn as a box, which is warning enough.
         warnings.filterwarnings("ignore", "Glyph", UserWarning)
         figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[:, :, :3].copy()  # type: ignore[attr-defined]
@@ -88,8 +114,6 @@ def _settings(theme: Theme) -> dict[str, object]:
         # A title may hold a $.
         "text.parse_math": False,
         "axes.titlesize": 9.0,
-        "axes.titleweight": "bold",
-        "axes.titlelocation": "left",
         "axes.titlepad": 16.0,
         "axes.labelsize": 8.0,
         "axes.labelcolor": theme.faint,
@@ -97,12 +121,7 @@ def _settings(theme: Theme) -> dict[str, object]:
         "axes.edgecolor": theme.faint,
         "axes.facecolor": theme.panel,
         "axes.linewidth": 0.7,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.grid": True,
-        "axes.axisbelow": True,
         "grid.color": theme.grid,
-        "grid.linewidth": 0.7,
         "xtick.color": theme.faint,
         "ytick.color": theme.faint,
         "xtick.labelsize": 7.5,
@@ -115,7 +134,6 @@ def _settings(theme: Theme) -> dict[str, object]:
         "text.color": theme.ink,
         "lines.linewidth": 1.4,
         "lines.solid_capstyle": "round",
-        "legend.frameon": False,
         "legend.fontsize": 7.5,
         "legend.handlelength": 1.1,
         "legend.handletextpad": 0.4,

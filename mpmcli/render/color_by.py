@@ -1,6 +1,6 @@
 """`--color-by`: which value of a particle is shown, and between which limits."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import get_args
 
@@ -10,6 +10,7 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.output.result import Result
 from mpmcli.render.coloring import Categories, Coloring
+from mpmcli.render.frame_choice import evenly_spaced
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.settings import LIMIT_MAX, LIMIT_MIN
 from mpmcli.render.theme import Theme
@@ -74,12 +75,7 @@ def color_by(
         InputError: the result stores no such thing, or there is no such colour map.
     """
     if name == "material":
-        appearances = scene.appearances
-        names, inks = (
-            tuple(appearance.name for appearance in appearances),
-            tuple(appearance.ink for appearance in appearances),
-        )
-        return Categories("material", names, inks, scene.material_of)
+        return material_colors(scene, [appearance.ink for appearance in scene.appearances])
     if name == "body":
         inks = tuple(BODY_INKS[k % len(BODY_INKS)] for k in range(len(scene.bodies)))
         return Categories("body", scene.bodies, inks, tuple(range(len(scene.bodies))))
@@ -96,6 +92,12 @@ def color_by(
         limits,
         theme.missing,
     )
+
+
+def material_colors(scene: RenderScene, inks: Sequence[str]) -> Categories:
+    """Return colours by material, "#rrggbb" of each."""
+    names = tuple(appearance.name for appearance in scene.appearances)
+    return Categories("material", names, tuple(inks), scene.material_of)
 
 
 def _value(name: str, result: Result, scene: RenderScene) -> _Value:
@@ -161,11 +163,10 @@ def _not_stored(name: str, result: Result, field: str) -> InputError:
 
 def _limits(value: _Value, result: Result) -> tuple[float, float]:
     """Return limits between which nearly all particles of the whole result lie."""
-    count = min(LOOKED_AT, result.frame_count)
     lows, highs = [], []
-    for k in np.unique(np.linspace(0, result.frame_count - 1, count).round().astype(int)):
+    for k in evenly_spaced(range(result.frame_count), LOOKED_AT):
         with np.errstate(all="ignore"):
-            values = value.of(result.frame(int(k), value.fields))
+            values = value.of(result.frame(k, value.fields))
         values = np.clip(values[np.isfinite(values)], -LIMIT_MAX, LIMIT_MAX)
         if len(values):
             low, high = np.quantile(values, (OUTSIDE, 1.0 - OUTSIDE))

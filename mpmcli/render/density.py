@@ -9,6 +9,7 @@ from mpmcli.output.header import RunHeader
 from mpmcli.output.result import Result
 from mpmcli.render.color_by import color_map
 from mpmcli.render.coloring import Coloring
+from mpmcli.render.frame_choice import evenly_spaced
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.theme import Theme, rgb_bytes
 from mpmcli.render.view import View
@@ -100,10 +101,9 @@ def density_colors(
 ) -> Coloring:
     """Return what the colours of a density mean; by default nearly no node of any frame exceeds the upper limit."""
     if limits is None:
-        header, found = result.header, [0.0]
-        count = min(LOOKED_AT, result.frame_count)
-        for k in np.unique(np.linspace(0, result.frame_count - 1, count).round().astype(int)):
-            density = grid_density(result.frame(int(k), ()), header, plane)
+        found = [0.0]
+        for k in evenly_spaced(range(result.frame_count), LOOKED_AT):
+            density = grid_density(result.frame(k, ()), result.header, plane)
             if (density > 0).any():
                 found.append(float(np.quantile(density[density > 0], 1.0 - OUTSIDE)))
         limits = 0.0, max(found) or 1.0

@@ -1,6 +1,7 @@
 """`--frame`: which frames of a result are meant."""
 
 import re
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -42,10 +43,10 @@ def choose_frames(text: str, result: Result) -> list[int]:
     return chosen
 
 
-def evenly_spaced(ks: list[int], count: int) -> list[int]:
-    """Return some of the frames, evenly spaced, the first and the last among them."""
+def evenly_spaced(ks: Sequence[int], count: int) -> list[int]:
+    """Return up to `count` of the frames, evenly spaced, the first and the last among them; of one, the last."""
     if count == 1:
-        return ks[-1:]
+        return [ks[-1]]
     places = np.unique(np.linspace(0, len(ks) - 1, count).round().astype(int))
     return [ks[place] for place in places]
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.output.result import Result
-from mpmcli.render.color_by import color_by
+from mpmcli.render.color_by import color_by, material_colors
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.density import DensityPainter, density_colors, slice_of
 from mpmcli.render.dots import DotsPainter
@@ -98,7 +98,8 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
         colors = density_colors(result, plane, theme, settings.limits, settings.cmap)
         camera = "front" if camera not in ("side", "top") else camera
     elif settings.color is None or (settings.mode == "surface" and settings.color == "material"):
-        colors = _legend(scene) if len(scene.appearances) > 1 else None
+        inks = [appearance.color for appearance in scene.appearances]
+        colors = material_colors(scene, inks) if len(inks) > 1 else None
     else:
         colors = color_by(settings.color, result, scene, theme, settings.limits, settings.cmap)
     if isinstance(colors, Coloring):
@@ -138,15 +139,6 @@ def expected_times(result: Result) -> tuple[float, ...]:
         if np.allclose(result.times, result.numbers * step, rtol=1e-3, atol=1e-3 * step):
             return 0.0, step, min(2 * step, header.end), header.end
     return tuple(result.times.tolist())
-
-
-def _legend(scene: RenderScene) -> Categories:
-    """Return the legend of materials that look like what they are."""
-    names, inks = (
-        tuple(appearance.name for appearance in scene.appearances),
-        tuple(appearance.color for appearance in scene.appearances),
-    )
-    return Categories("material", names, inks, scene.material_of)
 
 
 def usual_color(scene: RenderScene) -> str:

@@ -2,10 +2,11 @@
 
 import io
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
+from mpmcli.plot.style import empty_figure
 from mpmcli.validation.comparison import TARGET, points_of, series_of
 from mpmcli.validation.convergence import Point
 from mpmcli.validation.figure_axes import (
@@ -37,16 +38,8 @@ RC = {
     "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial"],
     "font.size": 10.0,
     "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
     "axes.grid.which": "major",
     "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.7,
-    "axes.axisbelow": True,
-    "legend.frameon": False,
 }
 SIZE = (10.0, 8.4)
 # Offset of the line of the expected slope, as a factor of the finest error.
@@ -80,20 +73,9 @@ def draw_case(report: CaseReport, form: Format = "svg") -> bytes:
         return saved(figure, form)
 
 
-@contextmanager
-def drawing(size: tuple[float, float]) -> "Iterator[Figure]":
-    """Provide an empty figure in the common style.
-
-    Args:
-        size: width and height, inches.
-    """
-    import matplotlib
-    from matplotlib.figure import Figure
-
-    with matplotlib.rc_context(RC):
-        figure = Figure(figsize=size, layout="constrained")
-        figure.get_layout_engine().set(w_pad=0.1, h_pad=0.12)
-        yield figure
+def drawing(size: tuple[float, float]) -> "AbstractContextManager[Figure]":
+    """Return an empty figure in the common style, (width, height) in inches, as a context."""
+    return empty_figure(size, RC, (0.1, 0.12))
 
 
 def saved(figure: "Figure", form: Format) -> bytes:
