@@ -25,8 +25,8 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = {"README.md": README} | {
     f"docs/{path.name}": path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").glob("*.md"))
 }
-# Written by scripts, and without commands.
-STUDIES = {"docs/hard-cases.md", "docs/stable-step.md"}
+# Figures of studies, without commands.
+STUDIES = {"docs/hard-cases.md", "docs/shading.md", "docs/stable-step.md"}
 
 # Commands that are run in a shorter form. The README gives the one of the demo itself.
 SHORTER = {

@@ -1,4 +1,4 @@
-"""What a material looks like: colours that are told apart, and how light meets it."""
+"""The appearance of materials: distinguishable colours, and a finish that selects the shading."""
 
 import math
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from mpmcli.scene.presets import PRESETS
 
-# How light meets it: clear and thin, clear and thick, lit from within, white crumbs, loose grains, bare metal, dull.
+# Kinds of shading: clear and thin, clear and thick, scattering inside, white crumbs, loose grains, bare metal, dull.
 Finish = Literal["water", "syrup", "translucent", "crumbly", "grains", "metal", "matte"]
 
 
@@ -17,8 +17,8 @@ class Appearance:
     Attributes:
         name: of the preset that it is nearest to, or of its law.
         color: "#rrggbb" of the lit surface.
-        ink: "#rrggbb" of dots and legends: told apart from every other, on a light ground and on a dark one.
-        finish: how light meets it.
+        ink: "#rrggbb" of dots and legends: distinguishable from every other on a light and on a dark background.
+        finish: kind of shading.
         liquid: whether it flows as one body, so that dots hide what it is.
     """
 
@@ -43,7 +43,7 @@ APPEARANCES = {
 }
 # Laws without a preset, in the order in which they come.
 OTHERS = ("#0f9d8a", "#c2569b", "#7d8a2e", "#4e6fb8", "#b0563c")
-# Two values of a parameter this far apart, as a ratio, differ as much as it can matter.
+# Upper bound of the ratio of two values of a parameter in the distance between materials.
 FAR = 1e6
 
 

@@ -17,10 +17,10 @@ from mpmcli.render.theme import Theme
 from mpmcli.scene.schema import ParticleField
 from mpmcli.scene.sentences import listed, nearest
 
-# What every result can show, and what needs a stored field.
+# Values available in every result, and values that need a stored field.
 ALWAYS = ("speed", "material", "body", "id")
 DERIVED = ("density", "pressure", "J", "stress")
-# By name of a field: unit, as far as it has one.
+# Units of the fields that have one.
 UNITS = {
     "velocity": "m/s",
     "density": "kg/m³",
@@ -30,15 +30,15 @@ UNITS = {
     "initial_position": "m",
     "affine": "1/s",
 }
-# Perceptually even; one that goes both ways from its middle for values around a neutral one.
+# Perceptually uniform maps; the diverging one is for values on both sides of a neutral value.
 SEQUENTIAL, DIVERGING = "viridis", "coolwarm"
-# Frames of the result that limits are taken from, at most, evenly spaced.
+# Maximum number of frames, evenly spaced, from which limits are computed.
 LOOKED_AT = 12
-# Share of the particles of a frame that may lie outside of the limits, at each end.
+# Fraction of the particles of a frame that may lie beyond the limits, at each end.
 OUTSIDE = 0.01
-# Bodies, told apart by colour-blind people too (Okabe and Ito 2008, Color universal design).
+# Colours of bodies that colour-blind people can distinguish (Okabe and Ito 2008, Color universal design).
 BODY_INKS = ("#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9", "#b0a410", "#8a8a8a")
-# Values that go beyond the neutral one by less than this share of their range, on one side, go one way only.
+# Values that exceed the neutral one on one side by less than this fraction of their range count as one-sided.
 ONE_SIDED = 0.02
 AXES = "xyz"
 
@@ -63,12 +63,12 @@ def color_by(
     limits: tuple[float, float] | None = None,
     cmap: str | None = None,
 ) -> Coloring | Categories:
-    """Find what a name means for a result.
+    """Return the colouring that a name stands for in a result.
 
     Args:
         name: one of `ALWAYS` and `DERIVED`, or a stored field: a vector is shown by its length, a tensor by its
             Frobenius norm, `stress.xy` is one component.
-        limits: of the colour map; by default nearly all particles of a dozen frames lie within.
+        limits: of the colour map; by default 98 % of the particles of a dozen frames lie within.
         cmap: name of a colour map of matplotlib.
 
     Raises:
@@ -179,7 +179,7 @@ def _limits(value: _Value, result: Result) -> tuple[float, float]:
         reach = max(abs(high - value.middle), abs(low - value.middle))
         low, high = value.middle - reach, value.middle + reach
     if high - low <= max(1e-6 * max(abs(low), abs(high)), LIMIT_MIN):
-        # All alike: in the middle of the map, however they are rounded.
+        # A constant value gets the middle of the map, however it is rounded.
         reach = 0.05 * max(abs(low), abs(high))
         reach = reach if reach > LIMIT_MIN else 1.0
         low, high = low - reach * (value.floor is None), high + reach

@@ -1,4 +1,4 @@
-"""What the colours of particles mean: a value with its unit and limits, or a kind with its name."""
+"""Colourings of particles: by a value with its unit and limits, or by category."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class Coloring:
 
     def values(self, frame: Frame) -> np.ndarray:
         """Return (n,) float64."""
-        # A quotient by zero is no number, and drawn as such.
+        # A quotient by zero is drawn as a missing value.
         with np.errstate(all="ignore"):
             return self.value(frame)
 
@@ -75,12 +75,12 @@ class Coloring:
 
 @dataclass(frozen=True)
 class Categories:
-    """Colours by kind: of which body, or of which material, a particle is.
+    """Colours by category: the body or the material of a particle.
 
     Attributes:
-        name: what the kinds are.
-        names, inks: of each kind; inks are "#rrggbb".
-        kind_of: (b,) kind of each body.
+        name: of the property, such as "material".
+        names, inks: of each category; inks are "#rrggbb".
+        kind_of: (b,) category of each body.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The density of the grid, as the solver's kernel makes it of the particles: an image in 2D, a slice in 3D."""
+"""The density of the grid by the kernel of the solver (docs/theory.md, 2.1): an image in 2D, a slice in 3D."""
 
 from dataclasses import dataclass
 
@@ -14,13 +14,13 @@ from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.theme import Theme, rgb_bytes
 from mpmcli.render.view import View
 
-# Nodes beyond a wall that a particle within reaches: their mass is that of the mirror image.
+# Nodes beyond a wall that receive mass from inside, which is mirrored back (docs/theory.md, 3.1).
 GHOSTS = 2
-# Below this share of the upper limit the picture fades into the ground.
+# Fraction of the upper limit below which the picture fades into the background.
 FADING = 0.1
-# Frames that the limits are taken from, at most.
+# Maximum number of frames from which the limits are computed.
 LOOKED_AT = 8
-# Share of the nodes with mass that may be denser than the upper limit.
+# Fraction of the nodes with mass that may exceed the upper limit.
 OUTSIDE = 0.01
 
 
@@ -63,7 +63,7 @@ def grid_density(frame: Frame, header: RunHeader, plane: Slice) -> np.ndarray:
     if plane.normal is not None:
         through = (plane.place - header.origin[plane.normal]) / h
         kept &= np.abs(place[:, plane.normal] - through) < 1.5
-        # Between nodes there is no grid, but the kernel is defined there as well.
+        # The plane may lie between nodes, where the kernel is defined too.
         weight = weight * _kernel(place[:, plane.normal] - through)
     place, weight = place[kept][:, list(plane.across)], weight[kept]
     size = cells[list(plane.across)] + 1 + 2 * GHOSTS
@@ -99,7 +99,7 @@ def _folded(total: np.ndarray) -> np.ndarray:
 def density_colors(
     result: Result, plane: Slice, theme: Theme, limits: tuple[float, float] | None = None, cmap: str | None = None
 ) -> Coloring:
-    """Return what the colours of a density mean; by default nearly no node of any frame exceeds the upper limit."""
+    """Return the colouring of a density; by default at most 1 % of the nodes with mass exceed the upper limit."""
     if limits is None:
         found = [0.0]
         for k in evenly_spaced(range(result.frame_count), LOOKED_AT):

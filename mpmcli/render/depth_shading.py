@@ -1,6 +1,6 @@
 """Shading by depth: what lies behind its surroundings is darker, so that dots show the shape of a body.
 
-VTK's eye-dome lighting and SSAO were compared with it, and take three to five times as long (docs/pictures/shading.md).
+VTK's eye-dome lighting and SSAO were compared with it, and take three to five times as long (docs/shading.md).
 """
 
 import numpy as np

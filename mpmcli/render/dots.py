@@ -1,4 +1,4 @@
-"""Particles as round dots of their own size: flat in 2D, balls that are shaded by depth in 3D."""
+"""Particles as round dots of their own size: flat in 2D, balls shaded by depth in 3D."""
 
 import math
 from typing import TYPE_CHECKING
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 
 # Diameter of a dot over the distance between particles: neighbours overlap a little, so that a body looks whole.
 OVERLAP = 1.15
-# Pixels: smaller dots would vanish, so that a single particle is seen.
+# Smallest diameter of a dot, pixels, so that a single particle is visible.
 SMALLEST = 1.5
 # Up to this number of particles, each pixel is the average of four, which makes round edges smooth.
 SMOOTHED = 400_000
-# Pixels across a dot; larger ones are drawn as large as this.
+# Largest diameter of a dot that is drawn, pixels.
 DOT_MAX = 255
-# Pixels along a side that software draws, and black beyond; and altogether, each of which takes 45 bytes.
+# Limits of software rendering: pixels along a side, beyond which it draws black, and in all, at 45 bytes each.
 SIDE_MAX, PIXELS_MAX = 16_384, 64_000_000
-# Sizes of dots in one picture in perspective: each stands for a layer of distances.
+# Number of sizes of dots in a perspective picture, one for each layer of distances.
 LAYERS = 12
-# Squares on each side of its own in which it is looked for what hides a dot.
+# Maximum number of squares on each side in which dots that hide another are sought.
 FARTHEST = 16
 
 
@@ -67,7 +67,7 @@ class DotsPainter:
         if not self._flat and len(points):
             seen = ~self._hidden(points, sizes)
             points, colors, sizes = points[seen], colors[seen], sizes[seen]
-        # In between, the size whose ratio to that of the dot is nearest to one.
+        # The level whose size has the ratio nearest to one.
         level_of = np.searchsorted(np.sqrt(self._levels[1:] * self._levels[:-1]), sizes)
         for level, size in enumerate(self._levels.tolist()):
             chosen = level_of == level
@@ -90,23 +90,23 @@ class DotsPainter:
         return np.maximum(diameters * scale, SMALLEST)
 
     def _hidden(self, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-        """Tell the dots behind others that cover them whole, (n,) bool: leaving them out changes no pixel."""
+        """Return which dots are wholly covered by others, (n,) bool: leaving them out changes no pixel."""
         pixels = self._view.pixels(points)
         inside = (pixels[:, :2] >= 0).all(axis=1) & (pixels[:, :2] < self._view.size).all(axis=1) & (pixels[:, 2] > 0)
         result = np.zeros(len(points), dtype=bool)
-        # A sample may be missing at the edge of a disc; one that lies in a square covers it and its eight neighbours.
+        # The edge of a disc may lack a sample; a disc centred in a square covers it and its eight neighbours.
         edge = 1.0 / self._offscreen.samples
         side = (0.5 * float(sizes.min()) - edge) / math.sqrt(8.0)
         if side >= 0.5 * edge and inside.any():
             reach = math.ceil((0.5 * float(sizes[inside].max()) + edge) / side)
-            # From a camera among the dots the nearest ones fill the picture, and to compare takes longer than to draw.
+            # For a camera among the dots, comparing takes longer than drawing.
             if reach > FARTHEST:
                 return result
             result[inside] = hidden(pixels[inside], side, float(self._diameters.max()), reach, cover=1)
         return result
 
     def _all_levels(self) -> np.ndarray:
-        """Return the sizes that dots are drawn in, pixels, rising: the same ones in all frames."""
+        """Return the diameters in which dots are drawn, pixels, increasing: the same in all frames."""
         view = self._view
         if view.parallel:
             return np.unique(np.maximum(self._diameters * view.pixels_per_metre, SMALLEST))
@@ -116,7 +116,7 @@ class DotsPainter:
         return np.geomspace(low, high, LAYERS) if high > 1.02 * low else np.array([high])
 
     def _set(self, level: int, points: np.ndarray, colors: np.ndarray, size: float) -> None:
-        """Let the actor of a level show these points."""
+        """Set the points that the actor of a level shows."""
         import pyvista as pv
         from vtkmodules.util.numpy_support import numpy_to_vtk
 
@@ -129,13 +129,13 @@ class DotsPainter:
                 rgb=True,
                 render_points_as_spheres=True,
                 lighting=not self._flat,
-                # Flat dots have the colours of the colour bar, to the last bit.
+                # Flat dots have exactly the colours of the colour bar.
                 ambient=1.0 if self._flat else 0.45,
                 diffuse=0.0 if self._flat else 0.65,
                 specular=0.0,
                 reset_camera=False,
             )
-            # VTK has places in single precision, which is too coarse where the domain lies far from the origin.
+            # VTK stores positions in single precision, too coarse for a domain far from the origin.
             actor.position = tuple(self._corner.tolist())
             self._actors[level] = mesh, actor
         mesh, actor = self._actors[level]

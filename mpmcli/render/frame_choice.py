@@ -1,4 +1,4 @@
-"""`--frame`: which frames of a result are meant."""
+"""The frames that `--frame` selects."""
 
 import re
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ HINT = "give a number, first, last, all, or A:B:S, from A up to but not B in ste
 
 
 def choose_frames(text: str, result: Result) -> list[int]:
-    """Return positions in the result of the frames that a text means, in order.
+    """Return the positions in the result of the frames that a text selects, in order.
 
     Args:
         text: N, "first", "last", "all" or "A:B:S"; a negative number counts from the end.

@@ -1,10 +1,10 @@
-"""Which particles others hide from the camera."""
+"""Particles that others hide from the camera."""
 
 import numpy as np
 
 
 def hidden(pixels: np.ndarray, cell: float, gap: float, reach: int = 1, cover: int = 0) -> np.ndarray:
-    """Tell the particles that cannot be seen, because others are before them and all around them.
+    """Return which particles are invisible, because others in front cover them and their surroundings.
 
     Args:
         pixels: (n, 3), pixels from the left and from the top, and the distance, m.

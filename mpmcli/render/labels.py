@@ -1,4 +1,4 @@
-"""Numbers, times and lengths as short texts, and the letters they are written in."""
+"""Numbers, times and lengths as short texts, and the fonts they are drawn in."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,7 +12,7 @@ from mpmcli.render.coloring import Coloring
 if TYPE_CHECKING:
     from PIL.ImageFont import FreeTypeFont
 
-# Unit and how many of it make one metre, from the longest.
+# Units of length, m, from the longest.
 LENGTHS = ((1e3, "km"), (1.0, "m"), (1e-2, "cm"), (1e-3, "mm"), (1e-6, "µm"))
 PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""))
 TIMES = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
@@ -46,13 +46,13 @@ def ticks_of(colors: Coloring, most: int) -> tuple[list[float], list[str], str]:
 
 
 def time_text(time: float, times: Sequence[float]) -> str:
-    """Write a time with as many digits as tell the times of a film apart, for example "t = 0.250 s"."""
+    """Return a time with enough digits to distinguish the times of a film, for example "t = 0.250 s"."""
     longest = max([abs(t) for t in times], default=0.0) or abs(time) or 1.0
     factor, unit = next(((f, u) for f, u in TIMES if longest >= 0.1 * f), TIMES[-1])
     ordered = np.unique(np.asarray(times, dtype=np.float64)) / factor
     step = float(np.median(np.diff(ordered))) if len(ordered) > 1 else 0.1
     least = min(max(0, math.ceil(-math.log10(step) - 1e-9)), DIGITS_MAX)
-    # A quarter has two digits; of a third or a thirtieth, one more than they need is enough.
+    # The digits of an exact step such as 0.25; one more than necessary for others such as 1/3.
     exact = (least + more for more in range(3) if abs(step * 10 ** (least + more) % 1 - 0.5) >= 0.45)
     digits = min(next(exact, least + 1), DIGITS_MAX)
     return f"t = {time / factor:.{digits}f} {unit}"
@@ -65,7 +65,7 @@ def round_length(longest: float) -> float:
 
 
 def length_text(length: float) -> str:
-    """Write a length in the unit that makes it a short number."""
+    """Return a length in the unit that gives a short number."""
     factor, unit = next(((f, u) for f, u in LENGTHS if length >= 0.999 * f), LENGTHS[-1])
     return f"{length / factor:g} {unit}"
 

@@ -1,4 +1,4 @@
-"""An off-screen window that is kept for all frames of a film: one rendering gives the picture and its depth."""
+"""An off-screen window, reused for all frames of a film: one rendering gives colours and depths."""
 
 from typing import TYPE_CHECKING
 
@@ -52,7 +52,7 @@ class OffscreenRenderer:
         self.plotter.add_light(light)
 
     def render(self) -> None:
-        """Draw what is there; `picture` and `depth` then read it."""
+        """Render the window, for `picture` and `depth` to read."""
         self.view.place(self.plotter)
         if self.plotter.render_window.GetNeverRendered():
             # The first picture of a window is drawn without what plotters set up when they are first shown.
@@ -65,7 +65,7 @@ class OffscreenRenderer:
         return averaged(window_pixels(self.plotter.render_window), self.samples)
 
     def depth(self) -> np.ndarray:
-        """Return how far away what each sample shows is, (h, w) float32, m; inf where there is nothing."""
+        """Return the distance of each sample from the camera, (h, w) float32, m; inf where nothing is drawn."""
         from vtkmodules.util.numpy_support import vtk_to_numpy
         from vtkmodules.vtkCommonCore import vtkFloatArray
 
@@ -79,12 +79,12 @@ class OffscreenRenderer:
         return np.where(z >= 1.0, np.float32(np.inf), distance.astype(np.float32))
 
     def close(self) -> None:
-        """Give the window back."""
+        """Release the window."""
         self.plotter.close()
 
 
 def window_pixels(window: "vtkRenderWindow") -> np.ndarray:
-    """Return what a window shows, rows from the top, (h, w, 3) uint8."""
+    """Return the pixels of a window, rows from the top, (h, w, 3) uint8."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
 

@@ -18,9 +18,9 @@ from mpmcli.render.surfaces.outline import OutlinePainter
 from mpmcli.render.theme import THEMES, Theme
 from mpmcli.render.view import View, aspect_of, view_of
 
-# Pictures whose height follows from the scene are no flatter than this, height over width, and no steeper.
+# Least ratio of height to width, and inverse of the largest, of pictures whose height follows from the scene.
 FLATTEST = 0.2
-# The texts around the scene grow with the picture, and the picture with the texts.
+# Iterations in which the sizes of the texts and of the picture settle.
 FITTING_ROUNDS = 4
 
 
@@ -40,11 +40,11 @@ class Painter(Protocol):
 
 @dataclass(frozen=True)
 class RenderSetup:
-    """All that pictures of one result with one setting share, but the painter and its window.
+    """Everything that the pictures of one result with one setting share, except the painter and its window.
 
     Attributes:
         settings: with the limits of the colours filled in.
-        colors: what a bar or a legend explains; None for none.
+        colors: explained by a colour bar or a legend; None without either.
     """
 
     result: Result
@@ -85,7 +85,7 @@ def surface_painter(scene: RenderScene, view: View, theme: Theme, colors: Colori
 
 
 def set_up(result: Result, settings: Settings) -> RenderSetup:
-    """Find out what pictures of a result need, and fill in what the settings leave open.
+    """Return what the pictures of a result share, and fill in what the settings leave open.
 
     Raises:
         InputError: the colours, the camera or the size are not possible.
@@ -106,9 +106,9 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
         settings = replace(settings, limits=colors.limits)
     width, height = settings.size
     times = expected_times(result)
-    # Elsewhere in 3D they are the edges of a box, and part of the scene.
+    # In other 3D pictures the walls are the edges of a box, part of the scene.
     walls = scene.dimension == 2 or settings.mode == "density"
-    # In perspective a length has no one size.
+    # A scale bar has no meaning in perspective.
     parallel = view_of(scene, camera, (width, width)).parallel
     layout = PictureLayout((width, height or width), scene, theme, times, colors, settings.grid, walls, parallel)
     if height is None:
@@ -121,7 +121,7 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
 
 
 def _grained(scene: RenderScene) -> RenderScene:
-    """Let everything that is no liquid be drawn as grains."""
+    """Return the scene with every material that is not liquid drawn as grains."""
     appearances = (
         appearance if appearance.liquid else replace(appearance, finish="grains") for appearance in scene.appearances
     )
@@ -129,9 +129,9 @@ def _grained(scene: RenderScene) -> RenderScene:
 
 
 def expected_times(result: Result) -> tuple[float, ...]:
-    """Return times that all labels of a film are written for, s: some of those of the whole run, if it goes on too.
+    """Return the times, s, that determine the digits of labels: those of the whole run, also while it goes on.
 
-    Otherwise milliseconds would become seconds while a film of a run under way is drawn.
+    Otherwise the unit of a film could change from milliseconds to seconds while a run is being drawn.
     """
     header = result.header
     if header.end is not None and header.frames is not None and header.frames > 1:
@@ -142,5 +142,5 @@ def expected_times(result: Result) -> tuple[float, ...]:
 
 
 def usual_color(scene: RenderScene) -> str:
-    """Return what dots are coloured by where nobody says: materials where they differ, or else speed."""
+    """Return the default colouring of dots: by material where there are several, else by speed."""
     return "material" if len(scene.appearances) > 1 else "speed"

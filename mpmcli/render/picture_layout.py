@@ -1,4 +1,4 @@
-"""What stands around a picture: title, time, colour bar or legend, scale bar, the walls of a flat domain."""
+"""The layout of a picture: title, time, colour bar or legend, scale bar, the walls of a flat domain."""
 
 import math
 from collections.abc import Sequence
@@ -16,19 +16,19 @@ from mpmcli.render.view import View
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
 
-# Sizes in pixels of a picture of 1280x720; they grow with the picture, and small ones keep a legible text.
+# Sizes in pixels for a picture of 1280x720; they scale with the picture, down to the smallest legible scale.
 PIXELS = 1280 * 720
 SMALLEST = 0.55
 TEXT, SMALL = 17, 14
 PAD = 16
 TOP, BOTTOM, LABEL, GAP = 44, 44, 26, 8
-# Pixels along a side of what is left for the scene, however much stands around it.
+# Least pixels along each side of the viewport.
 LEAST = 16
 BAR_WIDTH, TICK = 18, 6
 SWATCH = 16
-# Legends take this share of the width at most; longer names are cut.
+# Largest fraction of the width for legends; longer names are shortened.
 LEGEND_SHARE = 0.3
-# A scale bar is at most this share of the width.
+# Largest length of a scale bar, as a fraction of the width.
 SCALE_SHARE = 0.18
 TICKS = 6
 NO_NUMBER = "no number"
@@ -40,10 +40,10 @@ class PictureLayout:
 
     Args:
         size: of the whole picture, pixels, (width, height).
-        times: of the frames of the result, s, which say how many digits a time needs.
-        colors: what a bar or a legend explains; None for none.
+        times: of the frames of the result, s, which determine the digits of times.
+        colors: explained by a colour bar or a legend; None without either.
         grid: columns and rows of pictures of the scene.
-        walls: whether the walls of the domain are drawn around each of them, which are seen from the front.
+        walls: whether the walls of the domain are drawn around each of them.
         scale_bar: whether there is room for one below.
     """
 
@@ -153,13 +153,13 @@ class PictureLayout:
         if time is not None:
             told = time_text(time, self.times)
             draw.text((self.size[0] - pad, middle), told, self.theme.text, small, anchor="rm")
-            # The room of the longest time, so that a title does not change its length in a film.
+            # Space for the longest time, so that a title keeps its length throughout a film.
             room -= pad + max(small.getlength(time_text(t, self.times)) for t in (*self.times[-1:], time))
         title = cut(self.scene.title, lambda text: font.getlength(text) <= room)
         draw.text((pad, middle), title, self.theme.text, font, anchor="lm")
 
     def _time(self, draw: "ImageDraw", time: float, place: tuple[int, int]) -> None:
-        """Write the time above a picture of a montage, where there is room for it."""
+        """Draw the time above a picture of a montage, if it fits."""
         font, told = font_of(self._px(SMALL)), time_text(time, self.times)
         free = self.viewport_size[0] - font.getlength(told)
         if free >= 0:
@@ -167,7 +167,7 @@ class PictureLayout:
             draw.text((start, place[1]), told, self.theme.text, font, anchor="lm")
 
     def _walls(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
-        """Draw the walls around the domain, outside of it, so that nothing within is hidden."""
+        """Draw the walls just outside of the domain, so that nothing inside is hidden."""
         corners = view.pixels(np.array([self.scene.lower, self.scene.upper]))
         edges = np.rint(corners[:, :2] + place).astype(int)
         (x0, y0), (x1, y1) = edges.min(axis=0).tolist(), edges.max(axis=0).tolist()
@@ -211,13 +211,13 @@ class PictureLayout:
         return [colors.name, unit] if unit else [colors.name]
 
     def _bar_span(self, colors: Coloring) -> tuple[int, int]:
-        """Return about between which rows the bar stands, before it is known what its heading says."""
+        """Return the first and last row of the bar, estimated before the text of its heading is known."""
         line = self._px(SMALL + 6)
         top = self._px(TOP) + self._px(4) + (2 if colors.unit else 1) * line + self._px(8)
         return top, self.size[1] - self._bottom - self._px(PAD) - 2 * line
 
     def _ticks(self, colors: Coloring) -> tuple[list[float], list[str], str]:
-        """Return places, texts and unit of as many ticks as the bar has room for."""
+        """Return places, texts and unit of the ticks that fit along the bar."""
         top, bottom = self._bar_span(colors)
         return ticks_of(colors, max(1, min(TICKS, int((bottom - top) / (1.5 * self._px(SMALL))))))
 

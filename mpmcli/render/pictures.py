@@ -1,4 +1,4 @@
-"""Pictures of frames as files: which are to be made, and the making of them, in several processes."""
+"""Pictures of frames as files: which of them are missing or outdated, and drawing these in several processes."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -23,12 +23,12 @@ FOREIGN = "{path} is there already, and mpmcli render did not make it: give anot
 
 @dataclass(frozen=True)
 class PlannedPicture:
-    """A picture of one frame that is to be there in the end.
+    """The picture file of one frame, or of a montage.
 
     Attributes:
         k: position of the frame in the result.
         digest: of everything that it depends on.
-        made: whether it is there.
+        made: whether the file exists with this digest.
     """
 
     k: int
@@ -39,7 +39,7 @@ class PlannedPicture:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came up in a frame.
+    """Numbers of particles of a frame that could not be drawn.
 
     Attributes:
         missing: particles whose value is not a number.
@@ -52,7 +52,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class PictureJob:
-    """Pictures of some frames, as a process of its own makes them.
+    """Pictures of some frames, as a worker process makes them.
 
     Attributes:
         source: path of the result.
@@ -65,7 +65,7 @@ class PictureJob:
     plan: dict[int, PlannedPicture] = field(repr=False)
 
     def start(self) -> Callable[[int], Outcome]:
-        """Open the result and a window, and return what makes and writes the picture of a frame."""
+        """Open the result and a window, and return a function that draws and writes the picture of a frame."""
         setup = set_up(open_result(self.source), self.settings)
         renderer = PictureRenderer(setup)
 
@@ -79,7 +79,7 @@ class PictureJob:
 
 
 class PictureRenderer:
-    """A painter at work: whole pictures of frames, read one at a time."""
+    """Draws whole pictures of frames, which are read one at a time."""
 
     def __init__(self, setup: RenderSetup) -> None:
         choose_window()
@@ -90,7 +90,7 @@ class PictureRenderer:
         """Return the picture of a frame, or the montage of several, (h, w, 3) uint8.
 
         Args:
-            watch: told of each frame that has been drawn, and what came up in it.
+            watch: called with each frame that has been drawn, and its outcome.
         """
         setup, drawn, times, missing = self._setup, [], [], 0
         for k in ks:
@@ -112,8 +112,8 @@ class PictureRenderer:
 def picture_digest(result: Result, settings: Settings, ks: Sequence[int]) -> str:
     """Return a digest of what a picture of some frames depends on.
 
-    The ledger's row stands for the particles: it holds their energies and momenta to the last bit. How a time is
-    written hangs on other frames.
+    The ledger's row represents the particles, since it holds their energies and momenta to the last bit. The text of a
+    time depends on other frames.
     """
     times = expected_times(result)
     labels = [time_text(float(result.times[k]), times) for k in ks]
@@ -126,14 +126,14 @@ def picture_digest(result: Result, settings: Settings, ks: Sequence[int]) -> str
 def plan_pictures(
     result: Result, settings: Settings, ks: Sequence[int], path_of: Callable[[int], Path], *, overwrite: bool
 ) -> list[PlannedPicture]:
-    """Say which pictures are to be made; those that are there and still right are not made again.
+    """Return the pictures of some frames, and whether each exists and is up to date.
 
     Args:
         path_of: where the picture of a frame goes, by its position in the result.
-        overwrite: make all of them again, in place of whatever is there.
+        overwrite: draw all of them again, and replace any existing file.
 
     Raises:
-        InputError: something that mpmcli did not make is in the way.
+        InputError: a file exists that mpmcli did not make.
     """
     plan = []
     for k in ks:
@@ -146,7 +146,7 @@ def plan_pictures(
 
 
 def is_foreign(there: str | None) -> bool:
-    """Say whether a file with this digest, from `digest_of`, is not one of these pictures; nor is that of a ledger."""
+    """Return whether a digest, from `digest_of`, belongs to a file that is no picture of frames, such as a ledger's."""
     return there is not None and not re.fullmatch("[0-9a-f]{32}", there)
 
 
@@ -159,7 +159,7 @@ def make_pictures(
     watch: Callable[[int, Outcome], None] = lambda k, outcome: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Make the pictures of a plan that are not there yet.
+    """Draw the pictures of a plan that do not exist yet.
 
     Args:
         source: path of the result; settings: as `set_up` has filled them in.
@@ -172,7 +172,7 @@ def make_pictures(
     """
     due = {planned.k: planned for planned in plan if not planned.made}
     if due:
-        # Found out once, and handed down.
+        # Chosen once, and inherited by the workers.
         choose_window()
         render_frames(PictureJob(source, settings, due), list(due), workers, watch=watch, stop=stop)
 

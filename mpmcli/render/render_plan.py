@@ -20,7 +20,7 @@ class RenderSummary:
 
     Attributes:
         pictures: files, by frame; the one of a montage.
-        made: how many of them were made now.
+        made: number of them that were drawn now.
         film: the film, None where none was asked for.
         surfaces: the directory of the surfaces, None where none was asked for.
         warnings: sentences.
@@ -45,10 +45,10 @@ class RenderSummary:
 
 @dataclass(frozen=True)
 class RenderPlan:
-    """Pictures, a film or a montage of a result, all questions answered; nothing is drawn yet.
+    """A validated request for pictures, a film or a montage of a result; nothing is drawn yet.
 
     Attributes:
-        setup: what all pictures share.
+        setup: shared by all pictures.
         ks: positions of the frames in the result.
         plan: the picture files, one for each frame; one for a montage.
     """
@@ -78,17 +78,17 @@ class RenderPlan:
         watch: Callable[[int], None] = lambda done: None,
         stop: Callable[[], bool] = lambda: False,
     ) -> RenderSummary:
-        """Draw what is due, and put the film together.
+        """Draw the missing pictures, and write the film.
 
         Args:
             workers: processes at a time, as many as cores for None.
-            watch: told how many frames have been drawn.
-            stop: asked again and again whether to end.
+            watch: called with the number of frames drawn so far.
+            stop: polled; true ends the work.
 
         Raises:
-            InputError: nothing draws on this machine, or a place cannot be written to.
+            InputError: no OpenGL window opens on this machine, or a file cannot be written.
             RunError: a process crashed, or the disk is full.
-            KeyboardInterrupt: `stop` said so; pictures that are done stay.
+            KeyboardInterrupt: `stop` returned true; finished pictures stay.
         """
         workers = workers or available_cores()
         source, settings = self.setup.result.path, self.setup.settings
@@ -137,7 +137,7 @@ class RenderPlan:
             write_film([planned.path for planned in self.plan], movie, self.fps, digest=digest, watch=watched)
 
     def _warnings(self, outcomes: dict[int, Outcome]) -> list[str]:
-        """Say what could not be shown as it is, once for all frames."""
+        """Return sentences on particles that could not be drawn, one for all frames."""
         told = []
         numbers = self.setup.result.numbers
         colors = self.setup.colors

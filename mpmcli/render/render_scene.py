@@ -1,4 +1,4 @@
-"""What a picture needs to know of a run: its domain, its bodies and their materials."""
+"""The scene of a picture: the domain of a run, its bodies and the appearance of their materials."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -49,7 +49,7 @@ def render_scene_of(result: Result) -> RenderScene:
     """Read the facts off the header of a result.
 
     Raises:
-        InputError: it does not say what the domain is.
+        InputError: the header lacks the domain.
     """
     header, d = result.header, result.dimension
     if header.origin is None or not header.spacing:
@@ -88,7 +88,7 @@ def _up(gravity: np.ndarray | None, d: int) -> tuple[float, ...]:
 def _materials(
     bodies: Sequence[str], tables: Sequence[Mapping[str, Any]]
 ) -> tuple[tuple[Appearance, ...], tuple[int, ...]]:
-    """Find the materials that differ, and which each body has."""
+    """Return the appearances of the distinct materials, and the index of each body's material."""
     kinds: list[Mapping[str, Any]] = []
     firsts: list[str] = []
     appearances: list[Appearance] = []

@@ -1,4 +1,4 @@
-"""The options of `mpmcli render`, and what they ask for: what cannot be done is refused before anything is drawn."""
+"""The options of `mpmcli render`, validated before anything is drawn."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -52,10 +52,10 @@ class Request:
 
 
 def plan_render(result: Result, request: Request) -> RenderPlan:
-    """Check a request and work out what it means.
+    """Validate a request and return the plan that carries it out.
 
     Raises:
-        InputError: it cannot be done.
+        InputError: the request is not possible.
     """
     _require_sense(request)
     if request.movie is not None:

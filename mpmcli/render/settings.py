@@ -1,4 +1,4 @@
-"""What was asked of a picture, and the sentences for what cannot be asked."""
+"""The settings of a picture, and the parsing of their texts."""
 
 import math
 import re
@@ -9,11 +9,11 @@ from mpmcli.errors import InputError
 
 Mode = Literal["dots", "surface", "fluid", "density"]
 MODES: tuple[Mode, ...] = ("dots", "surface", "fluid", "density")
-# Pixels along a side, and altogether: more would be a slip of the pen, and not fit into the memory of a renderer.
+# Pixels along a side, and in all: more would not fit into the memory of a renderer.
 SIDE_MIN, SIDE_MAX = 64, 16_384
 PIXELS_MAX = 64_000_000
-# Of limits of colours and the distance between them, as numbers end not far beyond; of that distance over the limits,
-# as closer ones round to the same.
+# Largest limit of colours and least distance between two, well within double precision; least distance relative to the
+# limits, as closer ones round to the same number.
 LIMIT_MAX, LIMIT_MIN, NARROWEST = 1e300, 1e-300, 1e-12
 # Pictures in a montage, along each side.
 GRID_MAX = 20
@@ -21,7 +21,7 @@ GRID_MAX = 20
 
 @dataclass(frozen=True)
 class Settings:
-    """How pictures are made; all that they depend on beside the frame itself.
+    """Everything that a picture depends on, except the frame.
 
     Attributes:
         color: as `--color-by`; None for materials that look like what they are.

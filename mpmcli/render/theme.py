@@ -1,4 +1,4 @@
-"""Light and dark: the colours of everything that is not particles."""
+"""The light and the dark theme: the colours of everything except particles."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -14,7 +14,7 @@ class Theme:
         ground: background of the picture, and behind the particles in 2D.
         sky, horizon: of the background of a 3D scene, above and below.
         floor: what shadows fall on.
-        text: titles and numbers; faint: what is there to be found, not to be seen.
+        text: titles and numbers; faint: secondary marks.
         wall: lines of the domain.
         missing: values that are not numbers.
     """

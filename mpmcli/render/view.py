@@ -1,4 +1,4 @@
-"""Where the camera stands, and which pixel a point of the scene falls on."""
+"""The camera, and the projection of points onto pixels."""
 
 import math
 from dataclasses import dataclass
@@ -13,29 +13,29 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 CAMERAS = ("iso", "front", "side", "top")
-# Full vertical angle of a perspective view, degrees: a long lens, which distorts little.
+# Full vertical angle of a perspective view, degrees: a long lens distorts little.
 ANGLE = 24.0
-# Share of the picture that stays free around the domain, on each side.
+# Margin around the domain on each side, as a fraction of the picture.
 MARGIN = 0.04
-# Of "iso": degrees that the camera stands to the right of the front, and above the ground.
+# Angles of the camera "iso" to the right of the front and above the ground, degrees.
 AZIMUTH, ELEVATION = 32.0, 24.0
-# Pixels along the sides of a picture that is only thought of.
+# Pixels along the sides of the auxiliary picture that gives the aspect ratio.
 SQUARE = 1000
-# Sizes of the domain that a camera may be away from it: it is a hundredth of a pixel there.
+# Largest distance of a camera, in sizes of the domain, which then covers a hundredth of a pixel.
 FARTHEST = 1e5
-# Rounds in which the middle of the projected domain is brought to the middle of the picture.
+# Iterations that centre the projected domain in the picture.
 CENTRING_ROUNDS = 8
 
 
 @dataclass(frozen=True)
 class View:
-    """A camera and the size of what it takes.
+    """A camera and the size of its picture.
 
     Attributes:
         size: pixels, (width, height).
         position, focus, up: of the camera, (3,), m; `up` is a direction.
         height: length at the focus that the full height of the picture shows, m.
-        parallel: lengths look alike at every distance, so that a scale bar has a meaning.
+        parallel: parallel projection, in which a scale bar has a meaning.
         near, far: distances from the camera between which the domain lies, m.
     """
 
@@ -72,7 +72,7 @@ class View:
         return np.stack([0.5 * width + right * scale, 0.5 * height - up * scale, depth], axis=1)
 
     def place(self, plotter: "pv.Plotter") -> None:
-        """Put the camera of a plotter here."""
+        """Set the camera of a plotter to this view."""
         camera = plotter.camera
         camera.position, camera.focal_point, camera.up = self.position, self.focus, self.up
         camera.parallel_projection = self.parallel
@@ -170,7 +170,7 @@ def _free_view(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
     if np.linalg.norm(back) <= 1e-9 * max(np.abs(numbers).max(), 1e-300):
         raise InputError(f"{what}: this one looks at where it stands.")
     if np.linalg.norm(np.cross(back, up)) <= 1e-6 * np.linalg.norm(back):
-        # Straight up or down: any other direction will do for the upper edge.
+        # Looking straight up or down, any other direction serves as the upward one.
         up = np.eye(3)[(int(np.argmax(np.abs(up))) + 1) % 3]
     height = 2 * math.tan(math.radians(0.5 * ANGLE)) * float(np.linalg.norm(back))
     return _view(scene, size, position, focus, up, height, parallel=False)

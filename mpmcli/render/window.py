@@ -1,4 +1,4 @@
-"""Chooses the OpenGL window that draws without a screen, and tries it where it can do no harm.
+"""The choice of an OpenGL window that draws without a screen, tried in a separate process first.
 
 VTK takes a window at its first picture, and where the libraries of that window are missing it ends the interpreter by
 SIGSEGV, which no `except` catches. So each window is tried in a process of its own before this one opens any. That
@@ -17,12 +17,12 @@ from mpmcli.errors import InputError
 from mpmcli.processes.questions import Question, ask, module_command
 from mpmcli.render.window_probe import NO_VTK
 
-# Where VTK reads the class of its windows.
+# Environment variable from which VTK reads the class of its windows.
 SETTING = "VTK_DEFAULT_OPENGL_WINDOW"
-# Where a process finds what the one that started it has chosen.
+# Environment variable with the window that the parent process has chosen, as JSON.
 HANDED_DOWN = "MPMCLI_OPENGL_WINDOW"
 EGL, OSMESA, X = "vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow", "vtkXOpenGLRenderWindow"
-# Seconds; loading VTK from a cold disk has been seen to take most of them.
+# Seconds; loading VTK from a cold disk can take most of them.
 TIMEOUT = 120.0
 # The first version of VTK whose wheel draws without a screen.
 OLDEST_WITHOUT_SCREEN = (9, 4)
@@ -30,7 +30,7 @@ OLDEST_WITHOUT_SCREEN = (9, 4)
 
 @dataclass(frozen=True)
 class Window:
-    """A window that has drawn.
+    """A window that is known to draw.
 
     Attributes:
         setting: what VTK_DEFAULT_OPENGL_WINDOW says, "" where VTK is left to choose.
@@ -85,7 +85,7 @@ def try_windows(timeout: float = TIMEOUT) -> Iterator[Attempt]:
             named = {key: str(answer.get(key, "")) for key in ("renderer", "version")}
             yield Attempt(setting, Window(setting, str(answer["window"]), **named))
             return
-        # What came before a crash explains nothing.
+        # An answer before a crash has no meaning.
         yield Attempt(setting, None, reply.fault or str(answer.get("problem", "gave no answer")))
 
 

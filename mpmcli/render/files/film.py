@@ -17,11 +17,11 @@ from mpmcli.render.files.h264 import write_h264
 from mpmcli.render.files.picture_file import write_fault
 
 Picture = Path | np.ndarray
-# Beyond these it is a slip of the pen.
+# Frames per second, least and most.
 FPS_MIN, FPS_MAX = 0.01, 1000.0
-# Pictures from which the colours of a gif are chosen.
+# Number of pictures from which the palette of a gif is computed.
 FEW = 12
-# Before the digest at the end of a film; and the kind of box that players of .mp4 skip.
+# Marks the digest at the end of a film; type of the box that players of .mp4 skip.
 KEYWORD = b"mpmcli"
 SKIPPED = b"free"
 DIGEST_MAX = 64
@@ -29,7 +29,7 @@ NONE = "A film needs at least one picture, and there is none."
 
 
 def check_film(path: Path, fps: float) -> None:
-    """Raise InputError where no film can be made, before any picture is: another kind of file, or an absurd rate."""
+    """Raise InputError for a file that is neither .mp4 nor .gif, or for a rate out of range."""
     if path.suffix.lower() not in (".mp4", ".gif"):
         raise InputError(f"{path} would be no film: give a name that ends in .mp4 or .gif.")
     if not (math.isfinite(fps) and FPS_MIN <= fps <= FPS_MAX):
@@ -60,7 +60,7 @@ def write_film(
         path: its end says which kind: .mp4 or .gif.
         fps: frames per second.
         digest: from `settings_digest`, which `film_digest` reads back.
-        watch: told how many pictures have been taken in, after each.
+        watch: called after each picture with the number of pictures read.
 
     Raises:
         InputError: see `check_film`; there is no picture, one cannot be read or has another size, the place cannot be
@@ -140,7 +140,7 @@ def _name(picture: Picture, k: int) -> str:
 
 
 def _few(pictures: Sequence[Picture]) -> list[np.ndarray]:
-    """Return some pictures from first to last, to choose colours from."""
+    """Return some pictures from first to last, for the palette."""
     if not pictures:
         raise InputError(NONE)
     count = min(len(pictures), FEW)
@@ -148,7 +148,7 @@ def _few(pictures: Sequence[Picture]) -> list[np.ndarray]:
 
 
 def _kept(images: Iterable[np.ndarray], folder: Path) -> list[Path]:
-    """Keep pictures that come only once on the disk, until all of them have been seen."""
+    """Save the pictures of an iterator on disk, since they are read twice."""
     from PIL import Image
 
     kept = []

@@ -14,18 +14,18 @@ import numpy as np
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-# Browsers slow down what is faster.
+# Browsers slow down faster films.
 FPS_MAX = 50
-# The last of 256 colours stands for what the picture before it shows.
+# Colours of the palette; the last index marks pixels unchanged since the previous picture.
 COLOURS, UNCHANGED = 255, 255
-# Bits of each channel in which colours are counted.
+# Bits of each channel in the histogram of colours.
 BITS = 6
-# Pixels that the colours are chosen from.
+# Number of pixels from which the palette is computed.
 CHOOSING = 200_000
 
 
 def write_gif(few: Sequence[np.ndarray], images: Iterable[np.ndarray], place: Path, fps: float) -> None:
-    """Write pictures as a gif that repeats for ever, each as it comes.
+    """Write pictures, one at a time, as a gif that repeats for ever.
 
     Args:
         few: some of the pictures, whose colours are those of the film.
@@ -51,7 +51,7 @@ def write_gif(few: Sequence[np.ndarray], images: Iterable[np.ndarray], place: Pa
 def _palette(few: Sequence[np.ndarray]) -> "Image":
     """Return an image with the colours of the film.
 
-    Colours count by the root of how often they occur, so that a large background does not take them all.
+    Colours are weighted by the square root of their frequency, so that a large background does not dominate.
     """
     from PIL import Image
 

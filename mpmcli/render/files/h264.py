@@ -1,4 +1,4 @@
-"""H.264 in an .mp4, by the ffmpeg that imageio-ffmpeg brings or finds."""
+"""H.264 in an .mp4, by the ffmpeg that imageio-ffmpeg provides."""
 
 import subprocess
 import tempfile
@@ -14,13 +14,13 @@ from mpmcli.errors import InputError, RunError
 
 # Constant rate factor of H.264: 18 is visually near-lossless, 23 is ffmpeg's default.
 QUALITY = 18
-# Three times as fast as "medium" for films of the same size, and not to be told from it.
+# Three times as fast as "medium", for visually equal films of the same size.
 PRESET = "veryfast"
-# How the encoder shares its work is seen in the bytes, so it does not follow the machine's number of cores.
+# Fixed, since the bytes of a film depend on the number of threads.
 THREADS = 2
 # Lines of ffmpeg's stderr that are quoted on failure.
 LAST_WORDS = 2
-# Players take the colours of a large picture for BT.709, and ffmpeg would write BT.601.
+# Players assume BT.709 for large pictures, while ffmpeg writes BT.601 by default.
 COLOURS = (
     "scale=out_range=tv:out_color_matrix=bt709:flags=accurate_rnd+full_chroma_int+bicubic,"
     "setparams=range=tv:colorspace=bt709:color_primaries=bt709:color_trc=bt709"
@@ -28,7 +28,7 @@ COLOURS = (
 
 
 def write_h264(images: Iterable[np.ndarray], place: Path, name: Path, fps: float) -> None:
-    """Write pictures as a film, each as it comes.
+    """Write pictures, one at a time, as a film.
 
     Args:
         images: (h, w, 3) uint8, all of one size; at least one.
@@ -86,7 +86,7 @@ def _started(program: str, width: int, height: int, place: Path, fps: float, sai
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=said,
-            # Ctrl-C at the terminal is for this process, which then ends ffmpeg.
+            # Ctrl-C at the terminal reaches only this process, which then ends ffmpeg.
             start_new_session=True,
         )
     except OSError as error:
@@ -107,7 +107,7 @@ def _finish(process: subprocess.Popen, said: IO[bytes], name: Path) -> None:
 
 def _close(process: subprocess.Popen) -> None:
     assert process.stdin is not None
-    # It may not listen any more.
+    # The process may have ended.
     with suppress(OSError):
         process.stdin.close()
 

@@ -1,4 +1,4 @@
-"""PNG files that know what they show: a digest of the settings they were made with, in a text chunk."""
+"""PNG files with a digest of their settings in a text chunk."""
 
 import errno
 import hashlib
@@ -19,16 +19,16 @@ KEYWORD = "mpmcli"
 # 1280x720 dots: level 0 takes 11 ms for 2.8 MB, 1 18 ms for 228 kB, 4 22 ms for 207 kB, 9 300 ms for 200 kB.
 COMPRESS_LEVEL = 1
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
-# The last chunk, which a file that was cut off has lost.
+# The last chunk, which a truncated file lacks.
 END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 # Largest text chunk that is read, bytes; a digest is far shorter.
 TEXT_MAX = 4096
-# The disk, not what was asked for.
+# Errors of the disk rather than of the request.
 DISK_FAULTS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 
 
 def settings_digest(settings: dict[str, Any]) -> str:
-    """Return a digest of what a picture depends on, the version of mpmcli included: 32 hexadecimal digits.
+    """Return a digest of the settings of a picture and of the version of mpmcli, 32 hexadecimal digits.
 
     Args:
         settings: what JSON can hold, and numpy's numbers and arrays; the order of its keys does not matter, and
@@ -43,7 +43,7 @@ def settings_digest(settings: dict[str, Any]) -> str:
 
 
 def write_picture(path: Path, image: np.ndarray, digest: str) -> None:
-    """Write a PNG, whole or not at all, in place of what is there; its directory is made where it is missing.
+    """Write a PNG atomically, replacing an existing file; a missing directory is created.
 
     Args:
         image: (h, w, 3) uint8.
@@ -85,9 +85,9 @@ def digest_of(path: Path) -> str | None:
 
 
 def require_writable(path: Path) -> None:
-    """Raise InputError where a file cannot be made, before any work is put into it; nothing is made.
+    """Raise InputError if a file cannot be created, without creating it.
 
-    A disk may still refuse when it is written.
+    The disk may still be full when it is written.
     """
     directory = path.parent
     while not directory.exists() and directory != directory.parent:
@@ -100,7 +100,7 @@ def require_writable(path: Path) -> None:
 
 
 def write_fault(path: Path, error: OSError) -> MpmcliError:
-    """Return what to raise where a file could not be written: RunError for a fault of the disk, else InputError."""
+    """Return the exception for a file that could not be written: RunError for a fault of the disk, else InputError."""
     reason = error.strerror or str(error)
     if isinstance(error, FileExistsError | NotADirectoryError):
         reason = f"{path.parent} is no directory"
