@@ -93,16 +93,23 @@ def record_property(record_property: Callable[[str, object], None]) -> Callable[
 
 @pytest.fixture(scope="session")
 def backend_of() -> "Iterator[Callable[..., Backend]]":
-    """Return `start(precision, threads=2, arch="cpu")`: it ends the running backend and starts a fresh one.
+    """Return `start(precision, threads=2, arch="cpu", fully_optimised=False)`, which replaces the running backend.
 
     Taichi is global: whatever was built on the backend before dies with it, so a module starts one and
     builds its solvers on it, or keeps no solver from one test to the next.
+
+    Taichi's own optimisations take half of the time to compile and leave the bytes as they are (test_optimisation.py),
+    so that they are left out here. Commands that a test runs, and `fully_optimised` backends, have them.
     """
     from mpmcli.solver.backend import start_backend, stop_backend
 
-    def start(precision: str, threads: int = 2, arch: str = "cpu") -> "Backend":
+    def start(precision: str, threads: int = 2, arch: str = "cpu", *, fully_optimised: bool = False) -> "Backend":
         stop_backend()
-        return start_backend(arch, threads, precision)
+        if fully_optimised:
+            return start_backend(arch, threads, precision)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("TI_ADVANCED_OPTIMIZATION", "0")
+            return start_backend(arch, threads, precision)
 
     yield start
     stop_backend()

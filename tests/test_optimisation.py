@@ -1,0 +1,24 @@
+"""Tests compile with fewer of Taichi's optimisations than users do (conftest.py): both compute the same bytes."""
+
+from collections.abc import Callable
+
+import pytest
+import state_run
+
+from mpmcli.solver.solver import Solver
+
+# Two laws in one scene, forces and expressions.
+USUAL = ("forces",)
+STEPS = 40
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in USUAL else pytest.mark.slow) for name in state_run.NAMES]
+)
+def test_the_bytes_do_not_depend_on_the_optimisation(backend_of: Callable, name: str) -> None:
+    states = []
+    for fully_optimised in (True, False):
+        solver = Solver(state_run.scene_named(name), backend_of("f32", 1, fully_optimised=fully_optimised))
+        state_run.advance(solver, STEPS)
+        states.append(solver.state.save())
+    assert state_run.differences(*states) == []
