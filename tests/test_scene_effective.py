@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import create_model
 
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import (
@@ -19,6 +20,7 @@ from mpmcli.scene import (
     scene_to_toml,
 )
 from mpmcli.scene.presets import PRESETS
+from mpmcli.scene.quantity import Table
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SCENES = sorted(CONFIGS.glob("*.toml"))
@@ -101,6 +103,22 @@ def test_loading_the_effective_scene_gives_the_same_scene(data):
     assert again.scene == scene
     assert again.notes == ()  # nothing is left to choose
     assert scene_to_toml(again.scene) == text
+
+
+def test_a_new_list_of_tables_is_written_without_a_change_here():
+    """The layout follows the model: a list of tables that the schema gains is read back as it was."""
+
+    class Collider(Table):
+        center: tuple[float, float]
+        keys: tuple[dict[str, float], ...] = ()
+
+    extended = create_model("Extended", __base__=scene_model(LAWS), colliders=(tuple[Collider, ...], ()))
+    tables = [{"center": [0.5, 0.25], "keys": []}, {"center": [0.0, 1.0], "keys": [{"t": 0.0, "x": 1.0}]}]
+    scene = parse_scene(tomllib.loads((CONFIGS / "mixed_2d.toml").read_text(encoding="utf-8")), laws=LAWS).scene
+    colliders = tuple(map(Collider.model_validate, tables))
+    found = tomllib.loads(scene_to_toml(extended.model_construct(**dict(scene), colliders=colliders)))
+    assert found.pop("colliders") == tables
+    assert found == tomllib.loads(scene_to_toml(scene))
 
 
 def test_the_effective_scene_reads_well():

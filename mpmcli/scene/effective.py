@@ -1,5 +1,6 @@
 """The effective scene as TOML: every default filled in, laid out to be read."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import tomli_w
@@ -7,6 +8,8 @@ import tomli_w
 from mpmcli.scene.schema import Scene
 
 _WIDTH = 100
+# Keys of an entry of a list that are tables of their own, not inline.
+_OWN_TABLE = ("material",)
 
 
 def scene_to_toml(scene: Scene) -> str:
@@ -16,16 +19,22 @@ def scene_to_toml(scene: Scene) -> str:
     parameters, whatever presets and knobs they came from.
     """
     data = scene.model_dump(exclude_none=True, exclude={"domain": {"cells"}})
-    bodies = data.pop("bodies")
-    title = data.pop("title")
-    blocks = [f"title = {_value(title)}"]
-    blocks += [_table(f"[{name}]", data.pop(name)) for name in ("domain", "time")]
-    for body in bodies:
-        material = body.pop("material")
-        blocks += [_table("[[bodies]]", body), _table("[bodies.material]", material)]
-    blocks += [_table("[[forces]]", force) for force in data.pop("forces")]
-    blocks += [_table(f"[{name}]", table) for name, table in data.items()]
-    return "\n\n".join(blocks) + "\n"
+    return "\n\n".join(block for name, value in data.items() for block in _blocks(name, value)) + "\n"
+
+
+def _blocks(name: str, value: object) -> Iterator[str]:
+    """Lay out one key of the scene: a value, a table, or a list of tables; a material has a table of its own."""
+    match value:
+        case dict():
+            yield _table(f"[{name}]", value)
+        case list() | tuple():
+            for entry in value:
+                inner = {key: entry.pop(key) for key in _OWN_TABLE if key in entry}
+                yield _table(f"[[{name}]]", entry)
+                for key, table in inner.items():
+                    yield _table(f"[{name}.{key}]", table)
+        case _:
+            yield f"{name} = {_value(value)}"
 
 
 def _table(header: str, table: dict[str, Any]) -> str:
