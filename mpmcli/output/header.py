@@ -12,7 +12,11 @@ from pydantic import ValidationError
 from mpmcli import __version__
 from mpmcli.scene import Scene
 from mpmcli.scene.domain import Walls
+from mpmcli.scene.schema import SolverSettings, usual_particles_per_cell
 from mpmcli.scene.shapes import Shape
+
+# Of a scene that does not say.
+_TRANSFER = SolverSettings.model_fields["transfer"].default
 
 
 class LawFacts(Protocol):
@@ -149,7 +153,7 @@ class RunHeader:
             gravity=None if timed else steady,
             steady_gravity=steady,
             driven=timed or bool(scene.get("forces")),
-            keeps_spin=scene.get("solver", {}).get("transfer", "apic") == "apic",
+            keeps_spin=scene.get("solver", {}).get("transfer", _TRANSFER) == "apic",
             sticking=_sticking(domain.get("walls"), d),
             bodies=_bodies([str(name) for name in stored.get("bodies", ())], scene.get("bodies", []), d),
             laws=_laws(stored),
@@ -241,7 +245,7 @@ def _bodies(names: Sequence[str], tables: Sequence[Mapping[str, Any]], d: int) -
             name,
             table.get("material", {}),
             _volume(table.get("shape", {}), d),
-            table.get("particles_per_cell", 2**d),
+            table.get("particles_per_cell", usual_particles_per_cell(d)),
         )
         for name, table in zip(names, tables, strict=True)
     )

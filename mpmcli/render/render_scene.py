@@ -11,6 +11,7 @@ from mpmcli.output.header import BodyHeader
 from mpmcli.output.result import Result
 from mpmcli.plain_text import one_line
 from mpmcli.render.appearance import OTHERS, Appearance, appearance_of
+from mpmcli.scene.schema import usual_particles_per_cell
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def render_scene_of(result: Result) -> RenderScene:
     header, d = result.header, result.dimension
     if header.origin is None or not header.spacing:
         raise InputError(f"{result.path} does not say what its domain is, so that no picture can be framed.")
-    bodies = header.bodies or (BodyHeader("all", {}, None, 2**d),)
+    bodies = header.bodies or (BodyHeader("all", {}, None, usual_particles_per_cell(d)),)
     names = tuple(one_line(body.name) for body in bodies)
     appearances, material_of = _materials(names, [body.material for body in bodies])
     flat = [0.0] * (3 - d)

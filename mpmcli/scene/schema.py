@@ -54,8 +54,13 @@ class Time(Table):
     ] = 0.8
 
 
+def usual_particles_per_cell(dimension: int) -> int:
+    """Return the particles per cell of a body that does not give them: two per axis."""
+    return 2**dimension
+
+
 def _filled_lattice(value: object, info: ValidationInfo) -> object:
-    return 2 ** (scene_dimension(info) or 2) if value is None else value
+    return usual_particles_per_cell(scene_dimension(info) or 2) if value is None else value
 
 
 def _whole_lattice(count: int, info: ValidationInfo) -> int:
