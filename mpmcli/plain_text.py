@@ -1,4 +1,4 @@
-"""Tables, sizes and titles as plain text."""
+"""Tables, sizes, counts and titles as plain text."""
 
 SIZES = ("B", "kB", "MB", "GB", "TB", "PB")
 
@@ -16,8 +16,13 @@ def text_table(head: tuple[str, ...], rows: list[tuple[str, ...]], left: set[int
     return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number and its noun, such as "1 frame" or "2 frames"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def one_line(text: str) -> str:
-    """Return a text without line breaks and other characters that nothing is drawn for, as a font needs it."""
+    """Return a text without line breaks and other characters that have no glyph."""
     return " ".join("".join(character if character.isprintable() else " " for character in text).split())
 
 

@@ -1,1 +1,1 @@
-"""Speed of mpmcli beside the MPM examples that the taichi package ships, measured in turn."""
+"""Speed of mpmcli and of the MPM examples in the taichi package, measured alternately."""

@@ -8,8 +8,7 @@ import numpy as np
 DENSITY = 1.0
 BULK_MODULUS = 400.0
 GRAVITY = 9.8
-# mpm88 starts its block with this downward speed; here every block does, so that particles
-# change cells, and sorting them again is part of what is measured.
+# Initial downward speed of mpm88, here of every block: particles change cells, and sorting is part of the step.
 SPEED = 1.0
 # Lower corner and edge of the block in the example mpm88; mpm3d starts at 0.15, with the same edge.
 CORNER = 0.2

@@ -26,7 +26,7 @@ class Worker:
 
     Attributes:
         ready: its first answer.
-        start_seconds: time from asking for the process to that answer.
+        start_seconds: time from the start of the process to that answer.
     """
 
     def __init__(self, arguments: list[str]) -> None:
@@ -62,7 +62,7 @@ class Worker:
             self._process.stdin.write(command + "\n")
             self._process.stdin.flush()
         except OSError:
-            pass  # it has died; the answer says why
+            pass  # it has died; the answer contains the reason
         return self._answer()
 
     def close(self) -> None:
@@ -74,7 +74,7 @@ class Worker:
             try:
                 stream.close()
             except OSError:
-                continue  # unsent input of a process that is gone
+                continue  # unsent input of a process that has ended
 
     def _answer(self) -> dict:
         line = self._process.stdout.readline()

@@ -44,10 +44,10 @@ class Contestant(Protocol):
         """Advance by one time step; may return before the device is done."""
 
     def sync(self) -> None:
-        """Wait until every step asked for is done."""
+        """Wait until every requested step is done."""
 
     def is_sound(self) -> bool:
-        """Whether the state still makes sense."""
+        """Whether every particle is in the domain."""
 
 
 def run_block(contestant: Contestant, seconds: float) -> tuple[int, float]:
@@ -67,22 +67,22 @@ def run_block(contestant: Contestant, seconds: float) -> tuple[int, float]:
 
 
 class Rewinding(Contestant, Protocol):
-    """A contestant that can take the same steps again."""
+    """A contestant that can repeat steps."""
 
     watch_seconds: float
 
     def keep(self) -> None:
-        """Remember the state."""
+        """Save the state."""
 
     def rewind(self) -> None:
-        """Return to the state that was kept."""
+        """Restore the saved state."""
 
     def flowing(self) -> float:
         """Return the share of particles that flow."""
 
 
 def repeat_stretch(contestant: Rewinding, stretch: int, seconds: float) -> dict[str, float]:
-    """Take `stretch` steps from the state that was kept, until `seconds` have gone into steps, at least once.
+    """Take `stretch` steps from the state that was kept, until the steps have taken `seconds`, at least once.
 
     Returns:
         "steps" taken, and without those of the rewinding "seconds", "watch_seconds", which are the part of them that

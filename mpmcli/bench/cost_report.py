@@ -1,4 +1,4 @@
-"""What laws cost, as tables for people and as a dictionary for JSON."""
+"""The cost of laws, as text tables and as a dictionary for JSON."""
 
 import statistics
 from collections.abc import Iterator, Sequence
@@ -8,16 +8,16 @@ from mpmcli.bench.cases import BenchCase
 from mpmcli.bench.report import describe_machine, heading
 from mpmcli.plain_text import text_table
 
-# (law, its measure, how many times as much it may cost).
+# (law, reference law, largest ratio of their costs).
 TARGETS = (("fixed_corotated", "neo_hookean", 2.0), ("sand", "fluid", 5.0), ("snow", "fluid", 5.0))
-# How many times the sum of its parts a scene with two laws may cost.
+# Largest ratio of the cost of a scene with two laws to the sum of its parts.
 MIX_TARGET = 1.05
-# What every law is compared with.
+# Laws that every law is compared with.
 MEASURES = ("fluid", "neo_hookean")
 
 
 def name_of(names: Sequence[str]) -> str:
-    """Return what to call the laws of a column, by place, like "fluid + sand" or "half of sand"."""
+    """Return the name of the laws of a column, by place, such as "fluid + sand" or "half of sand"."""
     return ("" if all(names) else "half of ") + " + ".join(filter(None, names))
 
 
@@ -29,12 +29,12 @@ class CostResult:
         case: sizes and step.
         names: of the laws, by place, each with an equal share of the column; "" where the place is empty.
         costs: s per particle and step of each measured block, in order.
-        compile_seconds: what the first step took beyond a usual one, with nothing cached on disk.
+        compile_seconds: time of the first step beyond that of a usual one, without a cache on disk.
         bytes_per_particle: device memory, sort buffers included, of a particle of the law that takes most.
         flowing: share of the particles whose state the last step projected: those in plastic flow, or torn.
         watch_share: share of the time that went into measuring the state, for the limits of the next steps.
         smallest_step: smallest time step that was taken, s.
-        sound: whether every particle was still where it can be.
+        sound: whether every particle was in the domain at the end.
     """
 
     case: BenchCase
@@ -109,7 +109,7 @@ class Ratio:
 
 
 def ratio_of(result: CostResult, *parts: CostResult) -> Ratio:
-    """Return what a result costs over the mean of its parts, which is their sum with an equal share of particles."""
+    """Return the cost of a result over the mean of its parts, which is their sum with an equal share of particles."""
     rounds = [
         cost / statistics.fmean(beside)
         for cost, *beside in zip(result.costs, *(part.costs for part in parts), strict=True)
@@ -119,13 +119,13 @@ def ratio_of(result: CostResult, *parts: CostResult) -> Ratio:
 
 @dataclass(frozen=True)
 class Target:
-    """What a cost should be: at most `limit` times another.
+    """An upper bound of the ratio of two costs.
 
     Attributes:
         case: name of the case.
-        text: what is compared.
-        ratio: what was found.
-        limit: the most that it should be.
+        text: the two costs.
+        ratio: the measured ratio.
+        limit: the bound.
     """
 
     case: str
@@ -135,16 +135,16 @@ class Target:
 
     @property
     def met(self) -> bool:
-        """Whether it is."""
+        """Whether the ratio is within the bound."""
         return self.ratio.value <= self.limit
 
     def as_dict(self) -> dict:
-        """Return it as JSON can hold it."""
+        """Return it as a dictionary for JSON."""
         found = {"ratio": self.ratio.value, "ratio_min": self.ratio.low, "ratio_max": self.ratio.high}
         return {"case": self.case, "target": self.text, **found, "limit": self.limit, "met": self.met}
 
     def sentence(self) -> str:
-        """Say what was found, and what should be."""
+        """Return the ratio and the bound as a sentence."""
         verdict = "" if self.met else ", MISSED"
         return f"{self.case}: {self.text}: {self.ratio.value:.3f}, should be at most {self.limit:g}{verdict}."
 
@@ -170,11 +170,11 @@ class CostReport:
 
     @property
     def clock(self) -> str:
-        """What time is counted."""
+        """The clock of the measurements."""
         return "processor time" if self.threads == 1 else "wall time"
 
     def of(self, result: CostResult, *others: Sequence[str]) -> Ratio | None:
-        """Return a cost over the mean of others at the same case, or None where those were not measured."""
+        """Return the ratio of a cost to the mean of others at the same case, or None if those were not measured."""
         found = {other.names: other for other in self.results if other.case == result.case}
         if not others or not all(names in found for names in others):
             return None
@@ -182,7 +182,7 @@ class CostReport:
 
     @property
     def targets(self) -> tuple[Target, ...]:
-        """What the costs should be, as far as it was measured."""
+        """The bounds of the costs that were measured."""
         return tuple(self._targets())
 
     def _targets(self) -> Iterator[Target]:

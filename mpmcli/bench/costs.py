@@ -1,4 +1,4 @@
-"""Measures what laws cost: a process for each law and each mix, all alive, measured in turn (A B C ... A B C ...)."""
+"""Measures the cost of laws: a process for each law and each mix, measured in turn (A B C ... A B C ...)."""
 
 import statistics
 from collections.abc import Callable, Iterable, Sequence
@@ -28,24 +28,24 @@ def run_costs(
     precision: str = "f32",
     start: Start = start_worker,
 ) -> CostReport:
-    """Measure every law, and mixes of two beside each of their halves alone, and return the report.
+    """Measure every law, mixes of two laws, and each half of a mix alone, and return the report.
 
     Args:
         cases: of mpmcli.bench.materials.
         threads: of the processor, for all.
-        seconds: length of one block; a block takes the same steps from the same state as often as that needs. With
-            one thread the processor's time counts, with more the time that goes by.
-        progress: told one line of text as each law starts and each round of blocks is done.
+        seconds: length of one block, which repeats the same steps from the same state. Processor time is measured with
+            one thread, wall time with several.
+        progress: called with a line of text for each law that starts and each round of blocks.
         names: laws to measure; by default every law of the package.
         mixes: pairs of laws to measure in one scene.
         blocks: measured blocks of each law and mix.
         precision: "f32" or "f64".
         start: makes the process of a law, or of a mix with commas between its laws; tests replace it.
 
-    A law that cannot start, or breaks down, is left out, and the report says why.
+    A law that cannot start, or fails, is left out; the report gives the reason.
     """
     setting = Setting(threads, precision)
-    # One thread works all the time, unless another process takes its place: its own time leaves that out.
+    # The processor time of one thread excludes the time taken by other processes.
     clock = "processor_seconds" if threads == 1 else "seconds"
     tell = progress or (lambda line: None)
     singles = sorted(laws()) if names is None else names
@@ -97,7 +97,7 @@ class _Column:
         self.watch_shares.append(answer["watch_seconds"] / answer["seconds"])
 
     def finish(self) -> CostResult:
-        """Return what was found, and end the process."""
+        """Return the result, and end the process."""
         flowing = self.worker.ask("flowing")["share"]
         end = self.worker.ask("finish")
         return CostResult(
@@ -114,7 +114,7 @@ class _Column:
 
 
 def _lasting(columns: list[_Column], act: Callable[[_Column], None], flaws: list[str]) -> list[_Column]:
-    """Do something to each in turn, and return those that did not fail at it."""
+    """Apply `act` to each column in turn, and return those for which it did not fail."""
     lasting = []
     for column in columns:
         try:

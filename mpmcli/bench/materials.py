@@ -1,4 +1,4 @@
-"""What a law costs: one column, the same for every law, that lands, shears and collapses while it is measured."""
+"""The column in which the cost of a law is measured: it lands, shears and collapses."""
 
 from collections.abc import Sequence
 
@@ -10,8 +10,8 @@ from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import MaterialParameters
 
 # Parameters by the names that laws share, so that a new law needs no entry: one density, one stiffness, and strengths
-# well below what the weight (up to 7 kPa) and the impact (some 20 kPa) press with, so that plastic laws flow.
-# What else a law needs is taken from the middle of its knob.
+# well below the stress of the weight (up to 7 kPa) and of the impact (about 20 kPa), so that plastic laws flow.
+# Other parameters are those at the middle of their knobs.
 VALUES = {
     "density": 1000.0,
     "youngs_modulus": 4e5,
@@ -35,21 +35,21 @@ MATERIAL_CASES = (
     BenchCase(dimension=2, cells=128, particles=36_864, step=4e-5),
     BenchCase(dimension=3, cells=64, particles=65_536, step=1e-4),
 )
-# The cheapest pair, where what a second law adds to a step weighs most, and two that scenes would have.
+# The cheapest pair, for which the overhead of a second law is largest, and two typical ones.
 MIXES = (("fluid", "neo_hookean"), ("fluid", "sand"), ("neo_hookean", "snow"))
-# What is measured begins so long after the start, s, and takes so long: the wave of the impact, at some 25 m/s, is
-# then on its way through the column, which leans and spreads, and nothing has come to rest.
+# Start and duration of the measured interval, s. The wave of the impact, at about 25 m/s, is then inside the column,
+# which leans and spreads; nothing is at rest.
 SETTLING = 0.05
 STRETCH = 0.01
 
 
 def steps_of(case: BenchCase) -> tuple[int, int]:
-    """Return the number of steps before the state that is measured, and of the stretch that is."""
+    """Return the number of steps before the measured interval, and in it."""
     return round(SETTLING / case.step), round(STRETCH / case.step)
 
 
 def material_of(model: type[MaterialParameters]) -> dict[str, object]:
-    """Return the material that stands for a law, as a scene says it: VALUES, then knobs, then defaults.
+    """Return the material of a law, as a table of a scene: VALUES, then knobs, then defaults.
 
     Raises:
         RunError: the law needs a parameter that has neither a value here nor a knob.
@@ -62,7 +62,7 @@ def material_of(model: type[MaterialParameters]) -> dict[str, object]:
         elif field.is_required() and name != "law":
             knob = next((entry for entry in field.metadata if isinstance(entry, Knob)), None)
             if knob is None:
-                raise RunError(f'The law "{law}" needs {name}, for which the benchmark has no value and it no knob.')
+                raise RunError(f'The law "{law}" needs {name}, which has no knob and no value in the benchmark.')
             material[name] = knob.value(0.5)
     return material
 
@@ -107,11 +107,11 @@ def scene_of(names: Sequence[str], case: BenchCase, precision: str) -> dict:
 
 
 class Column(Ours):
-    """The solver on the column of some laws.
+    """The solver on the column of one or more laws.
 
     The column starts with a shear just above the floor, lands, leans and spreads; SETTLING later most particles of
-    a plastic law flow (`flowing` says how many). Every stretch that is measured takes the same steps from the same
-    state, so that blocks differ by the machine alone: `keep` remembers the state, `rewind` returns to it.
+    a plastic law flow (`flowing` returns their share). Every block takes the same steps from the same state: `keep`
+    saves the state, `rewind` restores it.
     """
 
     def __init__(self, names: Sequence[str], case: BenchCase, *, threads: int, precision: str, arch: str) -> None:
@@ -122,17 +122,17 @@ class Column(Ours):
         self._kept = self._solver.state.save()
 
     def keep(self) -> None:
-        """Remember the state of the run."""
+        """Save the state of the run."""
         self._kept = self._solver.state.save()
 
     def rewind(self) -> None:
-        """Return to the state that was kept, and take one step that is not measured."""
+        """Restore the saved state, and take one step that is not measured."""
         self._solver.state.load(self._kept)
         self.step()
         self.sync()
 
     def flowing(self) -> float:
-        """Return the share of particles whose state the next step projects: those that flow, or that were torn."""
+        """Return the share of particles that the next step projects: those in plastic flow, or torn."""
         from mpmcli.solver.observe import build_observation
 
         count = 0

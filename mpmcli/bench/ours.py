@@ -1,4 +1,4 @@
-"""Our side of the comparison: the same block, as a scene that any user could write."""
+"""The contestant of mpmcli: the same block, as a scene."""
 
 import numpy as np
 
@@ -32,7 +32,7 @@ def scene_of(case: BenchCase, precision: str) -> dict:
 
 
 def particles_of(case: BenchCase) -> BodyParticles:
-    """Return the particles that the peer starts from too, with equal shares of the block."""
+    """Return the initial particles of the peer, with equal shares of the block."""
     d = case.dimension
     volume = EDGE**d / case.particles
     return BodyParticles(
@@ -46,7 +46,7 @@ def particles_of(case: BenchCase) -> BodyParticles:
 
 
 class Ours:
-    """The solver on a scene, running in this process, which it takes over (taichi starts once)."""
+    """The solver on a scene in this process; Taichi starts only once per process."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class Ours:
         precision: str,
         arch: str,
     ) -> None:
-        # Here rather than above: a scene can be described without starting taichi.
+        # Imported here, so that a scene can be described without importing Taichi.
         from mpmcli.solver.backend import start_backend
         from mpmcli.solver.plan import make_plan
         from mpmcli.solver.solver import Solver
@@ -73,31 +73,31 @@ class Ours:
 
     @property
     def watch_seconds(self) -> float:
-        """Wall time spent so far on measuring the state."""
+        """Wall time of the measurements of the state, s."""
         return self._solver.measure_seconds
 
     def step(self) -> None:
-        """Advance by one step, as `frames` does: of the case's size, unless the limits ask for less."""
+        """Advance by one step, as `frames` does: of the case's size, or that of the limits if smaller."""
         self._dt, _ = self._solver.stable_step()
         self.smallest_step = min(self.smallest_step, self._dt)
         self._solver.step(self._dt)
 
     def sync(self) -> None:
-        """Wait until every step asked for is done; on the CPU each step has waited by itself."""
+        """Wait until every requested step is done; on the CPU each step waits."""
         if self._waits:
             self._solver.measure_state(self._dt)
 
     def positions(self) -> np.ndarray:
-        """Return where the particles are, (particles, dimension), m, in the order they started in."""
+        """Return the positions of the particles, (particles, dimension), m, in their initial order."""
         return self._solver.frame(0, [])[0].position
 
     def is_sound(self) -> bool:
-        """Whether every particle is where it can be."""
+        """Whether every particle is in the domain."""
         position = self.positions()
         return bool(((position >= 0) & (position <= 1)).all())
 
 
 def falling_block(case: BenchCase, *, threads: int, precision: str, arch: str) -> Ours:
-    """Return the solver on the block that the peer runs, too."""
+    """Return the solver on the block of the peer."""
     data, particles = scene_of(case, precision), [particles_of(case)]
     return Ours(data, case.step, particles, threads=threads, precision=precision, arch=arch)

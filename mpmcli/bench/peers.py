@@ -1,4 +1,4 @@
-"""The contestants that taichi brings: its MPM examples, read from the installed package and run as they are.
+"""The contestants from the taichi package: its MPM examples, read from the installed files.
 
 Only settings change: backend, threads, precision, grid, particles and step. The window at the end of each
 example is left out. Every line that is changed must be found exactly once, so that another version of the
@@ -77,7 +77,7 @@ def _only_line(lines: list[str], wanted: str, name: str) -> int:
 
 
 class Peer:
-    """An example of the taichi package, running in this process, which it takes over (taichi starts once)."""
+    """An example of the taichi package in this process; Taichi starts only once per process."""
 
     bytes_per_particle = None
 
@@ -96,15 +96,15 @@ class Peer:
         self._sync()
 
     def sync(self) -> None:
-        """Wait until every step asked for is done."""
+        """Wait until every requested step is done."""
         self._sync()
 
     def positions(self) -> np.ndarray:
-        """Return where the particles are, (particles, dimension), in the order they started in."""
+        """Return the positions of the particles, (particles, dimension), in their initial order."""
         return self._position.to_numpy()
 
     def is_sound(self) -> bool:
-        """Whether every particle is where it can be: speed means nothing for a run that broke down."""
+        """Whether every particle is in the domain."""
         position = self.positions()
         return bool(((position > 0) & (position < 1)).all())
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mpmcli import __version__
 from mpmcli.bench.cases import BenchCase
-from mpmcli.plain_text import text_table
+from mpmcli.plain_text import counted, text_table
 
 
 @dataclass(frozen=True)
@@ -18,12 +18,12 @@ class ContestantResult:
 
     Attributes:
         rates: particle-steps/s of each measured block, in order.
-        start_seconds: from asking for the process until it could step.
-        compile_seconds: what the first step took beyond a usual one, with nothing cached on disk.
+        start_seconds: from the start of the process until it could step.
+        compile_seconds: time of the first step beyond that of a usual one, without a cache on disk.
         peak_memory: largest resident memory of its process, bytes.
         bytes_per_particle: device memory per particle, None where it is not known.
         smallest_step: smallest time step that was taken, s.
-        sound: whether every particle was still where it can be.
+        sound: whether every particle was in the domain at the end.
     """
 
     rates: tuple[float, ...]
@@ -57,7 +57,7 @@ class ContestantResult:
 
 @dataclass(frozen=True)
 class CaseResult:
-    """Both contestants at one case; block k of one was measured right beside block k of the other."""
+    """Both contestants at one case; blocks k of both were measured one after the other."""
 
     case: BenchCase
     ours: ContestantResult
@@ -115,13 +115,12 @@ def _processor_name() -> str:
 
 def heading(machine: dict, arch: str, threads: int, precision: str) -> str:
     """Return the line above a table: machine, threads and precision."""
-    count = f"{threads} {'thread' if threads == 1 else 'threads'}"
-    return f"{machine['processor']}, {arch}, {count}, {precision}, taichi {machine['taichi']}"
+    return f"{machine['processor']}, {arch}, {counted(threads, 'thread')}, {precision}, taichi {machine['taichi']}"
 
 
 @dataclass(frozen=True)
 class BenchReport:
-    """Every case of one run of the benchmark, and what it ran with.
+    """Every case of one run of the benchmark, and its settings.
 
     Attributes:
         results: one per case, in the order they ran.

@@ -4,6 +4,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Literal
 
+from mpmcli.plain_text import counted
+
 Severity = Literal["error", "warning", "note"]
 # In decreasing order of severity.
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -105,7 +107,7 @@ class FrameFindings:
 
 def _finding(seen: _Seen) -> Finding:
     more = len(seen.frames) - 1
-    suffix = f"; the same is found in {more} more frame{'s' if more > 1 else ''}" if more > 0 else ""
+    suffix = f"; the same is found in {counted(more, 'more frame')}" if more > 0 else ""
     return Finding(
         seen.severity, seen.rule, f"{seen.what}{suffix}.", seen.fix, value=seen.value, body=seen.body, frame=seen.frame
     )

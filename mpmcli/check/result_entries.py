@@ -89,7 +89,7 @@ def arrays_of(frame: Frame, ids: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
-    """Open a result as far as it can be read.
+    """Open the readable part of a result.
 
     Raises:
         InputError: there is nothing at `path`, or nothing that this version of mpmcli wrote.

@@ -5,6 +5,7 @@ import numpy as np
 from mpmcli.check.finding import FrameFindings
 from mpmcli.frames.frame import Frame
 from mpmcli.output.header import RunHeader
+from mpmcli.plain_text import counted
 
 # No law is valid for J below the first. Coherent material would have torn for J above the second.
 CRUSHED, BLOWN_UP = 0.1, 10.0
@@ -64,10 +65,8 @@ class StateCheck:
             rows = np.isfinite(array).reshape(len(array), -1).all(1)
             p = int(np.flatnonzero(~rows)[0])
             body = self._body(frame, p)
-            what = (
-                f"In frame {number} {name} is not finite at {_particles(len(rows) - int(rows.sum()))}, the first "
-                f'of them number {p} of body "{body}"'
-            )
+            lost = counted(len(rows) - int(rows.sum()), "particle")
+            what = f'In frame {number} {name} is not finite at {lost}, the first of them number {p} of body "{body}"'
             fix = "Leave out the frames from here on, and run the scene again with a lower time.safety."
             self._findings.add(
                 "error", "not-finite", number, what, fix, value=len(rows) - int(rows.sum()), body=body, kind=name
@@ -90,8 +89,9 @@ class StateCheck:
         if not beyond.max() > tolerance:
             return
         p, body = int(beyond.argmax()), self._body(frame, int(beyond.argmax()))
+        outside = counted(int((beyond > tolerance).sum()), "particle")
         what = (
-            f"In frame {number} {_particles(int((beyond > tolerance).sum()))} out of the domain, the farthest "
+            f"In frame {number} {outside} out of the domain, the farthest "
             f'of them, number {p} of body "{body}", by {beyond[p]:.4g} m'
         )
         self._findings.add("error", "escaped", number, what, LOOK, value=float(beyond[p]), body=body)
@@ -210,7 +210,3 @@ def _hashes(position: np.ndarray) -> np.ndarray:
         result *= np.uint64(0x9E3779B97F4A7C15)
         result ^= result >> np.uint64(29)
     return result
-
-
-def _particles(count: int) -> str:
-    return f"{count} particle{'s' if count != 1 else ''}"

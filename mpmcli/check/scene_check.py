@@ -16,7 +16,7 @@ from mpmcli.check.shape_rules import shape_findings
 from mpmcli.check.step_rules import step_findings
 from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
-from mpmcli.plain_text import size_text, text_table
+from mpmcli.plain_text import counted, size_text, text_table
 from mpmcli.scene import LoadedScene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.plan import Plan, make_plan
@@ -232,7 +232,7 @@ def _forecast(check: SceneCheck) -> str:
 
 def _outcome(check: SceneCheck) -> str:
     counts = Counter(finding.severity for finding in check.findings)
-    found = [f"{counts[word]} {word}{'s' if counts[word] > 1 else ''}" for word in SEVERITIES if counts[word]]
+    found = [counted(counts[word], word) for word in SEVERITIES if counts[word]]
     return ("ok" if check.passes() else "not ok") + (f": {', '.join(found)}" if found else ": nothing found")
 
 

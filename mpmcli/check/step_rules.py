@@ -1,4 +1,4 @@
-"""Rules on the time step that a scene asks for."""
+"""Rules on the time step of a scene."""
 
 import math
 from collections.abc import Iterator

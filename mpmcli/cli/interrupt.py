@@ -27,7 +27,7 @@ def interrupt_came() -> bool:
 
 @contextmanager
 def interrupts_wait() -> Iterator[None]:
-    """Within this context the first signal raises nothing, for code that asks `interrupt_came` where it can stop.
+    """Within this context the first signal raises nothing, for code that polls `interrupt_came` where it can stop.
 
     An exception that comes between any two instructions may fall into a callback of a library, which loses it. A
     second signal raises all the same.

@@ -100,7 +100,7 @@ def run(arguments: list[str]) -> int:
         _print_error(f"error: {error}")
         return error.exit_code
     except (BrokenPipeError, SystemExit):
-        # The reader of stdout or stderr has gone, as in `mpmcli materials | head -1`. click and rich exit then.
+        # The reader of stdout or stderr has closed it, as in `mpmcli materials | head -1`. click and rich exit then.
         return 0
     except Exception as error:
         if interrupt_came():

@@ -8,7 +8,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 
 
 class ProgressBar:
-    """A progress bar and messages beside it; use it as a context around the work.
+    """A progress bar with messages above it; use it as a context around the work.
 
     Args:
         total: final count.

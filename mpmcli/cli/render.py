@@ -88,6 +88,7 @@ def command(
     """
     from mpmcli.cli.progress_bar import ProgressBar
     from mpmcli.output import open_result
+    from mpmcli.plain_text import counted
     from mpmcli.render.request import Request, plan_render
 
     # Without a home directory it warns about its cache.
@@ -105,6 +106,6 @@ def command(
     elif not quiet:
         kept = len(done.pictures) - done.made
         there = f", {kept} {'was' if kept == 1 else 'were'} there already" if kept else ""
-        click.echo(f"{done.made} picture{'s' if done.made != 1 else ''} made{there}", err=True)
+        click.echo(f"{counted(done.made, 'picture')} made{there}", err=True)
         print_text("\n".join(map(str, done.paths)))
     return 0

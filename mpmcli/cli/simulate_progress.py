@@ -7,6 +7,7 @@ import click
 
 from mpmcli.cli.progress_bar import ProgressBar
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.plain_text import counted
 from mpmcli.simulation.summary import RunSummary
 
 
@@ -40,9 +41,9 @@ class SimulateProgress:
         for note in summary.notes:
             self._bar.say(note)
         backend, plan = summary.backend, summary.plan
-        threads = f", {backend['threads']} threads" if backend["arch"] == "cpu" else ""
+        threads = f", {counted(backend['threads'], 'thread')}" if backend["arch"] == "cpu" else ""
         self._bar.say(
-            f"{summary.particles} particles on {backend['arch']}{threads}, {backend['precision']}; "
+            f"{counted(summary.particles, 'particle')} on {backend['arch']}{threads}, {backend['precision']}; "
             f"{plan.device_bytes / 1e6:.3g} MB on the device "
             f"({plan.bytes_per_particle} B per particle, {plan.bytes_per_node} B per node)"
         )

@@ -1,4 +1,4 @@
-"""What a command prints on stdout, and what becomes of the standard streams when a reader has gone."""
+"""Prints answers on stdout, and handles standard streams whose reader has closed them."""
 
 import json
 import os
@@ -21,7 +21,7 @@ def print_json(content: object) -> None:
 
 
 def print_text(text: str) -> None:
-    """Print what a command was asked for on stdout, with a newline; a reader that has gone is no error.
+    """Print an answer on stdout, with a newline; a closed pipe is no error.
 
     Raises:
         RunError: stdout is closed, or cannot be written to, as on a full disk.

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from types import TracebackType
 
 from mpmcli.cli.progress_bar import ProgressBar
+from mpmcli.plain_text import counted
 from mpmcli.validation.case import Case
 from mpmcli.validation.matrix import Run, label_of
 from mpmcli.validation.run_result import RunResult
@@ -26,9 +27,7 @@ class ValidateProgress:
 
     def __enter__(self) -> "ValidateProgress":
         cases = len(self._measures)
-        self._bar.say(
-            f"{cases} case{'s' if cases > 1 else ''}, {self._total} runs, {self._workers} at a time, one thread each"
-        )
+        self._bar.say(f"{counted(cases, 'case')}, {self._total} runs, {self._workers} at a time, one thread each")
         self._bar.__enter__()
         return self
 

@@ -3,6 +3,7 @@
 import importlib.metadata
 
 from mpmcli.doctor.probe_result import ProbeResult
+from mpmcli.plain_text import counted
 
 
 def cpu() -> ProbeResult:
@@ -10,8 +11,8 @@ def cpu() -> ProbeResult:
     from mpmcli.solver.trial import try_backend
 
     started = try_backend("cpu")
-    threads = f"{started.threads} thread{'s' if started.threads > 1 else ''}"
-    return ProbeResult("ok", f"Taichi {importlib.metadata.version('taichi')}, {threads}")
+    version = importlib.metadata.version("taichi")
+    return ProbeResult("ok", f"Taichi {version}, {counted(started.threads, 'thread')}")
 
 
 def cuda() -> ProbeResult:

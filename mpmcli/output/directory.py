@@ -104,7 +104,7 @@ def _remove_result(directory: Path) -> None:
         raise InputError(f"{directory / SCENE} was not written by mpmcli: give another directory with -o.")
     try:
         remove_segments(directory)
-        # The record goes last: while it is there, what remains is known to be ours.
+        # The record is removed last: while it exists, the remaining files are known to be mpmcli's.
         for path in sorted(ours, key=lambda path: path.name == RECORD):
             path.unlink(missing_ok=True)
     except OSError as error:

@@ -66,7 +66,7 @@ def sealed(path: Path, size: int = 0) -> Iterator[Path]:
 
 
 def _ask_for(path: Path, size: int) -> None:
-    """Reserve `size` bytes and let them go, so that a refusal comes here and not inside HDF5.
+    """Reserve and release `size` bytes, so that a full disk is found here and not inside HDF5.
 
     HDF5 that is refused space raises, and then crashes the interpreter at exit. Free space alone does
     not tell of quotas and limits.

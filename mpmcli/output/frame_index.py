@@ -1,4 +1,4 @@
-"""What an output says about its frames, without the particles."""
+"""The index of the frames of an output: times and ledger, without the particles."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

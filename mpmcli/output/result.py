@@ -39,7 +39,7 @@ class Result(ABC):
         ledger: T rows.
         header: facts about the run.
         dimension: 2 or 3.
-        field_names: the fields each Frame has beside position, velocity, body and material.
+        field_names: the fields of each Frame, without position, velocity, body and material.
         record: content of run.json, None where there is none.
     """
 
@@ -71,7 +71,7 @@ class Result(ABC):
             fields: names of the fields to read, all when None.
 
         Raises:
-            InputError: there is no such frame or field, or its file has gone.
+            InputError: there is no such frame or field, or its file is missing.
         """
         if not 0 <= k < self.frame_count:
             raise InputError(f"{self.path} has no frame {k}: it holds frames 0 to {self.frame_count - 1}.")

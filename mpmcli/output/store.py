@@ -12,7 +12,7 @@ from mpmcli.output.layout import FrameLayout
 
 
 class Store(ABC):
-    """Writes the frames of one run, each durable before the next is asked for.
+    """Writes the frames of one run, each durable before the next one is computed.
 
     Args:
         directory: the output directory, made by `prepare_directory`.

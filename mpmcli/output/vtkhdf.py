@@ -29,7 +29,7 @@ FORMAT = 1
 CONNECTIVITY = "Vertices/Connectivity"
 UNUSED_CELLS = ("Lines", "Polygons", "Strips")
 CHUNK_BYTES = 2**20
-# Beside the particles: headers, tables of the steps, ledger. Used only to ask for disk space.
+# Size without the particles: headers, tables of the steps, ledger. Used to reserve disk space.
 OVERHEAD_BYTES = 64 * 1024
 OVERHEAD_BYTES_PER_FRAME = 1024
 
@@ -163,7 +163,7 @@ def open_vtkhdf(path: Path) -> h5py.File:
         try:
             file = h5py.File(path, "r", locking=False)
         except OSError:
-            # Somebody in this process has it open with locking, and HDF5 wants the same of everyone.
+            # This process has the file open with locking; HDF5 requires one setting for all handles.
             file = h5py.File(path, "r")
     except OSError as error:
         reason = "is not an HDF5 file, or a damaged one" if path.exists() else "does not exist"

@@ -63,7 +63,7 @@ def render_frames(
         stop: called again and again; returns whether to end.
 
     Raises:
-        KeyboardInterrupt: `stop` said so.
+        KeyboardInterrupt: `stop` returned True.
         RunError: a process was ended from outside, or crashed.
         Exception: whatever the job raises, as itself.
     """
@@ -114,7 +114,7 @@ def _render_beside(
 
 
 class _Worker:
-    """One process, and the thread that hears its answers; `frame` is what it is at.
+    """One process, and the thread that reads its answers; `frame` is the one in work.
 
     An answer of None means that it ended.
     """
@@ -146,7 +146,7 @@ class _Worker:
             self.process.stdin.flush()  # type: ignore[union-attr]
 
     def dismiss(self, *, at_work: bool) -> None:
-        """Tell it that nothing more comes, and to leave what it is at."""
+        """Ask it to stop without finishing its frame."""
         if at_work:
             self.process.terminate()
         with suppress(OSError):

@@ -118,7 +118,7 @@ def ask_as_ended(
 
 @contextmanager
 def answering() -> Iterator[Callable[..., None]]:
-    """Let a process that was asked answer by `answer(name=value, ...)`; what libraries print goes to stderr."""
+    """Let a child process answer by `answer(name=value, ...)`; what libraries print goes to stderr."""
     _leave_no_core()
     with os.fdopen(os.dup(1), "w", encoding="utf-8") as answers:
         os.dup2(2, 1)
@@ -150,7 +150,7 @@ def _leave_no_core() -> None:
 
 
 class _Child:
-    """A process that was asked."""
+    """A running child process."""
 
     def __init__(self, question: Question) -> None:
         self._question = question
@@ -180,7 +180,7 @@ class _Child:
         self._begin = time.monotonic()
 
     def has_ended(self) -> bool:
-        """Say whether it is over, and end it where its time is."""
+        """Return whether it has ended; end it after its time limit."""
         if self._process.poll() is not None:
             return True
         if time.monotonic() - self._begin > self._question.timeout:
@@ -190,7 +190,7 @@ class _Child:
         return False
 
     def reply(self) -> Reply:
-        """Return what it left."""
+        """Return its reply."""
         answer = {}
         for line in _text(self._said).splitlines():
             try:
@@ -202,7 +202,7 @@ class _Child:
         return Reply(answer, self._fault(answer), _text(self._complained)[-COMPLAINT_LENGTH:].strip())
 
     def close(self) -> None:
-        """End it, whatever it is doing, and let its files go."""
+        """End the process if it is running, and close its files."""
         if self._process.poll() is None:
             self._end()
         for stream in (self._said, self._complained, self._process.stdin):

@@ -63,7 +63,7 @@ def color_by(
     limits: tuple[float, float] | None = None,
     cmap: str | None = None,
 ) -> Coloring | Categories:
-    """Return the colouring that a name stands for in a result.
+    """Return the colouring of a result by the name of a value.
 
     Args:
         name: one of `ALWAYS` and `DERIVED`, or a stored field: a vector is shown by its length, a tensor by its

@@ -168,7 +168,7 @@ def make_pictures(
     Raises:
         InputError: nothing draws on this machine, or a place cannot be written to.
         RunError: a process crashed, or the disk is full.
-        KeyboardInterrupt: `stop` said so.
+        KeyboardInterrupt: `stop` returned True.
     """
     due = {planned.k: planned for planned in plan if not planned.made}
     if due:

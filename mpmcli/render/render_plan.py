@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mpmcli.cores import available_cores
+from mpmcli.plain_text import counted
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.files.film import film_digest, write_film
 from mpmcli.render.files.picture_file import settings_digest, write_picture
@@ -21,7 +22,7 @@ class RenderSummary:
     Attributes:
         pictures: files, by frame; the one of a montage.
         made: number of them that were drawn now.
-        film: the film, None where none was asked for.
+        film: the film; None for pictures only.
         surfaces: the directory of the surfaces, None where none was asked for.
         warnings: sentences.
     """
@@ -34,7 +35,7 @@ class RenderSummary:
 
     @property
     def paths(self) -> list[Path]:
-        """What was asked for: the film or else the pictures, and the directory of the surfaces."""
+        """The requested outputs: the film or else the pictures, and the directory of the surfaces."""
         return [*([self.film] if self.film else self.pictures), *([self.surfaces] if self.surfaces else [])]
 
     def as_dict(self) -> dict[str, Any]:
@@ -158,4 +159,4 @@ class RenderPlan:
 def _particles(counts: list[int]) -> str:
     most = max(counts)
     upto = "up to " if len(counts) > 1 and min(counts) < most else ""
-    return f"{upto}{most} particle{'s' if most > 1 else ''}"
+    return upto + counted(most, "particle")

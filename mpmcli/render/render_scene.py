@@ -29,7 +29,7 @@ class RenderScene:
         material_of: (b,) index into `appearances`.
         distances: (b,) between neighbouring particles at the start, m.
         densities: (b,) at rest, kg/m^3.
-        fields: names of what is stored of each particle, beside position, velocity, body and material.
+        fields: names of the stored fields, without position, velocity, body and material.
     """
 
     title: str

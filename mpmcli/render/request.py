@@ -18,7 +18,7 @@ from mpmcli.render.settings import Mode, Settings, parse_grid, parse_limits, par
 from mpmcli.render.surfaces.save_surface import surface_paths
 from mpmcli.render.view import CAMERAS
 
-# Where pictures go, beside the result.
+# Directory of pictures in that of the result.
 DIRECTORY = "render"
 USUAL_FPS = 30.0
 USUAL_SIZE, USUAL_MONTAGE_SIZE = "1280x720", "1280xauto"
@@ -129,7 +129,7 @@ def _directory(result: Result) -> Path:
 
 
 def _montage_path(result: Result, mode: str, output: Path | None) -> Path:
-    """Return where a montage goes."""
+    """Return the path of a montage."""
     if output is not None and output.suffix and not output.is_dir():
         _require_png(output)
         return output
@@ -144,7 +144,7 @@ def _require_png(output: Path) -> None:
 
 
 def _paths(result: Result, mode: str, request: Request, count: int) -> Callable[[int], Path]:
-    """Return where the picture of each frame goes."""
+    """Return the path of the picture of each frame."""
     output = request.output
     if output is not None and output.suffix and not output.is_dir():
         _require_png(output)

@@ -56,7 +56,7 @@ def parse_size(text: str) -> tuple[int, int | None]:
 
 
 def require_possible(width: int, height: int, text: str) -> None:
-    """Raise InputError for a size that no picture can have; `text` is what was asked for."""
+    """Raise InputError for a size that no picture can have; `text` is the option as given."""
     if not (min(width, height) >= SIDE_MIN and max(width, height) <= SIDE_MAX and width * height <= PIXELS_MAX):
         raise InputError(
             f"--size {text} is not possible: a side has {SIDE_MIN} to {SIDE_MAX} pixels, and a picture at most "

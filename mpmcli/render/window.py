@@ -3,7 +3,7 @@
 VTK takes a window at its first picture, and where the libraries of that window are missing it ends the interpreter by
 SIGSEGV, which no `except` catches. So each window is tried in a process of its own before this one opens any. That
 takes half a second, which is less than the risk of remembering an answer that a change of drivers has made wrong; but
-the processes that this one starts are told and do not try again.
+an environment variable passes the answer to child processes.
 """
 
 import importlib.metadata
@@ -77,7 +77,7 @@ def try_windows(timeout: float = TIMEOUT) -> Iterator[Attempt]:
     command = module_command("mpmcli.render.window_probe")
     given = users_setting()
     for setting in [given] if given else _candidates():
-        # VTK may have another one for what the user wants; among ours each has its turn.
+        # VTK may map the class to another one; each of ours is tried in turn.
         wanted = [] if given or not setting else [setting]
         reply = ask(Question([*command, *wanted], timeout, {SETTING: setting or None}))
         answer = reply.answer
@@ -90,7 +90,7 @@ def try_windows(timeout: float = TIMEOUT) -> Iterator[Attempt]:
 
 
 def users_setting() -> str:
-    """Return the class that the user wants, "" where that is left to us; with an empty one VTK opens none."""
+    """Return the class that the user set, "" for none; VTK opens no window for an empty one."""
     return os.environ.get(SETTING, "").strip()
 
 

@@ -1,4 +1,4 @@
-"""Scenes: what is asked of a simulation, read from TOML, checked, and filled with particles."""
+"""Scenes: the description of a simulation, read from TOML, validated, and sampled with particles."""
 
 from mpmcli.scene.bounds import highest_speed, scene_bounds
 from mpmcli.scene.domain import Domain, Wall, Walls

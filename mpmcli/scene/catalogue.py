@@ -1,4 +1,4 @@
-"""What can be said of a material: the facts of every law and preset, as plain data."""
+"""The parameters of every law and the values of every preset, as plain data."""
 
 from typing import Any
 

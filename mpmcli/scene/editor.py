@@ -35,7 +35,7 @@ def json_schema(laws: Laws) -> dict[str, Any]:
             definitions[name] = _preset_table(table, law, own, name)
             forms.append({"$ref": f"#/$defs/{name}"})
         _add_knobs(table, law)
-        # `law` has a default in Python; in a scene it is what tells the laws apart.
+        # `law` has a default in Python; in a scene it selects the law.
         table["required"] = ["law", *table.get("required", [])]
     material = definitions["Body"]["properties"]["material"]
     definitions["Body"]["properties"]["material"] = {"description": material["description"], "oneOf": forms}

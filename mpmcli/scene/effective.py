@@ -15,7 +15,7 @@ _OWN_TABLE = ("material",)
 def scene_to_toml(scene: Scene) -> str:
     """Write a scene as TOML; loading the text again gives an equal scene.
 
-    Only `domain.spacing` is written, as `domain.cells` says the same. Materials are laws with physical
+    Only `domain.spacing` is written, which determines `domain.cells`. Materials are laws with physical
     parameters, whatever presets and knobs they came from.
     """
     data = scene.model_dump(exclude_none=True, exclude={"domain": {"cells"}})
@@ -51,5 +51,5 @@ def _value(value: object) -> str:
                 return "[\n    " + ",\n    ".join(inner) + ",\n]"
             return f"[{', '.join(inner)}]"
         case _:
-            # tomli_w knows how TOML escapes text and writes numbers.
+            # tomli_w escapes text and formats numbers.
             return tomli_w.dumps({"k": value}).removeprefix("k = ").rstrip("\n")

@@ -1,4 +1,4 @@
-"""From what a scene says of a material to a law's table: presets are filled in, and knobs become parameters.
+"""Expands the material of a scene to the table of a law: presets are filled in, and knobs become parameters.
 
 A material is written `"honey"`, `{ preset = "honey", thickness = 0.7, density = 1400 }`, or
 `{ law = "fluid", ... }`. What the scene says itself always wins over what its preset holds.
@@ -77,7 +77,7 @@ class _Material:
         self.presets = available_presets(laws)
 
     def expanded(self, written_so: object) -> dict[str, Any] | None:
-        """Return the law's table, or None after a problem that leaves nothing to go on with."""
+        """Return the table of the law, or None after a problem without which it cannot be made."""
         if isinstance(written_so, str):
             preset = self._preset(written_so, self.path)
             return self._table(preset, {}) if preset else None
@@ -100,7 +100,7 @@ class _Material:
         return self._table(preset, table) if preset else None
 
     def _kind(self, table: dict[str, Any]) -> tuple[str, str] | None:
-        """Return the key that says what the material is, and what it means: law or preset, perhaps misspelled."""
+        """Return the key that names the material, `law` or `preset`, perhaps misspelled, and its meaning."""
         if "law" in table and "preset" in table:
             sentence = "the preset has a law of its own; leave either the law or the preset out"
             return self._fault((*self.path, "law"), sentence)

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 class Knob:
     """A word, and a position from 0 to 1, for one parameter of a law.
 
-    It stands in the metadata of that parameter, beside its range:
+    It is an entry of the metadata of that parameter, after its range:
     `viscosity: Annotated[NotNegative, Field(description=...), Knob("thickness", 1e-3, 1e2, "...")] = 0.0`.
 
     Attributes:

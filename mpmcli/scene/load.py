@@ -23,7 +23,7 @@ from mpmcli.scene.schema import Scene, scene_model
 from mpmcli.scene.sentences import problems_of
 
 _POSITION = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
-# What tomllib says, where a plainer sentence helps more.
+# Messages of tomllib that a plainer sentence replaces.
 _SYNTAX = {
     "Cannot overwrite a value": "this key is given twice",
     "Invalid value": "this is no TOML value; text needs quotes, numbers and lists none",
@@ -124,7 +124,7 @@ def _validate(data: dict[str, Any], laws: Laws) -> tuple[Scene | None, list[Prob
 
 
 def _resolve(scene: Scene, knobs: dict[int, list[str]], source: str) -> LoadedScene:
-    """Let every material choose what it was left to choose, from what the scene can reach."""
+    """Set the "auto" parameters of every material from the speeds and pressures that the scene can reach."""
     bounds = scene_bounds(scene)
     bodies, notes = [], []
     for i, body in enumerate(scene.bodies):

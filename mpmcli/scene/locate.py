@@ -57,7 +57,7 @@ class _Scanner:
             self._skip(_BLANK_LINES)
 
     def _header(self, keys: list[str], double: bool) -> Path:
-        """Return the path of a header: names of arrays of tables stand for their latest element."""
+        """Return the path of a header: a name of an array of tables means its latest element."""
         path: Path = ()
         for key in keys[:-1]:
             path += (key,)

@@ -1,4 +1,4 @@
-"""What a scene says of a material: the base class of every law's parameters."""
+"""The base class of the parameters of every law."""
 
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, NamedTuple, Self
@@ -31,7 +31,7 @@ class SceneBounds:
 
 
 class Internal(NamedTuple):
-    """One internal variable of a law, a number that each particle stores beside its deformation.
+    """One internal variable of a law, a number that each particle stores in addition to its deformation.
 
     Attributes:
         name: of the output field that shows it.

@@ -21,7 +21,7 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> tuple[dic
     An override is `KEY=VALUE`. KEY is a path, `time.end`, in which an entry of a list is named by its
     index, `bodies[0].velocity` or `bodies.0.velocity`, and a body also by its name,
     `bodies.column.velocity`. VALUE is a TOML value; a bare word is taken as text. Whether the scene
-    knows the key is left to validation.
+    has the key is left to validation.
 
     Raises:
         InputError: one line for every override that cannot be read or placed.

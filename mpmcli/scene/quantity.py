@@ -87,10 +87,10 @@ _ONE_PER_AXIS = Field(json_schema_extra={"minItems": 2, "maxItems": 3})
 
 
 def list_of_axes(kind: Any, *, zeros: bool = False) -> Any:
-    """Return the type of a list with one value per axis; None, which TOML cannot write, may stand for zeros."""
+    """Return the type of a list with one value per axis; None, which TOML cannot write, means zeros."""
     default = [BeforeValidator(_zeros)] if zeros else []
     return Annotated[tuple[kind, ...], *default, AfterValidator(_as_long_as_the_scene), _ONE_PER_AXIS]
 
 
-# One number per axis; None stands for the default: zeros.
+# One number per axis; None means the default, zeros.
 Vector = list_of_axes(Number, zeros=True)

@@ -176,7 +176,7 @@ class Output(Table):
     ] = False
 
 
-# FLIP's share where a scene asks for AFLIP and does not say: a twentieth of the loss of APIC.
+# Default of FLIP's share in AFLIP: a twentieth of the loss of APIC.
 USUAL_FLIP = 0.95
 
 
@@ -258,7 +258,7 @@ class Scene(Table):
 
 @lru_cache
 def scene_model(laws: tuple[type[MaterialParameters], ...]) -> type[Scene]:
-    """Return the scene whose materials are one of the given laws, told apart by their key `law`.
+    """Return the scene whose materials are one of the given laws, distinguished by their key `law`.
 
     Its output fields are those of every scene and the internal variables of these laws. Cached, so that
     two scenes of the same laws have the same type and can be compared.

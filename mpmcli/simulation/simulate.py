@@ -28,7 +28,7 @@ SCENE = "scene.toml"
 
 @dataclass(frozen=True)
 class RunSettings:
-    """How a scene is run and stored, beside what it says itself.
+    """Settings of a run that are not part of its scene.
 
     Attributes:
         directory: where the result goes.
@@ -115,7 +115,7 @@ def simulate(
         summary.status, summary.message = "failed", str(error)
     finally:
         if summary.status == "running":
-            # An error of ours: the record must not claim that the run goes on.
+            # A fault of mpmcli: the record must not state that the run is going on.
             record.close("failed", "an internal error ended the run")
     summary.steps = solver.step_count
     clock.book(solver.first_step_seconds, "compile_s")

@@ -1,4 +1,4 @@
-"""Where the wall time of a run goes."""
+"""Wall time of the parts of a run."""
 
 import time
 

@@ -168,7 +168,7 @@ class ParticleGroup:
     @ti.func
     def store(self, p: int, deformation: ti.template(), inner: ti.template()):
         """Replace what particle p stores of its deformation, and its internal variables."""
-        # By the change: what a law left alone keeps every digit.
+        # Adds the difference, so that a deformation that the law did not change keeps every digit.
         change = deformation - self.stored(p)
         if ti.static(self.law.deformation == "F"):
             for i in ti.static(range(self.dimension)):

@@ -193,7 +193,7 @@ class Solver:
         Raises:
             UnstableRunError: a particle is lost.
         """
-        # On the CPU every step says so itself.
+        # On the CPU every step reports it.
         if not self.backend.on_cpu and self._kernels.particles.any_lost():
             self._stop(dt)
         if not self.state.step_control.measure(due):

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-# Range of T that is compared. Earlier the column hardly moves; later friction slows the thin front.
+# Range of T that is compared. Earlier the column is nearly at rest; later friction slows the thin front.
 FIRST, LAST = 1.0, 4.0
 # Height over width of the columns.
 N_SQUARED = 2.0

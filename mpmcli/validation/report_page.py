@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterable, Sequence
 
+from mpmcli.plain_text import counted
 from mpmcli.validation.choice import outcome, reason
 from mpmcli.validation.comparison import Compared, Ratios
 from mpmcli.validation.journal import FIGURES
@@ -94,7 +95,7 @@ def _default_words() -> str:
 def _environment(report: Report) -> str:
     facts = report.environment
     commit = f", commit {facts['commit']}" if facts["commit"] else ""
-    workers = f"{facts['workers']} run{'s' if facts['workers'] > 1 else ''} at a time"
+    workers = f"{counted(facts['workers'], 'run')} at a time"
     return (
         f"mpmcli {facts['mpmcli']}{commit}, level {report.level}, {facts['date']}. {facts['processor']}, "
         f"{facts['arch']}, {facts['threads']} thread per run, {workers}; Python {facts['python']}, Taichi "

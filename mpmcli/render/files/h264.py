@@ -51,7 +51,7 @@ def write_h264(images: Iterable[np.ndarray], place: Path, name: Path, fps: float
                 try:
                     process.stdin.write(np.ascontiguousarray(image))
                 except OSError:
-                    break  # it has ended, and said why
+                    break  # ffmpeg has ended; its stderr gives the reason
             if process is not None:
                 _finish(process, said, name)
         finally:

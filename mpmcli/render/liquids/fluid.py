@@ -23,7 +23,7 @@ from mpmcli.render.shading.material_groups import Group, groups_of
 from mpmcli.render.theme import Theme, rgb_bytes
 from mpmcli.render.view import View
 
-# Dots differ by so much in brightness, up or down, so that they can be told apart.
+# Largest deviation of the brightness of a dot, up or down, which makes neighbours distinguishable.
 TONE = 0.05
 # What is behind a surface by less than this, in distances between particles, lies on it, as the edges of the domain do.
 LIES_ON = 0.3
@@ -201,7 +201,7 @@ def _chosen(sample: Sample, which: np.ndarray) -> Sample:
 
 
 def _add(image: np.ndarray, samples: list[Sample]) -> None:
-    """Let each sample stand for its share of a pixel, instead of what the pixel showed."""
+    """Average the samples of each pixel."""
     bare = image.copy()
     for sample in samples:
         place = sample.row, sample.column

@@ -1,4 +1,4 @@
-"""The colours of a liquid's surface: what it lets through, what it throws back, and what glows in it."""
+"""The colours of the surface of a liquid: transmission, reflection and scattering."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ RIM = 0.35
 
 @dataclass(frozen=True)
 class Optics:
-    """How light goes through a liquid.
+    """Optical properties of a liquid.
 
     Attributes:
         depths: optical depths (natural logarithms) that the deepest colour loses over the length of the scene.
@@ -58,7 +58,7 @@ LAVA = Optics(
 
 
 def optics_of(appearance: Appearance) -> Optics:
-    """Return how light goes through a material."""
+    """Return the optical properties of a material."""
     if appearance.name.startswith("lava"):
         return LAVA
     return FINISHES.get(appearance.finish, FINISHES["matte"])

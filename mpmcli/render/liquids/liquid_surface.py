@@ -12,7 +12,7 @@ from mpmcli.render.liquids.screen_space import NOTHING, blurred, normals, smooth
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.view import View
 
-# Radius of the spheres that stand for particles, in distances between particles: they overlap.
+# Radius of the spheres of particles, in distances between particles: they overlap.
 RADIUS = 0.9
 # What is within this of a particle is liquid, however far it is from the next: a drop.
 CORE = 0.5

@@ -34,7 +34,7 @@ class Background:
         away = np.linalg.norm(np.maximum(beside, 0.0), axis=1)
         side = max(np.subtract(scene.upper, scene.lower))
         self.share = np.where(hit, np.exp(-((away / (FADE * side)) ** 2)), 0.0).astype(np.float32)
-        # What hardly shows is not worked out.
+        # Contributions below a visible difference are skipped.
         self.seen = np.flatnonzero(self.share > 1e-3)
         self.points = points[self.seen]
 

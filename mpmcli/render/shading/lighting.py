@@ -127,7 +127,7 @@ def fragment_code(
 
 
 def _carried(direction: str) -> str:
-    """Return the declarations of what goes from vertices to fragments, taken where the triangle is in the pixel."""
+    """Return the declarations of the varyings, sampled at the centroid of the covered part of the pixel."""
     names = ("carriedTint", "carriedRough", "worldPoint", "worldNormal")
     return f"centroid {direction} vec4 carriedLight;\n" + "".join(f"centroid {direction} vec3 {n};\n" for n in names)
 

@@ -106,7 +106,7 @@ class OutlinePainter:
         base = np.array(rgb(group.appearance.color), dtype=np.float32)
         ground = np.array(rgb(self.theme.ground), dtype=np.float32)
         if np.abs(base - ground).max() < 0.15:
-            # White on white: as much of the ink as tells it from the paper.
+            # White on white: as much ink as makes it visible.
             base = base + np.float32(0.25) * (np.array(rgb(group.appearance.ink), dtype=np.float32) - base)
         if group.appearance.finish == "grains":
             return self._grainy(group, base, depth, lit)
@@ -235,7 +235,7 @@ def _continued(mask: np.ndarray, inside: tuple[slice, slice]) -> np.ndarray:
 
 
 def _coarseness(distance: float, grid: Grid) -> int:
-    """Return how many pixels one node stands for, on which a cover is worked out."""
+    """Return the spacing of the nodes of the cover, in pixels."""
     return max(int(distance / (3.0 * grid.edge)), 1)
 
 

@@ -76,7 +76,7 @@ def save_surface(scene: RenderScene, frame: Frame, directory: Path) -> list[Path
 
 
 def write_series(scene: RenderScene, directory: Path, frames: Sequence[tuple[int, float]]) -> list[Path]:
-    """Write `surface_<material>.vtp.series` for every material, by which ParaView knows the times of its files.
+    """Write `surface_<material>.vtp.series` for every material, which gives ParaView the times of its files.
 
     Args:
         frames: numbers and times, s, of the frames that have been saved, in any order.
@@ -123,7 +123,7 @@ def save_surfaces(
     Raises:
         InputError: the directory cannot be made.
         RunError: a file cannot be written, or a process crashed.
-        KeyboardInterrupt: `stop` said so.
+        KeyboardInterrupt: `stop` returned True.
     """
     render_frames(SurfaceJob(result.path, directory), ks, workers, watch=watch, stop=stop)
     write_series(render_scene_of(result), directory, [(int(result.numbers[k]), float(result.times[k])) for k in ks])

@@ -158,7 +158,7 @@ class SurfaceRenderer:
 
         mapper = vtk.vtkPolyDataMapper()
         mapper.ScalarVisibilityOff()
-        # The shader wants metres.
+        # The shader uses metres.
         mapper.SetVBOShiftScaleMethod(0)
         for name in lighting.CARRIED:
             mapper.MapDataArrayToVertexAttribute(name, name, 0, -1)

@@ -17,7 +17,7 @@ WAVE_SPEED = math.sqrt(YOUNG / DENSITY)
 STRIP = 5
 PERIODS = 5
 # With this many, just under two steps of 0.8 of the limit fit between two frames of the coarsest bar, just under four
-# of the next: steps are hardly smaller than the setting asks for.
+# of the next: steps are at most slightly smaller than those of the setting.
 FRAMES_PER_PERIOD = 17
 # Loss at a free end, over that of the wave: 5.8 / n, from 13, 26 and 52 cells.
 END_LOSS = 5.8
@@ -32,7 +32,7 @@ class Bar(Case):
     levels = {"coarse": (13, 26), "default": (13, 26, 52), "fine": (13, 26, 52, 104)}  # noqa: RUF012
 
     def __init__(self, name: str, title: str, quarters: int, room: int) -> None:
-        """`quarters` of a wave fit into the bar; a free end has so many cells of `room` beyond it."""
+        """`quarters`: quarter waves in the bar; `room`: empty cells beyond a free end."""
         self.name, self.title, self.room = name, title, room
         self.b = quarters * math.pi / (2 * LENGTH)
         self.frequency = self.b * WAVE_SPEED

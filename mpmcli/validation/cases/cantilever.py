@@ -1,4 +1,4 @@
-"""Clamped beams with a load at the tip: one that hardly bends, and one that bends far, against the elastica."""
+"""Clamped beams with a load at the tip: a small and a large deflection, against the elastica."""
 
 import math
 from typing import Any
@@ -34,7 +34,7 @@ class Cantilever(Case):
     group = "solids"
     resolution = "cells through the thickness"
     load: float
-    # Particles per cell and axis for each that the setting asks for.
+    # Factor on the particles per cell and axis of the setting.
     finer = 1
 
     def beam(self, *, thin: bool = False) -> Beam:

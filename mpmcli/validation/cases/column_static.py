@@ -47,7 +47,7 @@ def rest_place(law: str, youngs_modulus: float, Y: np.ndarray) -> np.ndarray:
 class WeightedColumn(Case):
     """sigma_yy = -density g (height - Y), Y the height at the start, in a column between rollers with nu = 0.
 
-    Gravity comes on smoothly within ten periods of the column; what is measured are means over two periods after that.
+    Gravity rises smoothly within ten periods of the column; the measures are means over the two periods after that.
     """
 
     group = "solids"

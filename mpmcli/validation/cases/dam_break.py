@@ -92,7 +92,7 @@ class DamBreak(Case):
         times, fronts, heights = [], [], []
         for frame, _ in frames:
             x, y = frame.position.astype(np.float64).T
-            # Half of what a particle stands for.
+            # Half the edge of a particle.
             reach = WIDTH * math.sqrt(N_SQUARED / len(x)) / 2
             times.append(frame.time)
             fronts.append((np.quantile(x, 1 - FILM) + reach) / WIDTH)

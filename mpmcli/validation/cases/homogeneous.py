@@ -26,7 +26,7 @@ YIELD, EXPONENT = 0.05 * MU, 7.0
 BULK = LAMBDA + MU
 # Viscous stress is a third of the pressure.
 VISCOSITY = 0.02 * BULK * END / FINAL[0, 1]
-# Cells beside a block and above it, for what its faces do.
+# Empty cells at the sides of a block and above it, for the motion of its faces.
 BESIDE, ABOVE = 10, 8
 ELASTIC = {"density": DENSITY, "youngs_modulus": YOUNG, "poissons_ratio": NU}
 MATERIALS = {

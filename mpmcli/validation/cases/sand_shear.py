@@ -24,7 +24,7 @@ REACH, MIDDLE = 0.2, 0.2
 class SandShear(Case):
     """A squeezed block, free all around, that is pressed along x and drawn along y: v = rate (-x, y), off its centre.
 
-    Its middle knows nothing of the faces until a wave arrives, and is sheared homogeneously.
+    Its middle is sheared homogeneously until a wave arrives from the faces.
     """
 
     name = "sand_shear"
