@@ -20,7 +20,7 @@ class Invented(Case):
         Measure("drift", "m", "How far it went astray."),
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         raise NotImplementedError
 
     def measure(self, n: int, scene: object, frames: object) -> dict[str, float]:

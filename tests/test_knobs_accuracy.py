@@ -24,7 +24,7 @@ def measured(backend_of: Callable) -> Iterator[Callable[..., tuple[dict[str, flo
     def run(n: int, **knobs: str) -> tuple[dict[str, float], float, Scene]:
         key = (n, *sorted(knobs.items()))
         if key not in known:
-            scene = parse_scene(BAR.tables(n, Setting(**knobs)), laws=parameter_models()).scene
+            scene = parse_scene(BAR.scene_tables(n, Setting(**knobs)), laws=parameter_models()).scene
             solver = Solver(scene, backend_of("f64", 1))
             known[key] = (BAR.measure(n, scene, solver.frames()), solver.step_count / PERIODS, scene)
         return known[key]
@@ -61,7 +61,7 @@ def test_zeroed_walls_are_first_order(measured: Callable) -> None:
 
 def test_a_free_transfer_of_pic_takes_a_quarter(backend_of: Callable) -> None:
     """Without stress a wave of velocity loses D / h^2 (k h)^2 of its amplitude a step, twice what it does in a bar."""
-    tables = BAR.tables(13, Setting(transfer="pic"))
+    tables = BAR.scene_tables(13, Setting(transfer="pic"))
     tables["bodies"][0]["material"]["youngs_modulus"] = 1e-9
     # So slow that nothing moves.
     tables["time"] |= {"end": 0.1, "frames": 1, "step": 0.005}

@@ -165,7 +165,7 @@ CASE_FILE = '''\
 
 import numpy as np
 
-from mpmcli.validation.case import Case, Measure
+from mpmcli.validation.case import Case, Measure, elastic
 
 
 class Drift(Case):
@@ -176,20 +176,16 @@ class Drift(Case):
     levels = {"coarse": (8, 16), "default": (8, 16), "fine": (8, 16)}
     measures = (Measure("velocity error", "m/s", "Largest change of a velocity.", bound=lambda n: 1e-12),)
 
-    def tables(self, n, setting):
+    def tables(self, n):
         return {
             "domain": {"size": [1.0, 1.0], "cells": [n, n]},
-            "time": {"end": 0.1, "frames": 2, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": 0.1, "frames": 2},
             "bodies": [
                 {
                     "name": "block",
-                    "material": {
-                        "law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5, "poissons_ratio": 0.3,
-                    },
+                    "material": elastic("neo_hookean", 1000.0, 1e5, 0.3),
                     "shape": {"box": {"min": [0.25, 0.375], "max": [0.5, 0.625]}},
                     "velocity": [1.0, 0.0],
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             ],
         }

@@ -98,7 +98,7 @@ def test_the_scene_of_a_case_is_a_public_one(name: str) -> None:
     """Written as TOML, as --write-scene does, it is the same scene again, and one that `simulate` accepts."""
     case = CASES[name]
     n = COARSE[name][0]
-    loaded = parse_scene(case.tables(n, Setting()), laws=parameter_models())
+    loaded = parse_scene(case.scene_tables(n, Setting()), laws=parameter_models())
     again = parse_scene(tomllib.loads(scene_to_toml(loaded.scene)), laws=parameter_models())
     assert again.scene == loaded.scene
     findings = check_scene(loaded).findings

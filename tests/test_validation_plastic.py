@@ -40,7 +40,7 @@ def test_steep_sand_is_rejected_by_the_band_of_the_column(backend_of: Callable, 
     """A friction angle of 63 degrees runs out to half of the lower end of the band (docs/theory.md, 10)."""
     case, setting = all_cases()["sand_column_2"], Setting()
     n = case.levels["coarse"][0]
-    tables = case.tables(n, setting)
+    tables = case.scene_tables(n, setting)
     tables["bodies"][0]["material"]["friction_angle"] = 63.0
     asked = parse_scene(tables, laws=parameter_models()).scene
     found = case.measure(n, asked, Solver(asked, backend_of("f64")).frames())

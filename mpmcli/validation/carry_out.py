@@ -23,7 +23,7 @@ def scene_of(case: Case, n: int, setting: Setting) -> Scene:
     Raises:
         InputError: the scene is not valid.
     """
-    return parse_scene(case.tables(n, setting), laws=parameter_models(), source=f"<{case.name}>").scene
+    return parse_scene(case.scene_tables(n, setting), laws=parameter_models(), source=f"<{case.name}>").scene
 
 
 def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = None) -> RunResult:

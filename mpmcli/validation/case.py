@@ -15,6 +15,12 @@ Level = Literal["coarse", "default", "fine"]
 Frames = Iterable[tuple[Frame, LedgerRow]]
 
 
+def elastic(law: str, density: float, youngs_modulus: float, poissons_ratio: float, **more: float) -> dict[str, Any]:
+    """Return the table of a material with elastic moduli and further parameters, in SI units."""
+    moduli = {"youngs_modulus": youngs_modulus, "poissons_ratio": poissons_ratio}
+    return {"law": law, "density": density, **moduli, **more}
+
+
 def unbounded(n: int) -> float:
     """Return an infinite bound."""
     return math.inf
@@ -61,6 +67,7 @@ class Case(ABC):
         levels: the resolutions of each level, from coarse to fine.
         measures: the measures; the first one is the error of the case.
         varies: the fields of `Setting` that are varied.
+        finer: factor on the particles per cell and axis of the setting.
         note: remarks on the result, such as the origin of a bound; may be "".
     """
 
@@ -72,11 +79,24 @@ class Case(ABC):
     levels: ClassVar[dict[Level, tuple[int, ...]]]
     measures: ClassVar[tuple[Measure, ...]]
     varies: ClassVar[tuple[str, ...]] = ("precision", "kernel", "transfer", "walls", "per_axis", "safety")
+    finer: ClassVar[int] = 1
     note: ClassVar[str] = ""
 
     @abstractmethod
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
+        """Return the problem at resolution n, as the tables of a scene; `scene_tables` adds those of the setting."""
+
+    def scene_tables(self, n: int, setting: Setting) -> dict[str, Any]:
         """Return the scene at resolution n, as the tables of a TOML file."""
+        tables = self.tables(n)
+        per_cell = (self.finer * setting.per_axis) ** len(tables["domain"]["size"])
+        return {
+            "title": self.title,
+            **tables,
+            "time": {**tables["time"], "safety": setting.safety},
+            "solver": setting.solver_table(),
+            "bodies": [{**body, "particles_per_cell": per_cell} for body in tables["bodies"]],
+        }
 
     @abstractmethod
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:

@@ -31,10 +31,6 @@ class Setting:
         """Return the table [solver] of a scene, without entries at their default."""
         return {key: getattr(self, key) for key, usual in SCENE_DEFAULTS.items() if getattr(self, key) != usual}
 
-    def particles_per_cell(self, dimension: int) -> int:
-        """Return the number of particles per cell in 2 or 3 dimensions."""
-        return self.per_axis**dimension
-
     def changed_from(self, other: "Setting") -> dict[str, Any]:
         """Return the fields that differ from those of another setting, by name."""
         names = [field.name for field in fields(self)]

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
+from mpmcli.validation.case import Case, Frames, Measure, elastic
 from mpmcli.validation.linear_wave import discrete_wave
 from mpmcli.validation.oscillation import fit_oscillation
-from mpmcli.validation.setting import Setting
 
 LENGTH, YOUNG, DENSITY, SPEED = 25.0, 100.0, 1.0, 0.01
 WAVE_SPEED = math.sqrt(YOUNG / DENSITY)
@@ -85,31 +84,23 @@ class Bar(Case):
             "solid passes energy on to the second mode, some 5e-6 of it in a period at this amplitude."
         )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         h = LENGTH / n
         period = 2 * math.pi / self.frequency
         return {
-            "title": self.title,
             "domain": {
                 "size": [LENGTH + self.room * h, STRIP * h],
                 "cells": [n + self.room, STRIP],
                 "walls": "slip",
             },
-            "time": {"end": PERIODS * period, "frames": PERIODS * FRAMES_PER_PERIOD, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": PERIODS * period, "frames": PERIODS * FRAMES_PER_PERIOD},
             "output": {"fields": ["velocity", "initial_position"]},
             "bodies": [
                 {
                     "name": "bar",
-                    "material": {
-                        "law": "fixed_corotated",
-                        "density": DENSITY,
-                        "youngs_modulus": YOUNG,
-                        "poissons_ratio": 0.0,
-                    },
+                    "material": elastic("fixed_corotated", DENSITY, YOUNG, 0.0),
                     "shape": {"box": {"min": [0.0, 0.0], "max": [LENGTH, STRIP * h]}},
                     "velocity": [f"{SPEED} * sin({self.b!r} * X)", 0.0],
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             ],
         }

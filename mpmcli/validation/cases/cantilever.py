@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Level, Measure
+from mpmcli.validation.case import Case, Frames, Level, Measure, elastic
 from mpmcli.validation.elastica import Beam
 from mpmcli.validation.quasi_static import smooth_ramp, window_weights
-from mpmcli.validation.setting import Setting
 
 LENGTH, THICKNESS, YOUNG, DENSITY = 5.0, 1.0, 1e6, 1000.0
 SLENDERNESS = LENGTH / THICKNESS
@@ -43,33 +42,25 @@ class Cantilever(Case):
             return Beam(self.load, SPREAD)
         return Beam(self.load, SPREAD, axial=12 * SLENDERNESS**2, shear=5 * SLENDERNESS**2)
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         periods = RAMP + WINDOW
         # P / (density thickness length of the loaded part), m/s^2.
         pull = self.load * YOUNG * THICKNESS**2 / (12 * LENGTH**2) / (DENSITY * SPREAD * LENGTH)
         start = (1 - SPREAD) * LENGTH
         return {
-            "title": self.title,
             "domain": {
                 "origin": [0.0, -BELOW],
                 "size": [LENGTH + RIGHT, BELOW + THICKNESS + ABOVE],
                 "spacing": THICKNESS / n,
                 "walls": {"x_min": "stick"},
             },
-            "time": {"end": periods * PERIOD, "frames": periods * FRAMES_PER_PERIOD, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": periods * PERIOD, "frames": periods * FRAMES_PER_PERIOD},
             "output": {"fields": ["initial_position"]},
             "bodies": [
                 {
                     "name": "beam",
-                    "material": {
-                        "law": "fixed_corotated",
-                        "density": DENSITY,
-                        "youngs_modulus": YOUNG,
-                        "poissons_ratio": 0.0,
-                    },
+                    "material": elastic("fixed_corotated", DENSITY, YOUNG, 0.0),
                     "shape": {"box": {"min": [0.0, 0.0], "max": [LENGTH, THICKNESS]}},
-                    "particles_per_cell": self.finer**2 * setting.particles_per_cell(2),
                 }
             ],
             "forces": [

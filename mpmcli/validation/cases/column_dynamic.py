@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
+from mpmcli.validation.case import Case, Frames, Measure, elastic
 from mpmcli.validation.oscillation import fit_oscillation
-from mpmcli.validation.setting import Setting
 
 HEIGHT, YOUNG, DENSITY, GRAVITY = 1.0, 1e6, 1000.0, 1.0
 WAVE_SPEED = math.sqrt(YOUNG / DENSITY)
@@ -82,30 +81,22 @@ class ColumnDynamic(Case):
         "at any. The stress has corners, which no scheme of the grid follows: its error falls at first order."
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         h = HEIGHT / n
         return {
-            "title": self.title,
             "domain": {
                 "size": [STRIP * h, HEIGHT + ROOM * h],
                 "cells": [STRIP, n + ROOM],
                 "gravity": [0.0, -GRAVITY],
                 "walls": "slip",
             },
-            "time": {"end": PERIODS * PERIOD, "frames": PERIODS * FRAMES_PER_PERIOD, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": PERIODS * PERIOD, "frames": PERIODS * FRAMES_PER_PERIOD},
             "output": {"fields": ["stress", "initial_position"]},
             "bodies": [
                 {
                     "name": "column",
-                    "material": {
-                        "law": "fixed_corotated",
-                        "density": DENSITY,
-                        "youngs_modulus": YOUNG,
-                        "poissons_ratio": 0.0,
-                    },
+                    "material": elastic("fixed_corotated", DENSITY, YOUNG, 0.0),
                     "shape": {"box": {"min": [0.0, 0.0], "max": [STRIP * h, HEIGHT]}},
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             ],
         }

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
+from mpmcli.validation.case import Case, Frames, Measure, elastic
 from mpmcli.validation.quasi_static import smooth_ramp, window_weights
-from mpmcli.validation.setting import Setting
 
 HEIGHT, DENSITY, GRAVITY = 50.0, 80.0, 10.0
 WEIGHT = DENSITY * GRAVITY
@@ -57,34 +56,25 @@ class WeightedColumn(Case):
     youngs_modulus: float
     extra: dict[str, float] = {}  # noqa: RUF012
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         h = HEIGHT / n
         periods = RAMP + WINDOW
         # 4 height / c, s.
         period = 4 * HEIGHT / math.sqrt(self.youngs_modulus / DENSITY)
         return {
-            "title": self.title,
             "domain": {
                 "size": [STRIP * h, HEIGHT + ROOM * h],
                 "cells": [STRIP, n + ROOM],
                 "gravity": [0.0, f"-{GRAVITY} * {smooth_ramp(RAMP * period)}"],
                 "walls": "slip",
             },
-            "time": {"end": periods * period, "frames": periods * FRAMES_PER_PERIOD, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": periods * period, "frames": periods * FRAMES_PER_PERIOD},
             "output": {"fields": ["stress", "initial_position"]},
             "bodies": [
                 {
                     "name": "column",
-                    "material": {
-                        "law": self.law,
-                        "density": DENSITY,
-                        "youngs_modulus": self.youngs_modulus,
-                        "poissons_ratio": 0.0,
-                        **self.extra,
-                    },
+                    "material": elastic(self.law, DENSITY, self.youngs_modulus, 0.0, **self.extra),
                     "shape": {"box": {"min": [0.0, 0.0], "max": [STRIP * h, HEIGHT]}},
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             ],
         }

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Level, Measure
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.case import Case, Frames, Level, Measure, elastic
 
 FRAMES = 200
 DENSITY, YOUNG, POISSON = 1000.0, 1e4, 0.3
@@ -70,34 +69,28 @@ class Conservation(Case):
         # Some thousand steps.
         self.end = 20.0 if dimension == 2 else 10.0
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         d = self.dimension
-        material = {"density": DENSITY, "youngs_modulus": YOUNG, "poissons_ratio": POISSON}
         across = [1.5 * EDGE] * (d - 1)
         block, ball = [1.5 * EDGE, *across], [4.5 * EDGE, *across]
-        common = {"particles_per_cell": setting.particles_per_cell(d)}
         return {
-            "title": self.title,
             "domain": {"size": [6 * EDGE] + [3 * EDGE] * (d - 1), "cells": [6 * n] + [3 * n] * (d - 1)},
-            "time": {"end": self.end, "frames": FRAMES, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": self.end, "frames": FRAMES},
             "output": {"fields": ["velocity", "mass"]},
             "bodies": [
                 {
                     "name": "block",
-                    "material": {"law": "neo_hookean", **material},
+                    "material": elastic("neo_hookean", DENSITY, YOUNG, POISSON),
                     "shape": {"box": {"min": [c - EDGE / 2 for c in block], "max": [c + EDGE / 2 for c in block]}},
                     "velocity": [*DRIFT[:d]],
                     "velocity_gradient": started(SPIN, RATE, d),
-                    **common,
                 },
                 {
                     "name": "ball",
-                    "material": {"law": "fixed_corotated", **material},
+                    "material": elastic("fixed_corotated", DENSITY, YOUNG, POISSON),
                     "shape": {"ball": {"center": ball, "radius": RADIUS}},
                     "velocity": [-v for v in DRIFT[:d]],
                     "velocity_gradient": started(-0.5 * SPIN, -RATE, d),
-                    **common,
                 },
             ],
         }

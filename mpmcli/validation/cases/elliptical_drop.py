@@ -7,7 +7,6 @@ import numpy as np
 
 from mpmcli.scene import Scene
 from mpmcli.validation.case import Case, Frames, Measure
-from mpmcli.validation.setting import Setting
 
 # A0 = 1/s, R = 1 m; END and c = 15 A0 R as in the literature.
 DENSITY, SOUND, END = 1000.0, 15.0, 0.76
@@ -78,17 +77,15 @@ class EllipticalDrop(Case):
         "does not change, and 76 times as much energy would be lost."
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         return {
-            "title": self.title,
             "domain": {
                 "origin": [-1.5, -2.5],
                 "size": [3.0, 5.0],
                 "cells": [3 * n, 5 * n],
                 "gravity": [0.0, 0.0],
             },
-            "time": {"end": END, "frames": FRAMES, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": END, "frames": FRAMES},
             "output": {"fields": ["velocity", "initial_position"]},
             "bodies": [
                 {
@@ -98,7 +95,6 @@ class EllipticalDrop(Case):
                     "velocity": ["-X", "Y"],
                     # p = K (1/J - 1)
                     "deformation": f"1 / (1 + (1 - X**2 - Y**2) / {2 * SOUND**2!r})",
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             ],
         }

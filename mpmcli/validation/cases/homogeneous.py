@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.case import Case, Frames, Measure, elastic
 
 DENSITY, YOUNG, NU = 1000.0, 1e6, 0.3
 MU, LAMBDA = YOUNG / (2 * (1 + NU)), YOUNG * NU / ((1 + NU) * (1 - 2 * NU))
@@ -28,10 +27,10 @@ BULK = LAMBDA + MU
 VISCOSITY = 0.02 * BULK * END / FINAL[0, 1]
 # Empty cells at the sides of a block and above it, for the motion of its faces.
 BESIDE, ABOVE = 10, 8
-ELASTIC = {"density": DENSITY, "youngs_modulus": YOUNG, "poissons_ratio": NU}
+ELASTIC = (DENSITY, YOUNG, NU)
 MATERIALS = {
-    "neo-Hookean": {"law": "neo_hookean", **ELASTIC},
-    "corotated": {"law": "fixed_corotated", **ELASTIC},
+    "neo-Hookean": elastic("neo_hookean", *ELASTIC),
+    "corotated": elastic("fixed_corotated", *ELASTIC),
     "fluid": {
         "law": "fluid",
         "density": DENSITY,
@@ -39,7 +38,7 @@ MATERIALS = {
         "exponent": EXPONENT,
         "viscosity": VISCOSITY,
     },
-    "plastic": {"law": "von_mises", **ELASTIC, "yield_stress": YIELD, "hardening_modulus": 0.0},
+    "plastic": elastic("von_mises", *ELASTIC, yield_stress=YIELD, hardening_modulus=0.0),
 }
 
 
@@ -91,7 +90,7 @@ class Homogeneous(Case):
         "viscous stress is first order in the step, as C is that of the step before."
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         h = SIZE / n
         across, up = n + 2 * BESIDE, len(MATERIALS) * (n + ABOVE) + ABOVE
         bodies = []
@@ -103,14 +102,11 @@ class Homogeneous(Case):
                     "material": material,
                     "shape": {"box": {"min": low, "max": [x + SIZE for x in low]}},
                     "velocity_gradient": (FINAL / END).tolist(),
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             )
         return {
-            "title": self.title,
             "domain": {"size": [across * h, up * h], "cells": [across, up], "walls": "separate"},
-            "time": {"end": END, "frames": 1, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": END, "frames": 1},
             "output": {"fields": ["velocity", "stress", "deformation_gradient", "initial_position"]},
             "bodies": bodies,
         }

@@ -7,7 +7,6 @@ import numpy as np
 
 from mpmcli.scene import Scene
 from mpmcli.validation.case import Case, Frames, Measure
-from mpmcli.validation.setting import Setting
 
 HEIGHT, DENSITY, GRAVITY = 1.0, 1000.0, 9.81
 WEIGHT = DENSITY * GRAVITY * HEIGHT
@@ -17,28 +16,23 @@ FRAMES_PER_PERIOD = 40
 TERMS = 500
 
 
-def column(
-    title: str, n: int, setting: Setting, modulus: float, end: float, frames: int, body: dict[str, Any]
-) -> dict[str, Any]:
+def column(n: int, modulus: float, end: float, frames: int, body: dict[str, Any]) -> dict[str, Any]:
     """Return the tables of a column of n cells in a shaft with slip walls."""
     h = HEIGHT / n
     return {
-        "title": title,
         "domain": {
             "size": [SHAFT * h, HEIGHT + 4 * h],
             "cells": [SHAFT, n + 4],
             "gravity": [0.0, -GRAVITY],
             "walls": "slip",
         },
-        "time": {"end": end, "frames": frames, "safety": setting.safety},
-        "solver": setting.solver_table(),
+        "time": {"end": end, "frames": frames},
         "output": {"fields": ["velocity", "pressure", "volume_ratio", "initial_position"]},
         "bodies": [
             {
                 "name": "water",
                 "material": {"law": "fluid", "density": DENSITY, "bulk_modulus": modulus},
                 "shape": {"box": {"min": [0.0, 0.0], "max": [SHAFT * h, HEIGHT]}},
-                "particles_per_cell": setting.particles_per_cell(2),
                 **body,
             }
         ],
@@ -85,9 +79,9 @@ class Hydrostatic(Case):
         "order 3/2; in the cells below it is five times smaller and less."
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         still = {"initial_pressure": "hydrostatic"}
-        return column(self.title, n, setting, self.modulus, self.end, self.frames, still)
+        return column(n, self.modulus, self.end, self.frames, still)
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
         errors, speeds, spreads = [], [], []
@@ -154,9 +148,9 @@ class HydrostaticDrop(Case):
         "width of h^(2/3), so that the peak is reached at that order."
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         end, frames = self.periods * self.period, FRAMES_PER_PERIOD * self.periods
-        return column(self.title, n, setting, self.modulus, end, frames, {})
+        return column(n, self.modulus, end, frames, {})
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
         times, base, exact_base, errors = [], [], [], []

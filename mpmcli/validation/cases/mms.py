@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Level, Measure
+from mpmcli.validation.case import Case, Frames, Level, Measure, elastic
 from mpmcli.validation.manufactured import StandingWave
-from mpmcli.validation.setting import Setting
 
 # The grid has at least five cells per axis; in 1D the strip fills them.
 STRIP = 5
@@ -64,7 +63,7 @@ class ManufacturedWave(Case):
             ),
         )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         wave = self.wave
         d = len(wave.signs)
         size, cells = [1.0] * d, [n] * d
@@ -73,24 +72,16 @@ class ManufacturedWave(Case):
             size, cells = [1.0, STRIP / n], [n, STRIP]
             velocity, force = [*velocity, 0.0], [*force, 0.0]
         return {
-            "title": self.title,
             "domain": {"size": size, "cells": cells, "walls": "slip"},
-            "time": {"end": wave.period, "frames": FRAMES, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": wave.period, "frames": FRAMES},
             "output": {"fields": ["velocity", "stress", "initial_position"]},
             "forces": [{"acceleration": force}],
             "bodies": [
                 {
                     "name": "solid",
-                    "material": {
-                        "law": wave.law,
-                        "density": wave.density,
-                        "youngs_modulus": wave.young,
-                        "poissons_ratio": wave.poisson,
-                    },
+                    "material": elastic(wave.law, wave.density, wave.young, wave.poisson),
                     "shape": {"box": {"min": [0.0] * len(size), "max": size}},
                     "velocity": velocity,
-                    "particles_per_cell": setting.particles_per_cell(len(size)),
                 }
             ],
         }

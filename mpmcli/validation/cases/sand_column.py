@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.case import Case, Frames, Measure, elastic
 
 GRAVITY, DENSITY, FRICTION, NU = 9.81, 1600.0, 30.0, 0.3
 L0 = 0.2
@@ -66,35 +65,26 @@ class SandColumn(Case):
             ),
         )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         h = L0 / n
         across, up = (2 + math.ceil(self.runout[1])) * n, self.aspect * n + 4
         height = self.aspect * L0
         # E for K = lambda + mu, the bulk modulus of the plane.
         young = STIFFNESS * DENSITY * GRAVITY * height * 2 * (1 + NU) * (1 - 2 * NU)
         return {
-            "title": self.title,
             "domain": {
                 "size": [across * h, up * h],
                 "cells": [across, up],
                 "gravity": [0.0, -GRAVITY],
                 "walls": {"default": "separate", "x_min": "slip", "y_min": "stick"},
             },
-            "time": {"end": UNITS * math.sqrt(height / GRAVITY), "frames": 2, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": UNITS * math.sqrt(height / GRAVITY), "frames": 2},
             "output": {"fields": ["velocity"]},
             "bodies": [
                 {
                     "name": "sand",
-                    "material": {
-                        "law": "sand",
-                        "density": DENSITY,
-                        "youngs_modulus": young,
-                        "poissons_ratio": NU,
-                        "friction_angle": FRICTION,
-                    },
+                    "material": elastic("sand", DENSITY, young, NU, friction_angle=FRICTION),
                     "shape": {"box": {"min": [0.0, 0.0], "max": [L0, height]}},
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             ],
         }

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.case import Case, Frames, Measure, elastic
 
 DENSITY, YOUNG, NU, FRICTION = 1600.0, 1e7, 0.3, 30.0
 MU, LAMBDA = YOUNG / (2 * (1 + NU)), YOUNG * NU / ((1 + NU) * (1 - 2 * NU))
@@ -54,31 +53,22 @@ class SandShear(Case):
         "that of triaxial compression, would act as 27.5 degrees here, 7.7 % too weak (docs/theory.md, 5.7)."
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         h = SIZE / n
         end = REACH * SIZE / WAVE_SPEED
         rate, stretch = SHEAR / end, math.exp(SQUEEZE / 2)
         # Four cells of room all around.
         return {
-            "title": self.title,
             "domain": {"size": [(n + 8) * h] * 2, "cells": [n + 8] * 2, "gravity": [0.0, 0.0], "walls": "separate"},
-            "time": {"end": end, "frames": 1, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": end, "frames": 1},
             "output": {"fields": ["velocity", "stress", "initial_position"]},
             "bodies": [
                 {
                     "name": "sand",
-                    "material": {
-                        "law": "sand",
-                        "density": DENSITY,
-                        "youngs_modulus": YOUNG,
-                        "poissons_ratio": NU,
-                        "friction_angle": FRICTION,
-                    },
+                    "material": elastic("sand", DENSITY, YOUNG, NU, friction_angle=FRICTION),
                     "shape": {"box": {"min": [4 * h] * 2, "max": [SIZE + 4 * h] * 2}},
                     "velocity_gradient": [[-rate, 0.0], [0.0, rate]],
                     "deformation": [[stretch, 0.0], [0.0, stretch]],
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             ],
         }

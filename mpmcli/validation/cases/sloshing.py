@@ -8,7 +8,6 @@ import numpy as np
 from mpmcli.scene import Scene
 from mpmcli.validation.case import Case, Frames, Measure
 from mpmcli.validation.oscillation import fit_oscillation
-from mpmcli.validation.setting import Setting
 
 
 def standing_wave_frequency(gravity: float, wave_number: float, depth: float, amplitude: float = 0.0) -> float:
@@ -75,11 +74,10 @@ class Sloshing(Case):
         "grows when h falls, and three particles per axis make it smaller (0.07 % at L/32)."
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         h = LENGTH / n
         k, speed = WAVE_NUMBER, AMPLITUDE * LINEAR / math.sinh(WAVE_NUMBER * DEPTH)
         return {
-            "title": self.title,
             "domain": {
                 "size": [LENGTH, n * 5 // 8 * h],
                 "cells": [n, n * 5 // 8],
@@ -89,9 +87,7 @@ class Sloshing(Case):
             "time": {
                 "end": PERIODS * 2 * math.pi / LINEAR,
                 "frames": PERIODS * FRAMES_PER_PERIOD,
-                "safety": setting.safety,
             },
-            "solver": setting.solver_table(),
             "output": {"fields": ["velocity"]},
             "bodies": [
                 {
@@ -103,7 +99,6 @@ class Sloshing(Case):
                         f"{speed!r} * cos({k!r} * X) * sinh({k!r} * Y)",
                     ],
                     "initial_pressure": "hydrostatic",
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             ],
         }

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.case import Case, Frames, Measure, elastic
 
 DENSITY, DEPTH = 400.0, 1.0
 YOUNG, NU, COMPRESSION, HARDENING = 1.4e5, 0.2, 0.025, 10.0
@@ -65,32 +64,24 @@ class SnowOedometer(Case):
         Measure("stretch at the base", "", "Height over that at the start, of the lowest row."),
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         h = DEPTH / n
         return {
-            "title": self.title,
             "domain": {
                 "size": [STRIP * h, (n + 3) * h],
                 "cells": [STRIP, n + 3],
                 "gravity": [0.0, f"-{PULL!r} * t / {DURATION!r}"],
                 "walls": "slip",
             },
-            "time": {"end": DURATION, "frames": 1, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": DURATION, "frames": 1},
             "output": {"fields": ["velocity", "stress", "volume_ratio", "initial_position"]},
             "bodies": [
                 {
                     "name": "snow",
-                    "material": {
-                        "law": "snow",
-                        "density": DENSITY,
-                        "youngs_modulus": YOUNG,
-                        "poissons_ratio": NU,
-                        "critical_compression": COMPRESSION,
-                        "hardening": HARDENING,
-                    },
+                    "material": elastic(
+                        "snow", DENSITY, YOUNG, NU, critical_compression=COMPRESSION, hardening=HARDENING
+                    ),
                     "shape": {"box": {"min": [0.0, 0.0], "max": [STRIP * h, DEPTH]}},
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             ],
         }

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.case import Case, Frames, Measure, elastic
 
 RADIUS, YOUNG, POISSON, DENSITY, SPIN = 0.5, 1e6, 0.3, 1000.0, 5.0
 TURNS, FRAMES_PER_TURN = 10, 8
@@ -56,33 +55,24 @@ class SpinningDisc(Case):
         "cantilever)."
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         k, R = STRETCH, RADIUS
         radial = f"1 + {k!r} * ({(3 - 2 * POISSON) * R**2!r} - X**2 - Y**2"
         cross = f"{-2 * k!r} * X * Y"
         return {
-            "title": self.title,
             "domain": {"origin": [-HALF, -HALF], "size": [2 * HALF, 2 * HALF], "spacing": RADIUS / n},
             "time": {
                 "end": TURNS * 2 * math.pi / SPIN,
                 "frames": TURNS * FRAMES_PER_TURN,
-                "safety": setting.safety,
             },
-            "solver": setting.solver_table(),
             "output": {"fields": ["initial_position"]},
             "bodies": [
                 {
                     "name": "disc",
-                    "material": {
-                        "law": "neo_hookean",
-                        "density": DENSITY,
-                        "youngs_modulus": YOUNG,
-                        "poissons_ratio": POISSON,
-                    },
+                    "material": elastic("neo_hookean", DENSITY, YOUNG, POISSON),
                     "shape": {"ball": {"center": [0.0, 0.0], "radius": RADIUS}},
                     "velocity_gradient": [[0.0, -SPIN], [SPIN, 0.0]],
                     "deformation": [[f"{radial} - 2 * X**2)", cross], [cross, f"{radial} - 2 * Y**2)"]],
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             ],
         }

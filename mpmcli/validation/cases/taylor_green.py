@@ -7,7 +7,6 @@ import numpy as np
 
 from mpmcli.scene import Scene
 from mpmcli.validation.case import Case, Frames, Measure
-from mpmcli.validation.setting import Setting
 from mpmcli.validation.transfer_loss import apic_factor
 
 # L = 1 m, U = 1 m/s, density 1 kg/m^3.
@@ -68,13 +67,11 @@ class TaylorGreen(Case):
         "a loss of volume, 38 % and 57 %. From random places the cut-off costs less than 1 %."
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         modulus = SOUND**2
         return {
-            "title": self.title,
             "domain": {"size": [1.0, 1.0], "cells": [n, n], "gravity": [0.0, 0.0], "walls": "slip"},
-            "time": {"end": END, "frames": FRAMES, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": END, "frames": FRAMES},
             "output": {"fields": ["velocity"]},
             "bodies": [
                 {
@@ -94,7 +91,6 @@ class TaylorGreen(Case):
                         f"1 / (1 + ({PRESSURE!r} + 0.25 * (cos(2 * pi * X) + cos(2 * pi * Y))) / {modulus!r})"
                     ),
                     "sampling": "jittered",
-                    "particles_per_cell": setting.particles_per_cell(2),
                 }
             ],
         }

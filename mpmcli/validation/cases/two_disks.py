@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.case import Case, Frames, Measure, elastic
 
 RADIUS, CENTRE, SPEED = 0.2, 0.3, 0.1
 DENSITY, YOUNG, POISSON = 1000.0, 1000.0, 0.3
@@ -66,27 +65,19 @@ class TwoDisks(Case):
         "energy stays in vibrations of the disks."
     )
 
-    def tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def tables(self, n: int) -> dict[str, Any]:
         def disk(name: str, side: int) -> dict[str, Any]:
             return {
                 "name": name,
-                "material": {
-                    "law": "neo_hookean",
-                    "density": DENSITY,
-                    "youngs_modulus": YOUNG,
-                    "poissons_ratio": POISSON,
-                },
+                "material": elastic("neo_hookean", DENSITY, YOUNG, POISSON),
                 "shape": {"ball": {"center": [side * CENTRE + 0.5] * 2, "radius": RADIUS}},
                 "velocity": [-side * SPEED] * 2,
-                "particles_per_cell": setting.particles_per_cell(2),
             }
 
         cells = round(SIZE * n)
         return {
-            "title": self.title,
             "domain": {"size": [SIZE] * 2, "origin": [-MARGIN] * 2, "cells": [cells] * 2},
-            "time": {"end": END, "frames": FRAMES, "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "time": {"end": END, "frames": FRAMES},
             "output": {"fields": ["velocity", "mass"]},
             "bodies": [disk("lower", -1), disk("upper", 1)],
         }
