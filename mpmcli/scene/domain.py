@@ -1,6 +1,6 @@
 """The domain of a scene: a box of whole grid cells, gravity, and what its walls do."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
@@ -18,7 +18,7 @@ from mpmcli.scene.quantity import (
 )
 
 Wall = Literal["slip", "stick", "separate"]
-WALLS = ("slip", "stick", "separate")
+WALLS: tuple[str, ...] = get_args(Wall)
 MOST_CELLS = 2**31 - 1
 # Each wall acts on nodes up to two cells away from it, and no node may belong to both walls of an axis.
 FEWEST_CELLS = 5
@@ -58,7 +58,10 @@ def _one_word_for_all(value: object) -> object:
     if not isinstance(value, str):
         return value
     if value not in WALLS:
-        raise flaw(f'must be "slip", "stick" or "separate", or a table with one of them per face; found "{value}"')
+        words = [f'"{word}"' for word in WALLS]
+        raise flaw(
+            f'must be {", ".join(words[:-1])} or {words[-1]}, or a table with one of them per face; found "{value}"'
+        )
     return {"default": value}
 
 
