@@ -1,5 +1,6 @@
 """The VTKHDF store: what it writes is read back bit for bit, and survives crashes and full disks."""
 
+import math
 import os
 import shutil
 import signal
@@ -22,6 +23,7 @@ from vtkmodules.vtkIOHDF import vtkHDFReader
 from mpmcli.errors import InputError, RunError
 from mpmcli.output import SegmentStore, open_result, prepare_directory
 from mpmcli.output import pack as pack_module
+from mpmcli.output import store as store_module
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.segments import sealed_segments
 
@@ -110,6 +112,88 @@ def test_round_trip(counts, d, dtype, fields, compress):
             assert_vtk_sees(directory / "particles.vtkhdf", frames)
 
 
+def datasets(path: Path) -> dict[str, tuple]:
+    """Return type, shape and bytes of every data set of a file."""
+    found = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: found.update({name: item}) if isinstance(item, h5py.Dataset) else None)
+        return {name: (str(item.dtype), item.shape, item[()].tobytes()) for name, item in found.items()}
+
+
+@settings(deadline=None, max_examples=20)
+@given(
+    frames=st.lists(st.tuples(st.integers(0, 40), st.booleans()), min_size=1, max_size=6),
+    d=st.sampled_from([2, 3]),
+    compress=st.booleans(),
+)
+def test_frames_that_are_sealed_together_are_those_that_are_sealed_alone(frames, d, compress):
+    """Wherever the seals fall: sealed frames can be read, waiting ones do not count, the packed file is equal."""
+    made = [make_frame(k, n, d) for k, (n, _) in enumerate(frames)]
+    with TemporaryDirectory() as place:
+        alone, together = Path(place) / "alone", Path(place) / "together"
+        for directory in (alone, together):
+            directory.mkdir()
+        fill(alone, made, compress=compress)
+        store = SegmentStore(together, HEADER, compress=compress, hold=math.inf)
+        written = 0
+        for frame, (_, seal) in zip(made, frames, strict=True):
+            store.write(frame, make_row(frame.index, d))
+            if seal:
+                store.seal()
+                written = frame.index + 1
+            assert store.frames_written == written
+            if written:
+                result = open_result(together)
+                assert (result.kind, result.frame_count) == ("segments", written)
+                for read, expected in zip(result.frames(), made, strict=False):
+                    assert_same_frame(read, expected)
+        store.finish()
+        assert store.frames_written == len(frames) and os.listdir(together) == ["particles.vtkhdf"]
+        assert datasets(together / "particles.vtkhdf") == datasets(alone / "particles.vtkhdf")
+
+
+def test_frames_wait_for_the_time_or_the_size_that_seals_them(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(store_module.time, "monotonic", lambda: now[0])
+    store = SegmentStore(tmp_path, HEADER, hold=1.0)
+    counts = []
+    for k, at in enumerate((0.0, 0.5, 0.9, 1.0, 1.2, 5.0)):
+        now[0] = at
+        store.write(make_frame(k, 10, 2), make_row(k, 2))
+        counts.append(store.frames_written)
+    # The first waits until 1.0, and the fifth, which comes at 1.2, until 5.0.
+    assert counts == [0, 0, 0, 4, 4, 6]
+    store.write(make_frame(6, 10, 2), make_row(6, 2))
+    now[0] = 5.9
+    store.seal_due()
+    assert store.frames_written == 6
+    now[0] = 6.0
+    store.seal_due()
+    assert store.frames_written == 7
+    monkeypatch.setattr(store_module, "MOST_WAITING", 200_000)
+    store.write(make_frame(7, 10, 2), make_row(7, 2))
+    assert store.frames_written == 7
+    store.write(make_frame(8, 10_000, 2), make_row(8, 2))
+    assert store.frames_written == 9
+    names = [path.name for path in sealed_segments(tmp_path)]
+    assert names == [f"frame_{k:06d}.vtkhdf" for k in (0, 4, 6, 7)]
+
+
+def test_a_disk_that_is_full_at_a_seal_loses_the_waiting_frames_and_says_so(tmp_path, monkeypatch):
+    store = SegmentStore(tmp_path, HEADER, hold=math.inf)
+    for k in range(2):
+        store.write(make_frame(k, 100, 2), make_row(k, 2))
+    store.seal()
+    for k in (2, 3):
+        store.write(make_frame(k, 100, 2), make_row(k, 2))
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9 - 10**6, 10**6))
+    with pytest.raises(RunError, match=r"frame 2 needs .* the 2 frames before it are kept"):
+        store.seal()
+    monkeypatch.undo()
+    store.finish()
+    assert open_result(tmp_path).frame_count == store.frames_written == 2
+
+
 @pytest.mark.parametrize("compress", [False, True])
 def test_vtk_reads_every_frame_of_a_packed_file(tmp_path, compress):
     frames = [make_frame(k, n, 3, fields=tuple(FIELDS)) for k, n in enumerate((30_000, 31_274, 1, 29_137))]
@@ -194,7 +278,8 @@ def test_an_earlier_result_is_not_mixed_with_a_new_one(tmp_path):
         fill(tmp_path, [make_frame(0, 3, 2)])
 
 
-def test_a_killed_run_keeps_every_sealed_frame(tmp_path):
+@pytest.mark.parametrize("hold", [0.0, 0.1])
+def test_a_killed_run_keeps_every_sealed_frame(tmp_path, hold):
     """SIGKILL in the middle of a frame: what was reported as written is there, the rest is ignored."""
     program = f"""
 import sys
@@ -202,12 +287,12 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 from test_output_frames import make_frame, make_row
 from mpmcli.output import SegmentStore
-store = SegmentStore(Path({str(tmp_path)!r}), {{}})
+store = SegmentStore(Path({str(tmp_path)!r}), {{}}, hold={hold})
 k = 0
 while True:
     store.write(make_frame(k, 2000, 2), make_row(k, 2))
-    k = store.frames_written
-    print(k, flush=True)
+    k += 1
+    print(store.frames_written, flush=True)
 """
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
     reported = 0
@@ -219,7 +304,8 @@ while True:
     reported = int(rest[-1]) if rest else reported
     (tmp_path / "segments/frame_999999.vtkhdf.tmp").write_bytes(b"torn")
     result = open_result(tmp_path)
-    assert reported <= result.frame_count <= reported + 1
+    # One more seal than was reported, of one frame or of those of 0.1 s.
+    assert reported <= result.frame_count and (hold or result.frame_count <= reported + 1)
     for k, frame in enumerate(result.frames()):
         assert_same_frame(frame, make_frame(k, 2000, 2))
 
@@ -295,7 +381,7 @@ def test_a_damaged_or_foreign_segment_is_not_packed(tmp_path):
     with pytest.raises(RunError, match="left unpacked"):
         store.finish()
     last.unlink()
-    with pytest.raises(RunError, match="1 of the 2 frames"):
+    with pytest.raises(RunError, match=r"lacks frame_000001.vtkhdf, one of the 2 files written"):
         store.finish()
     other = SegmentStore(tmp_path / "other", {"scene": "another"})
     for k in range(2):

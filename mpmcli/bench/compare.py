@@ -4,7 +4,6 @@ import json
 import os
 import statistics
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
@@ -14,6 +13,7 @@ from typing import Self
 from mpmcli.bench.cases import CASES, BenchCase
 from mpmcli.bench.report import BenchReport, CaseResult, ContestantResult
 from mpmcli.errors import RunError
+from mpmcli.processes.questions import module_command
 
 # Measured blocks of each contestant.
 BLOCKS = 5
@@ -37,7 +37,7 @@ class Worker:
         self._stderr = tempfile.TemporaryFile(mode="w+", encoding="utf-8", errors="replace")  # noqa: SIM115
         begin = time.perf_counter()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "mpmcli.bench.contestant", *arguments],
+            module_command("mpmcli.bench.contestant", *arguments),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._stderr,

@@ -121,7 +121,8 @@ def _open_segments(directory: Path, findings: FrameFindings) -> OpenedResult:
     for segment in sealed_segments(directory):
         number = int(segment.stem.split("_")[1])
         try:
-            entries.append(_entry(open_result(segment), 0, number))
+            result = open_result(segment)
+            entries += [_entry(result, k, number + k) for k in range(result.frame_count)]
         except DAMAGE as error:
             what = f"The segment of frame {number} cannot be read ({_first_line(error).rstrip('.')})"
             findings.add("error", "unreadable", number, what, RUN_AGAIN)

@@ -1,6 +1,6 @@
 """How the arrays of a Frame lie in a file: names, types, and the padding of 2D to 3D for VTK."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -133,6 +133,19 @@ class FrameLayout:
             raise ValueError(f"frame {frame.index} holds other arrays, types or shapes than the first frame")
         for name, array in _named_arrays(frame):
             yield name, self.arrays[name].pad(array)
+
+    def stored_together(self, frames: Sequence[Frame]) -> Iterator[tuple[str, np.ndarray]]:
+        """Yield every array of some frames, one frame after the other, in the form of the file.
+
+        Raises:
+            ValueError: as `stored`.
+        """
+        if len(frames) == 1:
+            yield from self.stored(frames[0])
+            return
+        arrays = [dict(self.stored(frame)) for frame in frames]
+        for name in self.arrays:
+            yield name, np.concatenate([stored.pop(name) for stored in arrays])
 
     def frame(self, index: int, time: float, step: int, stored: Mapping[str, np.ndarray]) -> Frame:
         """Build the Frame back from arrays in the form of the file; `stored` may leave out fields."""

@@ -1,4 +1,4 @@
-"""Packing: many sealed one-frame files become one file, proved equal before it takes its name."""
+"""Packing: many sealed files become one file, proved equal before it takes its name."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -15,10 +15,10 @@ from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, part_tabl
 def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = False) -> None:
     """Write all frames of `segments` into `target`, compare every number, then give it its name.
 
-    Memory is that of one array of one frame. The segments are left as they are.
+    Memory is that of one array of one segment. The segments are left as they are.
 
     Args:
-        segments: sealed one-frame VTKHDF files of one run, in order.
+        segments: sealed VTKHDF files of one run, in order.
         target: file to make; an existing one is replaced at the very end.
         compress: gzip-1 with shuffle.
 
@@ -34,19 +34,22 @@ def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = Fa
     for segment, index in zip(segments, indices, strict=True):
         if index.layout != first.layout or index.header != first.header:
             raise RunError(f"{segment} is of another run than {segments[0]}: the frames were left unpacked.")
-    counts = [int(index.counts[0]) for index in indices]
-    kept = f"the {len(segments)} frames written are kept in {segments[0].parent} and stay readable there"
+    expected = FrameIndex.joined(indices)
+    counts = expected.counts.tolist()
+    kept = f"the {len(counts)} frames written are kept in {segments[0].parent} and stay readable there"
     purpose = f"packing the frames into {target.name}"
     size = file_size(first.layout, counts)
     require_free_space(target.parent, size, purpose, kept)
     try:
         with sealed(target, size) as temporary:
             with VtkhdfWriter(temporary, first.layout, counts, compress=compress) as writer:
-                for k, segment in enumerate(segments):
+                k = 0
+                for segment, index in zip(segments, indices, strict=True):
+                    frames, rows = len(index.counts), int(index.counts.sum())
                     with closing(open_vtkhdf(segment)) as source:
                         for name in first.layout.arrays:
-                            writer.write_array(k, name, read_array(source, name, 0, counts[k]))
-                expected = FrameIndex.joined(indices)
+                            writer.write_array(k, name, read_array(source, name, 0, rows), frames=frames)
+                    k += frames
                 writer.finish(expected.times, expected.frames, expected.steps, expected.ledger, header=expected.header)
             sync_file(temporary)
             difference = find_difference(temporary, segments, expected)
@@ -77,15 +80,17 @@ def find_difference(packed: Path, segments: Sequence[Path], expected: FrameIndex
         for name, table in part_tables(expected.counts).items():
             if not _same(root[name][...], table):
                 return name
-        if root["Steps"].attrs["NSteps"] != len(segments):
+        if root["Steps"].attrs["NSteps"] != len(expected.counts):
             return "NSteps"
-        for k, segment in enumerate(segments):
+        first = 0
+        for segment in segments:
             with closing(open_vtkhdf(segment)) as source:
+                rows = int(source["VTKHDF/NumberOfPoints"][:].sum())
                 for name in expected.layout.arrays:
-                    count = int(expected.counts[k])
-                    written = read_array(file, name, int(expected.offsets[k]), count)
-                    if not _same(written, read_array(source, name, 0, count)):
-                        return f"{name} of frame {expected.frames[k]}"
+                    written, stored = read_array(file, name, first, rows), read_array(source, name, 0, rows)
+                    if not _same(written, stored):
+                        return f"{name} of the frames of {segment.name}"
+            first += rows
     return ""
 
 

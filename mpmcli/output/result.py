@@ -118,15 +118,20 @@ class _SegmentsResult(Result):
     kind = "segments"
 
     def __init__(self, path: Path, segments: Sequence[Path]) -> None:
-        self._segments = list(segments)
-        super().__init__(path, FrameIndex.joined([_index_of(segment) for segment in segments]))
+        indices = [_index_of(segment) for segment in segments]
+        # Of each frame: its file, and its first row there.
+        self._places = [
+            (segment, int(offset)) for segment, index in zip(segments, indices, strict=True) for offset in index.offsets
+        ]
+        super().__init__(path, FrameIndex.joined(indices))
 
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        segment, offset = self._places[k]
         try:
-            return _read_arrays(self._segments[k], names, 0, int(self.particle_counts[k]))
+            return _read_arrays(segment, names, offset, int(self.particle_counts[k]))
         except InputError:
             packed = self.path / PACKED
-            if self._segments[k].exists() or not packed.exists():
+            if segment.exists() or not packed.exists():
                 raise
             # The run has ended since, and its frames were packed: the same ones, and perhaps more.
             return _read_arrays(packed, names, int(self._index.offsets[k]), int(self.particle_counts[k]))

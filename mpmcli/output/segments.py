@@ -1,6 +1,8 @@
-"""The store of a run: every frame a sealed file at once, one packed VTKHDF file at the end."""
+"""The store of a run: sealed files of one or more frames while it goes on, one packed VTKHDF file at the end."""
 
+import os
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -20,12 +22,12 @@ SEGMENT_NAME = re.compile(r"frame_\d{6,}\.vtkhdf")
 
 
 def segment_name(index: int) -> str:
-    """File name of the sealed frame with this number."""
+    """Return the file name of the segment whose first frame has this number."""
     return f"frame_{index:06d}.vtkhdf"
 
 
 def sealed_segments(directory: Path) -> list[Path]:
-    """Sealed frames of a run that was not packed, in order; unfinished files are not among them."""
+    """Return the sealed segments of a run that was not packed, in order, without unfinished files."""
     folder = directory / SEGMENTS
     if not folder.is_dir():
         return []
@@ -41,12 +43,15 @@ class SegmentStore(Store):
     file.
     """
 
-    def __init__(self, directory: Path, header: dict[str, Any], *, compress: bool = False) -> None:
-        super().__init__(directory, header, compress=compress)
+    def __init__(self, directory: Path, header: dict[str, Any], *, compress: bool = False, hold: float = 0.0) -> None:
+        super().__init__(directory, header, compress=compress, hold=hold)
         self.place = self._directory / SEGMENTS
+        self._sealed: set[str] = set()
 
     def finish(self) -> Path | None:
-        """Pack the sealed frames, verify the packed file, and remove the segments.
+        """Seal the waiting frames, pack all segments, verify the packed file, and remove the segments.
+
+        A single segment becomes the packed file as it is, unless that is compressed.
 
         Returns:
             The packed file; None when no frame was written.
@@ -54,17 +59,22 @@ class SegmentStore(Store):
         Raises:
             RunError: the disk cannot hold the packed file or it does not read back; the segments stay.
         """
+        self.seal()
         segments = sealed_segments(self._directory)
         # An interrupt may fall between the seal and the count; a sealed frame is never left behind.
-        if len(segments) < self.frames_written:
+        if missing := self._sealed - {path.name for path in segments}:
             raise RunError(
-                f"{self._directory / SEGMENTS} holds {len(segments)} of the {self.frames_written} frames written: "
-                "some were removed during the run; the others are kept."
+                f"{self._directory / SEGMENTS} lacks {min(missing)}, one of the {len(self._sealed)} "
+                "files written: it was removed during the run; the others are kept."
             )
         if not segments:
             return None
         packed = self._directory / PACKED
-        pack_segments(segments, packed, compress=self._compress)
+        if len(segments) == 1 and not self._compress:
+            os.replace(segments[0], packed)
+            sync_directory(self._directory)
+        else:
+            pack_segments(segments, packed, compress=self._compress)
         # The result is complete; a segment that somebody holds open may stay beside it.
         with suppress(OSError):
             remove_segments(self._directory)
@@ -80,17 +90,19 @@ class SegmentStore(Store):
             raise RunError(f"{self.place} could not be made ({error.strerror}); no frame was written.") from error
         sync_directory(self._directory)
 
-    def _size(self, layout: FrameLayout, count: int) -> int:
-        return file_size(layout, [count])
+    def _size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
+        return file_size(layout, counts)
 
-    def _write(self, layout: FrameLayout, frame: Frame, row: LedgerRow, size: int) -> None:
+    def _write(self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int) -> None:
         with (
-            sealed(self.place / segment_name(frame.index), size) as temporary,
-            VtkhdfWriter(temporary, layout, [len(frame.position)]) as writer,
+            sealed(self.place / segment_name(frames[0].index), size) as temporary,
+            VtkhdfWriter(temporary, layout, [len(frame.position) for frame in frames]) as writer,
         ):
-            for name, array in layout.stored(frame):
-                writer.write_array(0, name, array)
-            writer.finish([frame.time], [frame.index], [frame.step], [row], self._header)
+            for name, arrays in layout.stored_together(frames):
+                writer.write_array(0, name, arrays, frames=len(frames))
+            tables = zip(*((frame.time, frame.index, frame.step) for frame in frames), strict=True)
+            writer.finish(*tables, rows, self._header)
+        self._sealed.add(segment_name(frames[0].index))
 
 
 def remove_segments(directory: Path) -> None:

@@ -5,6 +5,7 @@ Every ParaView and VTK reads it, at the price of more and larger files; VTKHDF i
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -40,8 +41,8 @@ class VtkSeriesStore(Store):
     zlib in the .vtu files.
     """
 
-    def __init__(self, directory: Path, header: dict[str, Any], *, compress: bool = False) -> None:
-        super().__init__(directory, header, compress=compress)
+    def __init__(self, directory: Path, header: dict[str, Any], *, compress: bool = False, hold: float = 0.0) -> None:
+        super().__init__(directory, header, compress=compress, hold=hold)
         self._times: list[float] = []
         self._frames: dict[str, list[int]] = {name: [] for name in FRAME_COLUMNS}
         self._rows: list[LedgerRow] = []
@@ -56,20 +57,22 @@ class VtkSeriesStore(Store):
     def _start(self) -> None:
         self._directory.mkdir(parents=True, exist_ok=True)
 
-    def _size(self, layout: FrameLayout, count: int) -> int:
+    def _size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
         # Base64 makes 4 bytes of 3; each particle is a cell of its own: number, offset and type.
-        return count * (layout.bytes_per_particle + 24) * 4 // 3 + OVERHEAD_BYTES
+        return sum(counts) * (layout.bytes_per_particle + 24) * 4 // 3 + OVERHEAD_BYTES * len(counts)
 
-    def _write(self, layout: FrameLayout, frame: Frame, row: LedgerRow, size: int) -> None:
-        with sealed(self._directory / series_frame_name(frame.index)) as temporary:
-            _write_vtu(temporary, dict(layout.stored(frame)), compress=self._compress)
-        if frame.index == 0:
+    def _write(self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int) -> None:
+        for frame in frames:
+            with sealed(self._directory / series_frame_name(frame.index)) as temporary:
+                _write_vtu(temporary, dict(layout.stored(frame)), compress=self._compress)
+        if frames[0].index == 0:
             facts = {"format": FORMAT, "version": __version__, "header": self._header, "layout": layout.to_dict()}
             write_text(self._directory / SERIES_HEADER, json.dumps(facts, indent=1) + "\n")
-        self._times.append(float(frame.time))
-        self._rows.append(row)
-        for name, value in zip(FRAME_COLUMNS, (frame.index, frame.step, len(frame.position)), strict=True):
-            self._frames[name].append(int(value))
+        self._rows += rows
+        for frame in frames:
+            self._times.append(float(frame.time))
+            for name, value in zip(FRAME_COLUMNS, (frame.index, frame.step, len(frame.position)), strict=True):
+                self._frames[name].append(int(value))
         write_text(self._directory / SERIES_LEDGER, ledger_csv(self._rows, self._frames))
         # The .pvd comes last: what it lists is there.
         write_text(self._directory / SERIES, _pvd_text(self._times))

@@ -1,6 +1,8 @@
 """What every store of frames does: frames in order, room on the disk first, one sentence where writing fails."""
 
+import time
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,51 +12,97 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import require_free_space
 from mpmcli.output.layout import FrameLayout
 
+# Bytes of waiting frames above which they are sealed.
+MOST_WAITING = 32 * 1024 * 1024
+
 
 class Store(ABC):
-    """Writes the frames of one run, each durable before the next one is computed.
+    """Writes the frames of one run.
+
+    Frames are sealed in groups, since a durable file costs about 10 ms however small it is. Only sealed frames count as
+    written.
 
     Args:
         directory: the output directory, made by `prepare_directory`.
         header: entries of a `RunHeader` that JSON can hold.
         compress: whether the result is compressed.
+        hold: longest time between the write of a frame and its seal, s, if `seal_due` is called; 0 seals each at once.
 
     Attributes:
         place: where frames are written.
         frames_written: number of frames that a crash can no longer harm.
     """
 
-    def __init__(self, directory: Path, header: dict[str, Any], *, compress: bool = False) -> None:
+    def __init__(self, directory: Path, header: dict[str, Any], *, compress: bool = False, hold: float = 0.0) -> None:
         self._directory = self.place = Path(directory)
         self._header = header
         self._compress = compress
+        self._hold = hold
         self._layout: FrameLayout | None = None
+        self._waiting: list[tuple[Frame, LedgerRow]] = []
+        self._waiting_since = 0.0
         self.frames_written = 0
 
     def write(self, frame: Frame, row: LedgerRow) -> None:
-        """Write the next frame; it is durable when this returns.
+        """Take the next frame; seal the waiting frames if they fill MOST_WAITING bytes or one has waited for `hold`.
+
+        The arrays of the frame must not change afterwards.
 
         Raises:
             RunError: the disk is full or refuses; all frames before this one are kept.
             InputError: the directory holds an earlier result.
             ValueError: the frame is out of order or has other arrays than the first one.
         """
-        if frame.index != self.frames_written:
-            raise ValueError(f"frame {frame.index} was given where frame {self.frames_written} comes next")
+        following = self.frames_written + len(self._waiting)
+        if frame.index != following:
+            raise ValueError(f"frame {frame.index} was given where frame {following} comes next")
+        layout = FrameLayout.of(frame)
         if self._layout is None:
-            self._layout = FrameLayout.of(frame)
+            self._layout = layout
             if self._holds_result():
                 raise InputError(f"{self._directory} holds an earlier result: give another directory, or --overwrite.")
             self._start()
-        purpose, kept = f"frame {frame.index}", _frames_kept(self.frames_written)
-        size = self._size(self._layout, len(frame.position))
-        require_free_space(self._directory, size, purpose, kept)
+        if layout != self._layout:
+            raise ValueError(f"frame {frame.index} holds other arrays, types or shapes than the first frame")
+        if not self._waiting:
+            self._waiting_since = time.monotonic()
+        self._waiting.append((frame, row))
+        size = self._size(layout, [len(waiting.position) for waiting, _ in self._waiting])
+        if size >= MOST_WAITING:
+            self.seal()
+        self.seal_due()
+
+    def seal_due(self) -> None:
+        """Seal the waiting frames if one has waited for `hold`; cheap otherwise, for calls between slow frames.
+
+        Raises:
+            RunError: as `seal`.
+        """
+        if self._waiting and time.monotonic() - self._waiting_since >= self._hold:
+            self.seal()
+
+    def seal(self) -> None:
+        """Write all waiting frames durably.
+
+        Raises:
+            RunError: the disk is full or refuses; all frames before the waiting ones are kept.
+        """
+        if not self._waiting:
+            return
+        frames, rows = zip(*self._waiting, strict=True)
+        size = self._size(self._layout, [len(frame.position) for frame in frames])
+        purpose, kept = f"frame {frames[0].index}", _frames_kept(self.frames_written)
         try:
-            self._write(self._layout, frame, row, size)
-        except (OSError, RuntimeError) as error:
+            require_free_space(self._directory, size, purpose, kept)
+            self._write(self._layout, frames, rows, size)
+        except (OSError, RuntimeError, RunError) as error:
+            self._waiting.clear()
+            if isinstance(error, RunError):
+                raise
             reason = getattr(error, "strerror", None) or error
             raise RunError(f"{purpose} could not be written to {self.place} ({reason}); {kept}.") from error
-        self.frames_written += 1
+        self.frames_written += len(frames)
+        self._waiting.clear()
 
     @abstractmethod
     def finish(self) -> Path | None:
@@ -73,12 +121,12 @@ class Store(ABC):
         """Make the folder of the frames."""
 
     @abstractmethod
-    def _size(self, layout: FrameLayout, count: int) -> int:
-        """Return the bytes of a frame of `count` particles."""
+    def _size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
+        """Return the bytes of frames of `counts` particles."""
 
     @abstractmethod
-    def _write(self, layout: FrameLayout, frame: Frame, row: LedgerRow, size: int) -> None:
-        """Write a frame, durably."""
+    def _write(self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int) -> None:
+        """Write frames, durably."""
 
 
 def _frames_kept(count: int) -> str:

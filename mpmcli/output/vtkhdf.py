@@ -73,9 +73,9 @@ class VtkhdfWriter:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def write_array(self, k: int, name: str, stored: np.ndarray) -> None:
-        """Write one array of the k-th frame, in the form of the file (see `ArrayLayout.pad`)."""
-        self._datasets[name][self._offsets[k] : self._offsets[k + 1]] = stored
+    def write_array(self, k: int, name: str, stored: np.ndarray, frames: int = 1) -> None:
+        """Write one array of `frames` frames from the k-th on, in the form of the file (see `ArrayLayout.pad`)."""
+        self._datasets[name][self._offsets[k] : self._offsets[k + frames]] = stored
 
     def finish(
         self,

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,7 +15,7 @@ from mpmcli.materials.registry import laws
 from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, check_directory, prepare_directory
 from mpmcli.output.durable import write_text
 from mpmcli.output.header import RunHeader
-from mpmcli.output.segments import Store
+from mpmcli.output.store import Store
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.stopwatch import Stopwatch
 from mpmcli.simulation.summary import RunSummary
@@ -24,6 +25,8 @@ from mpmcli.solver.plan import make_plan, require_room
 from mpmcli.solver.solver import Solver
 
 SCENE = "scene.toml"
+# Longest time between the computation of a frame and its seal, s, unless a single step takes longer.
+HOLD = 1.0
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ def simulate(
     record.write()
     header = RunHeader.of(scene, text, [laws()[name] for name in solver.laws], summary.backend)
     kind = VtkSeriesStore if settings.form == "vtk" else SegmentStore
-    store = kind(settings.directory, header.stored, compress=scene.output.compress)
+    store = kind(settings.directory, header.stored, compress=scene.output.compress, hold=HOLD)
 
     clock = Stopwatch(summary.timings, began)
     failure: dict = {}
@@ -136,26 +139,52 @@ def _run(
     on_frame: Callable[[LedgerRow, RunSummary], None],
     stop: Callable[[], bool],
 ) -> None:
-    """Compute and store frame after frame, and keep the record and the summary up to date."""
-    frames = solver.frames(stop)
-    while True:
-        with clock.adding("solve_s"):
-            frame, row = next(frames, (None, None))
-        if frame is None:
-            return
+    """Compute and store frame after frame; the record and the summary follow the frames that are sealed."""
+    rows: list[LedgerRow] = []
+
+    def after_step() -> bool:
+        store.seal_due()
+        return stop()
+
+    def report() -> None:
+        sealed = rows[summary.frames : store.frames_written]
         with clock.adding("output_s"):
-            store.write(frame, row)
-            record.observe(row)
-            summary.frames, summary.steps = store.frames_written, solver.step_count
-            summary.first, summary.last = summary.first or row, row
             clock.book(solver.first_step_seconds, "compile_s")
             clock.book(solver.frame_seconds, "output_s")
+            summary.steps = solver.step_count
             summary.timings["watch_s"] = solver.measure_seconds
             record.timings = summary.timings
-            record.write()
-        on_frame(row, summary)
-        if stop():
-            raise KeyboardInterrupt
+            for row in sealed:
+                record.observe(row)
+            if sealed:
+                record.write()
+        for row in sealed:
+            summary.frames += 1
+            summary.first, summary.last = summary.first or row, row
+            on_frame(row, summary)
+
+    frames = solver.frames(after_step)
+    try:
+        while True:
+            with clock.adding("solve_s"):
+                frame, row = next(frames, (None, None))
+            if frame is None:
+                break
+            rows.append(row)
+            with clock.adding("output_s"):
+                store.write(frame, row)
+            report()
+            if stop():
+                raise KeyboardInterrupt
+    except BaseException:
+        # The first error is the one to be told.
+        with suppress(RunError):
+            store.seal()
+            report()
+        raise
+    with clock.adding("output_s"):
+        store.seal()
+    report()
 
 
 def _finish(store: Store, summary: RunSummary) -> None:
