@@ -61,6 +61,17 @@ def test_quiet_says_nothing(results):
     assert (results.directory / "series" / "particles.pvd").is_file()
 
 
+def test_few_particles_run_on_one_thread_with_the_same_bytes(results, tmp_path):
+    """One thread where it is faster, unless --threads says otherwise; the frames do not depend on it."""
+    run_here("simulate", results.directory / "scene.toml", "-o", tmp_path / "three", "--threads", "3", "--quiet")
+    places = results.directory / "packed", tmp_path / "three"
+    threads = [open_result(place).record["backend"]["threads"] for place in places]
+    assert threads == [1, 3]
+    for one, three in zip(*(open_result(place).frames() for place in places), strict=True):
+        assert one.position.tobytes() == three.position.tobytes()
+        assert one.velocity.tobytes() == three.velocity.tobytes()
+
+
 @pytest.mark.parametrize(
     ("path", "kind"),
     [

@@ -68,6 +68,29 @@ def frames(solver: Solver) -> Run:
     return list(solver.frames())
 
 
+def test_one_launch_reads_what_the_fields_hold(solver: Solver, frames: Run) -> None:
+    """Every array of a group, against Taichi's own copy of each field."""
+    assert frames
+    for group in solver.groups:
+        found = group.to_numpy()
+        v, C = group.motion_to_numpy()
+        internal = [values.to_numpy() for values in group.internal]
+        place = np.zeros(group.count, int) if group.body is None else group.body.to_numpy()
+        expected = {
+            "x": group.x.to_numpy(),
+            "v": v,
+            "C": C,
+            "deformation": group.deformation_to_numpy(),
+            "internal": np.array(internal).reshape(len(internal), group.count).T,
+            "id": group.id.to_numpy(),
+            "body": np.array(group.bodies)[place],
+        }
+        assert found.keys() == expected.keys()
+        for name, array in expected.items():
+            assert found[name].shape == array.shape and np.array_equal(found[name], array), name
+            assert found[name].flags.c_contiguous, name
+
+
 def test_frames_land_on_their_times(frames: Run) -> None:
     """t_k = end k / frames, exactly, from 0 on; the steps of an interval sum to it."""
     assert [frame.index for frame, _ in frames] == list(range(8))

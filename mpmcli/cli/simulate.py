@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
-from mpmcli.cli.options import json_option, plugin_option, quiet_option, set_option, threads_option
+from mpmcli.cli.options import json_option, plugin_option, quiet_option, set_option
 from mpmcli.cli.streams import print_json, print_text
 
 
@@ -28,7 +28,9 @@ from mpmcli.cli.streams import print_json, print_text
     show_default=True,
     help="Where to compute; auto takes CUDA or Metal where they are, and else the CPU.",
 )
-@threads_option
+@click.option(
+    "--threads", type=click.IntRange(min=1), help="CPU threads; by default all of them, or one for few particles."
+)
 @click.option("--precision", type=click.Choice(["f32", "f64"]), help="Replaces solver.precision of the scene.")
 @click.option(
     "--format",

@@ -30,9 +30,10 @@ class Observation:
 
 
 def build_observation(group: ParticleGroup) -> Callable[..., Observation]:
-    """Compile-ready observation of a group: call the result with the last step (s), and `stress=False` to do without.
+    """Return the observation of a group: a function of the last step, s.
 
-    The device's state does not change: the next step applies plastic flow.
+    Its `stress=False` leaves out the stress. Its `stored` are the deformation and the internal variables, (n, k), where
+    the caller has read them already. The device's state does not change: the next step applies plastic flow.
     """
     d, law = group.dimension, group.law
     kept = [e for e, (i, j) in enumerate(ENTRIES) if d == 3 or {i, j} <= {0, 1} or i == j == 2]
@@ -78,7 +79,7 @@ def build_observation(group: ParticleGroup) -> Callable[..., Observation]:
                         for i in ti.static(range(inner_count)):
                             state[p, (d * d if keeps_F else 1) + i] = inner[i]
 
-    def observed(dt: float, *, stress: bool) -> Observation:
+    def observed(dt: float, *, stress: bool, stored: tuple[np.ndarray, np.ndarray] | None = None) -> Observation:
         n, real = group.count, group.real
         first = d * d if keeps_F else 1
         entries = np.empty((n if stress else 1, len(kept)), real)
@@ -91,8 +92,10 @@ def build_observation(group: ParticleGroup) -> Callable[..., Observation]:
             for column, i, j in placed:
                 tau[:, i, j] = tau[:, j, i] = entries[:, column]
         if not law.projects:
-            internal = [values.to_numpy() for values in group.internal]
-            deformation = group.deformation_to_numpy()
+            if stored is None:
+                found = group.to_numpy()
+                stored = found["deformation"], found["internal"]
+            deformation, internal = stored[0], list(stored[1].T)
         else:
             internal = list(state[:, first:].T)
             deformation = state[:, :first].reshape(n, d, d) if keeps_F else state[:, 0]

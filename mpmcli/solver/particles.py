@@ -33,7 +33,7 @@ class ParticleGroup:
         real: numpy's type of the real fields.
         initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force.
         force: what acts on the particles of groups that are `pushed`.
-        table: per body a row of particle mass, particle volume and the constants of the law.
+        table: per body a row of particle mass, particle volume and the constants of the law; `rows` is its host copy.
     """
 
     def __init__(
@@ -70,7 +70,8 @@ class ParticleGroup:
         self.table = ti.Vector.field(len(rows[0]), float, shape=len(rows))
 
         self.real = host = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
-        self.table.from_numpy(np.array(rows, dtype=host))
+        self.rows = np.array(rows, dtype=host)
+        self.table.from_numpy(self.rows)
         self.x.from_numpy(np.concatenate([b.position - origin for b in particles]).astype(host))
         self.set_motion(np.concatenate([b.velocity for b in particles]), np.concatenate([b.affine for b in particles]))
         if self.initial is not None:
@@ -122,6 +123,52 @@ class ParticleGroup:
         gradient[:, :, :d] = C.transpose(0, 2, 1)
         self.v.from_numpy(v)
         self.gradient.from_numpy(gradient)
+
+    def to_numpy(self) -> dict[str, np.ndarray]:
+        """Return x, v, C, deformation, internal, (n, k), id and body, (n), in the solver's order, by one launch.
+
+        A launch per field would take most of the time of a frame of few particles.
+        """
+        d, n = self.dimension, self.count
+        widths = {"x": d, "v": d, "C": d * d, "deformation": d * d if self.J_minus_1 is None else 1}
+        widths["internal"] = len(self.internal)
+        reals, labels = np.empty((n, sum(widths.values())), self.real), np.zeros((n, 2), np.int32)
+        self._copy(reals, labels)
+        ends = np.cumsum(list(widths.values()))
+        found = {
+            name: np.ascontiguousarray(reals[:, end - width : end])
+            for (name, width), end in zip(widths.items(), ends, strict=True)
+        }
+        found["C"] = found["C"].reshape(n, d, d)
+        if self.J_minus_1 is None:
+            found["deformation"] = np.eye(d, dtype=self.real) + found["deformation"].reshape(n, d, d)
+        else:
+            found["deformation"] = 1 + found["deformation"].reshape(n)
+        found["id"] = np.ascontiguousarray(labels[:, 0])
+        found["body"] = np.array(self.bodies, np.int32)[labels[:, 1]]
+        return found
+
+    @ti.kernel
+    def _copy(self, reals: ti.types.ndarray(), labels: ti.types.ndarray()):
+        for p in range(self.count):
+            d = ti.static(self.dimension)
+            for c in ti.static(range(d)):
+                reals[p, c] = self.x[p][c]
+                reals[p, d + c] = self.v[p][c]
+                for a in ti.static(range(d)):
+                    reals[p, (2 + c) * d + a] = self.gradient[p][a, c]
+            first = ti.static((2 + d) * d)
+            width = ti.static(d * d if self.law.deformation == "F" else 1)
+            if ti.static(self.law.deformation == "F"):
+                for i, j in ti.static(ti.ndrange(d, d)):
+                    reals[p, first + i * d + j] = self.displacement_gradient[p][i, j]
+            else:
+                reals[p, first] = self.J_minus_1[p]
+            for i in ti.static(range(len(self.internal))):
+                reals[p, first + width + i] = self.internal[i][p]
+            labels[p, 0] = self.id[p]
+            if ti.static(self.several):
+                labels[p, 1] = self.body[p]
 
     def motion_to_numpy(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the velocity, (n, d), and the affine velocity C, (n, d, d), in the solver's order."""
@@ -204,8 +251,3 @@ class ParticleGroup:
         if ti.static(self.several):
             place = self.body[p]
         return self.table[place]
-
-    def body_index(self) -> np.ndarray:
-        """Return the scene's body index of each particle, (n,) int32, in the solver's order."""
-        place = np.zeros(self.count, np.int32) if self.body is None else self.body.to_numpy()
-        return np.array(self.bodies, np.int32)[place]

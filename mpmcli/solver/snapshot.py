@@ -22,6 +22,7 @@ class Snapshot:
 
     Attributes:
         x: (n, d) relative to the origin of the domain, m; v: (n, d); C: (n, d, d); deformation: (n) or (n, d, d).
+        internal: (n, k), the internal variables of the law.
         id, body: (n) int.
     """
 
@@ -30,6 +31,7 @@ class Snapshot:
     v: np.ndarray
     C: np.ndarray
     deformation: np.ndarray
+    internal: np.ndarray
     id: np.ndarray
     body: np.ndarray
 
@@ -40,22 +42,12 @@ class Snapshot:
 
     def per_body(self, column: int) -> np.ndarray:
         """Return an entry of the group's table for every particle, (n,) float64."""
-        table = self.group.table.to_numpy()[:, column].astype(np.float64)
-        return table[np.searchsorted(self.group.bodies, self.body)]
+        return self.group.rows[:, column].astype(np.float64)[np.searchsorted(self.group.bodies, self.body)]
 
 
 def read_group(group: ParticleGroup) -> Snapshot:
     """Copy one group from the device."""
-    v, C = group.motion_to_numpy()
-    return Snapshot(
-        group,
-        group.x.to_numpy(),
-        v,
-        C,
-        group.deformation_to_numpy(),
-        group.id.to_numpy(),
-        group.body_index(),
-    )
+    return Snapshot(group, **group.to_numpy())
 
 
 def _full_gradient(deformation: np.ndarray, dimension: int) -> np.ndarray:

@@ -281,7 +281,10 @@ class Solver:
         snapshots = [read_group(group) for group in self.groups]
         fields = self.scene.output.fields
         stress = any(name in STRESSES for name in fields)
-        seen = [observe(self.last_step, stress=stress) for observe in self._observe]
+        seen = [
+            observe(self.last_step, stress=stress, stored=(snapshot.deformation, snapshot.internal))
+            for observe, snapshot in zip(self._observe, snapshots, strict=True)
+        ]
         kept = (self._origin, self._position_type, self._initial)
         frame = build_frame(snapshots, seen, fields, *kept, index, self.time, self.step_count)
         gravity, moment = self.state.external_forces.gravity_at(self.time), affine_moment(self.scene.solver)

@@ -44,6 +44,8 @@ def build_cpu_step(
     """Build the kernels of a step (dt, kick) for these groups and nothing else."""
     d = grid.dimension
     threads = orders[0].threads
+    # One thread runs loops itself: the hand-over to a pool of one would take most of a step of few particles.
+    alone = threads == 1
     pairs = tuple(zip(range(len(groups)), groups, orders, strict=True))
     # Colours written out in one kernel: four would double the compile time of 3D scenes, two that of what scatters
     # more than is usual.
@@ -111,11 +113,13 @@ def build_cpu_step(
     @ti.kernel
     def p2g(part: int, kick: float):
         """Scatter some colours, after clearing the grid for the first ones."""
+        ti.loop_config(serialize=alone)
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
                 clear_rows(q // CHUNK, grid.row_count() if part == 0 else 0)
         for g, group, order in ti.static(pairs):
             for parity in ti.static(range(together)):
+                ti.loop_config(serialize=alone)
                 for q in range(CHUNK * threads):
                     if q % CHUNK == 0:
                         scatter_pencils(g, group, order, parity + together * part, q // CHUNK, kick)
@@ -127,12 +131,15 @@ def build_cpu_step(
         for k in ti.static(range(len(read_back))):
             read_back[k][None] = NOTHING
         if ti.static(nodes.needs_contact):
+            ti.loop_config(serialize=alone)
             for q in range(nodes.images.plane_nodes(grid)):
                 nodes.images.find_contact(grid, q, gravity.in_step(kick))
+        ti.loop_config(serialize=alone)
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
                 ti.atomic_max(largest_speed_squared[None], update_rows(q // CHUNK, gravity.in_step(kick)))
         for g, group, _order in ti.static(pairs):
+            ti.loop_config(serialize=alone)
             for q in range(CHUNK * threads):
                 if q % CHUNK == 0:
                     advance_share(g, group, q // CHUNK, dt)
