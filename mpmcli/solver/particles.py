@@ -132,7 +132,7 @@ class ParticleGroup:
         d, n = self.dimension, self.count
         widths = {"x": d, "v": d, "C": d * d, "deformation": d * d if self.J_minus_1 is None else 1}
         widths["internal"] = len(self.internal)
-        reals, labels = np.empty((n, sum(widths.values())), self.real), np.zeros((n, 2), np.int32)
+        reals, labels = np.empty((n, sum(widths.values())), self.real), np.empty((n, 2), np.int32)
         self._copy(reals, labels)
         ends = np.cumsum(list(widths.values()))
         found = {
@@ -167,8 +167,11 @@ class ParticleGroup:
             for i in ti.static(range(len(self.internal))):
                 reals[p, first + width + i] = self.internal[i][p]
             labels[p, 0] = self.id[p]
+            # Every entry is written: a GPU does not get the zeros of the host.
             if ti.static(self.several):
                 labels[p, 1] = self.body[p]
+            else:
+                labels[p, 1] = 0
 
     def motion_to_numpy(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the velocity, (n, d), and the affine velocity C, (n, d, d), in the solver's order."""
