@@ -15,7 +15,6 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.output import SegmentStore, open_result
 from mpmcli.scene import load_scene
 from mpmcli.simulation.simulate import RunSettings, simulate
-from mpmcli.solver.backend import Backend
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +107,7 @@ class FakeSolver:
 
     fault: BaseException | None = None
 
-    def __init__(self, *_: object, force: bool) -> None:
+    def __init__(self, *_: object, **__: object) -> None:
         self.particle_count, self.step_count = 1, 0
         self.first_step_seconds = self.frame_seconds = self.measure_seconds = 0.0
         self.laws = ("fluid",)
@@ -127,9 +126,8 @@ class FakeSolver:
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """Return `run(fault)`: the summary of a run whose solver raises it after two frames."""
-    backend = Backend("cpu", 1, "f32", compile_cache=True)
-    monkeypatch.setattr("mpmcli.simulation.simulate.start_backend", lambda *_, **__: backend)
-    monkeypatch.setattr("mpmcli.simulation.simulate.Solver", FakeSolver)
+    monkeypatch.setattr("mpmcli.simulation.simulate.start", lambda backend: backend)
+    monkeypatch.setattr("mpmcli.simulation.simulate.build_engine", FakeSolver)
     scene = tmp_path / "scene.toml"
     scene.write_text(SCENE, encoding="utf-8")
     loaded = load_scene(scene, laws=parameter_models())

@@ -134,10 +134,12 @@ class Column(Ours):
     def flowing(self) -> float:
         """Return the share of particles that the next step projects: those in plastic flow, or torn."""
         from mpmcli.solver.observe import build_observation
+        from mpmcli.solver.snapshot import read_group
 
         count = 0
         for group in self._solver.groups:
-            before = group.deformation_to_numpy().reshape(group.count, -1)
-            after = build_observation(group)(self._dt, stress=False).deformation.reshape(group.count, -1)
-            count += int((after != before).any(axis=1).sum())
+            found = read_group(group)
+            stored = found.deformation, found.internal
+            seen = build_observation(group)(self._dt, 0, group.count, stress=False, stored=stored)
+            count += int((seen.deformation != found.deformation).reshape(group.count, -1).any(axis=1).sum())
         return count / self.particles

@@ -167,7 +167,8 @@ class MirrorImages:
                 outward = value[axis]
                 if ti.static(not upper):
                     outward = -outward
-                self.walls.contact[f, self.walls.plane_index(node, axis)] = ti.cast(outward >= 0, int)
+                place = self.walls.plane_index(node, axis)
+                self.walls.contact[self.walls.first_plane + f, place] = ti.cast(outward >= 0, int)
 
 
 @ti.func

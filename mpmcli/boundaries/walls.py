@@ -22,10 +22,20 @@ class Walls:
         first: index of the wall's node plane at the lower faces; `last`, per axis, at the upper ones.
         separating: (axis, side) of every face whose word is "separate".
         lateral: per axis, the other axes.
-        contact: per separating face and node of its plane, whether the material presses on it.
+        contact: (planes, nodes) int, per separating face and node of its plane, whether the material presses on it.
+        first_plane: row of `contact` of the first separating face.
     """
 
-    def __init__(self, faces: Sequence[tuple[str, str]], first: int, cells: Sequence[int], shape: Sequence[int]):
+    def __init__(
+        self, faces: Sequence[tuple[str, str]], first: int, cells: Sequence[int], shape: Sequence[int], runs: int = 1
+    ) -> None:
+        """Allocate.
+
+        Args:
+            first: index of the wall's node plane at the lower faces.
+            shape: nodes of the grid per axis.
+            runs: sets of planes in `contact`.
+        """
         self.dimension = len(faces)
         self.faces = tuple(tuple(pair) for pair in faces)
         self.first = first
@@ -35,9 +45,10 @@ class Walls:
         )
         self.lateral = tuple(tuple(b for b in range(self.dimension) if b != a) for a in range(self.dimension))
         self.shape = tuple(shape)
+        self.first_plane = 0
         if self.separating:
             planes = [math.prod(self.shape[b] for b in self.lateral[a]) for a, _ in self.separating]
-            self.contact = ti.field(ti.i32, shape=(len(planes), max(planes)))
+            self.contact = ti.field(ti.i32, shape=(runs * len(planes), max(planes)))
 
     @ti.func
     def constrain(self, node: ti.template(), velocity: ti.template()):
@@ -106,7 +117,7 @@ class Walls:
         for f in ti.static(range(len(self.separating))):
             axis = ti.static(self.separating[f][0])
             if depth[axis] <= REACH and upper[axis] == self.separating[f][1]:
-                acts[axis] = self.contact[f, self.plane_index(inner, axis)]
+                acts[axis] = self.contact[self.first_plane + f, self.plane_index(inner, axis)]
         return acts
 
     @ti.func

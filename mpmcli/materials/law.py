@@ -88,6 +88,11 @@ class Law(ABC):
         self.dimension = dimension
         self.internal: tuple[Internal, ...] = self.parameters.internal_in(dimension)
 
+    @property
+    def terms(self) -> tuple[tuple[str, bool], ...]:
+        """Name and value of each flag that says which terms the law has: laws with equal ones compile to one kernel."""
+        return tuple(sorted((name, value) for name, value in vars(self).items() if isinstance(value, bool)))
+
     @abstractmethod
     def constants(self, parameters: MaterialParameters) -> tuple[float, ...]:
         """Return the constants passed to `respond` and `energy`, in their order; at least one."""

@@ -16,18 +16,15 @@ from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, check_directo
 from mpmcli.output.durable import write_text
 from mpmcli.output.header import RunHeader
 from mpmcli.output.store import Store
-from mpmcli.scene import LoadedScene, Scene, estimate_particles, scene_to_toml
+from mpmcli.scene import LoadedScene, Scene, scene_to_toml
+from mpmcli.simulation.engine import Engine, build_engine, choose_engine
 from mpmcli.simulation.stopwatch import Stopwatch
 from mpmcli.simulation.summary import RunSummary
-from mpmcli.solver.backend import Arch, start_backend
+from mpmcli.solver.backend import Arch, start
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.plan import make_plan, require_room
-from mpmcli.solver.solver import Solver
 
 SCENE = "scene.toml"
-# Particles, by dimension, below which one thread is faster than two: the hand-over to a pool of threads takes
-# about 0.4 ms of each step. The bytes of a run do not depend on its threads.
-FEW_PARTICLES = {2: 20_000, 3: 10_000}
 # Longest time between the computation of a frame and its seal, s, unless a single step takes longer.
 HOLD = 1.0
 
@@ -80,14 +77,14 @@ def simulate(
     began = time.perf_counter()
     scene = loaded.scene
     check_directory(settings.directory, settings.overwrite)
-    threads = settings.threads or (1 if estimate_particles(scene) < FEW_PARTICLES[scene.dimension] else None)
-    backend = start_backend(settings.arch, threads, scene.solver.precision, compile_cache=settings.compile_cache)
+    backend, batched = choose_engine(scene, settings.arch, settings.threads, compile_cache=settings.compile_cache)
     plan = make_plan(scene, backend)
     findings = check_scene(loaded, plan=plan, directory=settings.directory).findings
     if not (settings.force or passes(findings)):
         raise InputError(_refusal(loaded.source, findings))
     require_room(plan)
-    solver = Solver(scene, backend, force=settings.force)
+    start(backend)
+    solver = build_engine(scene, backend, batched=batched, force=settings.force)
     # Last, since it removes an earlier result.
     prepare_directory(settings.directory, settings.overwrite)
 
@@ -133,7 +130,7 @@ def simulate(
 
 
 def _run(
-    solver: Solver,
+    solver: Engine,
     store: Store,
     record: RunRecord,
     summary: RunSummary,

@@ -7,7 +7,7 @@ import os
 import platform
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -16,6 +16,16 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
+from mpmcli.plain_text import counted
+
+# Taichi's optimisations: all, all but those across branches, or few. Those across branches take most of the time to
+# compile the kernel of a batch and make nothing faster there. Few halve the rest, and steps are 7 to 18 % slower.
+Optimisation = Literal["all", "most", "few"]
+OPTIMISATION: dict[str, dict[str, bool]] = {
+    "all": {},
+    "most": {"cfg_optimization": False},
+    "few": {"advanced_optimization": False},
+}
 
 Arch = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
 ARCHES: tuple[str, ...] = ("auto", "cpu", "cuda", "vulkan", "metal")
@@ -37,12 +47,14 @@ class Backend:
         threads: CPU threads that kernels use (1 on a GPU).
         precision: "f32" or "f64", the type of every particle and node value.
         compile_cache: whether compiled kernels are kept for the next start.
+        optimisation: how much of Taichi's optimisation kernels get; results have the same bytes with any.
     """
 
     arch: str
     threads: int
     precision: str
     compile_cache: bool
+    optimisation: Optimisation = "all"
 
     @property
     def on_cpu(self) -> bool:
@@ -50,18 +62,25 @@ class Backend:
         return self.arch == "cpu"
 
 
-def start_backend(
-    arch: Arch = "auto", threads: int | None = None, precision: str = "f32", *, compile_cache: bool = True
+def choose_backend(
+    arch: Arch = "auto",
+    threads: int | None = None,
+    precision: str = "f32",
+    *,
+    compile_cache: bool = True,
+    optimisation: Optimisation = "all",
 ) -> Backend:
-    """Start Taichi and return the backend; a second call must request the same.
+    """Return the backend that a name stands for on this machine; it is not started.
 
     "auto" takes CUDA where a driver and a device are present, Metal on a Mac, and otherwise the CPU. Vulkan is taken
     only by name, since software Vulkan counts as a device.
 
+    Args:
+        threads: of the CPU; None for one on each core.
+
     Raises:
-        InputError: the backend is not there, cannot do this precision, or another one is running.
+        InputError: it cannot do this precision, or not with so many threads.
     """
-    global _started
     if arch not in ARCHES:
         raise InputError(f'--arch "{arch}" is not a backend; use one of {", ".join(ARCHES)}.')
     if precision not in ("f32", "f64"):
@@ -74,17 +93,33 @@ def start_backend(
     most = max(FEW_THREADS, 2 * cores)
     if not 1 <= count <= most:
         raise InputError(f"--threads {count} is not possible; give 1 to {most}, best {cores} on this machine.")
-    backend = Backend(wanted, count, precision, compile_cache)
+    return Backend(wanted, count, precision, compile_cache, optimisation)
+
+
+def start(backend: Backend) -> Backend:
+    """Start Taichi and return the backend; a second call must request the same, but for its optimisation.
+
+    Raises:
+        InputError: the backend is not there, or another one is running.
+    """
+    global _started
     if _started is not None:
-        if _started != backend:
+        if replace(_started, optimisation=backend.optimisation) != backend:
             raise InputError(
-                f"this process already runs on {_started.arch} with {_started.threads} threads in "
+                f"this process already runs on {_started.arch} with {counted(_started.threads, 'thread')} in "
                 f"{_started.precision}; another backend needs a new process."
             )
         return _started
     _initialise(backend)
     _started = backend
     return backend
+
+
+def start_backend(
+    arch: Arch = "auto", threads: int | None = None, precision: str = "f32", *, compile_cache: bool = True
+) -> Backend:
+    """Start what `choose_backend` returns; see both for the errors."""
+    return start(choose_backend(arch, threads, precision, compile_cache=compile_cache))
 
 
 def stop_backend() -> None:
@@ -155,6 +190,7 @@ def _initialise(backend: Backend) -> None:
             # Strict arithmetic is as fast on the CPU, and a NaN stays a NaN in every comparison.
             fast_math=False,
             log_level=ti.ERROR,
+            **OPTIMISATION[backend.optimisation],
         )
     came = ti.lang.impl.current_cfg().arch
     if came != arch:

@@ -10,6 +10,27 @@ from mpmcli.solver.ordering import TileOrder
 from mpmcli.solver.splines import PAD
 
 
+@ti.func
+def box_of(grid: ti.template(), low: int, high: int, drift: ti.template(), last_wall: int):
+    """Return the first and the last node in use along an axis.
+
+    Args:
+        low, high: first and last tile that holds particles.
+        drift: cells that a particle may move away from the tile that it was sorted into.
+        last_wall: node of the upper wall.
+    """
+    # A stencil starts up to `drift` cells outside its tile and ends `reach` nodes further up.
+    reach = ti.static(grid.scheme.spline.nodes - 1)
+    first = grid.tile * low - drift
+    last = grid.tile * high + grid.tile - 1 + drift + reach
+    # A box that comes near a wall holds the images beyond it too: they are read and written.
+    if first <= PAD + REACH:
+        first = PAD - REACH
+    if last >= last_wall - REACH:
+        last = last_wall + REACH
+    return first, last
+
+
 def build_box_search(grid: Grid, orders: Sequence[TileOrder], drift: int) -> Callable[[], None]:
     """Compile-ready search, to be called after a sort: it sets `grid.box`.
 
@@ -18,10 +39,6 @@ def build_box_search(grid: Grid, orders: Sequence[TileOrder], drift: int) -> Cal
     """
     d = grid.dimension
     orders = tuple(orders)
-    first_wall = PAD
-    last_wall = tuple(PAD + n for n in grid.cells)
-    # Nodes from the first to the last of a stencil.
-    reach = grid.scheme.spline.nodes - 1
     tile_low = ti.field(int, shape=d)
     tile_high = ti.field(int, shape=d)
 
@@ -40,14 +57,7 @@ def build_box_search(grid: Grid, orders: Sequence[TileOrder], drift: int) -> Cal
                         ti.atomic_max(tile_high[a], rest % ti.static(grid.tiles[a]))
                         rest = rest // ti.static(grid.tiles[a])
         for a in ti.static(range(d)):
-            # A stencil starts up to `drift` cells outside its tile and ends `reach` nodes further up.
-            first = grid.tile * tile_low[a] - drift
-            last = grid.tile * tile_high[a] + grid.tile - 1 + drift + reach
-            # A box that comes near a wall holds the images beyond it too: they are read and written.
-            if first <= first_wall + REACH:
-                first = first_wall - REACH
-            if last >= last_wall[a] - REACH:
-                last = last_wall[a] + REACH
+            first, last = box_of(grid, tile_low[a], tile_high[a], drift, ti.static(PAD + grid.cells[a]))
             grid.box[0, a] = first
             grid.box[1, a] = last - first + 1
 

@@ -62,7 +62,7 @@ class Gravity:
         result = ti.Vector.zero(float, self.dimension)
         for a in ti.static(range(self.dimension)):
             if ti.static(self.steady):
-                result[a] = kick * ti.static(self.constant[a])
+                result[a] = kick * self.constant[a]
             else:
                 result[a] = kick * self.clock.values[None][ti.static(self.places[a])]
         return result

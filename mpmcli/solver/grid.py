@@ -37,13 +37,13 @@ class Grid:
 
     Attributes:
         dimension: 2 or 3.
-        spacing: h, m.
+        spacing: h, m; inverse_spacing: 1/h; gradient_scale: h / D, the factor of a velocity gradient.
         cells: cells of the domain per axis.
         scheme: constants of the transfers.
         tile: edge of a tile, cells.
         shape: nodes per axis, margins included, a multiple of `tile`.
         tiles: tiles per axis.
-        strides: of the linear node index, per axis.
+        strides: of the linear node index, per axis; first_node: the linear index of node 0.
         lines: of a stencil's lines of nodes along the last axis: (offsets along the other axes, linear offset).
         width: numbers per node, at least d + 1.
         nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update.
@@ -53,11 +53,20 @@ class Grid:
     """
 
     def __init__(
-        self, dimension: int, spacing: float, cells: tuple[int, ...], width: int, scheme: TransferScheme
+        self,
+        dimension: int,
+        spacing: float,
+        cells: tuple[int, ...],
+        width: int,
+        scheme: TransferScheme,
+        runs: int = 1,
     ) -> None:
+        """Allocate nodes for a number of runs, the nodes of one after those of another."""
         self.dimension = dimension
         self.width = width
         self.spacing = spacing
+        self.inverse_spacing = 1 / spacing
+        self.gradient_scale = scheme.spline.inverse_moment / spacing
         self.cells = tuple(cells)
         self.scheme = scheme
         stencil = scheme.spline.nodes
@@ -69,10 +78,11 @@ class Grid:
             (o, sum(n * stride for n, stride in zip(o, self.strides, strict=False)))
             for o in product(range(stencil), repeat=dimension - 1)
         )
+        self.first_node = 0
         self.node_count = int(np.prod(self.shape))
-        self.nodes = ti.Vector.field(width, float, shape=self.node_count)
-        self.before = ti.Vector.field(width, float, shape=self.node_count) if scheme.keeps_before else None
-        self.box = ti.field(int, shape=(2, dimension))
+        self.nodes = ti.Vector.field(width, float, shape=runs * self.node_count)
+        self.before = ti.Vector.field(width, float, shape=runs * self.node_count) if scheme.keeps_before else None
+        self.box = ti.field(int, shape=(2 * runs, dimension))
 
     @staticmethod
     def tile_counts(cells: Sequence[int], stencil: int) -> tuple[int, ...]:
@@ -94,7 +104,7 @@ class Grid:
     @ti.func
     def linear_index(self, base: ti.template()):
         """Return the linear index of the node at the integer coordinates `base`."""
-        index = 0
+        index = self.first_node
         for a in ti.static(range(self.dimension)):
             index += base[a] * self.strides[a]
         return index

@@ -22,9 +22,8 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
     Raises:
         InputError: a particle is not in the domain.
     """
-    origin, upper = np.array(scene.domain.origin), np.array(scene.domain.upper)
-    for sample in particles:
-        _require_inside(sample, origin, upper)
+    require_inside(scene, particles)
+    origin = np.array(scene.domain.origin)
     first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
     layout = ti.Layout.AOS if backend.on_cpu else ti.Layout.SOA
     groups = []
@@ -39,14 +38,24 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
                 origin,
                 node_width(scene.dimension, on_cpu=True) if backend.on_cpu else scene.dimension,
                 layout,
+                serial=backend.on_cpu and backend.threads == 1,
                 keeps_initial=needs_initial(scene, members),
             )
         )
     return groups
 
 
+def require_inside(scene: Scene, particles: list[BodyParticles]) -> None:
+    """Refuse particles beyond the domain, or nowhere: the sort would count them in a tile that does not exist.
+
+    Raises:
+        InputError: a particle is not in the domain.
+    """
+    for sample in particles:
+        _require_inside(sample, np.array(scene.domain.origin), np.array(scene.domain.upper))
+
+
 def _require_inside(sample: BodyParticles, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Refuse particles beyond the domain, or nowhere: the sort would count them in a tile that does not exist."""
     inside = ((sample.position >= lower) & (sample.position <= upper)).all(axis=1)
     if not inside.all():
         p = int(np.argmin(inside))

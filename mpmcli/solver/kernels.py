@@ -12,9 +12,10 @@ from mpmcli.solver.box import build_box_search
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import DRIFT, Grid, node_width
 from mpmcli.solver.nodes import NodeUpdate
-from mpmcli.solver.ordering import SortBuffers, TileOrder, build_sort
+from mpmcli.solver.ordering import SortBuffers, TileOrder
 from mpmcli.solver.particle_update import ParticleUpdate
 from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.sorting import build_sort
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.step_cpu import build_cpu_step
 from mpmcli.solver.step_gpu import build_gpu_step

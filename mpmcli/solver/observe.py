@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.particle_arrays import ParticleArrays
 
 # Rows and columns of the entries of a symmetric 3 x 3 matrix, in the order of the arrays below; 2D leaves two out.
 ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
@@ -29,13 +29,13 @@ class Observation:
     internal: dict[str, np.ndarray]
 
 
-def build_observation(group: ParticleGroup) -> Callable[..., Observation]:
-    """Return the observation of a group: a function of the last step, s.
+def build_observation(group: ParticleArrays) -> Callable[..., Observation]:
+    """Return the observation of a range of particles: a function (dt, first, count) of the last step, s, and the range.
 
-    Its `stress=False` leaves out the stress. Its `stored` are the deformation and the internal variables, (n, k), where
-    the caller has read them already. The device's state does not change: the next step applies plastic flow.
+    Its `stress=False` leaves out the stress. Its `stored` are the deformation and the internal variables, (n, k), as
+    read from the device. The device's state does not change: the next step applies plastic flow.
     """
-    d, law = group.dimension, group.law
+    d, law, serial = group.dimension, group.law, group.serial
     kept = [e for e, (i, j) in enumerate(ENTRIES) if d == 3 or {i, j} <= {0, 1} or i == j == 2]
     placed = tuple((column, *ENTRIES[e]) for column, e in enumerate(kept))
     keeps_F = law.deformation == "F"
@@ -44,12 +44,15 @@ def build_observation(group: ParticleGroup) -> Callable[..., Observation]:
     @ti.kernel
     def observe(
         dt: float,
+        first: int,
         with_stress: ti.template(),
         tau: ti.types.ndarray(),
         energy: ti.types.ndarray(),
         state: ti.types.ndarray(),
     ):
-        for p in range(group.count):
+        ti.loop_config(serialize=serial)
+        for q in range(energy.shape[0]):
+            p = first + q
             _, C = group.motion(p)
             constants = group.constants(p)
             # Once for the state half a step back and once for the state: a loop, so that the law is compiled once.
@@ -62,43 +65,41 @@ def build_observation(group: ParticleGroup) -> Callable[..., Observation]:
                     stored *= 1.0 + back * C.trace()
                 stress, stress_zz, deformation, inner = law.respond(stored, group.inner(p), C, dt, constants)
                 if k == 0:
-                    energy[p] = law.energy(deformation, inner, constants)
+                    energy[q] = law.energy(deformation, inner, constants)
                 else:
                     if ti.static(with_stress):
                         for column, i, j in ti.static(placed):
                             if ti.static(i < d and j < d):
-                                tau[p, column] = stress[i, j]
+                                tau[q, column] = stress[i, j]
                             else:
-                                tau[p, column] = stress_zz
+                                tau[q, column] = stress_zz
                     if ti.static(law.projects):
                         if ti.static(keeps_F):
                             for i, j in ti.static(ti.ndrange(d, d)):
-                                state[p, i * d + j] = deformation[i, j]
+                                state[q, i * d + j] = deformation[i, j]
                         else:
-                            state[p, 0] = deformation
+                            state[q, 0] = deformation
                         for i in ti.static(range(inner_count)):
-                            state[p, (d * d if keeps_F else 1) + i] = inner[i]
+                            state[q, (d * d if keeps_F else 1) + i] = inner[i]
 
-    def observed(dt: float, *, stress: bool, stored: tuple[np.ndarray, np.ndarray] | None = None) -> Observation:
-        n, real = group.count, group.real
-        first = d * d if keeps_F else 1
+    def observed(dt: float, first: int, n: int, *, stress: bool, stored: tuple[np.ndarray, np.ndarray]) -> Observation:
+        real, width = group.real, d * d if keeps_F else 1
         entries = np.empty((n if stress else 1, len(kept)), real)
         energy = np.empty(n, real)
-        state = np.empty((n if law.projects else 1, first + inner_count), real)
-        observe(dt, stress, entries, energy, state)
+        state = np.empty((n if law.projects else 1, width + inner_count), real)
+        observe(dt, first, stress, entries, energy, state)
         tau = None
         if stress:
             tau = np.zeros((n, 3, 3), real)
+            # The sign of a zero depends on how far a kernel was optimised.
+            entries += 0.0
             for column, i, j in placed:
                 tau[:, i, j] = tau[:, j, i] = entries[:, column]
         if not law.projects:
-            if stored is None:
-                found = group.to_numpy()
-                stored = found["deformation"], found["internal"]
             deformation, internal = stored[0], list(stored[1].T)
         else:
-            internal = list(state[:, first:].T)
-            deformation = state[:, :first].reshape(n, d, d) if keeps_F else state[:, 0]
+            internal = list(state[:, width:].T)
+            deformation = state[:, :width].reshape(n, d, d) if keeps_F else state[:, 0]
         names = [variable.name for variable in law.internal]
         return Observation(tau, energy, deformation, dict(zip(names, internal, strict=True)))
 

@@ -6,13 +6,12 @@ counting sort, so the order, and with it every floating-point sum, is the same f
 (docs/theory.md, 8).
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import taichi as ti
 
 from mpmcli.solver.grid import Grid
-from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.particle_arrays import ParticleArrays
 
 # Taichi gives a CPU thread at least this many iterations of a parallel loop.
 CHUNK = 512
@@ -38,15 +37,15 @@ class SortBuffers:
     Attributes:
         order: (n) int, where the particle at each new place comes from.
         key: (n) int, tile of each particle; also the scratch of integer fields.
-        real: (n w) scratch of real fields, w the widest one's entries.
+        real: (n w) scratch of real fields; widest: w, the largest number of entries of a particle in one of them.
     """
 
-    def __init__(self, groups: Sequence[ParticleGroup]) -> None:
-        n = max(group.count for group in groups)
-        widest = max(entry_count(field) for group in groups for field in group.state)
+    def __init__(self, groups: Sequence[ParticleArrays]) -> None:
+        n = max(group.x.shape[0] for group in groups)
+        self.widest = max(entry_count(field) for group in groups for field in group.state)
         self.order = ti.field(int, shape=n)
         self.key = ti.field(int, shape=n)
-        self.real = ti.field(float, shape=n * widest)
+        self.real = ti.field(float, shape=n * self.widest)
 
 
 @ti.data_oriented
@@ -55,10 +54,13 @@ class TileOrder:
 
     Attributes:
         start: (tiles + 1) int, first particle of each tile.
+        first_tile: place in `start` of tile 0.
         work: (colours, threads + 1) int, first pencil of a colour of each thread.
     """
 
-    def __init__(self, group: ParticleGroup, grid: Grid, buffers: SortBuffers, threads: int, on_cpu: bool):
+    def __init__(
+        self, group: ParticleArrays, grid: Grid, buffers: SortBuffers, threads: int, on_cpu: bool, runs: int = 1
+    ) -> None:
         self.group = group
         self.grid = grid
         self.buffers = buffers
@@ -70,8 +72,9 @@ class TileOrder:
         self.pencil = grid.tiles[-1]
         self.colours = 2 ** (grid.dimension - 1)
         self.spans = -(-self.tiles // SPAN)
-        self.start = ti.field(int, shape=self.tiles + 1)
-        self.cursor = ti.field(int, shape=(self.tiles, threads))
+        self.first_tile = 0
+        self.start = ti.field(int, shape=runs * (self.tiles + 1))
+        self.cursor = ti.field(int, shape=(runs * self.tiles, threads))
         self.span_sum = ti.field(int, shape=self.spans)
         self.work = ti.field(int, shape=(self.colours, threads + 1))
 
@@ -86,7 +89,7 @@ class TileOrder:
     @ti.func
     def tile_of(self, p: int):
         """Return the linear index of the tile that holds the stencil's first node of particle p."""
-        base, _ = self.grid.scheme.spline.stencil(self.group.x[p], ti.static(1 / self.grid.spacing))
+        base, _ = self.grid.scheme.spline.stencil(self.group.x[p], self.grid.inverse_spacing)
         tile = 0
         for a in ti.static(range(self.grid.dimension)):
             tile = tile * ti.static(self.grid.tiles[a]) + ti.raw_div(base[a], ti.static(self.grid.tile))
@@ -119,150 +122,3 @@ class TileOrder:
         for a in ti.static(range(self.grid.dimension - 1)):
             tile = tile * ti.static(self.grid.tiles[a]) + place[a]
         return tile * self.pencil
-
-
-@dataclass(frozen=True)
-class Sort:
-    """The sort of one group.
-
-    Attributes:
-        run: sort the particles, and share the work.
-        share_work: set `TileOrder.work` from `TileOrder.start`; needed by itself where the latter was loaded.
-    """
-
-    run: Callable[[], None]
-    share_work: Callable[[], None]
-
-
-def build_sort(order: TileOrder) -> Sort:
-    """Compile-ready kernels of one group's sort."""
-    group, buffers = order.group, order.buffers
-    key, source = buffers.key, buffers.order
-    n, threads, tiles = group.count, order.threads, order.tiles
-
-    @ti.kernel
-    def count_stable():
-        for tile in range(tiles):
-            for t in range(threads):
-                order.cursor[tile, t] = 0
-        for p in range(n):
-            key[p] = order.tile_of(p)
-        for q in range(CHUNK * threads):
-            if q % CHUNK == 0:
-                t = q // CHUNK
-                for p in range(share_start(n, t, threads), share_start(n, t + 1, threads)):
-                    order.cursor[key[p], t] = order.cursor[key[p], t] + 1
-
-    @ti.kernel
-    def count_atomic():
-        for tile in range(tiles):
-            order.cursor[tile, 0] = 0
-        for p in range(n):
-            key[p] = order.tile_of(p)
-            order.cursor[key[p], 0] += 1
-
-    @ti.kernel
-    def scan():
-        for s in range(order.spans):
-            total = 0
-            for tile in range(s * SPAN, ti.min(tiles, (s + 1) * SPAN)):
-                for t in range(threads):
-                    total += order.cursor[tile, t]
-            order.span_sum[s] = total
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            before = 0
-            for s in range(order.spans):
-                size = order.span_sum[s]
-                order.span_sum[s] = before
-                before += size
-            order.start[tiles] = before
-        for s in range(order.spans):
-            place = order.span_sum[s]
-            for tile in range(s * SPAN, ti.min(tiles, (s + 1) * SPAN)):
-                order.start[tile] = place
-                for t in range(threads):
-                    size = order.cursor[tile, t]
-                    order.cursor[tile, t] = place
-                    place += size
-
-    @ti.kernel
-    def place_stable():
-        for q in range(CHUNK * threads):
-            if q % CHUNK == 0:
-                t = q // CHUNK
-                for p in range(share_start(n, t, threads), share_start(n, t + 1, threads)):
-                    place = order.cursor[key[p], t]
-                    source[place] = p
-                    order.cursor[key[p], t] = place + 1
-
-    @ti.kernel
-    def place_atomic():
-        for p in range(n):
-            place = ti.atomic_add(order.cursor[key[p], 0], 1)
-            source[place] = p
-
-    @ti.kernel
-    def move():
-        for field in ti.static(group.state):
-            entries = ti.static(entry_count(field))
-            for p in range(n):
-                value = field[source[p]]
-                if ti.static(entries == 1):
-                    buffers.real[p] = value
-                else:
-                    for e in ti.static(range(entries)):
-                        place = ti.static(e if field.m == 1 else (e // field.m, e % field.m))
-                        buffers.real[p * entries + e] = value[place]
-            for p in range(n):
-                if ti.static(entries == 1):
-                    field[p] = buffers.real[p]
-                else:
-                    for e in ti.static(range(entries)):
-                        place = ti.static(e if field.m == 1 else (e // field.m, e % field.m))
-                        field[p][place] = buffers.real[p * entries + e]
-        for label in ti.static(group.labels):
-            for p in range(n):
-                key[p] = label[source[p]]
-            for p in range(n):
-                label[p] = key[p]
-
-    @ti.kernel
-    def share_work():
-        # Threads take neighbouring pencils with about equal numbers of particles.
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            for colour in range(order.colours):
-                total = 0
-                for q in range(order.pencil_count(colour)):
-                    first = order.pencil_start(colour, q)
-                    total += order.start[first + order.pencil] - order.start[first]
-                done = 0
-                thread = 1
-                order.work[colour, 0] = 0
-                for q in range(order.pencil_count(colour)):
-                    first = order.pencil_start(colour, q)
-                    size = order.start[first + order.pencil] - order.start[first]
-                    # The boundary falls where more than half of the pencil lies beyond the share.
-                    while thread < threads and done + size // 2 >= share_start(total, thread, threads):
-                        order.work[colour, thread] = q
-                        thread += 1
-                    done += size
-                while thread <= threads:
-                    order.work[colour, thread] = order.pencil_count(colour)
-                    thread += 1
-
-    def sort() -> None:
-        if order.on_cpu:
-            count_stable()
-            scan()
-            place_stable()
-            move()
-            share_work()
-        else:
-            count_atomic()
-            scan()
-            place_atomic()
-            move()
-
-    return Sort(sort, share_work)

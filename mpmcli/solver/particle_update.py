@@ -30,6 +30,7 @@ class ParticleUpdate:
         self.watches_box = watches_box
         self.lost = ti.field(int, shape=group_count)
         self.lost.fill(NOT_LOST)
+        self.first_lost = 0
 
     def any_lost(self) -> bool:
         """Return whether any particle is lost."""
@@ -41,7 +42,7 @@ class ParticleUpdate:
         if volume_ratio(group, group.stored(p)) > SMALLEST_J:
             scatter(group, self.grid, p, kick, atomic)
         else:
-            ti.atomic_min(self.lost[g], p)
+            ti.atomic_min(self.lost[self.first_lost + g], p)
 
     @ti.func
     def advance(self, g: ti.template(), group: ti.template(), p: int, dt: float):
@@ -95,9 +96,9 @@ class ParticleUpdate:
             group.J_minus_1[p] += growth + growth * group.J_minus_1[p]
 
         # Position. Written so that a NaN is not sound; then it stays, and no later step writes outside the grid.
-        sound = beyond <= ti.static(0.5 * self.grid.spacing)
+        sound = beyond <= 0.5 * self.grid.spacing
         if ti.static(self.watches_box):
-            base, _ = self.grid.scheme.spline.stencil(inside, ti.static(1 / self.grid.spacing))
+            base, _ = self.grid.scheme.spline.stencil(inside, self.grid.inverse_spacing)
             for a in ti.static(range(d)):
                 low = self.grid.box[0, a]
                 reach = ti.static(self.grid.scheme.spline.nodes - 1)
@@ -105,7 +106,7 @@ class ParticleUpdate:
         for c in ti.static(range(d)):
             group.x[p][c] = ti.select(sound, inside[c], x[c])
         if not sound:
-            ti.atomic_min(self.lost[g], p)
+            ti.atomic_min(self.lost[self.first_lost + g], p)
         return deforming
 
     @ti.func

@@ -10,10 +10,13 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.tensors import determinant
 from mpmcli.solver.observe import Observation
-from mpmcli.solver.particles import MASS, VOLUME, ParticleGroup
+from mpmcli.solver.particle_arrays import MASS, VOLUME
+from mpmcli.solver.particles import ParticleGroup
 
 # Fields that need the stress of every particle.
 STRESSES = ("stress", "pressure")
+# Particles whose sums are formed at once, which bounds the memory.
+ROWS = 65_536
 
 
 @dataclass(frozen=True)
@@ -148,35 +151,44 @@ def measure(
         The entries of a `LedgerRow` that belong to the state alone, by name, summed in float64.
     """
     d = len(gravity)
-    mass = kinetic = elastic = potential = 0.0
-    linear = np.zeros(d)
-    angular = np.zeros(1 if d == 2 else 3)
-    inertia = moment * spacing**2
+    sums = np.zeros((1 + 2 * d + d * d,) * 2)
+    elastic = 0.0
     for s, o in zip(snapshots, seen, strict=True):
-        m, V0 = s.per_body(MASS), s.per_body(VOLUME)
-        x, v, C = (a.astype(np.float64) for a in (s.x, s.v, s.C))
-        mass += m.sum()
-        kinetic += 0.5 * (m @ (v * v).sum(1)) + 0.5 * inertia * (m @ (C * C).sum((1, 2)))
-        potential -= m @ ((x - 0.5 * dt * v) @ gravity)
-        linear += m @ v
-        # np.cross of plane vectors is deprecated, and the axial vector of C pairs the same indices.
-        pairs = [(0, 1)] if d == 2 else [(1, 2), (2, 0), (0, 1)]
-        for k, (a, b) in enumerate(pairs):
-            angular[k] += m @ (x[:, a] * v[:, b] - x[:, b] * v[:, a])
-            angular[k] += inertia * (m @ (C[:, b, a] - C[:, a, b]))
-        elastic += V0 @ o.energy.astype(np.float64)
+        sums += _weighted_products(s)
+        elastic += float(s.per_body(VOLUME) @ o.energy.astype(np.float64))
+    mass, inertia = sums[0, 0], moment * spacing**2
+    x, v, C = slice(1, 1 + d), slice(1 + d, 1 + 2 * d), slice(1 + 2 * d, None)
+    linear, by_place, affine = sums[0, v], sums[x, v], sums[0, C].reshape(d, d)
+    kinetic = 0.5 * (sums[v, v].trace() + inertia * sums[C, C].trace())
+    potential = -((sums[0, x] - 0.5 * dt * linear) @ gravity)
+    # The axial vector of C pairs the same indices.
+    pairs = [(0, 1)] if d == 2 else [(1, 2), (2, 0), (0, 1)]
+    angular = [by_place[a, b] - by_place[b, a] + inertia * (affine[b, a] - affine[a, b]) for a, b in pairs]
     J = [_volume_ratio(s, o) for s, o in zip(snapshots, seen, strict=True)]
     return {
         "mass": float(mass),
         "kinetic": float(kinetic),
-        "elastic": float(elastic),
+        "elastic": elastic,
         "potential": float(potential),
         "linear_momentum": tuple(linear.tolist()),
-        "angular_momentum": tuple(angular.tolist()),
-        "speed_max": float(np.sqrt(max(float((s.v * s.v).sum(1).max()) for s in snapshots))),
+        "angular_momentum": tuple(map(float, angular)),
+        "speed_max": float(np.sqrt(max(float(np.einsum("pc,pc->p", s.v, s.v).max()) for s in snapshots))),
         "volume_ratio_min": float(min(j.min() for j in J)),
         "volume_ratio_max": float(max(j.max() for j in J)),
     }
+
+
+def _weighted_products(snapshot: Snapshot) -> np.ndarray:
+    """Return sum m a a^T over the particles with a = (1, x, v, C), in float64."""
+    count, d = snapshot.x.shape
+    sums = np.zeros((1 + 2 * d + d * d,) * 2)
+    mass = snapshot.per_body(MASS)
+    for first in range(0, count, ROWS):
+        rows = slice(first, first + ROWS)
+        parts = (snapshot.x[rows], snapshot.v[rows], snapshot.C[rows].reshape(-1, d * d))
+        a = np.concatenate([np.ones((len(parts[0]), 1)), *parts], axis=1)
+        sums += (a * mass[rows, None]).T @ a
+    return sums
 
 
 def ledger_row(sums: dict, time: float, taken: Sequence[tuple[float, float, str]]) -> LedgerRow:

@@ -28,10 +28,8 @@ class SavedState:
     arrays: dict[str, np.ndarray]
 
 
-class State:
-    """The state of a run on its device.
-
-    On the CPU a run that is saved, loaded and continued, on any number of threads, gives the bytes of one that was not.
+class Progress:
+    """What changes in a run beside its particles.
 
     Attributes:
         time: s, in double precision; step_count: steps taken; last_step: size of the last one, s, 0 before the first.
@@ -43,15 +41,7 @@ class State:
 
     NUMBERS = ("time", "step_count", "last_step", "speed", "courant", "drift", "first_stable_step")
 
-    def __init__(
-        self,
-        groups: Sequence[ParticleGroup],
-        kernels: Kernels,
-        step_control: StepControl,
-        external_forces: ExternalForces,
-    ) -> None:
-        self._groups = groups
-        self._kernels = kernels
+    def __init__(self, step_control: StepControl, external_forces: ExternalForces) -> None:
         self.step_control = step_control
         self.external_forces = external_forces
         self.begin()
@@ -66,6 +56,27 @@ class State:
         self.drift = math.inf
         self.first_stable_step = 0.0
         self.step_control.begin()
+
+
+class State(Progress):
+    """The state of a run on its device.
+
+    On the CPU a run that is saved, loaded and continued, on any number of threads, gives the bytes of one that was not.
+    """
+
+    def __init__(
+        self,
+        groups: Sequence[ParticleGroup],
+        kernels: Kernels,
+        step_control: StepControl,
+        external_forces: ExternalForces,
+    ) -> None:
+        self._groups = groups
+        self._kernels = kernels
+        super().__init__(step_control, external_forces)
+
+    def begin(self) -> None:
+        super().begin()
         self._kernels.particles.lost.fill(NOT_LOST)
 
     def save(self) -> SavedState:

@@ -4,13 +4,13 @@ import math
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
+from typing import NamedTuple
 
 from mpmcli.materials.law import StateBound
 from mpmcli.scene import Scene
-from mpmcli.solver.backend import Backend
 from mpmcli.solver.particle_update import SMALLEST_J
 from mpmcli.solver.particles import ParticleGroup
-from mpmcli.solver.state_bounds import StateBounds, build_measurement
+from mpmcli.solver.state_bounds import Measurement, StateBounds
 from mpmcli.solver.step_cpu import StepResult
 from mpmcli.stability.limits import Limit, deformation_limit, mode_limit
 from mpmcli.stability.transfer_factors import step_inertia
@@ -29,21 +29,48 @@ SLOW = 0.1
 EASING = 1.001
 
 
+class StepCounters(NamedTuple):
+    """What decides on the steps between two measurements.
+
+    Attributes:
+        stiffness_limit: the smallest bound by the stiffness of the laws; eased: the bound that rises slowly, s.
+        rates: per group, the largest rate of deformation in the last step, 1/s.
+        unwatched: per group, the steps since its last measurement.
+        change, hardened: per group, the growth of the logarithm of its stiffness since then, by deformation and by
+            hardening.
+    """
+
+    stiffness_limit: Limit
+    eased: float
+    rates: tuple[float, ...]
+    unwatched: tuple[int, ...]
+    change: tuple[float, ...]
+    hardened: tuple[float, ...]
+
+
 class StepControl:
     """The last measurement of each group of particles, and the bounds on the step that follow from it.
 
     Attributes:
         seconds: wall time spent so far on measuring.
         longest: most steps between two measurements.
+        growth_allowed: growth of the logarithm of a stiffness at which it is measured.
     """
 
-    def __init__(self, scene: Scene, groups: Sequence[ParticleGroup], backend: Backend) -> None:
-        """Measure the groups for the first time."""
+    def __init__(
+        self, scene: Scene, groups: Sequence[ParticleGroup], measurements: Sequence[Measurement], *, on_cpu: bool
+    ) -> None:
+        """Measure the groups for the first time.
+
+        Args:
+            measurements: of each group.
+            on_cpu: whether every step reads back the speed and the rates of deformation.
+        """
         self._groups = groups
         self._names = tuple(body.name for body in scene.bodies)
         self._spacing = scene.domain.spacing
         self._inertia = step_inertia(scene.solver)
-        self._measure = [build_measurement(group, backend) for group in groups]
+        self._measure = measurements
         self._bounds = [measure.state() for measure in self._measure]
         # Per group: its rate of deformation after the last step as far as known, and since its last measurement steps
         # and growth of the logarithm of its stiffness: by deformation, and by hardening, which is measured by itself.
@@ -51,10 +78,10 @@ class StepControl:
         self._unwatched = [0] * len(groups)
         self._change = [0.0] * len(groups)
         self._hardened = [0.0] * len(groups)
-        self.longest = MOST_UNWATCHED_STEPS if backend.on_cpu else MOST_BLIND_STEPS
-        share = UNWATCHED_SHARE if backend.on_cpu else BLIND_SHARE
+        self.longest = MOST_UNWATCHED_STEPS if on_cpu else MOST_BLIND_STEPS
+        share = UNWATCHED_SHARE if on_cpu else BLIND_SHARE
         # A step of safety times the limit is stable until the stiffness has grown to safety^-2 of what it was.
-        self._growth_allowed = -2 * share * math.log(scene.time.safety)
+        self.growth_allowed = -2 * share * math.log(scene.time.safety)
         self.seconds = 0.0
         self._limits = [self._limits_of(g, bounds) for g, bounds in enumerate(self._bounds)]
         self._eased = math.inf
@@ -128,7 +155,7 @@ class StepControl:
         if result is not None:
             self._rates[:] = result.deformation_rates
             self._deformation_limit = _deformation_limit(self._rates)
-        due = []
+        pending = [0.0] * len(self._groups)
         for g, group in enumerate(self._groups):
             self._unwatched[g] += 1
             strain = dt * self._rates[g]
@@ -141,19 +168,56 @@ class StepControl:
                 sensitivity = max(sensitivity, 1.0) if courant >= SLOW else sensitivity
             self._change[g] += strain * sensitivity
             # The internal variables do not contain the last step's strain yet.
-            pending = strain * group.law.hardening
-            self._hardened[g] += pending
-            grown = self._change[g] >= self._growth_allowed
+            pending[g] = strain * group.law.hardening
+            self._hardened[g] += pending[g]
+        due = self._groups_due(None if result is None else result.state_bounds, pending)
+        self.seconds += time.perf_counter() - began
+        return due
+
+    def _groups_due(self, known: Sequence[StateBounds | None] | None, pending: Sequence[float]) -> list[int]:
+        """Return the groups to measure; what a step has read back is used in place of a measurement.
+
+        Args:
+            known: per group what the last step read back; None where steps are not read back.
+            pending: per group the growth that the internal variables do not contain yet.
+        """
+        due = []
+        for g in range(len(self._groups)):
+            grown = self._change[g] >= self.growth_allowed
             if self._unwatched[g] >= self.longest:
                 due.append(g)
-            elif grown or self._hardened[g] >= self._growth_allowed:
-                known = None if result is None else result.state_bounds[g]
-                if known is not None and _sound(known):
-                    self._take(g, known)
-                elif result is None and not grown and 2 * pending <= self._growth_allowed:
-                    self._measure_hardening(g, pending)
+            elif grown or self._hardened[g] >= self.growth_allowed:
+                if known is not None and known[g] is not None and _sound(known[g]):
+                    self._take(g, known[g])
+                elif known is None and not grown and 2 * pending[g] <= self.growth_allowed:
+                    self._measure_hardening(g, pending[g])
                 else:
                     due.append(g)
+        return due
+
+    def counters(self) -> StepCounters:
+        """Return what decides on the next steps until the next measurement."""
+        return StepCounters(
+            self._stiffness_limit,
+            self._eased,
+            *map(tuple, (self._rates, self._unwatched, self._change, self._hardened)),
+        )
+
+    def take_counters(self, counters: StepCounters) -> list[int]:
+        """Continue from counters that a kernel has advanced by some steps; return the groups to measure now.
+
+        Groups that harden are measured after every such series: their bounds count as read back.
+        """
+        began = time.perf_counter()
+        self._eased = counters.eased
+        self._rates[:], self._unwatched[:] = counters.rates, counters.unwatched
+        self._change[:], self._hardened[:] = counters.change, counters.hardened
+        self._deformation_limit = _deformation_limit(self._rates)
+        known = [
+            measure.state() if group.law.hardening > 0 else None
+            for group, measure in zip(self._groups, self._measure, strict=True)
+        ]
+        due = self._groups_due(known, [0.0] * len(known))
         self.seconds += time.perf_counter() - began
         return due
 

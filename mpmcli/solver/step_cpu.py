@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from mpmcli.solver.cpu_loops import clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid
 from mpmcli.solver.nodes import NodeUpdate
@@ -42,7 +43,6 @@ def build_cpu_step(
     gravity: Gravity,
 ) -> Callable[[float, float], StepResult]:
     """Build the kernels of a step (dt, kick) for these groups and nothing else."""
-    d = grid.dimension
     threads = orders[0].threads
     # One thread runs loops itself: the hand-over to a pool of one would take most of a step of few particles.
     alone = threads == 1
@@ -60,35 +60,6 @@ def build_cpu_step(
     )
     read_back = (*largest_rate, *(field for fields in maxima for field in fields))
     numbers = ti.types.vector(1 + len(read_back), float)
-
-    @ti.func
-    def clear_rows(t: int, count: int):
-        """Clear the share of thread t of `count` rows of nodes."""
-        for row in range(share_start(count, t, threads), share_start(count, t + 1, threads)):
-            first = grid.linear_index(grid.row_start(row))
-            for k in range(grid.box[1, d - 1]):
-                grid.clear(first + k)
-
-    @ti.func
-    def scatter_pencils(g: ti.template(), group: ti.template(), order: ti.template(), colour: int, t: int, kick: float):
-        """Scatter the particles in the pencils of a colour that thread t takes."""
-        for r in range(order.work[colour, t], order.work[colour, t + 1]):
-            first = order.pencil_start(colour, r)
-            for p in range(order.start[first], order.start[first + order.pencil]):
-                particles.scatter(g, group, p, kick, False)
-
-    @ti.func
-    def update_rows(t: int, gravity_step: ti.template()):
-        """Update the nodes in the rows of thread t; return the square of the largest velocity."""
-        rows = grid.row_count()
-        speed_squared = 0.0
-        for row in range(share_start(rows, t, threads), share_start(rows, t + 1, threads)):
-            node = grid.row_start(row)
-            first = grid.linear_index(node)
-            for k in range(grid.box[1, d - 1]):
-                speed_squared = ti.max(speed_squared, nodes.update(node, first + k, gravity_step))
-                node[d - 1] += 1
-        return speed_squared
 
     @ti.func
     def advance_share(g: ti.template(), group: ti.template(), t: int, dt: float):
@@ -116,13 +87,17 @@ def build_cpu_step(
         ti.loop_config(serialize=alone)
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
-                clear_rows(q // CHUNK, grid.row_count() if part == 0 else 0)
+                rows = grid.row_count() if part == 0 else 0
+                t = q // CHUNK
+                clear_rows(grid, share_start(rows, t, threads), share_start(rows, t + 1, threads))
         for g, group, order in ti.static(pairs):
             for parity in ti.static(range(together)):
                 ti.loop_config(serialize=alone)
                 for q in range(CHUNK * threads):
                     if q % CHUNK == 0:
-                        scatter_pencils(g, group, order, parity + together * part, q // CHUNK, kick)
+                        t, colour = q // CHUNK, parity + together * part
+                        first, last = order.work[colour, t], order.work[colour, t + 1]
+                        scatter_pencils(particles, g, group, order, colour, first, last, kick)
 
     @ti.kernel
     def update_and_g2p(dt: float, kick: float) -> numbers:
@@ -137,7 +112,9 @@ def build_cpu_step(
         ti.loop_config(serialize=alone)
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
-                ti.atomic_max(largest_speed_squared[None], update_rows(q // CHUNK, gravity.in_step(kick)))
+                rows, t = grid.row_count(), q // CHUNK
+                first, last = share_start(rows, t, threads), share_start(rows, t + 1, threads)
+                ti.atomic_max(largest_speed_squared[None], update_rows(grid, nodes, first, last, gravity.in_step(kick)))
         for g, group, _order in ti.static(pairs):
             ti.loop_config(serialize=alone)
             for q in range(CHUNK * threads):

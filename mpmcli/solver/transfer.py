@@ -9,7 +9,7 @@ instructions; that halves the time of the gather in 3D.
 
 import taichi as ti
 
-from mpmcli.solver.particles import MASS, VOLUME
+from mpmcli.solver.particle_arrays import MASS, VOLUME
 
 
 @ti.func
@@ -23,7 +23,6 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float, atom
     for quadratic splines), and w_i m. PIC leaves m C out. Without `atomic` no other thread may write those nodes.
     """
     d = ti.static(grid.dimension)
-    h = ti.static(grid.spacing)
     affine = ti.static(grid.scheme.affine)
     row = group.row(p)
     mass = row[MASS]
@@ -35,18 +34,18 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float, atom
         push, slope = group.force.acceleration(group, p, ti.static(group.force.spreads and affine))
         v += kick * push
         C += kick * slope
-    base, distance = grid.scheme.spline.stencil(group.x[p], 1 / h)
+    base, distance = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
 
     # Momentum and mass that the middle node would take, and their change per cell along each axis.
     middle = ti.Vector.zero(float, grid.width)
     change = ti.Matrix.zero(float, d, grid.width)
-    stress_scale = kick * row[VOLUME] * ti.static(grid.scheme.spline.inverse_moment / h)
+    stress_scale = kick * row[VOLUME] * grid.gradient_scale
     for c in ti.static(range(d)):
         middle[c] = mass * v[c]
         for a in ti.static(range(d)):
             if ti.static(affine):
-                change[a, c] = (mass * h) * C[c, a] - stress_scale * stress[c, a]
+                change[a, c] = (mass * grid.spacing) * C[c, a] - stress_scale * stress[c, a]
             else:
                 change[a, c] = -stress_scale * stress[c, a]
             middle[c] -= change[a, c] * (distance[a] - 1.0)
@@ -69,14 +68,14 @@ def scatter_before(
 ):
     """Add the momentum of a particle, without this step's stress and forces, to `grid.before`."""
     d = ti.static(grid.dimension)
-    base, distance = grid.scheme.spline.stencil(x, ti.static(1 / grid.spacing))
+    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
     middle = ti.Vector.zero(float, grid.width)
     change = ti.Matrix.zero(float, d, grid.width)
     for c in ti.static(range(d)):
         middle[c] = mass * v[c]
         for a in ti.static(range(d)):
-            change[a, c] = (mass * ti.static(grid.spacing)) * C[c, a]
+            change[a, c] = (mass * grid.spacing) * C[c, a]
             middle[c] -= change[a, c] * (distance[a] - 1.0)
     add_linear(grid.before, grid, grid.linear_index(base), w, middle, change, atomic)
 
@@ -139,7 +138,7 @@ def gather(x: ti.template(), grid: ti.template(), field: ti.template()):
     as a node; entries beyond the d components of the velocity have no meaning.
     """
     d = ti.static(grid.dimension)
-    base, distance = grid.scheme.spline.stencil(x, ti.static(1 / grid.spacing))
+    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
     first = grid.linear_index(base)
     velocity = ti.Vector.zero(float, grid.width)
@@ -168,8 +167,7 @@ def gather(x: ti.template(), grid: ti.template(), field: ti.template()):
                 if ti.static(o[a] == 3):
                     moment[a, c] += 2.0 * total[c]
             moment[d - 1, c] += high[c] - low[c]
-    scale = ti.static(grid.scheme.spline.inverse_moment / grid.spacing)
     for a in ti.static(range(d)):
         for c in ti.static(range(grid.width)):
-            moment[a, c] = (moment[a, c] - velocity[c] * (distance[a] - 1.0)) * scale
+            moment[a, c] = (moment[a, c] - velocity[c] * (distance[a] - 1.0)) * grid.gradient_scale
     return velocity, moment

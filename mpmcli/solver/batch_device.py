@@ -1,0 +1,69 @@
+"""What a batch has on the device, and the view of it that one run has in the kernel."""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+
+from mpmcli.boundaries.walls import Walls
+from mpmcli.boundaries.zeroed_walls import ZeroedWalls
+from mpmcli.solver.grid import Grid
+from mpmcli.solver.nodes import NodeUpdate
+from mpmcli.solver.ordering import TileOrder
+from mpmcli.solver.particle_arrays import ParticleArrays
+from mpmcli.solver.particle_update import ParticleUpdate
+
+
+@dataclass(frozen=True)
+class Device:
+    """What a batch has on the device.
+
+    Attributes:
+        runs: number of runs; room: particles of each, per group.
+        groups, orders: of each law, with the particles of all runs.
+    """
+
+    runs: int
+    room: Sequence[int]
+    threads: int
+    grid: Grid
+    groups: Sequence[ParticleArrays]
+    orders: Sequence[TileOrder]
+    walls: Walls | ZeroedWalls
+    nodes: NodeUpdate
+    particles: ParticleUpdate
+
+
+def _changed(thing: object, **attributes: object) -> object:
+    result = copy(thing)
+    for name, value in attributes.items():
+        setattr(result, name, value)
+    return result
+
+
+def views(
+    device: Device, w: object, h: object, inverse: object, scale: object, box: object, last: object, extent: object
+) -> tuple[Grid, NodeUpdate, ParticleUpdate, tuple[TileOrder, ...]]:
+    """Return the grid, the updates and the orders of one run.
+
+    Args:
+        w: its number. This and what follows are variables of the kernel.
+        h, inverse, scale: spacing, inverse_spacing and gradient_scale of the `Grid`; box: its box.
+        last: node of the upper walls per axis; extent: size of the domain, m.
+    """
+    grid = _changed(
+        device.grid,
+        spacing=h,
+        inverse_spacing=inverse,
+        gradient_scale=scale,
+        box=box,
+        first_node=w * device.grid.node_count,
+    )
+    walls = _changed(device.walls, last=last)
+    images = device.nodes.images
+    if images is not None:
+        walls.first_plane = w * len(walls.separating)
+        images = _changed(images, walls=walls)
+    nodes = _changed(device.nodes, grid=grid, images=images, boundaries=(walls,))
+    particles = _changed(device.particles, grid=grid, extent=extent, first_lost=w * len(device.groups))
+    orders = tuple(_changed(order, grid=grid, first_tile=w * (order.tiles + 1)) for order in device.orders)
+    return grid, nodes, particles, orders

@@ -1,0 +1,63 @@
+"""Where the host and the kernel of a batch find the numbers of a run: columns of two arrays with a row per run."""
+
+from collections.abc import Iterable, Sequence
+from types import SimpleNamespace
+
+from mpmcli.solver.state_bounds import ENTRIES
+
+# Status of a run: free, or waiting for the host; to be measured; advancing; measured, as a bound on its step requires;
+# with lost particles; with a stable step that collapsed.
+IDLE, MEASURE, GOING, ATTEND, LOST, COLLAPSED = range(6)
+# Bounds on the step by their code; of equal ones the lower code counts, as in a comparison of `Limit`s.
+LIMITS = ("", "deformation", "force", "forced", "maximum", "speed", "viscosity", "wave")
+
+# Columns of the numbers, float64. The last four are constants: a literal in a kernel has the precision of particles.
+REALS = (
+    *("time", "target", "last_step", "speed", "courant", "drift", "eased", "stiffness"),
+    *("smallest", "smallest_courant", "largest", "largest_courant"),
+    *("growth_allowed", "safety", "safety_squared", "maximum", "pull", "collapse"),
+    *("spacing", "inverse_spacing", "gradient_scale"),
+    *("drift_allowed", "easing", "slack", "infinity"),
+)
+# Columns of the counts, int32.
+COUNTS = ("status", "arrived", "steps", "budget", "limit", "stiffness_limit", "forced", "longest")
+
+
+def _columns(first: int, names: Iterable[str]) -> dict[str, int]:
+    return {name: first + i for i, name in enumerate(names)}
+
+
+def _blocks(first: int, widths: Sequence[int]) -> tuple[tuple[int, ...], int]:
+    """Return the first column of each block, and the column after the last."""
+    starts = [first]
+    for width in widths:
+        starts.append(starts[-1] + width)
+    return tuple(starts[:-1]), starts[-1]
+
+
+class Layout:
+    """Columns of a batch of runs in d dimensions with some laws.
+
+    Attributes:
+        real: column of each number by name: those of REALS; `gravity` and `extent`, per axis; `rate`, `change`,
+            `hardened`, `sensitivity`, `hardening` and (the first of) `maxima`, per group.
+        count: column of each count by name: those of COUNTS; `cells`, per axis; `particles`, `unwatched`, per group.
+        reals, counts: number of columns.
+    """
+
+    def __init__(self, dimension: int, internal: Sequence[int]) -> None:
+        """Assign columns; `internal` are the numbers of internal variables of the laws."""
+        columns: dict[str, object] = _columns(0, REALS)
+        end, groups = len(REALS), [1] * len(internal)
+        for name in ("gravity", "extent"):
+            columns[name], end = _blocks(end, [1] * dimension)
+        for name in ("rate", "change", "hardened", "sensitivity", "hardening"):
+            columns[name], end = _blocks(end, groups)
+        columns["maxima"], self.reals = _blocks(end, [ENTRIES + 2 * n for n in internal])
+        self.real = SimpleNamespace(**columns)
+        columns = _columns(0, COUNTS)
+        columns["cells"], end = _blocks(len(COUNTS), [1] * dimension)
+        for name in ("particles", "unwatched"):
+            columns[name], end = _blocks(end, groups)
+        self.counts = end
+        self.count = SimpleNamespace(**columns)

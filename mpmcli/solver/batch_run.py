@@ -1,0 +1,276 @@
+"""One run of a batch: fills its place on the device, and attends to it between launches."""
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.materials.law import Law
+from mpmcli.scene import BodyParticles, Scene
+from mpmcli.solver.batch import Batch
+from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, GOING, IDLE, LIMITS, LOST, MEASURE
+from mpmcli.solver.external_forces import ExternalForces
+from mpmcli.solver.groups import require_inside
+from mpmcli.solver.observe import Observation
+from mpmcli.solver.particle_update import NOT_LOST
+from mpmcli.solver.particles import initial_state, table_of
+from mpmcli.solver.plan import members_of
+from mpmcli.solver.run import COLLAPSE, Run
+from mpmcli.solver.snapshot import Snapshot
+from mpmcli.solver.state import Progress
+from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
+from mpmcli.solver.step_control import StepControl, StepCounters
+
+# Particle-steps of a run in one launch: some tenths of a second, after which the host may stop the run.
+BUDGET = 2_000_000
+
+
+class BatchGroup:
+    """The particles of one law of one run; attributes as of `ParticleGroup`."""
+
+    def __init__(self, batch: Batch, g: int, slot: int, law: Law, bodies: list[int], rows: np.ndarray, count: int):
+        self.law, self.bodies, self.count = law, tuple(bodies), count
+        self.arrays = batch.device.groups[g]
+        self.dimension, self.real, self.internal = self.arrays.dimension, self.arrays.real, self.arrays.internal
+        self.rows = rows.astype(self.real)
+        self.first = slot * batch.kind.particles[g]
+        self._row = slot * batch.kind.bodies[g]
+
+    def to_numpy(self) -> dict[str, np.ndarray]:
+        """Return x, v, C, deformation, internal, (n, k), id and body, (n), in the solver's order."""
+        return self.arrays.read(self.first, self.count, self.bodies, self._row)
+
+    def write(self, found: dict[str, np.ndarray], place: np.ndarray) -> None:
+        """Fill the device with particles, see `initial_state`."""
+        self.arrays.write(self.first, found, self._row + place)
+        for i, row in enumerate(self.rows):
+            self.arrays.table[self._row + i] = row.tolist()
+
+
+class BatchRun(Run):
+    """A scene in one place of a batch."""
+
+    def __init__(
+        self,
+        batch: Batch,
+        slot: int,
+        scene: Scene,
+        particles: list[BodyParticles] | None = None,
+        *,
+        force: bool = False,
+    ) -> None:
+        """Fill the place.
+
+        Args:
+            slot: number of the place, whose last run has ended.
+            particles: one entry per body, in place of the scene's own sampling.
+            force: take time.step as it is, above the stable step too.
+
+        Raises:
+            InputError: a particle is not in the domain.
+        """
+        super().__init__(scene, batch.backend, particles, force=force)
+        require_inside(scene, self._particles)
+        self.batch, self.slot = batch, slot
+        self._begun = False
+        self._numbers, self._counts = batch.numbers[slot], batch.counts[slot]
+        self._real, self._count = batch.layout.real, batch.layout.count
+        first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in self._particles])])
+        self.groups = []
+        for g, shared in enumerate(batch.kind.members):
+            bodies = members_of(scene, shared.name)
+            own = [self._particles[i] for i in bodies]
+            law = type(shared)([scene.bodies[i].material for i in bodies], scene.dimension)
+            count = sum(len(b.position) for b in own)
+            group = BatchGroup(batch, g, slot, law, bodies, table_of(law, own), count)
+            group.write(*initial_state(law, own, [int(first_ids[i]) for i in bodies], self._origin))
+            self.groups.append(group)
+            self._counts[self._count.particles[g]] = count
+            lost = batch.device.particles.lost
+            if lost[slot * len(batch.kind.members) + g] != NOT_LOST:
+                lost[slot * len(batch.kind.members) + g] = NOT_LOST
+        self._set_constants()
+        self._set_counts(status=MEASURE)
+
+    @property
+    def step_count(self) -> int:
+        """Steps taken."""
+        return self.state.step_count if self._begun else 0
+
+    @property
+    def measure_seconds(self) -> float:
+        """Wall time spent so far on measuring the state for the limits."""
+        return self.state.step_control.seconds if self._begun else 0.0
+
+    def _set(self, **values: float) -> None:
+        for name, value in values.items():
+            self._numbers[getattr(self._real, name)] = value
+
+    def _set_counts(self, **values: int) -> None:
+        for name, value in values.items():
+            self._counts[getattr(self._count, name)] = value
+
+    def _get(self, name: str) -> float:
+        return float(self._numbers[getattr(self._real, name)])
+
+    def _get_count(self, name: str) -> int:
+        return int(self._counts[getattr(self._count, name)])
+
+    def _set_constants(self) -> None:
+        """Store what does not change during the run."""
+        scene, h = self.scene, self.spacing
+        gravity = scene.domain.gravity_at(0.0)
+        for a, n in enumerate(scene.domain.cells):
+            self._numbers[self._real.gravity[a]] = gravity[a]
+            self._numbers[self._real.extent[a]] = n * h
+            self._counts[self._count.cells[a]] = n
+        maximum = math.inf if scene.time.step == "auto" else scene.time.step
+        self._set(
+            spacing=h,
+            inverse_spacing=1 / h,
+            gradient_scale=self.batch.device.grid.scheme.spline.inverse_moment / h,
+            safety=scene.time.safety,
+            safety_squared=scene.time.safety**2,
+            maximum=maximum,
+        )
+        self._set_counts(forced=self._forced)
+
+    def _measurement(self, g: int) -> Measurement:
+        first = self._real.maxima[g]
+        group = self.groups[g]
+        columns = slice(first, first + entries(group))
+        # Internal variables by themselves are measured on a GPU only.
+        return Measurement(lambda: state_bounds_of(group, self._numbers[columns].tolist()), dict)
+
+    def events(self) -> Iterator[tuple[Frame, LedgerRow] | None]:
+        """Yield a frame and its ledger row for each output time, as `Solver.frames`; None where the batch must launch.
+
+        Raises:
+            UnstableRunError: a particle left the domain, was inverted or became non-finite.
+        """
+        yield None
+        self.first_step_seconds = self.batch.first_seconds
+        control = StepControl(
+            self.scene, self.groups, [self._measurement(g) for g in range(len(self.groups))], on_cpu=True
+        )
+        self.state = Progress(control, ExternalForces(self.scene, self.groups, self.backend))
+        self._begun = True
+        self._begin()
+        self._set(
+            growth_allowed=control.growth_allowed,
+            pull=self.state.external_forces.pull(0.0),
+            collapse=COLLAPSE * self.state.first_stable_step,
+        )
+        self._set_counts(longest=control.longest)
+        for g, group in enumerate(self.groups):
+            self._numbers[self._real.sensitivity[g]] = group.law.sensitivity
+            self._numbers[self._real.hardening[g]] = group.law.hardening
+        self._push()
+        yield self.frame(0, [])
+        count = self.scene.time.frames
+        for index in range(1, count + 1):
+            target = self.scene.time.end * index / count
+            if target <= self.time:
+                continue
+            self._set(target=target, smallest=math.inf, largest=0.0, largest_courant=0.0)
+            before = self.step_count
+            self._set_counts(arrived=0, limit=0)
+            yield from self._reach()
+            self.state.time = target
+            self._measure(range(len(self.groups)))
+            self._push()
+            yield self.frame(index, self._taken(before))
+
+    def _reach(self) -> Iterator[None]:
+        """Let the batch launch until the run has reached its target."""
+        arrived = False
+        while not arrived:
+            self._set_counts(status=GOING, budget=max(1, BUDGET // self.particle_count), steps=0)
+            yield None
+            self._pull()
+            arrived = self._get_count("arrived") == 1
+            status = self._get_count("status")
+            if status == LOST:
+                self._set_counts(status=IDLE)
+                self._stop(self.last_step, self._lost())
+            if status == COLLAPSED:
+                self._set_counts(status=IDLE)
+                self._stop_collapsed(self.stable_step()[0])
+            if status == ATTEND:
+                due = self.state.step_control.take_counters(self._counters())
+                # At a frame all are measured.
+                if due and not arrived:
+                    self._measure(due)
+                self._push()
+
+    def _measure(self, due: range | list[int]) -> None:
+        """Take the measurement of some groups that the kernel has made after the last step."""
+        if not self.state.step_control.measure(due):
+            self._stop(self.last_step, self._lost())
+        if self.state.step_control.fresh:
+            self.state.speed = self.state.step_control.speed
+
+    def _lost(self) -> list[int | None]:
+        """Return a lost particle of each group, in solver order, None where none is known."""
+        count = len(self.groups)
+        found = self.batch.device.particles.lost.to_numpy()[self.slot * count :][:count]
+        return [None if p == NOT_LOST else int(p) - group.first for p, group in zip(found, self.groups, strict=True)]
+
+    def _counters(self) -> StepCounters:
+        def numbers(columns: tuple[int, ...]) -> tuple[float, ...]:
+            return tuple(self._numbers[list(columns)].tolist())
+
+        return StepCounters(
+            self.state.step_control.counters().stiffness_limit,
+            self._get("eased"),
+            numbers(self._real.rate),
+            tuple(self._counts[list(self._count.unwatched)].tolist()),
+            numbers(self._real.change),
+            numbers(self._real.hardened),
+        )
+
+    def _pull(self) -> None:
+        """Read what the kernel has changed."""
+        for name in ("time", "last_step", "speed", "courant", "drift"):
+            setattr(self.state, name, self._get(name))
+        self.state.step_count += self._get_count("steps")
+
+    def _push(self) -> None:
+        """Write what the host has changed."""
+        for name in ("time", "last_step", "speed", "courant", "drift"):
+            self._set(**{name: getattr(self.state, name)})
+        counters = self.state.step_control.counters()
+        self._set(stiffness=counters.stiffness_limit.value, eased=counters.eased)
+        self._set_counts(stiffness_limit=LIMITS.index(counters.stiffness_limit.name))
+        for g in range(len(self.groups)):
+            self._numbers[self._real.rate[g]] = counters.rates[g]
+            self._numbers[self._real.change[g]] = counters.change[g]
+            self._numbers[self._real.hardened[g]] = counters.hardened[g]
+            self._counts[self._count.unwatched[g]] = counters.unwatched[g]
+
+    def _taken(self, before: int) -> list[tuple[float, float, str]]:
+        """Return the steps since the step `before` as `ledger_row` counts them: the smallest one, and the largest."""
+        smallest = self._get("smallest"), self._get("smallest_courant"), LIMITS[self._get_count("limit")]
+        steps = self.step_count - before
+        return [smallest] + [(self._get("largest"), self._get("largest_courant"), "")] * (steps - 1)
+
+    def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
+        """Yield as `Solver.frames`, where this is the only run of its batch.
+
+        Raises:
+            UnstableRunError: see `events`.
+            KeyboardInterrupt: `stop`, called after each launch, returned True.
+        """
+        for event in self.events():
+            if event is not None:
+                yield event
+                continue
+            self.batch.launch()
+            if stop():
+                raise KeyboardInterrupt
+
+    def _observe(self, g: int, snapshot: Snapshot, *, stress: bool) -> Observation:
+        group, stored = self.groups[g], (snapshot.deformation, snapshot.internal)
+        return self.batch.observations[g](self.last_step, group.first, group.count, stress=stress, stored=stored)

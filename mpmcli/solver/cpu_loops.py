@@ -1,0 +1,44 @@
+"""The loops of a step over a share of the nodes or of the particles, as one CPU thread runs them."""
+
+import taichi as ti
+
+
+@ti.func
+def clear_rows(grid: ti.template(), first: int, last: int):
+    """Clear the nodes in rows first to last - 1 of the box in use."""
+    for row in range(first, last):
+        node = grid.linear_index(grid.row_start(row))
+        for k in range(grid.box[1, ti.static(grid.dimension - 1)]):
+            grid.clear(node + k)
+
+
+@ti.func
+def scatter_pencils(
+    particles: ti.template(),
+    g: ti.template(),
+    group: ti.template(),
+    order: ti.template(),
+    colour: int,
+    first: int,
+    last: int,
+    kick: float,
+):
+    """Scatter the particles of the g-th group in pencils first to last - 1 of a colour."""
+    for r in range(first, last):
+        tile = order.first_tile + order.pencil_start(colour, r)
+        for p in range(order.start[tile], order.start[tile + order.pencil]):
+            particles.scatter(g, group, p, kick, False)
+
+
+@ti.func
+def update_rows(grid: ti.template(), nodes: ti.template(), first: int, last: int, gravity_step: ti.template()):
+    """Update the nodes in rows first to last - 1 of the box in use; return the square of the largest velocity."""
+    d = ti.static(grid.dimension)
+    speed_squared = 0.0
+    for row in range(first, last):
+        node = grid.row_start(row)
+        index = grid.linear_index(node)
+        for k in range(grid.box[1, d - 1]):
+            speed_squared = ti.max(speed_squared, nodes.update(node, index + k, gravity_step))
+            node[d - 1] += 1
+    return speed_squared

@@ -1,0 +1,243 @@
+"""The fields of particles of one law on the device, and what kernels read of a particle."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import taichi as ti
+
+from mpmcli.materials.law import Law
+
+# Entries of the per-body table that come before the constants of the law.
+MASS, VOLUME, CONSTANTS = 0, 1, 2
+
+
+@ti.data_oriented
+class ParticleArrays:
+    """Fields of particles of one law, of one run or of several, each of which has a contiguous range.
+
+    Attributes:
+        law: the constitutive law.
+        dimension: d.
+        x: position relative to the origin of the domain, (n) Vector(d), m.
+        v: velocity, (n) Vector, m/s, as wide as a node of the grid; the first d entries count.
+        gradient: of the velocity, (n) matrix of d rows as wide, 1/s: row a holds dv/dx_a, the transpose of C.
+        displacement_gradient: F - I, (n) matrix of d rows, each as wide as a node; None where the law keeps J.
+        J_minus_1: J - 1, (n); None where the law keeps F. Both are stored as the difference from rest: a step adds
+            strains of 1e-6 and less, which single precision would round off next to 1.
+        internal: the law's internal variables, (n) each.
+        id: (n) int, row of the particle in every frame.
+        body: (n) int, row of its body in the table; None where `several` is false.
+        several: whether particles may belong to more than one body.
+        serial: whether loops that copy particles from and to the host run on one thread, which few particles need.
+        initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force.
+        force: what acts on the particles of groups that are `pushed`.
+        table: per body a row of particle mass, particle volume and the constants of the law.
+        real: numpy's type of the real fields.
+    """
+
+    def __init__(
+        self,
+        law: Law,
+        dimension: int,
+        count: int,
+        table: tuple[int, int],
+        width: int,
+        layout: ti.Layout,
+        *,
+        several: bool,
+        serial: bool,
+        keeps_initial: bool = False,
+    ) -> None:
+        """Allocate.
+
+        Args:
+            count: particles n; table: rows and columns of the table.
+            width: numbers per node of the grid.
+        """
+        self.law = law
+        self.dimension = d = dimension
+        self.x = ti.Vector.field(d, float, shape=count, layout=layout)
+        self.v = ti.Vector.field(width, float, shape=count, layout=layout)
+        self.gradient = ti.Matrix.field(d, width, float, shape=count, layout=layout)
+        keeps_F = law.deformation == "F"
+        self.displacement_gradient = ti.Matrix.field(d, width, float, shape=count, layout=layout) if keeps_F else None
+        self.J_minus_1 = None if keeps_F else ti.field(float, shape=count)
+        self.internal = tuple(ti.field(float, shape=count) for _ in law.internal)
+        self.id = ti.field(int, shape=count)
+        self.several = several
+        self.serial = serial
+        self.body = ti.field(int, shape=count) if several else None
+        self.keeps_initial = keeps_initial
+        self.initial = ti.Vector.field(d, float, shape=count, layout=layout) if keeps_initial else None
+        self.pushed = False
+        self.force = None
+        self.table = ti.Vector.field(table[1], float, shape=table[0])
+        self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
+
+    @property
+    def state(self) -> tuple[ti.Field, ...]:
+        """Every real field that the sort must move."""
+        initial = () if self.initial is None else (self.initial,)
+        deformation = self.J_minus_1 if self.displacement_gradient is None else self.displacement_gradient
+        return (self.x, self.v, self.gradient, deformation, *self.internal, *initial)
+
+    @property
+    def labels(self) -> tuple[ti.Field, ...]:
+        """Every integer field that the sort must move."""
+        return (self.id,) if self.body is None else (self.id, self.body)
+
+    def read(self, first: int, count: int, bodies: Sequence[int], row: int = 0) -> dict[str, np.ndarray]:
+        """Return x, v, C, deformation, internal, (n, k), id and body, (n), of a range of particles, by one launch.
+
+        A launch per field would take most of the time of a frame of few particles.
+
+        Args:
+            bodies: index in the scene of each body of the group; row: of the first of them in the table.
+        """
+        d = self.dimension
+        widths = {"x": d, "v": d, "C": d * d, "deformation": self._deformation_width, "internal": len(self.internal)}
+        reals, labels = np.empty((count, sum(widths.values())), self.real), np.empty((count, 2), np.int32)
+        self._read(first, reals, labels)
+        found, end = {}, 0
+        for name, width in widths.items():
+            found[name] = reals[:, end : end + width]
+            end += width
+        found["C"] = found["C"].reshape(count, d, d)
+        if self.J_minus_1 is None:
+            found["deformation"] = np.eye(d, dtype=self.real) + found["deformation"].reshape(count, d, d)
+        else:
+            found["deformation"] = 1 + found["deformation"].reshape(count)
+        found["id"] = labels[:, 0]
+        found["body"] = np.array(bodies, np.int32)[labels[:, 1] - row]
+        return found
+
+    def write(self, first: int, found: dict[str, np.ndarray], row: np.ndarray) -> None:
+        """Set a range of particles to what `read` returned, by one launch.
+
+        Args:
+            row: of the body of each particle in the table, (n) int, in place of `found["body"]`.
+        """
+        count = len(found["x"])
+        rest = np.eye(self.dimension) if self.J_minus_1 is None else 1.0
+        parts = (found["x"], found["v"], found["C"], found["deformation"] - rest, found["internal"])
+        reals = np.concatenate([part.reshape(count, -1).astype(self.real) for part in parts], axis=1)
+        labels = np.stack([found["id"], row], axis=1).astype(np.int32)
+        self._write(first, np.ascontiguousarray(reals), np.ascontiguousarray(labels))
+
+    @property
+    def _deformation_width(self) -> int:
+        return self.dimension**2 if self.J_minus_1 is None else 1
+
+    @ti.kernel
+    def _read(self, first: int, reals: ti.types.ndarray(), labels: ti.types.ndarray()):
+        ti.loop_config(serialize=self.serial)
+        for q in range(reals.shape[0]):
+            d = ti.static(self.dimension)
+            p = first + q
+            for c in ti.static(range(d)):
+                reals[q, c] = self.x[p][c]
+                reals[q, d + c] = self.v[p][c]
+                for a in ti.static(range(d)):
+                    reals[q, (2 + c) * d + a] = self.gradient[p][a, c]
+            start = ti.static((2 + d) * d)
+            if ti.static(self.law.deformation == "F"):
+                for i, j in ti.static(ti.ndrange(d, d)):
+                    reals[q, start + i * d + j] = self.displacement_gradient[p][i, j]
+            else:
+                reals[q, start] = self.J_minus_1[p]
+            for i in ti.static(range(len(self.internal))):
+                reals[q, start + self._deformation_width + i] = self.internal[i][p]
+            labels[q, 0] = self.id[p]
+            # Every entry is written: a GPU does not get the zeros of the host.
+            if ti.static(self.several):
+                labels[q, 1] = self.body[p]
+            else:
+                labels[q, 1] = 0
+
+    @ti.kernel
+    def _write(self, first: int, reals: ti.types.ndarray(), labels: ti.types.ndarray()):
+        ti.loop_config(serialize=self.serial)
+        for q in range(reals.shape[0]):
+            d = ti.static(self.dimension)
+            width = ti.static(self.v.n)
+            p = first + q
+            for c in ti.static(range(d)):
+                self.x[p][c] = reals[q, c]
+            for c in ti.static(range(width)):
+                self.v[p][c] = reals[q, d + c] if ti.static(c < d) else 0.0
+                for a in ti.static(range(d)):
+                    self.gradient[p][a, c] = reals[q, (2 + c) * d + a] if ti.static(c < d) else 0.0
+            start = ti.static((2 + d) * d)
+            if ti.static(self.law.deformation == "F"):
+                for i, j in ti.static(ti.ndrange(d, width)):
+                    if ti.static(j < d):
+                        self.displacement_gradient[p][i, j] = reals[q, start + i * d + j]
+                    else:
+                        self.displacement_gradient[p][i, j] = 0.0
+            else:
+                self.J_minus_1[p] = reals[q, start]
+            for i in ti.static(range(len(self.internal))):
+                self.internal[i][p] = reals[q, start + self._deformation_width + i]
+            self.id[p] = labels[q, 0]
+            if ti.static(self.several):
+                self.body[p] = labels[q, 1]
+
+    @ti.func
+    def stored(self, p: int):
+        """Return J, or F as a d x d matrix, of particle p."""
+        if ti.static(self.law.deformation == "F"):
+            F = ti.Matrix.identity(float, self.dimension)
+            for i in ti.static(range(self.dimension)):
+                for j in ti.static(range(self.dimension)):
+                    F[i, j] += self.displacement_gradient[p][i, j]
+            return F
+        else:
+            return 1.0 + self.J_minus_1[p]
+
+    @ti.func
+    def inner(self, p: int):
+        """Return the internal variables of particle p; one 0 where the law has none."""
+        values = ti.Vector.zero(float, ti.static(max(len(self.internal), 1)))
+        for i in ti.static(range(len(self.internal))):
+            values[i] = self.internal[i][p]
+        return values
+
+    @ti.func
+    def store(self, p: int, deformation: ti.template(), inner: ti.template()):
+        """Replace what particle p stores of its deformation, and its internal variables."""
+        # Adds the difference, so that a deformation that the law did not change keeps every digit.
+        change = deformation - self.stored(p)
+        if ti.static(self.law.deformation == "F"):
+            for i in ti.static(range(self.dimension)):
+                for j in ti.static(range(self.dimension)):
+                    self.displacement_gradient[p][i, j] += change[i, j]
+        else:
+            self.J_minus_1[p] += change
+        for i in ti.static(range(len(self.internal))):
+            self.internal[i][p] = inner[i]
+
+    @ti.func
+    def constants(self, p: int):
+        """Return the constants of the law for particle p."""
+        row = self.row(p)
+        return ti.Vector([row[CONSTANTS + c] for c in ti.static(range(row.n - CONSTANTS))])
+
+    @ti.func
+    def motion(self, p: int):
+        """Return the velocity, d, and the affine velocity C, d x d, of particle p."""
+        d = ti.static(self.dimension)
+        v = ti.Vector.zero(float, d)
+        C = ti.Matrix.zero(float, d, d)
+        for c in ti.static(range(d)):
+            v[c] = self.v[p][c]
+            for a in ti.static(range(d)):
+                C[c, a] = self.gradient[p][a, c]
+        return v, C
+
+    @ti.func
+    def row(self, p: int):
+        """Return the row of the table that particle p reads."""
+        row = 0
+        if ti.static(self.several):
+            row = self.body[p]
+        return self.table[row]

@@ -1,0 +1,206 @@
+"""Runs of a batch have the bytes that they have alone in a `Solver`: for any law and wall, on any number of threads."""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import pytest
+import state_run
+
+from mpmcli.errors import MpmcliError
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import Scene, parse_scene, sample_bodies
+from mpmcli.solver.batch import Batch, Kind, can_batch
+from mpmcli.solver.batch_run import BatchRun
+from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.solver import Solver
+
+# By name: materials, dimension, and further tables of the scene.
+SCENES = {name: ((name,), 2, {}) for name in state_run.MATERIALS} | {
+    "two laws, two bodies of one": (("sand", "fluid", "sand"), 2, {}),
+    "3D, AFLIP": (("snow",), 3, {"solver": {"transfer": "aflip", "flip": 0.9}}),
+    "cubic splines, f64": (("neo_hookean",), 2, {"solver": {"kernel": "cubic", "precision": "f64"}}),
+    "zeroed walls, PIC": (("fluid",), 2, {"solver": {"walls": "zeroed", "transfer": "pic"}}),
+    "slip and stick": (("sand",), 2, {"domain": {"walls": {"default": "slip", "y_min": "stick"}}}),
+}
+# Kept in the default suite; the others carry the marker slow.
+USUAL = ("fluid", "snow", "sand", "two laws, two bodies of one", "3D, AFLIP", "slip and stick")
+Output = list[tuple[Frame, LedgerRow]]
+
+
+def scene_named(name: str, other: bool = False) -> Scene:
+    """Return blocks that hit a floor; the `other` one has other cells, parameters, gravity, sizes and times."""
+    materials, d, more = SCENES[name]
+    width = 0.8 / len(materials)
+    bodies = [
+        {
+            "name": f"body {k}",
+            "material": state_run.MATERIALS[law] | ({"density": 700.0 + 100 * k} if other else {}),
+            "shape": {
+                "box": {
+                    "min": [0.1 + width * k, 0.02, 0.3][:d],
+                    "max": [0.1 + width * (k + (0.7 if other else 0.8)), 0.3 if other else 0.4, 0.6][:d],
+                }
+            },
+            "velocity": [1.0 - other, -2.0, 0.5][:d],
+        }
+        for k, law in enumerate(materials)
+    ]
+    cells = (17 if other else 20) if d == 2 else (11 if other else 12)
+    data = {
+        "domain": {"size": [1.0] * d, "cells": [cells] * d, "gravity": [0.5 * other, -9.81, 0.0][:d]}
+        | more.get("domain", {}),
+        "time": {"end": 0.05 if other else 0.06, "frames": 3, "safety": 0.7 if other else 0.8},
+        "output": {"fields": ["velocity", "stress", "volume_ratio", "deformation_gradient"]},
+        "bodies": bodies,
+        "solver": more.get("solver", {}),
+    }
+    return parse_scene(data, laws=parameter_models(), source=name).scene
+
+
+def batch_of(scenes: Sequence[Scene], backend: object) -> Batch:
+    """Return a batch with room for one run of each scene."""
+    kinds = [Kind.of(scene, sample_bodies(scene)) for scene in scenes]
+    kind = kinds[0]
+    for more in kinds[1:]:
+        kind = kind.joined(more)
+    return Batch(kind, backend, len(scenes))
+
+
+def outputs_of(batch: Batch, scenes: Sequence[Scene]) -> list[Output | MpmcliError]:
+    """Run a scene in each place of a batch, all at once; a run that stops gives its error."""
+    streams = [BatchRun(batch, slot, scene).events() for slot, scene in enumerate(scenes)]
+    found: list = [[] for _ in scenes]
+    open_streams = dict(enumerate(streams))
+    while open_streams:
+        for slot, stream in list(open_streams.items()):
+            try:
+                while (event := next(stream)) is not None:
+                    found[slot].append(event)
+            except StopIteration:
+                del open_streams[slot]
+            except MpmcliError as error:
+                found[slot] = error
+                del open_streams[slot]
+        batch.launch()
+    return found
+
+
+def same(found: Output, expected: Output) -> Iterator[str]:
+    """Yield what two outputs differ in."""
+    if len(found) != len(expected):
+        yield f"{len(found)} frames for {len(expected)}"
+    for (frame, row), (other, other_row) in zip(found, expected, strict=False):
+        if row != other_row or (frame.time, frame.step) != (other.time, other.step):
+            yield f"row {frame.index}: {row} for {other_row}"
+        arrays = {"position": (frame.position, other.position), "velocity": (frame.velocity, other.velocity)}
+        arrays |= {"body": (frame.body, other.body), "material": (frame.material, other.material)}
+        arrays |= {field: (frame.fields[field], other.fields[field]) for field in other.fields}
+        yield from (
+            f"{field} {frame.index}" for field, pair in arrays.items() if pair[0].tobytes() != pair[1].tobytes()
+        )
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in USUAL else pytest.mark.slow) for name in SCENES]
+)
+def test_runs_of_a_batch_have_the_bytes_of_a_solver(backend_of: Callable, name: str) -> None:
+    """Two runs in which all numbers differ."""
+    scenes = [scene_named(name), scene_named(name, other=True)]
+    backend = backend_of(scenes[0].solver.precision, 1)
+    found = outputs_of(batch_of(scenes, backend), scenes)
+    for outcome, scene in zip(found, scenes, strict=True):
+        expected = list(Solver(scene, backend).frames())
+        assert expected[-1][1].steps >= 5
+        assert list(same(outcome, expected)) == []
+
+
+@pytest.mark.parametrize("name", ["two laws, two bodies of one", "3D, AFLIP"])
+def test_threads_share_no_memory(backend_of: Callable, name: str) -> None:
+    """Many runs at once on three threads, again and again, have the bytes that they have on one."""
+    scenes = [scene_named(name, other=k % 2 == 1) for k in range(7)]
+    truth = outputs_of(batch_of(scenes, backend := backend_of("f32", 1)), scenes)
+    batch = batch_of(scenes, backend_of("f32", 3))
+    assert batch.backend.threads == 3 != backend.threads
+    for _ in range(5):
+        for outcome, expected in zip(outputs_of(batch, scenes), truth, strict=True):
+            assert list(same(outcome, expected)) == []
+
+
+def test_a_place_is_used_again(backend_of: Callable) -> None:
+    """A run leaves nothing behind in its place, one that became unstable included."""
+    backend = backend_of("f32", 1)
+    first, second = scene_named("sand"), scene_named("sand", other=True)
+    batch = batch_of([first, second], backend)
+    fresh = outputs_of(batch, [first, second])
+    again = outputs_of(batch, [second, first])
+    assert list(same(again[0], fresh[1])) == list(same(again[1], fresh[0])) == []
+
+
+def test_an_unstable_run_stops_alone(backend_of: Callable) -> None:
+    """It says what a solver says, and the others and the next in its place go on."""
+    backend = backend_of("f32", 1)
+    sound = scene_named("neo_hookean")
+    time = sound.time.model_copy(update={"step": 0.004, "end": 0.4})
+    wild = sound.model_copy(update={"time": time})
+    batch = batch_of([sound, wild], backend)
+    runs = [BatchRun(batch, 0, sound), BatchRun(batch, 1, wild, force=True)]
+    streams, found, errors = [run.events() for run in runs], [[], []], [None, None]
+    for _ in range(1000):
+        for slot, stream in enumerate(streams):
+            try:
+                while (event := next(stream, None)) is not None:
+                    found[slot].append(event)
+            except UnstableRunError as error:
+                errors[slot] = error
+        batch.launch()
+    solver = Solver(wild, backend, force=True)
+    expected = []
+    with pytest.raises(UnstableRunError) as caught:
+        expected.extend(solver.frames())
+    assert errors[0] is None
+    assert str(errors[1]) == str(caught.value)
+    assert list(same(found[0], list(Solver(sound, backend).frames()))) == []
+    again = outputs_of(batch, [wild.model_copy(update={"time": sound.time}), sound])
+    assert list(same(again[1], found[0])) == []
+
+
+def test_what_is_compiled_decides_on_the_kind() -> None:
+    def kind_of(name: str, **changes: object) -> Kind:
+        scene = scene_named(name).model_copy(update=changes)
+        return Kind.of(scene, sample_bodies(scene))
+
+    sand = scene_named("sand")
+    wide = kind_of("sand").joined(Kind.of(other := scene_named("sand", other=True), sample_bodies(other)))
+    assert wide.cells == (20, 20)
+    assert wide.particles == kind_of("sand").particles
+    assert kind_of("sand").joined(kind_of("fluid")) is None
+    assert kind_of("sand").joined(kind_of("slip and stick")) is None
+    assert kind_of("sand").joined(kind_of("two laws, two bodies of one")) is None
+    assert can_batch(sand)
+    assert not can_batch(state_run.scene_named("forces"))
+
+
+def test_kinds_are_equal_where_flags_are() -> None:
+    """Numbers of a material are data; a term that a law leaves out is compiled."""
+    fluid = scene_named("fluid")
+    thin = fluid.bodies[0].material.model_copy(update={"viscosity": 0.1})
+    dry = fluid.bodies[0].material.model_copy(update={"viscosity": 0.0})
+
+    def kind_with(material: object) -> Kind:
+        scene = fluid.model_copy(update={"bodies": (fluid.bodies[0].model_copy(update={"material": material}),)})
+        return Kind.of(scene, sample_bodies(scene))
+
+    assert kind_with(thin).joined(Kind.of(fluid, sample_bodies(fluid))) is not None
+    assert kind_with(dry).joined(Kind.of(fluid, sample_bodies(fluid))) is None
+
+
+def test_frames_stop_on_request(backend_of: Callable) -> None:
+    scene = scene_named("sand")
+    run = BatchRun(batch_of([scene], backend_of("f32", 1)), 0, scene)
+    frames = run.frames(stop=lambda: run.step_count > 0)
+    next(frames)
+    with pytest.raises(KeyboardInterrupt):
+        list(frames)
+    assert np.isfinite(run.frame(1, [])[0].position).all()
