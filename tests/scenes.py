@@ -79,9 +79,9 @@ def restart(solver: Solver, sample: BodyParticles, end: float) -> None:
 
 def sums(solver: Solver) -> dict:
     """Return what the ledger sums at this moment, in float64."""
-    seen = [observe(solver.last_step, stress=False) for observe in solver._observe]
-    gravity = np.array(solver.scene.domain.gravity)
-    return measure([read_group(group) for group in solver.groups], seen, gravity, solver.spacing, solver.last_step)
+    snapshots = [read_group(group) for group in solver.groups]
+    seen = [solver._observe(g, snapshot, stress=False) for g, snapshot in enumerate(snapshots)]
+    return measure(snapshots, seen, np.array(solver.scene.domain.gravity), solver.spacing, solver.last_step)
 
 
 def total_energy(solver: Solver) -> float:

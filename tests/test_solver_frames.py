@@ -88,7 +88,6 @@ def test_one_launch_reads_what_the_fields_hold(solver: Solver, frames: Run) -> N
         assert found.keys() == expected.keys()
         for name, array in expected.items():
             assert found[name].shape == array.shape and np.array_equal(found[name], array), name
-            assert found[name].flags.c_contiguous, name
 
 
 def test_frames_land_on_their_times(frames: Run) -> None:

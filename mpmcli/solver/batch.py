@@ -129,7 +129,7 @@ class Batch:
         else:
             walls = Walls(kind.faces, PAD, grid.cells, grid.shape, runs)
             images = MirrorImages(walls)
-        buffers = SortBuffers(groups)
+        buffers = SortBuffers(groups, runs)
         orders = [TileOrder(group, grid, buffers, 1, True, runs) for group in groups]
         self.device = Device(
             runs,

@@ -268,7 +268,8 @@ class BatchRun(Run):
                 yield event
                 continue
             self.batch.launch()
-            if stop():
+            # Frame 0 is always there.
+            if self.step_count and stop():
                 raise KeyboardInterrupt
 
     def _observe(self, g: int, snapshot: Snapshot, *, stress: bool) -> Observation:

@@ -35,13 +35,15 @@ class SortBuffers:
     """Scratch memory of the sort, shared by all groups.
 
     Attributes:
+        room: particles of the largest group of one run.
         order: (n) int, where the particle at each new place comes from.
         key: (n) int, tile of each particle; also the scratch of integer fields.
         real: (n w) scratch of real fields; widest: w, the largest number of entries of a particle in one of them.
     """
 
-    def __init__(self, groups: Sequence[ParticleArrays]) -> None:
+    def __init__(self, groups: Sequence[ParticleArrays], runs: int = 1) -> None:
         n = max(group.x.shape[0] for group in groups)
+        self.room = n // runs
         self.widest = max(entry_count(field) for group in groups for field in group.state)
         self.order = ti.field(int, shape=n)
         self.key = ti.field(int, shape=n)

@@ -15,35 +15,36 @@ def sort_serially(order: ti.template(), first: int, count: int, run: int):
     buffers = order.buffers
     tiles = ti.static(order.tiles)
     cursor = run * tiles
+    # Other runs may be at other groups, which begin elsewhere: the scratch memory of a run is that of no other.
+    own = run * ti.static(buffers.room)
     for tile in range(tiles):
         order.cursor[cursor + tile, 0] = 0
-    for p in range(first, first + count):
-        tile = order.tile_of(p)
-        buffers.key[p] = tile
+    for q in range(count):
+        tile = order.tile_of(first + q)
+        buffers.key[own + q] = tile
         order.cursor[cursor + tile, 0] = order.cursor[cursor + tile, 0] + 1
-    place = first
+    place = 0
     for tile in range(tiles):
-        order.start[order.first_tile + tile] = place
+        order.start[order.first_tile + tile] = first + place
         size = order.cursor[cursor + tile, 0]
         order.cursor[cursor + tile, 0] = place
         place += size
-    order.start[order.first_tile + tiles] = place
-    for p in range(first, first + count):
-        tile = cursor + buffers.key[p]
-        buffers.order[order.cursor[tile, 0]] = p
+    order.start[order.first_tile + tiles] = first + place
+    for q in range(count):
+        tile = cursor + buffers.key[own + q]
+        buffers.order[own + order.cursor[tile, 0]] = first + q
         order.cursor[tile, 0] = order.cursor[tile, 0] + 1
     for field in ti.static(group.state):
-        # Other runs may be at other fields, whose particles have other numbers of entries.
-        place = first * ti.static(buffers.widest)
+        scratch = own * ti.static(buffers.widest)
         for q in range(count):
-            keep(buffers, field, place, q, buffers.order[first + q])
+            keep(buffers, field, scratch, q, buffers.order[own + q])
         for q in range(count):
-            take(buffers, field, place, q, first + q)
+            take(buffers, field, scratch, q, first + q)
     for label in ti.static(group.labels):
-        for p in range(first, first + count):
-            buffers.key[p] = label[buffers.order[p]]
-        for p in range(first, first + count):
-            label[p] = buffers.key[p]
+        for q in range(count):
+            buffers.key[own + q] = label[buffers.order[own + q]]
+        for q in range(count):
+            label[first + q] = buffers.key[own + q]
 
 
 @ti.func
