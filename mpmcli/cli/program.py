@@ -20,6 +20,7 @@ COMMANDS = {
     "info": "Say what a result or a scene holds.",
     "render": "Draw frames of a result: pictures, films, montages.",
     "plot": "Draw a result's ledger: energies, momentum, steps, volumes, reach.",
+    "export": "Write a dataset or a result for learners, numpy or ParaView.",
     "materials": "List laws, presets, their parameters and knobs.",
     "schema": "Print the JSON Schema of scenes, for editors.",
     "validate": "Measure speed against error on problems with known answers.",

@@ -1,0 +1,270 @@
+"""Reading a dataset: its trajectories by number, with arrays that are read when they are asked for."""
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpmcli.dataset.shard import (
+    LABELS,
+    LEDGER,
+    MOVING,
+    SPLITS,
+    TABLES,
+    group_name,
+    open_shard,
+    read_ledger,
+    shard_splits,
+)
+from mpmcli.errors import InputError
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output import Result, open_result
+from mpmcli.output.header import RunHeader
+from mpmcli.output.layout import FrameLayout
+from mpmcli.output.run_record import RECORD
+from mpmcli.output.segments import PACKED, SEGMENTS
+from mpmcli.output.series import SERIES
+
+SHARDS = "shards"
+Particles = slice | np.ndarray
+ALL = slice(None)
+
+
+class Trajectory(ABC):
+    """T frames of the same N particles. No file stays open, so it can be copied to other processes.
+
+    Attributes:
+        number: in the dataset.
+        split: "train", "valid" or "test".
+        draws: what was drawn for it, by the key of the scene.
+        header: facts about the run.
+        times: (T,) float64, s.
+        steps, frames: (T,) int64, time steps since the start, and number of each frame in its run.
+        particle_count: N.
+        field_names: names of the further arrays.
+    """
+
+    number: int
+    split: str
+    draws: dict[str, Any]
+    header: RunHeader
+    times: np.ndarray
+    steps: np.ndarray
+    frames: np.ndarray
+    particle_count: int
+    field_names: tuple[str, ...]
+
+    @property
+    def frame_count(self) -> int:
+        """T."""
+        return len(self.times)
+
+    @property
+    def position(self) -> np.ndarray:
+        """(T, N, d), m; each access reads the file."""
+        return self.read("position")
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """(T, N, d), m/s; each access reads the file."""
+        return self.read("velocity")
+
+    @property
+    def body(self) -> np.ndarray:
+        """(N,) int32, index into the bodies of the header."""
+        return self.read("body")
+
+    @property
+    def material(self) -> np.ndarray:
+        """(N,) int32, index into the laws of the header."""
+        return self.read("material")
+
+    def field(self, name: str) -> np.ndarray:
+        """Read a field, (T, N) or (T, N, ...).
+
+        Raises:
+            InputError: as `read`.
+        """
+        return self.read(name)
+
+    def read(self, name: str, frames: slice = ALL, particles: Particles = ALL) -> np.ndarray:
+        """Read some frames of some particles of an array.
+
+        Args:
+            name: "position", "velocity", a field, or, for which `frames` does not matter, "body" or "material".
+            frames: a slice with a positive step.
+            particles: a slice, or indices.
+
+        Returns:
+            (frames, particles, ...) in the type of the file; (particles,) of "body" and "material".
+
+        Raises:
+            InputError: there is no such array, or the file is missing or damaged.
+        """
+        if name not in (*MOVING, *LABELS, *self.field_names):
+            known = ", ".join(self.field_names) or "none"
+            raise InputError(f'trajectory {self.number} holds no field "{name}": its fields are {known}.')
+        array = self._read(name, frames)
+        return array[particles] if name in LABELS else array[:, particles]
+
+    def layout(self) -> FrameLayout:
+        """Return names, types and shapes of the arrays of a frame."""
+        first = slice(0, 1)
+        position, velocity = (self.read(name, first)[0] for name in MOVING)
+        fields = {name: self.read(name, first)[0] for name in self.field_names}
+        return FrameLayout.of(Frame(0, 0.0, 0, position, velocity, self.body, self.material, fields))
+
+    @property
+    @abstractmethod
+    def ledger(self) -> list[LedgerRow]:
+        """T rows; each access reads the file."""
+
+    @abstractmethod
+    def _read(self, name: str, frames: slice) -> np.ndarray:
+        """Read some frames of all particles of an array that is there."""
+
+
+class _StoredTrajectory(Trajectory):
+    """A trajectory in a shard."""
+
+    def __init__(self, shard: Path, number: int) -> None:
+        self._shard = shard
+        with open_shard(shard) as file:
+            group = file[group_name(number)]
+            self.number, self.split = number, str(group.attrs["split"])
+            self.draws = json.loads(group.attrs["draws"])
+            self.header = RunHeader.read(json.loads(group.attrs["header"]))
+            self.times, self.steps, self.frames = (group[name][:] for name in TABLES)
+            self.particle_count = group["position"].shape[1]
+            fixed = (*MOVING, *LABELS, *TABLES, LEDGER)
+            self.field_names = tuple(name for name in group if name not in fixed)
+
+    @property
+    def ledger(self) -> list[LedgerRow]:
+        with open_shard(self._shard) as file:
+            return read_ledger(file[group_name(self.number)])
+
+    def _read(self, name: str, frames: slice) -> np.ndarray:
+        with open_shard(self._shard) as file:
+            array = file[group_name(self.number)][name]
+            return array[:] if name in LABELS else array[frames]
+
+
+class _ResultTrajectory(Trajectory):
+    """The result of a single run."""
+
+    def __init__(self, result: Result) -> None:
+        counts = result.particle_counts
+        if counts.min() != counts.max():
+            raise InputError(
+                f"{result.path} has frames of {counts.min()} to {counts.max()} particles: "
+                "a trajectory has the same ones in all frames."
+            )
+        self._result = result
+        self.number, self.split, self.draws = 0, SPLITS[0], {}
+        self.header = result.header
+        self.times, self.frames = result.times, result.numbers
+        self.steps = np.cumsum([row.steps for row in result.ledger])
+        self.particle_count = int(counts[0])
+        self.field_names = result.field_names
+
+    @property
+    def ledger(self) -> list[LedgerRow]:
+        return self._result.ledger
+
+    def _read(self, name: str, frames: slice) -> np.ndarray:
+        fields = [name] if name in self.field_names else []
+
+        def array(k: int) -> np.ndarray:
+            frame = self._result.frame(k, fields)
+            return frame.fields[name] if fields else getattr(frame, name)
+
+        if name in LABELS:
+            return array(0)
+        chosen = range(self.frame_count)[frames]
+        return np.stack([array(k) for k in chosen]) if chosen else array(0)[None][:0]
+
+
+class Dataset:
+    """Trajectories by number, made by `open_dataset`; iteration yields all of them in the order of their numbers.
+
+    No file stays open, so that a Dataset can be copied to the workers of a data loader.
+
+    Attributes:
+        path: as it was opened.
+        numbers: of the trajectories, ascending.
+        splits: the numbers of each split, by "train", "valid" and "test".
+    """
+
+    def __init__(self, path: Path, splits: dict[int, str], source: dict[int, Path] | Result) -> None:
+        self.path = path
+        self.numbers = tuple(sorted(splits))
+        self.splits = {split: tuple(n for n in self.numbers if splits[n] == split) for split in SPLITS}
+        self._known = frozenset(splits)
+        self._source = source
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        return (self[number] for number in self.numbers)
+
+    def __getitem__(self, number: int) -> Trajectory:
+        """Return a trajectory; its arrays are read later.
+
+        Raises:
+            InputError: there is none with this number, or its shard is missing or damaged.
+        """
+        if number not in self._known:
+            first, last = self.numbers[0], self.numbers[-1]
+            held = f"{len(self)}, from {first} to {last}" if len(self) > 1 else f"number {first} only"
+            raise InputError(f"{self.path} has no trajectory {number}: it holds {held}.")
+        if isinstance(self._source, Result):
+            return _ResultTrajectory(self._source)
+        return _StoredTrajectory(self._source[number], number)
+
+    @cached_property
+    def dimension(self) -> int:
+        """2 or 3, that of the first trajectory."""
+        return self[self.numbers[0]].header.dimension
+
+
+def open_dataset(path: Path | str) -> Dataset:
+    """Open a dataset for reading, or the result of a single run as a dataset of one trajectory.
+
+    That trajectory has the number 0 and the split "train".
+
+    Args:
+        path: the directory of a dataset, the directory of a result, its particles.vtkhdf or its particles.pvd.
+
+    Raises:
+        InputError: nothing of the kind is there, it holds no trajectory, or a shard is damaged.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path} does not exist: give the directory of a dataset, or a result.")
+    if path.is_dir() and not (path / SHARDS).is_dir():
+        if (path / "sweep.toml").exists():
+            raise InputError(f"{path} is an empty dataset: it holds no trajectory yet.")
+        if not any((path / name).exists() for name in (PACKED, SEGMENTS, SERIES, RECORD)) and path.name != SEGMENTS:
+            raise InputError(f"{path} is not a dataset: it has no directory {SHARDS}, and it is no result either.")
+    if not (path / SHARDS).is_dir():
+        return Dataset(path, {0: SPLITS[0]}, open_result(path))
+    splits: dict[int, str] = {}
+    places: dict[int, Path] = {}
+    for shard in sorted((path / SHARDS).glob("*.h5")):
+        found = shard_splits(shard)
+        if twice := places.keys() & found.keys():
+            raise InputError(
+                f"trajectory {min(twice)} lies in {places[min(twice)]} and in {shard}: remove one of them."
+            )
+        splits |= found
+        places |= dict.fromkeys(found, shard)
+    if not splits:
+        raise InputError(f"{path} is an empty dataset: it holds no trajectory yet.")
+    return Dataset(path, splits, places)

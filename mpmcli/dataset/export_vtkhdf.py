@@ -1,0 +1,54 @@
+"""Export as results: one temporal VTKHDF file for each trajectory, as `mpmcli simulate` packs it."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpmcli.dataset.shard import LABELS, group_name
+from mpmcli.dataset.thinned import ThinnedTrajectory
+from mpmcli.output.layout import POSITION
+from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
+
+
+def check(trajectories: Sequence[ThinnedTrajectory]) -> None:
+    """Refuse nothing: each trajectory has a file of its own."""
+
+
+def size(trajectories: Sequence[ThinnedTrajectory]) -> int:
+    """Return the bytes of the files."""
+    return sum(file_size(each.layout, [each.particle_count] * each.frame_count) for each in trajectories)
+
+
+def write(
+    directory: Path, trajectories: Sequence[ThinnedTrajectory], tick: Callable[[], None]
+) -> tuple[dict[str, Any], list[str]]:
+    """Write the files, and return their part of the metadata, and notes."""
+    for each in trajectories:
+        _write_trajectory(directory / f"{group_name(each.source.number)}.vtkhdf", each)
+        tick()
+    thinned = any(
+        (e.particle_count, e.frame_count) != (e.source.particle_count, e.source.frame_count) for e in trajectories
+    )
+    note = "The headers and ledgers stay those of the whole runs: mpmcli check finds frames or particles missing."
+    return {}, [note] if thinned else []
+
+
+def _write_trajectory(path: Path, trajectory: ThinnedTrajectory) -> None:
+    n, frames, layout = trajectory.particle_count, trajectory.frame_count, trajectory.layout
+    # The same for all frames.
+    fixed = {name: trajectory.label(name) for name in LABELS} | {"id": np.arange(n, dtype=layout.arrays["id"].dtype)}
+    with VtkhdfWriter(path, layout, [n] * frames) as writer:
+        for name, array in layout.arrays.items():
+            if name in fixed:
+                for k in range(frames):
+                    writer.write_array(k, name, array.pad(fixed[name]))
+                continue
+            k = 0
+            for block in trajectory.blocks("position" if name == POSITION else name):
+                joined = block.reshape(len(block) * n, *block.shape[2:])
+                writer.write_array(k, name, array.pad(joined), frames=len(block))
+                k += len(block)
+        header = trajectory.source.header.stored
+        writer.finish(trajectory.times, trajectory.frames, trajectory.steps, trajectory.ledger(), header)

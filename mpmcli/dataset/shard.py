@@ -1,0 +1,165 @@
+"""A shard: one HDF5 file with some trajectories of a dataset, whose bytes depend on its content alone.
+
+/                     format = "mpmcli-dataset", version = 1
+/000007               number, split, draws (JSON), header (JSON, see `RunHeader`)
+/000007/position      (T, N, d) m; velocity (T, N, d) m/s; each output field (T, N) or (T, N, ...)
+/000007/body          (N,) int32; material (N,) int32, index into the laws of the header
+/000007/time          (T,) float64, s; step (T,) int64; frame (T,) int64
+/000007/ledger/mass   and every other column of the ledger, T rows
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from mpmcli.errors import InputError
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.ledger_table import COLUMNS, ledger_columns, ledger_rows
+
+FORMAT, VERSION = "mpmcli-dataset", 1
+SPLITS = ("train", "valid", "test")
+MOVING, LABELS, TABLES = ("position", "velocity"), ("body", "material"), ("time", "step", "frame")
+LEDGER = "ledger"
+# Of a compressed chunk: as much as HDF5 caches of a dataset.
+CHUNK_BYTES = 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryData:
+    """One trajectory of T frames with N particles each.
+
+    Attributes:
+        number: in the dataset, from 0.
+        split: "train", "valid" or "test".
+        draws: what was drawn for it, by the key of the scene; JSON can hold it.
+        header: `RunHeader.stored`.
+        position, velocity: (T, N, d) float32 or float64, m and m/s.
+        body, material: (N,), indices into the bodies and laws of the header.
+        time: (T,), s.
+        step, frame: (T,), time steps since the start, and number of the frame.
+        ledger: T rows.
+        fields: further arrays of `output.fields`, (T, N) or (T, N, ...), by name.
+    """
+
+    number: int
+    split: str
+    draws: Mapping[str, Any]
+    header: Mapping[str, Any]
+    position: np.ndarray
+    velocity: np.ndarray
+    body: np.ndarray
+    material: np.ndarray
+    time: np.ndarray
+    step: np.ndarray
+    frame: np.ndarray
+    ledger: Sequence[LedgerRow]
+    fields: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+def group_name(number: int) -> str:
+    """Return the name of a trajectory's group."""
+    return f"{number:06d}"
+
+
+def write_trajectory(file: h5py.File, data: TrajectoryData, *, compress: bool = False) -> None:
+    """Add a trajectory to a shard that is open for writing.
+
+    The bytes of the file depend on the trajectories and their order alone, not on when or where it is written.
+
+    Args:
+        compress: gzip-1 with shuffle, for what moves.
+
+    Raises:
+        ValueError: the split or the name of a field is not possible, shapes contradict each other, or the shard
+            holds the trajectory already.
+    """
+    if fault := _fault(data):
+        raise ValueError(f"trajectory {data.number}: {fault}")
+    file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+    # Fields keep their order.
+    group = file.create_group(group_name(data.number), track_order=True)
+    group.attrs["number"], group.attrs["split"] = data.number, data.split
+    group.attrs["draws"], group.attrs["header"] = json.dumps(dict(data.draws)), json.dumps(dict(data.header))
+    for name, array in {"position": data.position, "velocity": data.velocity, **data.fields}.items():
+        options = _storage(array) if compress and array.size else {}
+        group.create_dataset(name, data=array, track_times=False, **options)
+    tables = {name: (getattr(data, name), np.int32) for name in LABELS}
+    tables |= {"time": (data.time, np.float64), "step": (data.step, np.int64), "frame": (data.frame, np.int64)}
+    for name, (array, dtype) in tables.items():
+        group.create_dataset(name, data=np.asarray(array, dtype), track_times=False)
+    ledger = group.create_group(LEDGER)
+    for name, column in ledger_columns(data.ledger).items():
+        ledger.create_dataset(name, data=column, track_times=False)
+
+
+@contextmanager
+def open_shard(path: Path) -> Iterator[h5py.File]:
+    """Open a sealed shard for reading.
+
+    Raises:
+        InputError: it is missing, no shard, of a newer mpmcli, or damaged; also where what is read from it is.
+    """
+    if not path.exists():
+        raise InputError(f"{path} is missing: the dataset is not complete.")
+    try:
+        # A sealed shard never changes, so no lock is taken.
+        with h5py.File(path, "r", locking=False) as file:
+            if file.attrs.get("format") != FORMAT:
+                raise InputError(f"{path} is no shard of a dataset of mpmcli: its format is not {FORMAT}.")
+            if file.attrs["version"] > VERSION:
+                raise InputError(f"{path} was written by a newer version of mpmcli; update mpmcli to read it.")
+            yield file
+    # What h5py, numpy and JSON raise on a file whose content contradicts itself.
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path} is damaged: what it should hold cannot be read.") from error
+
+
+def shard_splits(path: Path) -> dict[int, str]:
+    """Return the split of each trajectory in a shard, by number.
+
+    Raises:
+        InputError: as `open_shard`.
+    """
+    with open_shard(path) as file:
+        splits = {int(group.attrs["number"]): str(group.attrs["split"]) for group in file.values()}
+        if not set(splits.values()) <= set(SPLITS):
+            raise ValueError("a split has another name")
+        return splits
+
+
+def read_ledger(group: h5py.Group) -> list[LedgerRow]:
+    """Read the ledger of a trajectory."""
+    return ledger_rows({name: group[LEDGER][name][:] for name in COLUMNS})
+
+
+def _fault(data: TrajectoryData) -> str:
+    """Return what is wrong with a trajectory, "" where nothing is."""
+    if data.split not in SPLITS:
+        return f'its split is "{data.split}", and not one of {", ".join(SPLITS)}'
+    if data.position.ndim != 3 or data.velocity.shape != data.position.shape:
+        return "position and velocity must both be (T, N, d)"
+    frames, particles = data.position.shape[:2]
+    for name, array in data.fields.items():
+        if name in (*MOVING, *LABELS, *TABLES, LEDGER) or "/" in name:
+            return f'"{name}" cannot name a field'
+        if array.shape[:2] != (frames, particles):
+            return f"{name} must be (T, N, ...) with T = {frames} and N = {particles}, not {array.shape}"
+    if any(len(getattr(data, name)) != particles for name in LABELS):
+        return f"body and material must have {particles} entries"
+    if any(len(getattr(data, name)) != frames for name in (*TABLES, LEDGER)):
+        return f"time, step, frame and ledger must have {frames} entries"
+    return ""
+
+
+def _storage(array: np.ndarray) -> dict[str, Any]:
+    row = array.itemsize * int(np.prod(array.shape[2:]))
+    particles = min(array.shape[1], max(1, CHUNK_BYTES // row))
+    frames = min(array.shape[0], max(1, CHUNK_BYTES // (row * particles)))
+    chunks = (frames, particles, *array.shape[2:])
+    return {"chunks": chunks, "compression": "gzip", "compression_opts": 1, "shuffle": True}

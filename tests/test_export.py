@@ -1,0 +1,399 @@
+"""Exports are read by readers written from the descriptions of the formats, which know nothing of mpmcli."""
+
+import json
+import os
+import shutil
+from collections import namedtuple
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from command import run_here
+from made_dataset import COUNTS, PAUSE, SPLITS, made_dataset, made_trajectory, write_dataset
+from made_result import write_made
+from test_dataset_statistics import agree, plain
+
+import mpmcli.dataset
+from mpmcli.dataset.export import FORMATS
+from mpmcli.dataset.thinned import chosen_particles, joined_row
+from mpmcli.output import open_result
+
+FORMS = tuple(FORMATS)
+FRAMES, INPUTS = 11, 6
+
+
+class LagrangeBenchReader:
+    """What LagrangeBench's H5Dataset does: windows of inputs and one target to train, whole chunks to validate."""
+
+    def __init__(self, directory: Path, split: str, extra: int = 0) -> None:
+        self.metadata = json.loads((directory / "metadata.json").read_text())
+        self.split, self.path = split, directory / f"{split}.h5"
+        with h5py.File(self.path) as file:
+            self.keys = list(file)
+            self.length = file["00000/position"].shape[0]
+        self.window = INPUTS + extra + (1 if split == "train" else 0)
+        self.per_trajectory = self.length - self.window + 1 if split == "train" else self.length // self.window
+
+    def __len__(self) -> int:
+        return self.per_trajectory * len(self.keys)
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        k, place = divmod(index, self.per_trajectory)
+        first = place if self.split == "train" else place * self.window
+        with h5py.File(self.path) as file:
+            group = file[self.keys[k]]
+            position = group["position"][first : first + self.window].transpose(1, 0, 2)
+            kind = group["particle_type"][:]
+        padding = self.metadata["num_particles_max"] - len(position)
+        position = np.pad(position, ((0, padding), (0, 0), (0, 0)))
+        return position, np.pad(kind, (0, padding), constant_values=-1)
+
+
+class GnsReader:
+    """What the SamplesDataset of GNS does, with the shape (N, m) for several properties."""
+
+    def __init__(self, path: Path) -> None:
+        with np.load(path, allow_pickle=True) as file:
+            self.data = file["gns_data"] if "gns_data" in file else [item for _, item in file.items()]
+        self.with_property = len(self.data[0]) >= 3
+        self.ends = np.cumsum([entry[0].shape[0] - INPUTS for entry in self.data])
+
+    def __len__(self) -> int:
+        return int(self.ends[-1])
+
+    def __getitem__(self, index: int) -> tuple[tuple, np.ndarray]:
+        k = int(np.searchsorted(self.ends - 1, index, side="left"))
+        time = INPUTS + index - (int(self.ends[k - 1]) if k else 0)
+        entry = self.data[k]
+        position = np.transpose(entry[0][time - INPUTS : time], (1, 0, 2))
+        n = len(position)
+        kind = np.full(n, entry[1], dtype=int)
+        shape = (n,) if not self.with_property or entry[2].ndim == 1 else entry[2].shape
+        properties = (np.full(shape, entry[2], dtype=float),) if self.with_property else ()
+        return (position, kind, *properties, n), entry[0][time]
+
+
+def exported(path: Path, form: str, target: Path, *options: object) -> dict:
+    """Export by the command line, and return its answer as JSON."""
+    outcome = run_here("export", path, "--to", form, "-o", target, "--json", *options)
+    assert outcome.status == 0, outcome.stderr
+    answer = json.loads(outcome.stdout)
+    assert sorted(answer["files"]) == sorted(os.listdir(target))
+    assert sorted(os.listdir(target.parent)) == sorted({path.name, target.name}), "something temporary was left"
+    for note in answer["notes"]:
+        assert f"note: {note}" in outcome.stderr
+    return answer
+
+
+def metadata_of(directory: Path) -> dict:
+    return json.loads((directory / "metadata.json").read_text())
+
+
+def positions(path: Path, split: str, stride: int = 1) -> list[np.ndarray]:
+    dataset = mpmcli.dataset.open(path)
+    return [dataset[number].position[::stride] for number in dataset.splits[split]]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_lagrangebench_reads_windows_and_chunks(tmp_path, dimension):
+    path = made_dataset(tmp_path / "set", dimension=dimension)
+    exported(path, "lagrangebench", tmp_path / "out")
+    reader = LagrangeBenchReader(tmp_path / "out", "train")
+    assert reader.keys == ["00000", "00001"] and len(reader) == 2 * (FRAMES - INPUTS)
+    sample, kind = reader[6]
+    assert sample.shape == (max(COUNTS), INPUTS + 1, dimension) and sample.dtype == np.float32
+    written = positions(path, "train")[1]
+    np.testing.assert_array_equal(sample[: COUNTS[1]], written[1 : 1 + INPUTS + 1].transpose(1, 0, 2))
+    # Fluid is 0; the other law has a type that NodeType leaves free.
+    body = mpmcli.dataset.open(path)[1].body
+    np.testing.assert_array_equal(kind[: COUNTS[1]], np.where(body == 0, 0, 4))
+    assert (kind[COUNTS[1] :] == -1).all()
+    for split in ("valid", "test"):
+        chunk, _ = LagrangeBenchReader(tmp_path / "out", split, extra=2)[0]
+        assert chunk.shape == (max(COUNTS), INPUTS + 2, dimension)
+
+
+@pytest.mark.parametrize("form", ["lagrangebench", "gns"])
+@pytest.mark.parametrize("stride", [1, 3])
+def test_metadata_of_learners(tmp_path, form, stride):
+    path = made_dataset(tmp_path / "set", dimension=2)
+    exported(path, form, tmp_path / "out", "--stride", stride)
+    metadata = metadata_of(tmp_path / "out")
+    frames = len(range(0, FRAMES, stride))
+    if form == "gns":
+        assert metadata["sequence_length"] == frames
+        # 5 velocities, distances to 4 walls, 16 numbers of the type.
+        assert (metadata["nnode_in"], metadata["nedge_in"], metadata["material_feature_len"]) == (30, 3, 0)
+        assert metadata["particle_types"] == {"fluid": 5, "sand": 6}
+    else:
+        assert metadata["sequence_length_train"] == metadata["sequence_length_test"] == frames - 1
+        assert metadata["periodic_boundary_conditions"] == [False] * 3
+        assert metadata["particle_types"] == {"fluid": 0, "sand": 4}
+    assert metadata["bounds"] == [[0.0, 1.0], [0.0, 1.0]] and metadata["dim"] == 2
+    assert metadata["dt"] * metadata["write_every"] == pytest.approx(PAUSE * stride, rel=1e-12)
+    # Four particles in a cell of 0.05 m are 0.025 m apart.
+    assert (metadata["cell_size"], metadata["dx"]) == (0.05, 0.025)
+    assert metadata["default_connectivity_radius"] == pytest.approx(1.5 * 0.025)
+    assert metadata["num_particles_max"] == max(COUNTS) and metadata["num_frames"] == frames
+    assert [metadata[f"num_trajs_{split}"] for split in ("train", "valid", "test")] == [2, 1, 1]
+    assert metadata["trajectories"] == {"train": [0, 1], "valid": [2], "test": [3]}
+    found = {name: np.array(metadata[name]) for name in ("vel_mean", "vel_std", "acc_mean", "acc_std")}
+    agree(namedtuple("Found", found)(**found), plain(positions(path, "train", stride)))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_gns_reads_samples_of_equal_materials(tmp_path, dimension):
+    path = made_dataset(tmp_path / "set", dimension=dimension)
+    exported(path, "gns", tmp_path / "out")
+    reader = GnsReader(tmp_path / "out" / "train.npz")
+    assert len(reader) == 2 * (FRAMES - INPUTS) and not reader.with_property
+    (sample, kind, n), label = reader[FRAMES - INPUTS + 1]
+    written = positions(path, "train")[1]
+    assert n == COUNTS[1] and sample.dtype == np.float32 and sample.shape == (n, INPUTS, dimension)
+    np.testing.assert_array_equal(sample, written[1 : 1 + INPUTS].transpose(1, 0, 2))
+    np.testing.assert_array_equal(label, written[1 + INPUTS])
+    np.testing.assert_array_equal(kind, np.where(mpmcli.dataset.open(path)[1].body == 0, 5, 6))
+
+
+def test_gns_has_one_property_where_one_parameter_differs(tmp_path):
+    made = [made_trajectory(k, viscosity=0.5 * k, split=split) for k, split in enumerate(SPLITS)]
+    exported(write_dataset(tmp_path / "set", made), "gns", tmp_path / "out")
+    metadata = metadata_of(tmp_path / "out")
+    assert metadata["material_feature_names"] == ["viscosity"] and metadata["nnode_in"] == 31
+    assert (metadata["material_feature_min"], metadata["material_feature_max"]) == ([0.0], [1.5])
+    (_, _, properties, n), _ = GnsReader(tmp_path / "out" / "train.npz")[FRAMES - INPUTS]
+    assert properties.shape == (n,)
+    # Sand has no viscosity.
+    np.testing.assert_array_equal(properties, np.where(made[1].body == 0, 0.5, 0.0))
+
+
+def test_gns_has_several_properties_where_several_parameters_differ(tmp_path):
+    made = [made_trajectory(k, viscosity=0.5 * k, density=1500.0 + k) for k in range(2)]
+    answer = exported(write_dataset(tmp_path / "set", made), "gns", tmp_path / "out")
+    assert metadata_of(tmp_path / "out")["material_feature_names"] == ["density", "viscosity"]
+    assert any("np.full" in note for note in answer["notes"])
+    (_, _, properties, _), _ = GnsReader(tmp_path / "out" / "train.npz")[FRAMES - INPUTS]
+    expected = np.array([[1000.0, 0.5], [1501.0, 0.0]])
+    np.testing.assert_array_equal(properties, expected[made[1].body])
+
+
+@pytest.mark.parametrize("form", ["lagrangebench", "gns"])
+def test_an_empty_split_is_left_out_and_said(tmp_path, form):
+    path = write_dataset(tmp_path / "set", [made_trajectory(k, split="train") for k in range(2)])
+    answer = exported(path, form, tmp_path / "out")
+    end = "h5" if form == "lagrangebench" else "npz"
+    assert answer["files"] == ["metadata.json", f"train.{end}"]
+    assert [note for note in answer["notes"] if f"valid.{end} is left out" in note]
+    assert answer["trajectories"] == {"train": 2, "valid": 0, "test": 0}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_npz_holds_all_arrays_as_they_are(tmp_path, dtype):
+    path = made_dataset(tmp_path / "set", dtype=dtype)
+    exported(path, "npz", tmp_path / "out", "--stride", 2)
+    source = mpmcli.dataset.open(path)[2]
+    with np.load(tmp_path / "out" / "000002.npz", allow_pickle=False) as file:
+        for name in ("position", "velocity", "pressure", "deformation_gradient"):
+            np.testing.assert_array_equal(file[name], source.read(name, slice(None, None, 2)))
+            assert file[name].dtype == dtype
+        np.testing.assert_array_equal(file["body"], source.body)
+        np.testing.assert_array_equal(file["material"], source.material)
+        np.testing.assert_array_equal(file["time"], source.times[::2])
+        np.testing.assert_array_equal(file["step"], source.steps[::2])
+        assert file["frame"].tolist() == list(range(0, FRAMES, 2))
+    metadata = metadata_of(tmp_path / "out")
+    assert metadata["draws"]["000002"] == source.draws and metadata["laws"]["000002"] == ["fluid", "sand"]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_vtkhdf_of_a_result_has_the_bytes_that_simulate_packs(tmp_path, dimension):
+    path = write_made(tmp_path / "run", dimension=dimension)
+    exported(path, "vtkhdf", tmp_path / "out")
+    assert (tmp_path / "out" / "000000.vtkhdf").read_bytes() == (path / "particles.vtkhdf").read_bytes()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_vtkhdf_of_a_dataset_opens_as_a_result(tmp_path, dimension):
+    path = made_dataset(tmp_path / "set", dimension=dimension)
+    answer = exported(path, "vtkhdf", tmp_path / "out", "--trajectory", 2)
+    assert answer["files"] == ["000002.vtkhdf", "metadata.json"]
+    source, result = mpmcli.dataset.open(path)[2], open_result(tmp_path / "out" / "000002.vtkhdf")
+    assert result.ledger == source.ledger and result.header.stored == source.header.stored
+    assert result.field_names == source.field_names and result.times.tolist() == source.times.tolist()
+    for k, frame in enumerate(result.frames()):
+        np.testing.assert_array_equal(frame.position, source.position[k])
+        np.testing.assert_array_equal(frame.velocity, source.velocity[k])
+        np.testing.assert_array_equal(frame.body, source.body)
+        np.testing.assert_array_equal(frame.fields["deformation_gradient"], source.field("deformation_gradient")[k])
+        assert (frame.index, frame.step) == (k, source.steps[k])
+    # And as a dataset again.
+    np.testing.assert_array_equal(mpmcli.dataset.open(result.path)[0].position, source.position)
+
+
+def test_ledgers_of_left_out_frames_are_joined(tmp_path):
+    path = made_dataset(tmp_path / "set")
+    exported(path, "vtkhdf", tmp_path / "out", "--stride", 4)
+    rows, found = mpmcli.dataset.open(path)[0].ledger, open_result(tmp_path / "out" / "000000.vtkhdf").ledger
+    assert len(found) == 3 and found[0] == rows[0]
+    assert found[1].steps == sum(row.steps for row in rows[1:5]) and found[1].mass == rows[4].mass
+    assert found[1].step_min == min(row.step_min for row in rows[1:5])
+    assert found[1].step_max == max(row.step_max for row in rows[1:5])
+    assert found[2] == joined_row(rows[5:9])
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_fewer_particles_are_the_same_ones_in_every_format_and_frame(tmp_path, form):
+    path = made_dataset(tmp_path / "set")
+    exported(path, form, tmp_path / "out", "--max-particles", 24)
+    source = mpmcli.dataset.open(path)[0]
+    # Number 0 has 30 particles, a third of them of the second body.
+    chosen = chosen_particles(source.body, 24, 0)
+    assert len(set(chosen)) == 24 and np.bincount(source.body[chosen]).tolist() == [16, 8]
+    expected = source.read("position", particles=chosen)
+    if form == "lagrangebench":
+        with h5py.File(tmp_path / "out" / "train.h5") as file:
+            found = file["00000/position"][:]
+    elif form == "gns":
+        found = GnsReader(tmp_path / "out" / "train.npz").data[0][0]
+    elif form == "npz":
+        found = np.load(tmp_path / "out" / "000000.npz")["position"]
+    else:
+        found = np.stack([f.position for f in open_result(tmp_path / "out" / "000000.vtkhdf").frames()])
+    np.testing.assert_array_equal(found, expected)
+    metadata = metadata_of(tmp_path / "out")
+    assert metadata["num_particles_max"] == 24 and metadata["particle_seed"] == 0
+    # The largest trajectory had 36 particles: 24 of them are as far apart as on a lattice with 2/3 of its points.
+    assert metadata["dx"] == pytest.approx(0.025 * (36 / 24) ** 0.5)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_same_export_has_the_same_bytes(tmp_path, form):
+    path = made_dataset(tmp_path / "set")
+    files = []
+    for name in ("a", "b"):
+        assert run_here("export", path, "--to", form, "-o", tmp_path / name, "-q").status == 0
+        files.append({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()})
+    assert files[0] == files[1]
+
+
+def test_an_earlier_export_is_replaced_only_when_asked(tmp_path):
+    path, target = made_dataset(tmp_path / "set"), tmp_path / "out"
+    exported(path, "npz", target)
+    assert "--overwrite" in refused(path, "gns", target)
+    assert sorted(exported(path, "gns", target, "--overwrite")["files"]) == [
+        "metadata.json",
+        "test.npz",
+        "train.npz",
+        "valid.npz",
+    ]
+    (target / "notes.txt").write_text("mine")
+    assert "it holds notes.txt" in refused(path, "gns", target, "--overwrite")
+
+
+def refused(path: Path, form: str, target: Path, *options: object) -> str:
+    """Return the sentence with which an export is refused, which changes nothing."""
+    before = everything(target.parent)
+    outcome = run_here("export", path, "--to", form, "-o", target, *options)
+    assert outcome.status == 2 and outcome.stdout == "", outcome
+    assert everything(target.parent) == before
+    assert len(outcome.stderr.splitlines()) == 1 and outcome.stderr.startswith("error: ")
+    return outcome.stderr
+
+
+def everything(directory: Path) -> dict[str, bytes | None]:
+    return {str(p): p.read_bytes() if p.is_file() else None for p in directory.rglob("*")}
+
+
+def test_bad_input_is_refused_with_a_sentence(tmp_path, monkeypatch):
+    path, target = made_dataset(tmp_path / "set"), tmp_path / "deep" / "out"
+    assert "does not exist" in refused(tmp_path / "none", "npz", target)
+    assert "has no trajectory 9" in refused(path, "npz", target, "--trajectory", 9)
+    assert "take a smaller --stride" in refused(path, "gns", target, "--stride", 9)
+    assert "not an earlier export" in refused(path, "gns", path, "--overwrite")
+    assert "'--to'" in refused(path, "csv", target)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    monkeypatch.chdir(empty)
+    assert "present directory" in refused(path, "gns", Path("."))
+
+
+@pytest.mark.parametrize("form", ["lagrangebench", "gns"])
+def test_trajectories_that_differ_are_no_set_for_learners(tmp_path, form):
+    different = {
+        "frames": write_dataset(tmp_path / "frames", [made_trajectory(0), made_trajectory(1, frames=9)]),
+        "time": write_dataset(tmp_path / "time", [made_trajectory(0), made_trajectory(1, pause=0.02)]),
+        "dimension": write_dataset(tmp_path / "dim", [made_trajectory(0), made_trajectory(1, dimension=3)]),
+    }
+    out = tmp_path / "out"
+    assert "trajectory 1 has 9 frames and trajectory 0 11" in refused(different["frames"], form, out)
+    assert "trajectory 1 has frames that are not 0.01 s apart" in refused(different["time"], form, out)
+    assert "trajectory 1 is 3D" in refused(different["dimension"], form, out)
+    # Each alone is one.
+    assert run_here("export", different["frames"], "--to", form, "-o", out, "--trajectory", 1).status == 0
+
+
+def test_a_full_disk_is_found_before_anything_is_written(tmp_path, monkeypatch):
+    path = made_dataset(tmp_path / "set")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: namedtuple("Usage", "free")(1000))
+    outcome = run_here("export", path, "--to", "npz", "-o", tmp_path / "out")
+    assert outcome.status == 1 and "nothing was written" in outcome.stderr
+    assert os.listdir(tmp_path) == ["set"]
+
+
+def test_an_export_that_breaks_off_leaves_nothing(tmp_path):
+    """A damaged shard is found when its turn comes; the earlier export stays."""
+    path, target = made_dataset(tmp_path / "set"), tmp_path / "new" / "out"
+    with h5py.File(path / "shards" / "00001.h5", "a") as file:
+        del file["000003/velocity"]
+    outcome = run_here("export", path, "--to", "npz", "-o", target)
+    assert outcome.status == 2 and "00001.h5 is damaged" in outcome.stderr
+    assert os.listdir(tmp_path) == ["set"]
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+def test_an_interrupted_export_leaves_what_was_there(tmp_path, monkeypatch, earlier):
+    path, target = made_dataset(tmp_path / "set"), tmp_path / "new" / "out"
+    if earlier:
+        assert run_here("export", path, "--to", "gns", "-o", target).status == 0
+    before = everything(tmp_path)
+    monkeypatch.setattr("mpmcli.cli.export.interrupt_came", lambda: True)
+    assert run_here("export", path, "--to", "npz", "-o", target, "--overwrite").status == 130
+    assert everything(tmp_path) == before
+
+
+def test_the_answer_is_a_line_on_stdout(tmp_path):
+    outcome = run_here("export", made_dataset(tmp_path / "set"), "--to", "npz", "-o", tmp_path / "out")
+    assert outcome.stdout.startswith(
+        f"{tmp_path / 'out'}: 4 trajectories (train 2, valid 1, test 1) of up to 11 frames"
+    )
+    assert run_here("export", tmp_path / "set", "--to", "npz", "-o", tmp_path / "q", "-q").stdout == ""
+
+
+def test_a_law_keeps_its_type_whatever_the_others_are(tmp_path):
+    """Nine types hold all laws of mpmcli and one more for GNS, and all but one for LagrangeBench."""
+    for form, taken in (("gns", {3}), ("lagrangebench", {1, 2, 3})):
+        module = FORMATS[form]
+        free = set(range(9)) - taken
+        assert set(module.USUAL.values()) <= free and set(module.FREE) <= free
+        assert len(set(module.USUAL.values())) == len(module.USUAL)
+    for materials, types in {
+        ("neo_hookean", "sand"): {"neo_hookean": 8, "sand": 4},
+        ("fixed_corotated", "neo_hookean"): {"fixed_corotated": 8, "neo_hookean": 7},
+    }.items():
+        made = made_trajectory(0)
+        header = {**made.header, "materials": list(materials)}
+        path = write_dataset(tmp_path / "-".join(materials), [replace(made, header=header)])
+        target = tmp_path / "out"
+        run_here("export", path, "--to", "lagrangebench", "-o", target, "--overwrite")
+        assert metadata_of(target)["particle_types"] == types
+
+
+def test_too_many_laws_are_refused(tmp_path):
+    made = made_trajectory(0)
+    names = [f"law_{k}" for k in range(9)]
+    header = {**made.header, "materials": names, "laws": [made.header["laws"][0]] * 9}
+    path = write_dataset(tmp_path / "set", [replace(made, header=header)])
+    assert "GNS has no particle type left for law_6" in refused(path, "gns", tmp_path / "out")
+    assert "LagrangeBench has no particle type left for law_5" in refused(path, "lagrangebench", tmp_path / "out")
