@@ -17,8 +17,17 @@ def text_table(head: tuple[str, ...], rows: list[tuple[str, ...]], left: set[int
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number and its noun, such as "1 frame" or "2 frames"."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"
+    """Return a number and its noun, such as "1 frame", "2 frames" or "2 trajectories"."""
+    if count == 1:
+        return f"{count} {noun}"
+    return f"{count} {noun[:-1]}ies" if noun.endswith("y") else f"{count} {noun}s"
+
+
+def duration_text(seconds: float) -> str:
+    """Write a time in the unit that suits it, such as "40 s", "12 min" or "3.5 h"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"
 
 
 def one_line(text: str) -> str:

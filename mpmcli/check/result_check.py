@@ -1,5 +1,6 @@
 """`mpmcli check RESULT`: whether a run stayed stable and its frames are complete."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -8,12 +9,14 @@ import numpy as np
 
 from mpmcli.check.finding import Finding, FrameFindings, passes
 from mpmcli.check.result_agreement import AgreementCheck
-from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, arrays_of, open_entries
+from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, arrays_of, kept_entries, open_entries
 from mpmcli.check.result_ledger import check_ledger
 from mpmcli.check.result_motion import MomentumCheck, MotionCheck
 from mpmcli.check.result_order import check_order, frames_expected
 from mpmcli.check.result_state import StateCheck
 from mpmcli.errors import InputError
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.header import RunHeader
 from mpmcli.output.segments import PACKED
 from mpmcli.plain_json import finite_json
@@ -42,7 +45,7 @@ class ResultCheck:
 
     Attributes:
         path: file or directory read.
-        kind: "packed", "segments", "series", or "none" if nothing can be read.
+        kind: "packed", "segments", "series", "memory", or "none" if nothing can be read.
         status: status of the run in its record, "unknown" without one.
         findings: by decreasing severity.
         first_bad_frame: number of the first frame with an error or a warning, or None.
@@ -125,14 +128,28 @@ def check_result(path: Path) -> ResultCheck:
     """
     findings = FrameFindings()
     opened = open_entries(path, findings)
+    check = _check(opened, findings)
+    if opened.kind == "segments" and (opened.path / PACKED).exists():
+        # The run ended during the check, and has packed its frames.
+        return check_result(opened.path)
+    return check
+
+
+def check_kept(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[LedgerRow]) -> ResultCheck:
+    """Check a finished run in memory, as `check_result` checks its files.
+
+    Args:
+        frames, ledger: all of the run.
+    """
+    return _check(kept_entries(header, frames, ledger), FrameFindings())
+
+
+def _check(opened: OpenedResult, findings: FrameFindings) -> ResultCheck:
     header = opened.header
     check_order(opened, header, findings)
     figures = check_ledger(opened.entries, header, findings)
     if opened.entries:
         figures |= _check_frames(opened, header, findings)
-    if opened.kind == "segments" and (opened.path / PACKED).exists():
-        # The run ended during the check, and has packed its frames.
-        return check_result(opened.path)
     found = findings.found()
     bad = [f.frame for f in found if f.severity != "note" and f.frame is not None]
     first_bad = min(bad, default=None)

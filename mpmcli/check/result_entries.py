@@ -1,5 +1,6 @@
 """Opens a result that may be damaged: the frames that can be read, and findings for the others."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ class Entry:
         time: time listed in the file, s.
         row: row of the ledger.
         count: number of particles listed in the file.
-        result: result that holds the frame.
+        result: result that holds the frame, None where it is in memory.
         k: index of the frame in `result`.
     """
 
@@ -41,7 +42,7 @@ class Entry:
     time: float
     row: LedgerRow
     count: int
-    result: Result
+    result: Result | None
     k: int
 
     def read(self) -> tuple[Frame, np.ndarray]:
@@ -64,12 +65,26 @@ class Entry:
 
 
 @dataclass(frozen=True)
+class KeptEntry(Entry):
+    """A frame in memory, all of which is known.
+
+    Attributes:
+        frame: the frame.
+    """
+
+    frame: Frame
+
+    def read(self) -> tuple[Frame, np.ndarray]:
+        return self.frame, np.arange(self.count, dtype=np.int32)
+
+
+@dataclass(frozen=True)
 class OpenedResult:
     """The readable part of a result.
 
     Attributes:
         path: file or directory read.
-        kind: "packed", "segments", "series", or "none" if nothing can be read.
+        kind: "packed", "segments", "series", "memory", or "none" if nothing can be read.
         header: header of the run.
         record: content of run.json, or None.
         entries: frames in the order of the files.
@@ -86,6 +101,15 @@ def arrays_of(frame: Frame, ids: np.ndarray) -> dict[str, np.ndarray]:
     """Return all arrays of a frame by name."""
     standard = {name: getattr(frame, name) for name in ("position", "velocity", "body", "material")}
     return {"id": ids, **standard, **frame.fields}
+
+
+def kept_entries(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[LedgerRow]) -> OpenedResult:
+    """Return the frames of a run in memory that has finished, with the rows of its ledger."""
+    entries = [
+        KeptEntry(frame.index, frame.index, frame.time, row, len(frame.position), None, k, frame)
+        for k, (frame, row) in enumerate(zip(frames, ledger, strict=True))
+    ]
+    return OpenedResult(Path(), "memory", header, {"status": "finished"}, entries)
 
 
 def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:

@@ -17,6 +17,8 @@ from mpmcli.errors import MpmcliError
 COMMANDS = {
     "simulate": "Run a scene and store its particles.",
     "check": "Say which step is safe and why, or whether a result stayed stable.",
+    "sweep": "Compute a dataset of many varied runs.",
+    "dataset": "Count, verify and merge datasets.",
     "info": "Say what a result or a scene holds.",
     "render": "Draw frames of a result: pictures, films, montages.",
     "plot": "Draw a result's ledger: energies, momentum, steps, volumes, reach.",

@@ -12,6 +12,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,22 @@ def shard_splits(path: Path) -> dict[int, str]:
         if not set(splits.values()) <= set(SPLITS):
             raise ValueError("a split has another name")
         return splits
+
+
+def checksum(group: h5py.Group) -> str:
+    """Return a BLAKE2b hash, hexadecimal, of all that a trajectory's group holds, compressed or not."""
+    total = blake2b(digest_size=16)
+    for name in sorted(group.attrs):
+        total.update(f"{name} = {group.attrs[name]}\n".encode())
+
+    def add(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset):
+            array = item[...]
+            total.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+            total.update(np.ascontiguousarray(array).data)
+
+    group.visititems(add)
+    return total.hexdigest()
 
 
 def read_ledger(group: h5py.Group) -> list[LedgerRow]:

@@ -2,10 +2,11 @@
 
 import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path as File
+from types import MappingProxyType
 from typing import Any
 
 from pydantic import ValidationError
@@ -60,8 +61,8 @@ def load_scene(path: str | PathLike[str], overrides: Sequence[str] = (), *, laws
     Raises:
         InputError: one line per fault: `FILE:LINE: KEY PATH: what is wrong and what would be right`.
     """
-    text = _read(File(path))
-    return parse_scene(_parse(text, str(path)), laws=laws, source=str(path), text=text, overrides=overrides)
+    text, data = read_toml(path)
+    return parse_scene(data, laws=laws, source=str(path), text=text, overrides=overrides)
 
 
 def parse_scene(
@@ -87,10 +88,13 @@ def parse_scene(
     data, overridden = apply_overrides(data, overrides)
     scene, problems, notes = _validate(data, laws)
     if problems or scene is None:
-        lines = key_lines(text)
-        problems.sort(key=lambda p: line_of(p.path, lines) or 0)
-        raise InputError("\n".join(_report(p, source, lines, overridden) for p in problems))
+        raise InputError(report(problems, source, text, overridden))
     return _resolve(scene, notes, source)
+
+
+def scene_problems(data: dict[str, Any], laws: Laws) -> list[Problem]:
+    """Return everything for which `parse_scene` would refuse parsed TOML."""
+    return _validate(data, laws)[1]
 
 
 def _validate(data: dict[str, Any], laws: Laws) -> tuple[Scene | None, list[Problem], dict[int, list[str]]]:
@@ -134,7 +138,23 @@ def _resolve(scene: Scene, knobs: dict[int, list[str]], source: str) -> LoadedSc
     return LoadedScene(scene.model_copy(update={"bodies": tuple(bodies)}), tuple(notes), source)
 
 
-def _report(problem: Problem, source: str, lines: dict[Path, int], overridden: dict[Path, str]) -> str:
+def report(
+    problems: list[Problem], source: str, text: str, overridden: Mapping[Path, str] = MappingProxyType({})
+) -> str:
+    """Write problems line by line, in the order of the file that they are in.
+
+    Args:
+        problems: what is wrong.
+        source: the file as it was given, or what to call it.
+        text: its TOML text, for line numbers.
+        overridden: texts of the overrides by the paths that they set.
+    """
+    lines = key_lines(text)
+    ordered = sorted(problems, key=lambda p: line_of(p.path, lines) or 0)
+    return "\n".join(_line(p, source, lines, overridden) for p in ordered)
+
+
+def _line(problem: Problem, source: str, lines: dict[Path, int], overridden: Mapping[Path, str]) -> str:
     """Write a problem with its place: the override that made it, or the file and its line."""
     for end in range(len(problem.path), 0, -1):
         if problem.path[:end] in overridden:
@@ -146,20 +166,34 @@ def _report(problem: Problem, source: str, lines: dict[Path, int], overridden: d
     return ": ".join(filter(None, [place, path_text(problem.path), problem.sentence]))
 
 
-def _read(file: File) -> str:
+def read_toml(path: str | PathLike[str], kind: str = "scene") -> tuple[str, dict[str, Any]]:
+    """Return the text of a TOML file, and what it holds.
+
+    Args:
+        path: the file.
+        kind: what the file describes, one word, for errors.
+
+    Raises:
+        InputError: the file cannot be read, or is not valid TOML.
+    """
+    text = _read(File(path), kind)
+    return text, _parse(text, str(path))
+
+
+def _read(file: File, kind: str) -> str:
     try:
         # utf-8-sig: some editors begin a file with a byte order mark.
         return file.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file; give the path of a scene in TOML") from None
+        raise InputError(f"{file}: there is no such file; give the path of a {kind} in TOML") from None
     except IsADirectoryError:
-        inside = file / "scene.toml"
-        hint = f"did you mean {inside}?" if inside.is_file() else "give the path of a scene in TOML"
+        inside = file / f"{kind}.toml"
+        hint = f"did you mean {inside}?" if inside.is_file() else f"give the path of a {kind} in TOML"
         raise InputError(f"{file}: this is a directory; {hint}") from None
     except UnicodeDecodeError as error:
         raise InputError(
             f"{file}: this is no text in UTF-8 (byte {error.start} is {error.object[error.start]:#04x}); "
-            "give a scene in TOML"
+            f"give a {kind} in TOML"
         ) from None
     except OSError as error:
         raise InputError(f"{file}: the file cannot be read: {error.strerror}") from None

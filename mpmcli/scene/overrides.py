@@ -32,7 +32,7 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> tuple[dic
     for override in overrides:
         try:
             path, value = _split(override)
-            placed[_place(data, path, value)] = f"--set {override}"
+            placed[set_value(data, path, value)] = f"--set {override}"
         except InputError as fault:
             faults.append(f"--set {override}: {fault}")
     if faults:
@@ -45,9 +45,18 @@ def _split(override: str) -> tuple[list[str], object]:
     key, text = key.strip(), text.strip()
     if not equals:
         raise InputError("an override is KEY=VALUE, for example time.end=0.5; the = is missing")
+    return key_parts(key), _value(text)
+
+
+def key_parts(key: str) -> list[str]:
+    """Return the parts of a key as `apply_overrides` takes it; indices stay text.
+
+    Raises:
+        InputError: this is no path of keys; a sentence without a place.
+    """
     if not _PATH.fullmatch(key):
         raise InputError(f'"{key}" is no key; a key is a path such as time.end or bodies[0].velocity')
-    return [index or name.strip() for index, name in _PART.findall(key)], _value(text)
+    return [index or name.strip() for index, name in _PART.findall(key)]
 
 
 def _value(text: str) -> object:
@@ -61,8 +70,17 @@ def _value(text: str) -> object:
     raise InputError(f"{text or 'nothing'} is no TOML value; write a number, a list or a word, or text in quotes")
 
 
-def _place(data: dict[str, Any], parts: list[str], value: object) -> Path:
-    """Set the value, make the tables on the way to it, and return its path."""
+def set_value(data: dict[str, Any], parts: list[str], value: object) -> Path:
+    """Set one value of parsed TOML in place, with the tables on the way to it, and return its path.
+
+    Args:
+        data: parsed TOML, which is changed.
+        parts: what `key_parts` returns.
+        value: the new value.
+
+    Raises:
+        InputError: the parts lead nowhere; a sentence without a place.
+    """
     at: Any = data
     path: Path = ()
     for position, part in enumerate(parts):

@@ -56,8 +56,7 @@ def choose_engine(
     """
     backend = choose_backend(arch, threads, scene.solver.precision, compile_cache=compile_cache)
     particles = estimate_particles(scene)
-    few = particles < FEW_PARTICLES[scene.dimension]
-    if not (backend.on_cpu and few and threads in (None, 1)):
+    if not _is_small(scene, particles, backend) or threads not in (None, 1):
         return backend, False
     batched = can_batch(scene)
     optimisation = "all"
@@ -67,6 +66,15 @@ def choose_engine(
     return choose_backend(
         "cpu", 1, scene.solver.precision, compile_cache=compile_cache, optimisation=optimisation
     ), batched
+
+
+def suits_batch(scene: Scene, particles: int, backend: Backend) -> bool:
+    """Return whether a batch can run a scene of so many particles, and faster than a `Solver`."""
+    return _is_small(scene, particles, backend) and can_batch(scene)
+
+
+def _is_small(scene: Scene, particles: int, backend: Backend) -> bool:
+    return backend.on_cpu and particles < FEW_PARTICLES[scene.dimension]
 
 
 def build_engine(scene: Scene, backend: Backend, *, batched: bool, force: bool = False) -> Engine:

@@ -1,0 +1,127 @@
+"""Sends tasks to the workers of a Dask cluster, its own or one that runs already."""
+
+import queue
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+
+from mpmcli.dataset.compute import Task, compute
+from mpmcli.dataset.manifest import Row
+from mpmcli.errors import InputError, RunError
+
+# Tasks under way for each worker: one to compute, and one that waits for it.
+AHEAD = 2
+# Workers that a task may lose before it counts as failed.
+LOSSES = 5
+# Seconds between looks at `stop`.
+PATIENCE = 0.2
+
+Outcome = tuple[Task, list[Row] | None]
+
+
+class Workers:
+    """Workers that compute tasks, as `local_workers` and `joined_workers` give them.
+
+    Attributes:
+        count: number of workers.
+    """
+
+    def __init__(self, client: object) -> None:
+        self._client = client
+        self.count = len(client.scheduler_info(n_workers=-1)["workers"])
+
+    def outcomes(self, tasks: Iterable[Task], stop: Callable[[], bool]) -> Iterator[Outcome]:
+        """Yield each task with its rows as it ends; with None where every worker that took it was lost.
+
+        Raises:
+            RunError: a file could not be written, or the cluster is gone.
+            KeyboardInterrupt: `stop` returned True; what is under way is abandoned.
+        """
+        from distributed import Future
+        from distributed.scheduler import KilledWorker
+
+        ended: queue.Queue[tuple[Task, Future]] = queue.Queue()
+        waiting = iter(tasks)
+        under_way = 0
+
+        def send() -> bool:
+            task = next(waiting, None)
+            if task is None:
+                return False
+            future = self._client.submit(compute, task, pure=False, retries=0)
+            future.add_done_callback(lambda done, task=task: ended.put((task, done)))
+            return True
+
+        while under_way < AHEAD * self.count and send():
+            under_way += 1
+        while under_way:
+            if stop():
+                raise KeyboardInterrupt
+            try:
+                task, future = ended.get(timeout=PATIENCE)
+            except queue.Empty:
+                continue
+            if not send():
+                under_way -= 1
+            if future.status == "cancelled":
+                raise RunError("the cluster has ended; the trajectories that are done are kept, and --resume goes on.")
+            error = future.exception()
+            if error is None:
+                yield task, future.result()
+            elif not isinstance(error, KilledWorker):
+                raise error
+            elif len(task.numbers) > 1:
+                # One of them takes its worker with it; which one, the next tries tell.
+                yield from self.outcomes([replace(task, numbers=(number,)) for number in task.numbers], stop)
+            else:
+                yield task, None
+
+
+@contextmanager
+def local_workers(count: int) -> Iterator[Workers]:
+    """Start workers on this machine, one process each, that end with the block."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set(_SETTINGS))
+        cluster = LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            memory_limit=None,
+            dashboard_address=None,
+            silence_logs="CRITICAL",
+        )
+        stack.enter_context(cluster)
+        yield Workers(stack.enter_context(Client(cluster)))
+
+
+@contextmanager
+def joined_workers(address: str) -> Iterator[Workers]:
+    """Use the workers of a running scheduler; they see the dataset at the same path.
+
+    Raises:
+        InputError: there is no scheduler at the address, or it has no worker.
+    """
+    import dask
+    from distributed import Client
+
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set(_SETTINGS))
+        try:
+            client = stack.enter_context(Client(address, timeout=10))
+        except (OSError, ValueError) as error:
+            raise InputError(f"--scheduler {address}: no scheduler answers there; give tcp://HOST:PORT.") from error
+        workers = Workers(client)
+        if workers.count == 0:
+            raise InputError(f"--scheduler {address}: this scheduler has no worker; start dask worker {address}.")
+        yield workers
+
+
+_SETTINGS = {
+    "distributed.scheduler.allowed-failures": LOSSES,
+    # A step of a large scene holds the interpreter for longer than Dask expects.
+    "distributed.admin.tick.limit": "1h",
+    "distributed.comm.timeouts.connect": "30s",
+}

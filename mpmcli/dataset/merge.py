@@ -1,0 +1,58 @@
+"""Joins the parts of a dataset that `mpmcli sweep --shard` has computed."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from mpmcli.dataset.compute import QUARANTINE
+from mpmcli.dataset.dataset import SHARDS
+from mpmcli.dataset.folder import require_empty
+from mpmcli.dataset.manifest import Manifest
+from mpmcli.dataset.report import Status, status_of, verify
+from mpmcli.errors import InputError, RunError
+from mpmcli.output.durable import require_free_space, sync_directory, sync_file, write_text
+
+
+def merge(parts: Sequence[Path], target: Path) -> Status:
+    """Copy the parts of one sweep into one dataset, which equals that of a sweep in one part.
+
+    Raises:
+        InputError: a part is missing, not complete, damaged, or of another sweep; nothing was written.
+        RunError: the disk refuses.
+    """
+    require_empty(target)
+    facts = [Manifest(part).facts() for part in parts]
+    for part, own in zip(parts, facts, strict=True):
+        if {**own, "part": None} != {**facts[0], "part": None}:
+            raise InputError(f"{part} is of another sweep than {parts[0]}, or of another version of mpmcli.")
+    count = facts[0]["part"][1]
+    there = sorted(own["part"][0] for own in facts)
+    # A part beyond the last shard is empty, and nobody can compute it.
+    shards = -(-facts[0]["count"] // facts[0]["per_shard"])
+    needed = list(range(1, min(count, shards) + 1))
+    if there != needed:
+        missing = sorted(set(needed) - set(there))
+        what = f"part {missing[0]}/{count} is missing" if missing else "a part is given twice"
+        raise InputError(f"{what}: give each of the {len(needed)} parts once.")
+    for part in parts:
+        if faults := verify(part).faults:
+            raise InputError(f"{part} cannot be merged: {faults[0]}")
+    files = [file for part in parts for folder in (SHARDS, QUARANTINE) for file in sorted((part / folder).glob("*.h5"))]
+    target.mkdir(parents=True, exist_ok=True)
+    size = sum(file.stat().st_size for file in files)
+    require_free_space(target, size, "the merged dataset", "the parts are kept")
+    try:
+        for file in files:
+            copy = target / file.parent.name / file.name
+            copy.parent.mkdir(exist_ok=True)
+            shutil.copyfile(file, copy)
+            sync_file(copy)
+            sync_directory(copy.parent)
+        for name in ("sweep.toml", "base.toml"):
+            write_text(target / name, (parts[0] / name).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RunError(f"{target} could not be written ({error.strerror}); the parts are kept.") from error
+    manifest = Manifest(target)
+    manifest.create({**facts[0], "part": [1, 1]})
+    manifest.put(row for part in parts for row in Manifest(part).rows())
+    return status_of(target)

@@ -1,0 +1,182 @@
+"""What is wrong with a sweep whose tables are valid: placements, keys, and the scenes that it can make."""
+
+import copy
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from mpmcli.dataset.distributions import is_number
+from mpmcli.dataset.draw import draw
+from mpmcli.dataset.placed_bodies import PlacementError, template_extent
+from mpmcli.dataset.sweep import ROUND_OFF, Placement, Sweep
+from mpmcli.errors import InputError
+from mpmcli.scene.expand import Laws
+from mpmcli.scene.load import scene_problems
+from mpmcli.scene.overrides import key_parts, set_value
+from mpmcli.scene.problem import Path, Problem, path_text
+from mpmcli.scene.quantity import AXES, NUMBER_WORDS
+from mpmcli.scene.sentences import listed, nearest, quoted, written
+
+MOST_BODIES = 1000
+
+
+def sweep_problems(sweep: Sweep, laws: Laws) -> list[Problem]:
+    """Return everything that is wrong with a sweep, at paths of the sweep file; its base scene is valid.
+
+    Args:
+        sweep: what the file says.
+        laws: parameter models of the constitutive laws that a material may follow.
+    """
+    problems = [*_misplaced(sweep)]
+    if problems:
+        return problems
+    set_by, problems = _owners(sweep)
+    return problems or _faulty_scenes(sweep, laws, set_by)
+
+
+def _misplaced(sweep: Sweep) -> Iterator[Problem]:
+    """Find placements that do not fit the base scene."""
+    bodies = {body["name"]: body for body in sweep.base_data["bodies"]}
+    domain = sweep.base_data["domain"]
+    names = [place.body for place in sweep.placements]
+    for index, place in enumerate(sweep.placements):
+        path = ("place", index)
+        if place.body not in bodies:
+            guess = nearest(place.body, list(bodies))
+            hint = f'did you mean "{guess}"?' if guess else f"the bodies are {listed(quoted(list(bodies)), 'and')}"
+            yield Problem((*path, "body"), f'no body of the base scene has the name "{place.body}"; {hint}')
+        elif place.body in names[:index]:
+            yield Problem((*path, "body"), f'"{place.body}" is placed already; a template is for one placement')
+        else:
+            taken = [n for n in bodies if n not in names and re.fullmatch(rf"{re.escape(place.body)}_\d+", n)]
+            if taken:
+                said = f'makes bodies of names such as "{taken[0]}", which the base scene has; rename one of them'
+                yield Problem((*path, "body"), said)
+            yield from _misshapen(place, path, bodies[place.body]["shape"])
+        size = domain["size"]
+        for k, (axis, low, high) in enumerate(zip(AXES, place.region.min, place.region.max, strict=False)):
+            start = domain.get("origin", [0.0] * len(size))[k]
+            end = start + size[k]
+            if low < start - ROUND_OFF * size[k] or high > end + ROUND_OFF * size[k]:
+                found = f"{axis} = {low:g} to {high:g} of {start:g} to {end:g} m"
+                yield Problem((*path, "region"), f"must lie in the domain; found {found}")
+
+
+def _misshapen(place: Placement, path: Path, shape: dict[str, Any]) -> Iterator[Problem]:
+    """Find extents that do not fit the shape of the template, and counts that are none."""
+    form = next(iter(shape))
+    if form not in ("box", "ball"):
+        yield Problem((*path, "body"), f'must be a box or a ball; "{place.body}" is a {form}')
+        return
+    foreign, own = ("radius", "size") if form == "box" else ("size", "radius")
+    if getattr(place, foreign) is not None:
+        yield Problem((*path, foreign), f'"{place.body}" is a {form}, which has no {foreign}; give {own}')
+    counts = [count for count in place.count.extremes() if not _is_count(count)]
+    if counts:
+        right = f"must be whole numbers from 1 to {MOST_BODIES}, such as {{ integers = [1, 3] }}"
+        yield Problem((*path, "count"), f"{right}; found {written(counts[0])}")
+    room = [high - low for low, high in zip(place.region.min, place.region.max, strict=True)]
+    drawn = getattr(place, own)
+    for extent in [template_extent(shape)] if drawn is None else drawn.extremes():
+        if form == "box" and not _is_size(extent, len(room)):
+            right = f"must be {NUMBER_WORDS[len(room)]} numbers greater than 0"
+            yield Problem((*path, own), f"{right}; found {written(extent)}")
+        elif form == "ball" and not (is_number(extent) and extent > 0):
+            yield Problem((*path, own), f"must be a number greater than 0; found {written(extent)}")
+        else:
+            size = extent if form == "box" else [2 * extent] * len(room)
+            if any(x > r * (1 + ROUND_OFF) for x, r in zip(size, room, strict=True)):
+                sides, found = (" x ".join(f"{x:.6g}" for x in lengths) for lengths in (room, size))
+                yield Problem((*path, own), f"must fit into the region, {sides} m; found {found} m")
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MOST_BODIES
+
+
+def _is_size(value: object, dimension: int) -> bool:
+    return isinstance(value, list) and len(value) == dimension and all(is_number(x) and x > 0 for x in value)
+
+
+def _owners(sweep: Sweep) -> tuple[dict[Path, Path], list[Problem]]:
+    """Return by path of the base scene where the sweep file sets it, and what is wrong with keys of [vary]."""
+    names = [body["name"] for body in sweep.base_data["bodies"]]
+    problems: list[Problem] = []
+    set_by: dict[Path, Path] = {}
+    for k, place in enumerate(sweep.placements):
+        index = names.index(place.body)
+        set_by[("bodies", index, "shape")] = ("place", k)
+        if place.velocity is not None:
+            set_by[("bodies", index, "velocity")] = ("place", k, "velocity")
+    data = copy.deepcopy(sweep.base_data)
+    for key, distribution in sweep.vary.items():
+        at = ("vary", key)
+        try:
+            path = set_value(data, key_parts(key), distribution.extremes()[0])
+        except InputError as fault:
+            problems.append(Problem(at, str(fault)))
+            continue
+        if path[0] == "bodies" and (len(path) < 3 or path[2] == "name"):
+            problems.append(Problem(at, "vary what a body is made of, such as bodies.NAME.velocity, and not its name"))
+            continue
+        for other, owner in set_by.items():
+            shared = min(len(path), len(other))
+            if path[:shared] == other[:shared]:
+                same = path_text(owner) if owner[0] == "vary" else f'the placement of "{names[path[1]]}"'
+                problems.append(Problem(at, f"sets what {same} sets as well; leave one of them out"))
+                break
+        else:
+            set_by[path] = at
+    return set_by, problems
+
+
+def _faulty_scenes(sweep: Sweep, laws: Laws, set_by: dict[Path, Path]) -> list[Problem]:
+    """Find what is wrong with trajectory 0, and what is new with it at the ends of each distribution.
+
+    Bodies that find no place at an end, say all of the largest size, are no fault: hardly a trajectory draws them.
+    """
+    try:
+        usual = _scene_problems(sweep, laws, set_by, {})
+    except PlacementError as error:
+        return [Problem(("place", error.placement), error.sentence)]
+    found = [p if p.path else Problem((), f"trajectory 0: {p.sentence}") for p in usual]
+    places = {key: ("vary", key) for key in sweep.vary}
+    for k, place in enumerate(sweep.placements):
+        places |= {key: ("place", k, key.rpartition(".")[2]) for key in place.distributions}
+    for key, distribution in sweep.distributions.items():
+        for value in distribution.extremes():
+            try:
+                variant = _scene_problems(sweep, laws, set_by, {key: value})
+            except PlacementError:
+                continue
+            for problem in variant:
+                if problem.path != places[key] and problem not in usual:
+                    where = f"{path_text(problem.path)}: " if problem.path else ""
+                    problem = Problem(places[key], f"with {written(value)}: {where}{problem.sentence}")
+                if problem not in usual and problem not in found:
+                    found.append(problem)
+    return found
+
+
+def _scene_problems(sweep: Sweep, laws: Laws, set_by: dict[Path, Path], given: dict[str, Any]) -> list[Problem]:
+    """Return what is wrong with the scene of trajectory 0, at paths of the sweep file; at none where it sets nothing.
+
+    Args:
+        sweep: the sweep.
+        laws: parameter models of laws.
+        set_by: by path of the base scene, where the sweep file sets it.
+        given: values in place of drawn ones.
+    """
+    drawn = draw(sweep, 0, given)
+    found: list[Problem] = []
+    for problem in scene_problems(drawn.data, laws):
+        path = problem.path
+        if path[:1] == ("bodies",) and len(path) > 1:
+            path = ("bodies", drawn.origins[int(path[1])], *path[2:])
+        owner = next((owner for base, owner in set_by.items() if path[: len(base)] == base), None)
+        sentence = problem.sentence if owner else f"{path_text(problem.path)}: {problem.sentence}"
+        new = Problem(owner or (), sentence)
+        # The bodies of one placement have the faults of their template each.
+        if new not in found:
+            found.append(new)
+    return found

@@ -1,0 +1,109 @@
+"""Computes many scenes, one after another, in one process: scenes of one kind share the device and its kernels."""
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+from mpmcli.scene import Scene, sample_bodies
+from mpmcli.simulation.engine import suits_batch
+from mpmcli.simulation.recording import Recording, record
+from mpmcli.solver.backend import Arch, Backend, Optimisation, choose_backend, start, stop_backend
+from mpmcli.solver.batch import Batch, Kind
+from mpmcli.solver.batch_run import BatchRun
+from mpmcli.solver.plan import make_plan, require_room
+from mpmcli.solver.solver import Solver
+
+# Kinds whose kernels are kept at once.
+MOST_KINDS = 8
+
+
+class Runner:
+    """Computes scenes with kernels that stay compiled.
+
+    Taichi frees fields only where all of them are freed, so that memory stays flat by a restart of the backend: for
+    a kind that needs more room than an earlier one, and for each scene with many particles.
+    """
+
+    def __init__(self, arch: Arch = "auto", threads: int | None = 1, optimisation: Optimisation = "most") -> None:
+        """Choose the backend; nothing starts.
+
+        Args:
+            threads: CPU threads of a scene with many particles; one with few takes a single thread.
+        """
+        self._arch, self._threads, self._optimisation = arch, threads, optimisation
+        self._backend: Backend | None = None
+        self._batches: list[Batch] = []
+
+    def expect(self, scenes: Iterable[Scene]) -> None:
+        """Make room for scenes to come, so that they need no restart."""
+        kinds: list[Kind] = []
+        backend = None
+        for scene in scenes:
+            particles = sample_bodies(scene)
+            backend = self._choose(scene)
+            if not suits_batch(scene, sum(len(b.position) for b in particles), backend):
+                continue
+            kind = Kind.of(scene, particles)
+            place = next((i for i, known in enumerate(kinds) if known.joined(kind) is not None), None)
+            if place is None:
+                kinds.append(kind)
+            else:
+                kinds[place] = kinds[place].joined(kind)
+        for kind in kinds[:MOST_KINDS]:
+            self._batch_for(kind, backend)
+
+    def run(self, scene: Scene, stop: Callable[[], bool] = lambda: False) -> Recording:
+        """Run a scene to its end or to where it stops.
+
+        Raises:
+            InputError: it cannot be run: a particle outside the domain, too little memory, no such backend.
+            KeyboardInterrupt: `stop` returned True.
+        """
+        particles = sample_bodies(scene)
+        backend = self._choose(scene)
+        if suits_batch(scene, sum(len(b.position) for b in particles), backend):
+            backend = replace(backend, threads=1)
+            engine = BatchRun(self._batch_for(Kind.of(scene, particles), backend), 0, scene, particles)
+        else:
+            require_room(make_plan(scene, backend))
+            self._restart(backend)
+            engine = Solver(scene, backend, particles)
+        return record(engine, scene, backend, stop)
+
+    def _choose(self, scene: Scene) -> Backend:
+        return choose_backend(self._arch, self._threads, scene.solver.precision, optimisation=self._optimisation)
+
+    def _restart(self, backend: Backend) -> None:
+        self._batches.clear()
+        stop_backend()
+        self._backend = start(backend)
+
+    def _batch_for(self, kind: Kind, backend: Backend) -> Batch:
+        """Return a batch with room for a run of this kind."""
+        if self._backend != backend:
+            self._restart(backend)
+        wanted = kind
+        for batch in self._batches:
+            joined = batch.kind.joined(kind)
+            if joined == batch.kind:
+                return batch
+            wanted = joined or wanted
+        if wanted is not kind or len(self._batches) == MOST_KINDS:
+            self._restart(backend)
+        self._batches.append(Batch(_roomy(wanted), backend))
+        return self._batches[-1]
+
+
+def _roomy(kind: Kind) -> Kind:
+    """Return a kind with some room to spare, so that few sizes occur and compiled kernels are found again."""
+    return replace(kind, particles=tuple(map(_rounded, kind.particles)), bodies=tuple(map(_power, kind.bodies)))
+
+
+def _rounded(count: int) -> int:
+    """Return the next quarter of a power of two."""
+    quarter = max(64, _power(count) // 8)
+    return math.ceil(count / quarter) * quarter
+
+
+def _power(count: int) -> int:
+    return 1 << max(0, count - 1).bit_length()
