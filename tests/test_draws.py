@@ -268,6 +268,8 @@ def test_choices_are_not_shared_between_draws():
     one = draw(sweep, 0)
     one.data["bodies"][1]["velocity"][0] = 99
     assert one.values["bodies.stone.velocity"] == draw(sweep, 0).data["bodies"][1]["velocity"] == [1.0, 0.0]
+    one.values["bodies.stone.velocity"][0] = 99
+    assert draw(sweep, 0).values["bodies.stone.velocity"] == [1.0, 0.0]
 
 
 def test_values_survive_json_and_toml():

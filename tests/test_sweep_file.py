@@ -230,11 +230,11 @@ def test_a_faulty_distribution_is_named(value, sentence):
         ('"time..end" = 1', 'time..end: "time..end" is no key; a key is a path such as time.end or bodies[0].velocity'),
         (
             '"bodies.sand.name" = "a"',
-            "bodies.sand.name: vary what a body is made of, such as bodies.NAME.velocity, and not its name",
+            "bodies.sand.name: vary what a body or a force holds, such as bodies.NAME.velocity, and not its name",
         ),
         (
             '"bodies.sand" = 3',
-            "bodies.sand: vary what a body is made of, such as bodies.NAME.velocity, and not its name",
+            "bodies.sand: vary what a body or a force holds, such as bodies.NAME.velocity, and not its name",
         ),
     ],
 )
@@ -265,6 +265,18 @@ def test_a_key_that_is_not_in_the_base_scene_is_one_sentence(line, sentence):
 def test_values_that_make_no_scene_are_found_before_anything_runs(line, sentence):
     key = line.split('"')[1]
     assert refusal(varied(line)) == [f"sweep.toml:6: vary.{key}: {sentence}"]
+
+
+def test_a_fault_that_several_bodies_and_values_have_is_said_once():
+    two = SWEEP.replace("integers = [1, 3]", "grid = [2]")
+    # The bodies of the placement come before the stone and move its index.
+    assert refusal(two.replace("uniform = [25, 40]", "choice = [95.0]")) == [
+        "sweep.toml:5: vary.bodies.sand.material.friction_angle: must be less than 90; found 95.0"
+    ]
+    velocities = "{ grid = [[0.0, 0.0], [1.0, 2.0, 3.0], [4.0, 5.0, 6.0]] }"
+    assert refusal(two.replace("[vary]", f'[vary]\n"bodies.stone.velocity" = {velocities}')) == [
+        "sweep.toml:5: vary.bodies.stone.velocity: needs two numbers in this 2D scene (as many as domain.size); found 3"
+    ]
 
 
 def test_two_keys_for_one_value_are_refused():

@@ -4,15 +4,23 @@ import queue
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from mpmcli.dataset.compute import Task, compute
 from mpmcli.dataset.manifest import Row
 from mpmcli.errors import InputError, RunError
 
+if TYPE_CHECKING:
+    from distributed import LocalCluster
+
 # Tasks under way for each worker: one to compute, and one that waits for it.
 AHEAD = 2
 # Workers that a task may lose before it counts as failed.
 LOSSES = 5
+# Of the status pages that Dask serves: this machine only, on a free port.
+LOCAL = "127.0.0.1:0"
+# Attempts to start a cluster.
+STARTS = 3
 # Seconds between looks at `stop`.
 PATIENCE = 0.2
 
@@ -79,22 +87,38 @@ class Workers:
 
 @contextmanager
 def local_workers(count: int) -> Iterator[Workers]:
-    """Start workers on this machine, one process each, that end with the block."""
+    """Start workers on this machine, one process each, that end with the block.
+
+    Raises:
+        RunError: they do not start.
+    """
     import dask
-    from distributed import Client, LocalCluster
+    from distributed import Client
 
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(_SETTINGS))
-        cluster = LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            processes=True,
-            memory_limit=None,
-            dashboard_address=None,
-            silence_logs="CRITICAL",
-        )
-        stack.enter_context(cluster)
+        cluster = stack.enter_context(_local_cluster(count))
         yield Workers(stack.enter_context(Client(cluster)))
+
+
+def _local_cluster(count: int) -> "LocalCluster":
+    """Start a cluster; again, where a worker was killed before it had started, which Dask does not forgive."""
+    from distributed import LocalCluster
+
+    for left in reversed(range(STARTS)):
+        try:
+            return LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                processes=True,
+                memory_limit=None,
+                dashboard_address=LOCAL,
+                silence_logs="CRITICAL",
+            )
+        except (RuntimeError, OSError) as error:
+            if not left:
+                raise RunError(f"the workers do not start ({error}); --resume goes on with what is done.") from error
+    raise AssertionError
 
 
 @contextmanager

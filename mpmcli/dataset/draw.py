@@ -98,7 +98,7 @@ def _put_in_place(data: dict[str, Any], placed: dict[str, list[dict[str, Any]]])
             bodies.append(body if new is None else _body_from(body, new))
             origins.append(index)
     data["bodies"] = bodies
-    if "forces" in data:
+    if isinstance(data.get("forces"), list):
         data["forces"] = [
             force if new is None else {**force, "body": new["name"]}
             for force in data["forces"]

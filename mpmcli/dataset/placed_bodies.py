@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from mpmcli.dataset.placement import STARTS, TRIES, NoPlace, RoundedBox, Wanted, find_places, rounded_box
-from mpmcli.dataset.sweep import Placement, Sweep
+from mpmcli.dataset.sweep import Placement
 from mpmcli.dataset.trajectory_values import TrajectoryValues
 from mpmcli.errors import InputError
 from mpmcli.scene import Shape
@@ -22,14 +22,19 @@ class PlacementError(InputError):
     """The bodies of a trajectory have no place.
 
     Attributes:
+        source: the sweep file.
         placement: index of the placement in the sweep.
-        sentence: trajectory, what is wrong with it, and what to change, without the file.
+        sentence: trajectory, what is wrong with it, and what to change.
     """
 
-    def __init__(self, sweep: Sweep, number: int, placement: int, sentence: str) -> None:
+    def __init__(self, source: str, placement: int, sentence: str) -> None:
+        super().__init__(source, placement, sentence)
+        self.source = source
         self.placement = placement
-        self.sentence = f"trajectory {number}: {sentence}"
-        super().__init__(f"{sweep.path}: {self.sentence}")
+        self.sentence = sentence
+
+    def __str__(self) -> str:
+        return f"{self.source}: {self.sentence}"
 
 
 def place_bodies(values: TrajectoryValues, data: dict[str, Any]) -> list[list[dict[str, Any]]]:
@@ -71,7 +76,7 @@ def place_bodies(values: TrajectoryValues, data: dict[str, Any]) -> list[list[di
         index, placed, wanted = farthest
         there = [body for body, (of, _) in zip(wanted, chosen, strict=True) if of == index]
         sentence = _crowded(placements[index], there, placed, len(wanted))
-        raise PlacementError(values.sweep, values.number, index, sentence)
+        raise PlacementError(str(values.sweep.path), index, f"trajectory {values.number}: {sentence}")
     result: list[list[dict[str, Any]]] = [[] for _ in placements]
     for (index, k), want, center in zip(chosen, wanted, centers, strict=True):
         place = placements[index]

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from mpmcli.dataset.dataset import SHARDS
 from mpmcli.dataset.folder import Folder
 from mpmcli.dataset.manifest import VERDICTS, Manifest, Row
 from mpmcli.dataset.shard import checksum, group_name, open_shard
@@ -132,15 +133,13 @@ def verify(path: Path, on_file: Callable[[int, int], None] = lambda done, total:
         elif row.accepted:
             faults.append(f"trajectory {row.number} is included, but has no file.")
     known = {path / name for name in by_file}
-    faults += [f"{found} is in no row of the manifest." for found in _files(path) if found not in known]
+    faults += [
+        f"{found} is in no row of the manifest." for found in sorted((path / SHARDS).glob("*.h5")) if found not in known
+    ]
     for done, (name, rows) in enumerate(sorted(by_file.items()), 1):
         faults += _faults_of(path / name, rows)
         on_file(done, len(by_file))
     return Verification(path, sum(len(rows) for rows in by_file.values()), tuple(faults))
-
-
-def _files(path: Path) -> list[Path]:
-    return sorted(found for folder in ("shards", "pending", "quarantine") for found in (path / folder).glob("*.h5"))
 
 
 def _faults_of(file: Path, rows: list[Row]) -> list[str]:

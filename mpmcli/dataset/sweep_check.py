@@ -116,8 +116,9 @@ def _owners(sweep: Sweep) -> tuple[dict[Path, Path], list[Problem]]:
         except InputError as fault:
             problems.append(Problem(at, str(fault)))
             continue
-        if path[0] == "bodies" and (len(path) < 3 or path[2] == "name"):
-            problems.append(Problem(at, "vary what a body is made of, such as bodies.NAME.velocity, and not its name"))
+        if path[0] in ("bodies", "forces") and (len(path) < 3 or path[2] == "name"):
+            said = "vary what a body or a force holds, such as bodies.NAME.velocity, and not its name"
+            problems.append(Problem(at, said))
             continue
         for other, owner in set_by.items():
             shared = min(len(path), len(other))

@@ -24,7 +24,7 @@ SWEEP, BASE = "sweep.toml", "base.toml"
 # Trajectories whose sizes give the size of all.
 SAMPLE = 16
 # Bytes of a trajectory beside its arrays: headers of HDF5 and the scene; times and ledger of a frame.
-HEADER_BYTES, FRAME_BYTES = 40_000, 200
+HEADER_BYTES, FRAME_BYTES = 11_000, 200
 
 
 def open_folder(sweep: Sweep, settings: SweepSettings) -> tuple[Folder, Manifest]:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import ExitStack, nullcontext
 
 from mpmcli import __version__
 from mpmcli.cores import available_cores
@@ -37,7 +37,23 @@ def run_sweep(
         RunError: a file could not be written; what was done is kept.
     """
     began = time.perf_counter()
-    folder, manifest = open_folder(sweep, settings)
+    with ExitStack() as stack:
+        # Nothing is written where there is no scheduler.
+        joined = stack.enter_context(joined_workers(settings.scheduler)) if settings.scheduler else None
+        folder, manifest = open_folder(sweep, settings)
+        return _run(sweep, settings, folder, manifest, joined, began, on_progress, stop)
+
+
+def _run(
+    sweep: Sweep,
+    settings: SweepSettings,
+    folder: Folder,
+    manifest: Manifest,
+    joined: Workers | None,
+    began: float,
+    on_progress: Callable[[SweepState], None],
+    stop: Callable[[], bool],
+) -> SweepState:
     rows = {row.number: row for row in manifest.rows() if folder.is_kept(row)}
     state = SweepState(settings.directory, sum(len(folder.numbers(shard)) for shard in folder.shards), len(rows))
     for row in rows.values():
@@ -47,7 +63,8 @@ def run_sweep(
     keeper.seal_complete(folder.shards)
     try:
         if numbers:
-            with _workers(settings, len(numbers)) as workers:
+            count = min(settings.workers or available_cores(), len(numbers))
+            with nullcontext(joined) if joined else local_workers(count) as workers:
                 state.start_seconds = time.perf_counter() - began
                 since = time.perf_counter()
                 for task, found in workers.outcomes(_tasks(sweep, settings, numbers, workers.count), stop):
@@ -102,12 +119,6 @@ def _lost(sweep: Sweep, number: int) -> Row:
         **empty,
         **counts,
     )
-
-
-def _workers(settings: SweepSettings, numbers: int) -> AbstractContextManager[Workers]:
-    if settings.scheduler:
-        return joined_workers(settings.scheduler)
-    return local_workers(min(settings.workers or available_cores(), numbers))
 
 
 def _tasks(sweep: Sweep, settings: SweepSettings, numbers: Sequence[int], workers: int) -> list[Task]:

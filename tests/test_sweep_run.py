@@ -1,0 +1,288 @@
+"""Sweeps: one dataset however it is computed, whatever is killed, with nothing bad in it."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import h5py
+import numpy as np
+import psutil
+import pytest
+from command import ROOT, run_here, started
+from test_plugin import LAW
+from tiny_sweep import BASE, contents, small_shards, tiny_sweep, told, write_sweep
+
+from mpmcli.dataset import open as open_dataset
+from mpmcli.dataset.compute import Task, compute
+from mpmcli.dataset.draw import draw
+from mpmcli.dataset.merge import merge
+from mpmcli.dataset.report import status_of, verify
+from mpmcli.dataset.sweep_run import run_sweep
+from mpmcli.dataset.sweep_state import SweepSettings
+from mpmcli.errors import InputError
+from mpmcli.output import open_result
+from mpmcli.scene import Time
+
+# A law that is stable by its own word, and in truth is not: its pressure pulls.
+WRONG_LAW = LAW.replace("spherical = constants[0]", "spherical = -constants[0]")
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The dataset of the tiny sweep, in three shards, by two workers."""
+    directory = tmp_path_factory.mktemp("truth")
+    with pytest.MonkeyPatch.context() as patch:
+        small_shards(patch)
+        state = run_sweep(tiny_sweep(directory), SweepSettings(directory / "dataset", workers=2))
+    assert (state.status, state.done, state.accepted) == ("finished", 12, 12)
+    return directory / "dataset"
+
+
+def test_a_dataset_holds_each_trajectory_once(truth: Path) -> None:
+    """Its numbers, splits, draws and frames are those of the sweep, and its files are in the manifest."""
+    dataset = open_dataset(truth)
+    sweep = tiny_sweep(truth.parent)
+    assert dataset.numbers == tuple(range(12))
+    assert {path.name for path in truth.iterdir()} >= {"sweep.toml", "base.toml", "manifest.sqlite", "shards"}
+    assert not (truth / "pending").exists()
+    assert sorted(path.name for path in (truth / "shards").iterdir()) == ["00000.h5", "00001.h5", "00002.h5"]
+    for trajectory, row in zip(dataset, told(truth), strict=True):
+        drawn = draw(sweep, trajectory.number)
+        assert trajectory.draws == drawn.values == json.loads(row.draws)
+        assert trajectory.split == sweep.split_of(trajectory.number) == row.split
+        assert trajectory.position.shape == trajectory.velocity.shape == (5, row.particles, 2)
+        assert np.isfinite(trajectory.position).all()
+        assert (row.verdict, row.accepted, row.retries, row.frames) == ("stable", 1, 0, 5)
+        np.testing.assert_allclose(trajectory.times, np.linspace(0, 0.05, 5), rtol=1e-12)
+    assert verify(truth).faults == ()
+
+
+def test_a_trajectory_has_the_bytes_of_its_scene_by_itself(truth: Path, tmp_path: Path) -> None:
+    """`simulate` of the scene in the header, and `export` of the trajectory, give the same particles."""
+    trajectory = open_dataset(truth)[5]
+    (tmp_path / "scene.toml").write_text(trajectory.header.stored["scene"], encoding="utf-8")
+    assert run_here("simulate", tmp_path / "scene.toml", "-o", tmp_path / "run", "-q").status == 0
+    exported = run_here("export", truth, "--to", "vtkhdf", "--trajectory", 5, "-o", tmp_path / "exported")
+    assert exported.status == 0
+    alone = open_result(tmp_path / "run")
+    again = open_result(next((tmp_path / "exported").rglob("*.vtkhdf")))
+    for k, (frame, other) in enumerate(zip(alone.frames(), again.frames(), strict=True)):
+        for name in ("position", "velocity", "body", "material"):
+            assert np.array_equal(getattr(frame, name), getattr(other, name)), (k, name)
+        assert np.array_equal(frame.position, trajectory.position[k])
+
+
+def test_parts_and_another_number_of_workers_make_the_same_dataset(
+    truth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small_shards(monkeypatch)
+    sweep = tiny_sweep(tmp_path)
+    parts = [tmp_path / "first", tmp_path / "second"]
+    for i, part in enumerate(parts, 1):
+        state = run_sweep(sweep, SweepSettings(part, workers=1, part=(i, 2)))
+        assert (state.done, state.expected) == ([8, 4][i - 1],) * 2
+    merge(parts[::-1], tmp_path / "whole")
+    assert contents(tmp_path / "whole") == contents(truth)
+    assert told(tmp_path / "whole") == told(truth)
+    with pytest.raises(InputError, match="part 2/2 is missing"):
+        merge(parts[:1], tmp_path / "half")
+    with pytest.raises(InputError, match="a part is given twice"):
+        merge([parts[0], parts[0], parts[1]], tmp_path / "half")
+    assert not (tmp_path / "half").exists()
+
+
+def test_workers_of_a_running_scheduler_make_the_same_dataset(
+    truth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A scheduler and two workers, each a process of its own, as a batch system starts them."""
+    small_shards(monkeypatch)
+    address = tmp_path / "address.json"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": ROOT}
+    programs = [
+        [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", "--no-dashboard"],
+        *[[sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1", "--no-dashboard"]] * 2,
+    ]
+    processes = [subprocess.Popen([*words, "--scheduler-file", str(address)], **quiet) for words in programs]
+    try:
+        _wait(lambda: address.exists() and address.read_text().endswith("}"), 60)
+        where = json.loads(address.read_text())["address"]
+        _wait(lambda: _worker_count(where) == 2, 60)
+        state = run_sweep(tiny_sweep(tmp_path), SweepSettings(tmp_path / "dataset", scheduler=where))
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+    assert state.accepted == 12
+    assert contents(tmp_path / "dataset") == contents(truth)
+    assert told(tmp_path / "dataset") == told(truth)
+
+
+def _worker_count(address: str) -> int:
+    from distributed import Client
+
+    with Client(address) as client:
+        return len(client.scheduler_info(n_workers=-1)["workers"])
+
+
+def _wait(ready: object, seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while not ready():
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def _kill_often(command: list[str], directory: Path, kills: int, draws: random.Random, pause: float) -> int:
+    """Run a command again and again, killing it or one of its children, and return how often anything was killed."""
+    done = 0
+    while True:
+        with started(directory, *command) as process:
+            while done < kills:
+                try:
+                    process.wait(draws.uniform(0.2, 1.0) * pause)
+                    break
+                except subprocess.TimeoutExpired:
+                    pass
+                children = psutil.Process(process.pid).children(recursive=True)
+                victim = draws.choice([process.pid, *(child.pid for child in children)])
+                os.kill(victim, signal.SIGKILL)
+                done += 1
+                if victim == process.pid:
+                    break
+            out, err = process.communicate(timeout=300)
+        if process.returncode != -signal.SIGKILL:
+            assert process.returncode == 0, (out, err)
+            return done
+
+
+@pytest.mark.parametrize(("count", "kills"), [(16, 2), pytest.param(200, 5, marks=pytest.mark.slow)], ids=["16", "200"])
+def test_a_sweep_that_is_killed_and_resumed_makes_the_same_dataset(tmp_path: Path, count: int, kills: int) -> None:
+    """SIGKILL at random times, to the command and to its workers."""
+    base = BASE.replace("end = 0.05", "end = 0.5").replace("cells = [16, 16]", "cells = [32, 32]")
+    path = write_sweep(tmp_path, count, base)
+    whole = run_here("sweep", path, "-o", tmp_path / "whole", "--workers", 2, "-q")
+    assert whole.status == 0, whole.stderr
+    began = time.monotonic()
+    command = ["sweep", path, "-o", "killed", "--resume", "--workers", "2", "-q"]
+    killed = _kill_often(list(map(str, command)), tmp_path, kills, random.Random(5), 6.0)
+    assert killed >= 1, f"nothing was killed in {time.monotonic() - began:.0f} s"
+    assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
+    assert told(tmp_path / "killed") == told(tmp_path / "whole")
+    assert run_here("dataset", "verify", tmp_path / "killed", "-q").status == 0
+
+
+def test_an_interrupt_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C: exit code 130, and --resume computes the rest only."""
+    small_shards(monkeypatch, 2)
+    sweep, settings = tiny_sweep(tmp_path, 6), SweepSettings(tmp_path / "dataset", workers=1, resume=True)
+    seen: list[int] = []
+    state = run_sweep(sweep, settings, lambda state: seen.append(state.done), lambda: bool(seen))
+    assert state.status == "interrupted" and 0 < state.done < 6
+    status = status_of(tmp_path / "dataset")
+    assert (len(status.rows), status.expected) == (state.done, 6)
+    missing = f"{6 - state.done} trajectories not computed; mpmcli sweep --resume goes on."
+    assert verify(tmp_path / "dataset").faults == (missing,)
+    again = run_sweep(sweep, settings)
+    assert (again.status, again.kept, again.done) == ("finished", state.done, 6)
+    assert verify(tmp_path / "dataset").faults == ()
+
+
+def test_a_bad_trajectory_is_tried_again_and_then_left_out(tmp_path: Path) -> None:
+    """A law of the wrong sign: three runs of each, with ever smaller steps."""
+    law = tmp_path / "wrong.py"
+    law.write_text(WRONG_LAW, encoding="utf-8")
+    base = BASE.replace(
+        '{ preset = "sand", friction_angle = 30.0 }', '{ law = "log_fluid", density = 1e3, sound_speed = 100.0 }'
+    )
+    path = write_sweep(tmp_path, 2, base)
+    text = path.read_text(encoding="utf-8").replace("material.friction_angle", "material.density")
+    # The block stands on the floor: in free fall nothing disturbs it.
+    path.write_text(text[: text.index("[place]")].replace("[25, 40]", "[900, 1100]"), encoding="utf-8")
+    outcome = run_here("sweep", path, "-o", tmp_path / "dataset", "--plugin", law, "--workers", 1, "--json", "-q")
+    assert outcome.status == 1, outcome.stderr
+    report = json.loads(outcome.stdout)
+    assert report["accepted"] == 0 and report["dataset"]["retried"] == 2
+    for row, one in zip(told(tmp_path / "dataset"), report["dataset"]["excluded"], strict=True):
+        assert row.verdict in ("unstable", "escaped") and row.retries == 2 and not row.accepted
+        assert "the run became unstable at step" in row.reason and one["reason"] == row.reason
+        with h5py.File(tmp_path / "dataset" / row.file) as file:
+            group = file[f"{row.number:06d}"]
+            assert len(group["time"]) == row.frames < 5
+            scene = tomllib.loads(json.loads(group.attrs["header"])["scene"])
+            assert scene["time"]["safety"] == Time.model_fields["safety"].default / 4
+    assert not (tmp_path / "dataset" / "shards").exists()
+    assert run_here("dataset", "verify", tmp_path / "dataset", "-q").status == 0
+    status = run_here("dataset", "status", tmp_path / "dataset").stdout
+    assert "0 of 2 trajectories included" in status and "000001" in status
+
+
+@pytest.mark.parametrize("count", [60, pytest.param(500, marks=pytest.mark.slow)])
+def test_memory_stays_flat(tmp_path: Path, count: int) -> None:
+    """Of the process of a worker, over trajectories of many sizes."""
+    sweep = tiny_sweep(tmp_path, count)
+    process, sizes = psutil.Process(), []
+    for number in range(count):
+        compute(Task(tmp_path / "dataset", sweep, (number,)))
+        sizes.append(process.memory_info().rss)
+    # The first ones compile kernels and fill caches.
+    assert max(sizes[-20:]) < 1.02 * max(sizes[20:40])
+
+
+def test_what_has_changed_is_found(truth: Path, tmp_path: Path) -> None:
+    """One bit, a file that is gone, a file that nobody wrote."""
+    import shutil
+
+    copy = tmp_path / "copy"
+    shutil.copytree(truth, copy)
+    with h5py.File(copy / "shards" / "00001.h5", "r+") as file:
+        file["000006/position"][2, 3, 1] = np.nextafter(file["000006/position"][2, 3, 1], np.float32(9))
+    (copy / "shards" / "00002.h5").unlink()
+    (copy / "shards" / "00009.h5").write_bytes(b"")
+    outcome = run_here("dataset", "verify", copy, "-q")
+    assert outcome.status == 1
+    assert "trajectory 6 in" in outcome.stdout and "its checksum differs" in outcome.stdout
+    assert "00002.h5 is missing" in outcome.stdout and "00009.h5 is in no row" in outcome.stdout
+    assert "3 faults" in outcome.stdout
+
+
+def test_bad_input_has_one_sentence(truth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is written; exit code 2."""
+    path = write_sweep(tmp_path)
+
+    def refused(*words: object) -> str:
+        before = sorted(tmp_path.rglob("*"))
+        outcome = run_here("sweep", path, *words)
+        assert outcome.status == 2 and outcome.stdout == "" and outcome.stderr.count("\n") == 1, outcome
+        assert sorted(tmp_path.rglob("*")) == before
+        return outcome.stderr
+
+    assert "holds a dataset: --resume goes on with it" in refused("-o", truth)
+    assert "another sweep, or of another count" in refused("-o", truth, "--resume", "--count", 11)
+    assert "holds part 1/1 of the sweep" in refused("-o", truth, "--resume", "--shard", "1/2")
+    assert "--shard 2/2 is empty: 12 trajectories fill 1 shard" in refused("-o", tmp_path / "d", "--shard", "2/2")
+    assert "3/2 is no part" in refused("-o", tmp_path / "d", "--shard", "3/2")
+    assert "exists and is not empty" in refused("-o", tmp_path)
+    assert "no scheduler answers there" in refused("-o", tmp_path / "d", "--scheduler", "tcp://127.0.0.1:1")
+    monkeypatch.setattr("mpmcli.dataset.sweep_folder.shutil.disk_usage", lambda _: SimpleNamespace(free=5))
+    assert "but the dataset needs about" in refused("-o", tmp_path / "d")
+    assert run_here("dataset", "status", tmp_path).status == 2
+
+
+def test_a_rehearsal_tells_draws_disk_and_time(truth: Path, tmp_path: Path) -> None:
+    """Its bytes are those of the dataset, within what headers take, and its draws those that come."""
+    outcome = run_here("sweep", write_sweep(tmp_path), "--dry-run", "--json", "-o", tmp_path / "d")
+    assert outcome.status == 0, outcome.stderr
+    report = json.loads(outcome.stdout)
+    rows = told(truth)
+    assert [one["values"] for one in report["trajectories"]] == [json.loads(row.draws) for row in rows]
+    assert all(one["particles"] == row.particles for one, row in zip(report["trajectories"], rows, strict=True))
+    stored = sum(path.stat().st_size for path in (truth / "shards").iterdir())
+    assert report["bytes"] == pytest.approx(stored, rel=0.3)
+    assert report["seconds"] > 0 and not (tmp_path / "d").exists()
