@@ -5,11 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scenes import sums
 from solver_state import bodies_of, scene_of
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene, sample_bodies
+from mpmcli.solver.snapshot import build_arrays, read_group
 from mpmcli.solver.solver import Solver
 
 H = 0.1
@@ -88,6 +90,19 @@ def test_one_launch_reads_what_the_fields_hold(solver: Solver, frames: Run) -> N
         assert found.keys() == expected.keys()
         for name, array in expected.items():
             assert found[name].shape == array.shape and np.array_equal(found[name], array), name
+
+
+def test_a_kernel_sums_and_orders_as_numpy_does(solver: Solver, frames: Run) -> None:
+    """The frame by one launch against the arrays of the groups, and the ledger against sums in numpy."""
+    frame, row = solver.frame(7, [])
+    snapshots = [read_group(group) for group in solver.groups]
+    arrays = build_arrays(snapshots, np.float64)
+    assert np.array_equal(frame.velocity, arrays.v)
+    assert np.array_equal(frame.position, arrays.x + np.array(solver.scene.domain.origin))
+    assert np.array_equal(frame.body, arrays.labels[:, 0]) and np.array_equal(frame.material, arrays.labels[:, 1])
+    for name, expected in sums(solver).items():
+        np.testing.assert_allclose(getattr(row, name), expected, rtol=1e-12, err_msg=name)
+    assert np.abs(frames[-1][1].angular_momentum[0]) > 0 and row.elastic > 0
 
 
 def test_frames_land_on_their_times(frames: Run) -> None:

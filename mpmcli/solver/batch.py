@@ -19,6 +19,7 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.batch_device import Device
 from mpmcli.solver.batch_kernel import build_batch_kernel
 from mpmcli.solver.batch_layout import Layout
+from mpmcli.solver.frame_reader import build_frame_reader
 from mpmcli.solver.grid import DRIFT, Grid, node_width
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.observe import build_observation
@@ -101,7 +102,7 @@ class Batch:
         device: all of it.
         layout: columns of `numbers`, (runs, k) float64, and `counts`, (runs, l) int32, which the kernel reads and
             changes.
-        observations: per law.
+        observations, readers: per law.
         seconds: wall time of all launches; first_seconds: of the first, which compiles the kernel.
     """
 
@@ -149,6 +150,7 @@ class Batch:
         for name, value in constants.items():
             self.numbers[:, getattr(self.layout.real, name)] = value
         self.observations = [build_observation(group) for group in groups]
+        self.readers = [build_frame_reader(group) for group in groups]
         self.seconds = self.first_seconds = 0.0
         self._launch = build_batch_kernel(self.device, self.layout)
 

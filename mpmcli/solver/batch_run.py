@@ -12,6 +12,7 @@ from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.batch import Batch
 from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, GOING, IDLE, LIMITS, LOST, MEASURE
 from mpmcli.solver.external_forces import ExternalForces
+from mpmcli.solver.frame_reader import FrameArrays
 from mpmcli.solver.groups import require_inside
 from mpmcli.solver.observe import Observation
 from mpmcli.solver.particle_update import NOT_LOST
@@ -22,13 +23,14 @@ from mpmcli.solver.snapshot import Snapshot
 from mpmcli.solver.state import Progress
 from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
 from mpmcli.solver.step_control import StepControl, StepCounters
+from mpmcli.solver.sums import Sums
 
 # Particle-steps of a run in one launch: some tenths of a second, after which the host may stop the run.
 BUDGET = 2_000_000
 
 
 class BatchGroup:
-    """The particles of one law of one run; attributes as of `ParticleGroup`."""
+    """The particles of one law of one run; attributes as of `ParticleGroup`, and its first particle and table row."""
 
     def __init__(self, batch: Batch, g: int, slot: int, law: Law, bodies: list[int], rows: np.ndarray, count: int):
         self.law, self.bodies, self.count = law, tuple(bodies), count
@@ -36,17 +38,17 @@ class BatchGroup:
         self.dimension, self.real, self.internal = self.arrays.dimension, self.arrays.real, self.arrays.internal
         self.rows = rows.astype(self.real)
         self.first = slot * batch.kind.particles[g]
-        self._row = slot * batch.kind.bodies[g]
+        self.row = slot * batch.kind.bodies[g]
 
     def to_numpy(self) -> dict[str, np.ndarray]:
         """Return x, v, C, deformation, internal, (n, k), id and body, (n), in the solver's order."""
-        return self.arrays.read(self.first, self.count, self.bodies, self._row)
+        return self.arrays.read(self.first, self.count, self.bodies, self.row)
 
     def write(self, found: dict[str, np.ndarray], place: np.ndarray) -> None:
         """Fill the device with particles, see `initial_state`."""
-        self.arrays.write(self.first, found, self._row + place)
+        self.arrays.write(self.first, found, self.row + place)
         for i, row in enumerate(self.rows):
-            self.arrays.table[self._row + i] = row.tolist()
+            self.arrays.table[self.row + i] = row.tolist()
 
 
 class BatchRun(Run):
@@ -275,3 +277,8 @@ class BatchRun(Run):
     def _observe(self, g: int, snapshot: Snapshot, *, stress: bool) -> Observation:
         group, stored = self.groups[g], (snapshot.deformation, snapshot.internal)
         return self.batch.observations[g](self.last_step, group.first, group.count, stress=stress, stored=stored)
+
+    def _read(self, g: int, arrays: FrameArrays) -> tuple[Sums, np.ndarray]:
+        group = self.groups[g]
+        places = np.array(group.bodies, np.int32)
+        return self.batch.readers[g](self.last_step, group.first, group.count, places, g, arrays, group.row)

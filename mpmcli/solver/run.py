@@ -7,12 +7,23 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.materials.law import Law
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError, cause_of, diagnose, first_unsound, rate_of_change
+from mpmcli.solver.frame_reader import FrameArrays
 from mpmcli.solver.observe import Observation
-from mpmcli.solver.snapshot import STRESSES, Snapshot, build_frame, ledger_row, measure, read_group
+from mpmcli.solver.snapshot import (
+    STRESSES,
+    Snapshot,
+    build_arrays,
+    build_fields,
+    ledger_row,
+    measure,
+    read_group,
+)
 from mpmcli.solver.state import Progress
+from mpmcli.solver.sums import Sums, ledger_sums
 from mpmcli.stability.limits import Limit, force_limit, speed_limit
 from mpmcli.stability.transfer_factors import affine_moment
 
@@ -161,14 +172,36 @@ class Run:
     def frame(self, index: int, taken: list[tuple[float, float, str]]) -> tuple[Frame, LedgerRow]:
         """Return the state as a frame, and the ledger row for the steps (size, Courant number, limit) taken."""
         began = time.perf_counter()
-        snapshots = [read_group(group) for group in self.groups]
-        fields = self.scene.output.fields
-        stress = any(name in STRESSES for name in fields)
-        seen = [self._observe(g, snapshot, stress=stress) for g, snapshot in enumerate(snapshots)]
-        kept = (self._origin, self._position_type, self._initial)
-        frame = build_frame(snapshots, seen, fields, *kept, index, self.time, self.step_count)
+        names = [name for name in self.scene.output.fields if name not in ("velocity", "initial_position")]
+        on_cpu, real = self.backend.on_cpu, self.groups[0].real
+        snapshots, seen = [], []
+        if names or not on_cpu:
+            stress = any(name in STRESSES for name in names)
+            snapshots = [read_group(group) for group in self.groups]
+            seen = [self._observe(g, snapshot, stress=stress) for g, snapshot in enumerate(snapshots)]
         gravity, moment = self.state.external_forces.gravity_at(self.time), affine_moment(self.scene.solver)
-        sums = measure(snapshots, seen, gravity, self.spacing, self.last_step, moment)
+        physics = (gravity, self.spacing, self.last_step, moment)
+        if on_cpu:
+            arrays = FrameArrays.empty(self.particle_count, self.scene.dimension, real)
+            found = [self._read(g, arrays) for g in range(len(self.groups))]
+            ratios = [_total_ratios(group.law, J) for group, (_, J) in zip(self.groups, found, strict=True)]
+            sums = ledger_sums([own for own, _ in found], ratios, *physics)
+        else:
+            arrays = build_arrays(snapshots, real)
+            sums = measure(snapshots, seen, *physics)
+        fields = build_fields(snapshots, seen, names, real) if names else {}
+        if self._initial is not None:
+            fields["initial_position"] = self._initial.astype(self._position_type)
+        frame = Frame(
+            index=index,
+            time=self.time,
+            step=self.step_count,
+            position=(arrays.x + self._origin).astype(self._position_type),
+            velocity=arrays.v,
+            body=np.ascontiguousarray(arrays.labels[:, 0]),
+            material=np.ascontiguousarray(arrays.labels[:, 1]),
+            fields={name: fields[name] for name in self.scene.output.fields if name != "velocity"},
+        )
         row = ledger_row(sums, self.time, taken)
         self.frame_seconds += time.perf_counter() - began
         return frame, row
@@ -176,3 +209,13 @@ class Run:
     def _observe(self, g: int, snapshot: Snapshot, *, stress: bool) -> Observation:
         """Evaluate the law of the g-th group for its particles."""
         raise NotImplementedError
+
+    def _read(self, g: int, arrays: FrameArrays) -> tuple[Sums, np.ndarray]:
+        """Fill the rows of the g-th group; see `build_frame_reader`."""
+        raise NotImplementedError
+
+
+def _total_ratios(law: Law, volumes: np.ndarray) -> np.ndarray:
+    """Return volume over volume at rest, (n,), from J and the internal variables, (n, 1 + k)."""
+    internal = {variable.name: volumes[:, 1 + i] for i, variable in enumerate(law.internal)}
+    return law.total_volume_ratio(volumes[:, 0], internal)

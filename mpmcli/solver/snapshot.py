@@ -6,12 +6,13 @@ from functools import cached_property
 
 import numpy as np
 
-from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.tensors import determinant
+from mpmcli.solver.frame_reader import FrameArrays
 from mpmcli.solver.observe import Observation
 from mpmcli.solver.particle_arrays import MASS, VOLUME
 from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.sums import Sums, axis_pairs, ledger_sums
 
 # Fields that need the stress of every particle.
 STRESSES = ("stress", "pressure")
@@ -86,49 +87,31 @@ def _field(name: str, snapshot: Snapshot, seen: Observation, at_rest: dict[str, 
     return seen.internal[name] if name in seen.internal else np.full(group.count, at_rest[name])
 
 
-def build_frame(
-    snapshots: Sequence[Snapshot],
-    seen: Sequence[Observation],
-    fields: Sequence[str],
-    origin: np.ndarray,
-    position_type: type,
-    initial: np.ndarray | None,
-    index: int,
-    time: float,
-    step: int,
-) -> Frame:
-    """Put the groups together, each particle in the row of its id.
+def build_arrays(snapshots: Sequence[Snapshot], real: type) -> FrameArrays:
+    """Put what every frame has in the order of the ids."""
+    count, dimension = sum(len(s.id) for s in snapshots), snapshots[0].x.shape[1]
+    arrays = FrameArrays.empty(count, dimension, real)
+    for material, s in enumerate(snapshots):
+        arrays.x[s.id], arrays.v[s.id] = s.x, s.v
+        arrays.labels[s.id, 0], arrays.labels[s.id, 1] = s.body, material
+    return arrays
 
-    Args:
-        position_type: numpy's of the positions.
-        initial: (n, d) positions at the start, m, where the field initial_position is among the fields.
-    """
+
+def build_fields(
+    snapshots: Sequence[Snapshot], seen: Sequence[Observation], names: Sequence[str], real: type
+) -> dict[str, np.ndarray]:
+    """Return further fields by name, in the order of the ids."""
     ids = np.concatenate([s.id for s in snapshots])
-
-    def ordered(parts: Sequence[np.ndarray]) -> np.ndarray:
-        joined = np.concatenate(parts)
-        result = np.empty_like(joined)
-        result[ids] = joined
-        return result
-
-    def of_field(name: str) -> np.ndarray:
-        if name == "initial_position":
-            return initial.astype(position_type)
-        return ordered([_field(name, s, o, at_rest).astype(real) for s, o in zip(snapshots, seen, strict=True)])
-
     # What particles of other laws show of an internal variable.
     at_rest = {variable.name: variable.at_rest for s in snapshots for variable in s.group.law.internal}
-    real = snapshots[0].x.dtype
-    return Frame(
-        index=index,
-        time=time,
-        step=step,
-        position=ordered([(s.x.astype(np.float64) + origin).astype(position_type) for s in snapshots]),
-        velocity=ordered([s.v for s in snapshots]),
-        body=ordered([s.body for s in snapshots]),
-        material=ordered([np.full(len(s.id), m, np.int32) for m, s in enumerate(snapshots)]),
-        fields={name: of_field(name) for name in fields if name != "velocity"},
-    )
+    fields = {}
+    for name in names:
+        joined = np.concatenate(
+            [_field(name, s, o, at_rest).astype(real) for s, o in zip(snapshots, seen, strict=True)]
+        )
+        fields[name] = np.empty_like(joined)
+        fields[name][ids] = joined
+    return fields
 
 
 def measure(
@@ -139,56 +122,36 @@ def measure(
     dt: float,
     moment: float = 0.25,
 ) -> dict[str, float | tuple[float, ...]]:
-    """Sum what a run conserves; the affine velocity carries energy and angular momentum too (Jiang et al. 2017).
-
-    Leapfrog has its velocities half a step dt (s) before its positions. All energies are taken there, where their sum
-    is second order in the step; with the positions as they are it would swing by v dt/2 times the force.
-
-    Args:
-        moment: D / h^2, see `stability.transfer_factors.affine_moment`.
-
-    Returns:
-        The entries of a `LedgerRow` that belong to the state alone, by name, summed in float64.
-    """
-    d = len(gravity)
-    sums = np.zeros((1 + 2 * d + d * d,) * 2)
-    elastic = 0.0
-    for s, o in zip(snapshots, seen, strict=True):
-        sums += _weighted_products(s)
-        elastic += float(s.per_body(VOLUME) @ o.energy.astype(np.float64))
-    mass, inertia = sums[0, 0], moment * spacing**2
-    x, v, C = slice(1, 1 + d), slice(1 + d, 1 + 2 * d), slice(1 + 2 * d, None)
-    linear, by_place, affine = sums[0, v], sums[x, v], sums[0, C].reshape(d, d)
-    kinetic = 0.5 * (sums[v, v].trace() + inertia * sums[C, C].trace())
-    potential = -((sums[0, x] - 0.5 * dt * linear) @ gravity)
-    # The axial vector of C pairs the same indices.
-    pairs = [(0, 1)] if d == 2 else [(1, 2), (2, 0), (0, 1)]
-    angular = [by_place[a, b] - by_place[b, a] + inertia * (affine[b, a] - affine[a, b]) for a, b in pairs]
-    J = [_volume_ratio(s, o) for s, o in zip(snapshots, seen, strict=True)]
-    return {
-        "mass": float(mass),
-        "kinetic": float(kinetic),
-        "elastic": elastic,
-        "potential": float(potential),
-        "linear_momentum": tuple(linear.tolist()),
-        "angular_momentum": tuple(map(float, angular)),
-        "speed_max": float(np.sqrt(max(float(np.einsum("pc,pc->p", s.v, s.v).max()) for s in snapshots))),
-        "volume_ratio_min": float(min(j.min() for j in J)),
-        "volume_ratio_max": float(max(j.max() for j in J)),
-    }
+    """Return the entries of a `LedgerRow` that belong to the state alone; see `ledger_sums`."""
+    sums = [_sums(s, o) for s, o in zip(snapshots, seen, strict=True)]
+    ratios = [_volume_ratio(s, o) for s, o in zip(snapshots, seen, strict=True)]
+    return ledger_sums(sums, ratios, gravity, spacing, dt, moment)
 
 
-def _weighted_products(snapshot: Snapshot) -> np.ndarray:
-    """Return sum m a a^T over the particles with a = (1, x, v, C), in float64."""
+def _sums(snapshot: Snapshot, seen: Observation) -> Sums:
+    """Sum over the particles of a law, by the products sum m a a^T with a = (1, x, v, C)."""
     count, d = snapshot.x.shape
-    sums = np.zeros((1 + 2 * d + d * d,) * 2)
+    products = np.zeros((1 + 2 * d + d * d,) * 2)
     mass = snapshot.per_body(MASS)
     for first in range(0, count, ROWS):
         rows = slice(first, first + ROWS)
         parts = (snapshot.x[rows], snapshot.v[rows], snapshot.C[rows].reshape(-1, d * d))
         a = np.concatenate([np.ones((len(parts[0]), 1)), *parts], axis=1)
-        sums += (a * mass[rows, None]).T @ a
-    return sums
+        products += (a * mass[rows, None]).T @ a
+    x, v, C = slice(1, 1 + d), slice(1 + d, 1 + 2 * d), slice(1 + 2 * d, None)
+    turning, affine = products[x, v], products[0, C].reshape(d, d)
+    pairs = axis_pairs(d)
+    return Sums(
+        mass=products[0, 0],
+        place=products[0, x],
+        momentum=products[0, v],
+        motion=products[v, v].trace(),
+        affine=products[C, C].trace(),
+        turning=np.array([turning[a, b] - turning[b, a] for a, b in pairs]),
+        spin=np.array([affine[b, a] - affine[a, b] for a, b in pairs]),
+        elastic=float(snapshot.per_body(VOLUME) @ seen.energy.astype(np.float64)),
+        speed_squared=float(np.einsum("pc,pc->p", snapshot.v, snapshot.v).max()),
+    )
 
 
 def ledger_row(sums: dict, time: float, taken: Sequence[tuple[float, float, str]]) -> LedgerRow:

@@ -4,11 +4,14 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 
+import numpy as np
+
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.external_forces import ExternalForces
+from mpmcli.solver.frame_reader import FrameArrays, build_frame_reader
 from mpmcli.solver.groups import build_groups
 from mpmcli.solver.kernels import Kernels
 from mpmcli.solver.observe import Observation, build_observation
@@ -18,6 +21,7 @@ from mpmcli.solver.snapshot import Snapshot
 from mpmcli.solver.state import State
 from mpmcli.solver.state_bounds import build_measurement
 from mpmcli.solver.step_control import StepControl
+from mpmcli.solver.sums import Sums
 
 # Cells that a particle of a GPU run may move in a step beyond the estimate.
 UNSEEN = 0.05
@@ -50,6 +54,7 @@ class Solver(Run):
         self._kernels = Kernels(scene, backend, self.groups, forces.gravity)
         self.grid = self._kernels.grid
         self._observations = [build_observation(group) for group in self.groups]
+        self._readers = [build_frame_reader(group) for group in self.groups]
         measurements = [build_measurement(group, backend) for group in self.groups]
         step_control = StepControl(scene, self.groups, measurements, on_cpu=backend.on_cpu)
         self.state = State(self.groups, self._kernels, step_control, forces)
@@ -133,6 +138,10 @@ class Solver(Run):
     def _observe(self, g: int, snapshot: Snapshot, *, stress: bool) -> Observation:
         stored = snapshot.deformation, snapshot.internal
         return self._observations[g](self.last_step, 0, self.groups[g].count, stress=stress, stored=stored)
+
+    def _read(self, g: int, arrays: FrameArrays) -> tuple[Sums, np.ndarray]:
+        group = self.groups[g]
+        return self._readers[g](self.last_step, 0, group.count, np.array(group.bodies, np.int32), g, arrays)
 
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield the state as it is and then one frame for each output time to come, with its ledger row.
