@@ -93,14 +93,16 @@ class TestOurs:
 import numpy as np
 from mpmcli.bench.cases import BenchCase
 from mpmcli.bench.{module} import {name}
-side = {name}({case!r}, threads=1, precision="f64", arch="cpu")
+side = {name}({case!r}, threads=2, precision="f64", arch="cpu")
 if "{module}" == "ours":
-    side._solver.state.last_step = {case.step}
-for _ in range({steps}):
-    side.step()
+    # Few particles: the batch, on one thread.
+    assert side.threads == 1
+    side.engine.begin()
+    side.engine.state.last_step = {case.step}
+assert side.advance({steps}) == {steps}
 side.sync()
 assert side.particles == {case.particles}
-assert side.smallest_step == {case.step}
+assert abs(side.smallest_step / {case.step} - 1) < 1e-9
 assert side.is_sound()
 np.save("{module}.npy", side.positions())
 """)
@@ -115,13 +117,15 @@ class Clock:
 
     particles = 7
     bytes_per_particle = 64
+    threads = 2
     smallest_step = 1e-3
 
     def __init__(self) -> None:
         self.now = 0.0
 
-    def step(self) -> None:
-        self.now += 0.01
+    def advance(self, count: int) -> int:
+        self.now += 0.01 * count
+        return count
 
     def sync(self) -> None:
         pass
@@ -143,7 +147,7 @@ class TestWorker:
         monkeypatch.setattr(contestant.time, "perf_counter", lambda: clock.now)
         assert contestant.serve(lambda: clock, ["first\n", "run 0.1\n", "finish\n"], answers) == 0
         ready, first, block, end = map(json.loads, answers.getvalue().splitlines())
-        assert ready == {"particles": 7, "bytes_per_particle": 64}
+        assert ready == {"particles": 7, "bytes_per_particle": 64, "threads": 2}
         assert first == {"seconds": pytest.approx(0.01)}
         assert block["steps"] in (10, 11)
         assert end["sound"] is True
@@ -160,7 +164,7 @@ class TestWorker:
 
     def test_a_peer_runs_in_its_own_process(self) -> None:
         with start_worker("peer", SMALL_2D, Setting(threads=1)) as process:
-            assert process.ready == {"particles": 200, "bytes_per_particle": None}
+            assert process.ready == {"particles": 200, "bytes_per_particle": None, "threads": 1}
             assert process.ask("first")["seconds"] > 0
             assert process.ask("run 0.01")["steps"] > 0
             assert process.ask("finish")["sound"] is True
@@ -177,7 +181,7 @@ class FakeWorker:
 
     def __init__(self, who: str, step_seconds: float, particles: int, log: list[tuple[str, str]]) -> None:
         self.who, self.step_seconds, self.log = who, step_seconds, log
-        self.ready = {"particles": particles, "bytes_per_particle": None}
+        self.ready = {"particles": particles, "bytes_per_particle": None, "threads": 1}
         self.closed = False
 
     def ask(self, command: str) -> dict:
@@ -239,10 +243,11 @@ class TestReport:
         compile_seconds=1.24,
         peak_memory=150_000_000,
         bytes_per_particle=96,
+        threads=1,
         smallest_step=8e-5,
         sound=True,
     )
-    peer = replace(side, rates=(1e6, 1e6, 2e6), bytes_per_particle=None)
+    peer = replace(side, rates=(1e6, 1e6, 2e6), bytes_per_particle=None, threads=2)
 
     def report(self, peer: ContestantResult = peer) -> BenchReport:
         result = CaseResult(CASES[-1], ours=self.side, peer=peer)
@@ -253,7 +258,7 @@ class TestReport:
         assert lines[0] == "A processor, cpu, 2 threads, f32, taichi 1.7.4"
         row = next(line for line in lines if line.startswith("3d-128"))
         found = " ".join(row.split())
-        assert found == "3d-128 524,288 3.00 mpm3d 1.00 3.00 1.50-4.00 0.5+1.2 / 0.5+1.2 150 / 150"
+        assert found == "3d-128 524,288 1 / 2 3.00 mpm3d 1.00 3.00 1.50-4.00 0.5+1.2 / 0.5+1.2 150 / 150"
         assert lines[-1] == "Device memory at 3d-128: 96 bytes per particle."
 
     def test_table_warns_of_a_run_that_broke_down(self) -> None:
@@ -261,15 +266,19 @@ class TestReport:
         assert "Beware: mpm3d broke down at 3d-128" in self.report(replace(self.peer, sound=False)).table()
 
     def test_table_warns_of_smaller_steps(self) -> None:
-        result = CaseResult(CASES[-1], ours=replace(self.side, smallest_step=4e-5), peer=self.peer)
-        report = replace(self.report(), results=(result,))
-        assert "Beware: at 3d-128 mpmcli's own limits asked for steps down to 4e-05 s" in report.table()
+        def report_of(step: float) -> str:
+            result = CaseResult(CASES[-1], ours=replace(self.side, smallest_step=step), peer=self.peer)
+            return replace(self.report(), results=(result,)).table()
+
+        assert "Beware" not in report_of((1 - 1e-9) * 8e-5)
+        assert "Beware: at 3d-128 mpmcli's own limits asked for steps down to 4e-05 s" in report_of(4e-5)
 
     def test_dictionary_is_json_with_every_block(self) -> None:
         found = json.loads(json.dumps(self.report().as_dict()))
         (case,) = found["cases"]
         assert found["threads"] == 2
         assert case["ours"]["particle_steps_per_s_blocks"] == [2e6, 4e6, 3e6]
+        assert (case["ours"]["threads"], case["peer"]["threads"]) == (1, 2)
         assert case["ratio"] == 3
         assert (case["ratio_min"], case["ratio_max"]) == (1.5, 4)
         assert case["ours"]["device_bytes_per_particle"] == 96

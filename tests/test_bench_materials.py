@@ -101,6 +101,7 @@ class Spring:
 
     particles = 7
     bytes_per_particle = 64
+    threads = 1
     smallest_step = 1e-3
 
     def __init__(self) -> None:
@@ -110,9 +111,11 @@ class Spring:
     def watch_seconds(self) -> float:
         return 0.02 * self.now
 
-    def step(self) -> None:
-        self.place += 1
-        self.now += 0.01 * self.place
+    def advance(self, count: int) -> int:
+        for _ in range(count):
+            self.place += 1
+            self.now += 0.01 * self.place
+        return count
 
     def sync(self) -> None:
         pass

@@ -101,7 +101,7 @@ class Setting:
     """Settings of both contestants.
 
     Attributes:
-        threads: of the processor.
+        threads: of the processor, that each may use.
         precision: "f32" or "f64".
         arch: device, "cpu", "cuda" or "vulkan".
     """
@@ -133,7 +133,7 @@ def run_bench(
 
     Args:
         cases: sizes to measure, of mpmcli.bench.cases.
-        threads: of the processor, for both.
+        threads: of the processor, for both; ours leaves few particles to one, as `mpmcli simulate` does.
         seconds: length of one block.
         progress: called with a line of text for each case and each pair of blocks.
         blocks: measured blocks of each contestant.
@@ -195,6 +195,7 @@ def _contestant_result(worker: Worker, rates: list[float], first: float) -> Cont
         compile_seconds=max(0.0, first - typical),
         peak_memory=end["peak_memory"],
         bytes_per_particle=worker.ready["bytes_per_particle"],
+        threads=worker.ready["threads"],
         smallest_step=end["smallest_step"],
         sound=end["sound"],
     )

@@ -5,7 +5,7 @@
 
 It answers on stdout, one JSON object per line, and waits for commands on stdin without using the processor:
 
-    (start)        {"particles": 524288, "bytes_per_particle": 88 or null}     ready to step
+    (start)        {"particles": 524288, "bytes_per_particle": 88 or null, "threads": 2}     ready to step
     first          {"seconds": 2.9}                                            one step, kernels compiled
     run SECONDS    {"steps": 31, "seconds": 1.02}                              steps for about that long
     finish         {"sound": true, "smallest_step": 8e-5, "peak_memory": 219152384}    and ends
@@ -38,10 +38,11 @@ class Contestant(Protocol):
 
     particles: int
     bytes_per_particle: int | None
+    threads: int
     smallest_step: float
 
-    def step(self) -> None:
-        """Advance by one time step; may return before the device is done."""
+    def advance(self, count: int) -> int:
+        """Take about `count` time steps and return how many; may return before the device is done."""
 
     def sync(self) -> None:
         """Wait until every requested step is done."""
@@ -55,10 +56,8 @@ def run_block(contestant: Contestant, seconds: float) -> tuple[int, float]:
     steps, chunk, elapsed = 0, 1, 0.0
     start = time.perf_counter()
     while elapsed < seconds:
-        for _ in range(chunk):
-            contestant.step()
+        steps += contestant.advance(chunk)
         contestant.sync()
-        steps += chunk
         elapsed = time.perf_counter() - start
         # Few waits for the device, and no overshoot: grow until what is left limits the next chunk.
         left = int(steps / elapsed * (seconds - elapsed)) + 1
@@ -93,13 +92,11 @@ def repeat_stretch(contestant: Rewinding, stretch: int, seconds: float) -> dict[
         contestant.rewind()
         watching -= contestant.watch_seconds
         start, busy_before = time.perf_counter(), time.process_time()
-        for _ in range(stretch):
-            contestant.step()
+        steps += contestant.advance(stretch)
         contestant.sync()
         elapsed += time.perf_counter() - start
         busy += time.process_time() - busy_before
         watching += contestant.watch_seconds
-        steps += stretch
     return {"steps": steps, "seconds": elapsed, "processor_seconds": busy, "watch_seconds": watching}
 
 
@@ -129,20 +126,20 @@ def serve(start: Callable[[], Contestant], commands: Iterable[str], answers: IO[
 
     try:
         contestant = start()
-        answer(particles=contestant.particles, bytes_per_particle=contestant.bytes_per_particle)
+        facts = ("particles", "bytes_per_particle", "threads")
+        answer(**{name: getattr(contestant, name) for name in facts})
         for command in commands:
             match command.split():
                 case ["first"]:
                     begin = time.perf_counter()
-                    contestant.step()
+                    contestant.advance(1)
                     contestant.sync()
                     answer(seconds=time.perf_counter() - begin)
                 case ["run", seconds]:
                     steps, elapsed = run_block(contestant, float(seconds))
                     answer(steps=steps, seconds=elapsed)
                 case ["keep", steps]:
-                    for _ in range(int(steps)):
-                        contestant.step()
+                    contestant.advance(int(steps))
                     contestant.sync()
                     contestant.keep()
                     answer()

@@ -119,16 +119,16 @@ class Column(Ours):
             raise RunError(f"There is no law {min(unknown)}.")
         data = scene_of(names, case, precision)
         super().__init__(data, case.step, threads=threads, precision=precision, arch=arch)
-        self._kept = self._solver.state.save()
+        self._kept = self.engine.state.save()
 
     def keep(self) -> None:
         """Save the state of the run."""
-        self._kept = self._solver.state.save()
+        self._kept = self.engine.state.save()
 
     def rewind(self) -> None:
         """Restore the saved state, and take one step that is not measured."""
-        self._solver.state.load(self._kept)
-        self.step()
+        self.engine.state.load(self._kept)
+        self.advance(1)
         self.sync()
 
     def flowing(self) -> float:
@@ -137,9 +137,9 @@ class Column(Ours):
         from mpmcli.solver.snapshot import read_group
 
         count = 0
-        for group in self._solver.groups:
+        for group in self.engine.groups:
             found = read_group(group)
             stored = found.deformation, found.internal
-            seen = build_observation(group)(self._dt, 0, group.count, stress=False, stored=stored)
+            seen = build_observation(group)(self.engine.last_step, 0, group.count, stress=False, stored=stored)
             count += int((seen.deformation != found.deformation).reshape(group.count, -1).any(axis=1).sum())
         return count / self.particles

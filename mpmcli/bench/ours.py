@@ -1,5 +1,7 @@
 """The contestant of mpmcli: the same block, as a scene."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from mpmcli.bench.cases import BULK_MODULUS, CORNER, DENSITY, EDGE, GRAVITY, BenchCase
@@ -46,7 +48,12 @@ def particles_of(case: BenchCase) -> BodyParticles:
 
 
 class Ours:
-    """The solver on a scene in this process; Taichi starts only once per process."""
+    """A run of a scene in this process; Taichi starts only once per process.
+
+    Attributes:
+        engine: what computes it.
+        threads: of the processor, that it uses.
+    """
 
     def __init__(
         self,
@@ -57,39 +64,52 @@ class Ours:
         threads: int,
         precision: str,
         arch: str,
+        serial: bool = False,
+        force: bool = False,
     ) -> None:
+        """Put the scene on the device.
+
+        Args:
+            data: the scene; step: its time.step, s.
+            particles: one entry per body, in place of the scene's own sampling.
+            serial: leave a scene with few particles to one thread, as `mpmcli simulate` does.
+            force: take time.step above the stable step too.
+        """
         # Imported here, so that a scene can be described without importing Taichi.
-        from mpmcli.solver.backend import start_backend
+        from mpmcli.solver.backend import choose_backend, start
+        from mpmcli.solver.engine import build_engine, suits_batch
         from mpmcli.solver.plan import make_plan
-        from mpmcli.solver.solver import Solver
 
         scene = parse_scene(data, laws=parameter_models(), source=data["title"]).scene
-        backend = start_backend(arch, threads, precision, compile_cache=False)
-        self._solver = Solver(scene, backend, particles=particles)
-        self._waits = not backend.on_cpu
-        self._dt = self.smallest_step = step
-        self.particles: int = self._solver.particle_count
+        backend = choose_backend(arch, threads, precision, compile_cache=False)
+        batched = serial and suits_batch(scene, sum(body.count for body in particles or ()), backend)
+        if batched:
+            backend = replace(backend, threads=1, optimisation="most")
+        start(backend)
+        self.engine = build_engine(scene, backend, particles, batched=batched, force=force)
+        self.threads = backend.threads
+        self.smallest_step = step
+        self.particles: int = self.engine.particle_count
         self.bytes_per_particle: int | None = make_plan(scene, backend).bytes_per_particle
 
     @property
     def watch_seconds(self) -> float:
         """Wall time of the measurements of the state, s."""
-        return self._solver.measure_seconds
+        return self.engine.measure_seconds
 
-    def step(self) -> None:
-        """Advance by one step, as `frames` does: of the case's size, or that of the limits if smaller."""
-        self._dt, _ = self._solver.stable_step()
-        self.smallest_step = min(self.smallest_step, self._dt)
-        self._solver.step(self._dt)
+    def advance(self, count: int) -> int:
+        """Take about `count` steps and return how many."""
+        steps, smallest = self.engine.advance(count)
+        self.smallest_step = min(self.smallest_step, smallest)
+        return steps
 
     def sync(self) -> None:
         """Wait until every requested step is done; on the CPU each step waits."""
-        if self._waits:
-            self._solver.measure_state(self._dt)
+        self.engine.wait()
 
     def positions(self) -> np.ndarray:
         """Return the positions of the particles, (particles, dimension), m, in their initial order."""
-        return self._solver.frame(0, [])[0].position
+        return self.engine.frame(0, [])[0].position
 
     def is_sound(self) -> bool:
         """Whether every particle is in the domain."""
@@ -98,6 +118,6 @@ class Ours:
 
 
 def falling_block(case: BenchCase, *, threads: int, precision: str, arch: str) -> Ours:
-    """Return the solver on the block of the peer."""
+    """Return what `mpmcli simulate` computes with, on the block of the peer."""
     data, particles = scene_of(case, precision), [particles_of(case)]
-    return Ours(data, case.step, particles, threads=threads, precision=precision, arch=arch)
+    return Ours(data, case.step, particles, threads=threads, precision=precision, arch=arch, serial=True, force=True)

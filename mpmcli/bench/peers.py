@@ -87,13 +87,20 @@ class Peer:
         module = _run_source(source, f"<{case.peer} of taichi, adapted>")
         self.particles: int = module.n_particles
         self.smallest_step = case.step
-        self.step: Callable[[], None] = module.substep
+        self.threads = threads
+        self._step: Callable[[], None] = module.substep
         self._sync: Callable[[], None] = module.ti.sync
         self._position = getattr(module, _POSITION[case.peer])
         module.init()
         self._position.from_numpy(case.positions().astype(np.float32 if precision == "f32" else np.float64))
         getattr(module, _VELOCITY[case.peer]).fill(module.ti.Vector(case.velocity().tolist()))
         self._sync()
+
+    def advance(self, count: int) -> int:
+        """Take `count` steps."""
+        for _ in range(count):
+            self._step()
+        return count
 
     def sync(self) -> None:
         """Wait until every requested step is done."""

@@ -11,9 +11,9 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import Scene, scene_to_toml
-from mpmcli.simulation.engine import Engine
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import LEFT, OUTRAN, UnstableRunError
+from mpmcli.solver.engine import Engine
 
 Verdict = Literal["stable", "suspect", "unstable", "escaped", "failed"]
 

@@ -5,11 +5,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.simulation.engine import suits_batch
 from mpmcli.simulation.recording import Recording, record
 from mpmcli.solver.backend import Arch, Backend, Optimisation, choose_backend, start, stop_backend
 from mpmcli.solver.batch import Batch, Kind
 from mpmcli.solver.batch_run import BatchRun
+from mpmcli.solver.engine import suits_batch
 from mpmcli.solver.plan import make_plan, require_room
 from mpmcli.solver.solver import Solver
 

@@ -17,11 +17,12 @@ from mpmcli.output.durable import write_text
 from mpmcli.output.header import RunHeader
 from mpmcli.output.store import Store
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
-from mpmcli.simulation.engine import Engine, build_engine, choose_engine
+from mpmcli.simulation.engine import choose_engine
 from mpmcli.simulation.stopwatch import Stopwatch
 from mpmcli.simulation.summary import RunSummary
 from mpmcli.solver.backend import Arch, start
 from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.engine import Engine, build_engine
 from mpmcli.solver.plan import make_plan, require_room
 
 SCENE = "scene.toml"

@@ -153,6 +153,38 @@ class BatchRun(Run):
             UnstableRunError: a particle left the domain, was inverted or became non-finite.
         """
         yield None
+        self._start()
+        yield self.frame(0, [])
+        count = self.scene.time.frames
+        for index in range(1, count + 1):
+            target = self.scene.time.end * index / count
+            if target <= self.time:
+                continue
+            before = self.step_count
+            yield from self._reach(target)
+            yield self.frame(index, self._taken(before))
+
+    def begin(self) -> None:
+        """Take the bounds of time 0, where this is the only run of its batch; a second call does nothing."""
+        if not self._begun:
+            self.batch.launch()
+            self._start()
+
+    def advance(self, count: int) -> tuple[int, float]:
+        """Take `count` steps as large as the next one, fewer or more where it changes; see `Engine.advance`."""
+        self.begin()
+        self._push()
+        before = self.step_count
+        step = min(self.stable_step()[0], self.scene.time.end / self.scene.time.frames)
+        for _ in self._reach(self.time + count * step):
+            self.batch.launch()
+        return self.step_count - before, self._get("smallest")
+
+    def wait(self) -> None:
+        """Wait until the device has taken every step; each launch waits."""
+
+    def _start(self) -> None:
+        """Take the bounds of time 0 from the measurement of the first launch."""
         self.first_step_seconds = self.batch.first_seconds
         control = StepControl(
             self.scene, self.groups, [self._measurement(g) for g in range(len(self.groups))], on_cpu=True
@@ -170,23 +202,11 @@ class BatchRun(Run):
             self._numbers[self._real.sensitivity[g]] = group.law.sensitivity
             self._numbers[self._real.hardening[g]] = group.law.hardening
         self._push()
-        yield self.frame(0, [])
-        count = self.scene.time.frames
-        for index in range(1, count + 1):
-            target = self.scene.time.end * index / count
-            if target <= self.time:
-                continue
-            self._set(target=target, smallest=math.inf, largest=0.0, largest_courant=0.0)
-            before = self.step_count
-            self._set_counts(arrived=0, limit=0)
-            yield from self._reach()
-            self.state.time = target
-            self._measure(range(len(self.groups)))
-            self._push()
-            yield self.frame(index, self._taken(before))
 
-    def _reach(self) -> Iterator[None]:
-        """Let the batch launch until the run has reached its target."""
+    def _reach(self, target: float) -> Iterator[None]:
+        """Let the batch launch until the run has reached a time, s."""
+        self._set(target=target, smallest=math.inf, largest=0.0, largest_courant=0.0)
+        self._set_counts(arrived=0, limit=0)
         arrived = False
         while not arrived:
             self._set_counts(status=GOING, budget=max(1, BUDGET // self.particle_count), steps=0)
@@ -206,6 +226,9 @@ class BatchRun(Run):
                 if due and not arrived:
                     self._measure(due)
                 self._push()
+        self.state.time = target
+        self._measure(range(len(self.groups)))
+        self._push()
 
     def _measure(self, due: range | list[int]) -> None:
         """Take the measurement of some groups that the kernel has made after the last step."""

@@ -60,6 +60,9 @@ class Solver(Run):
         self.state = State(self.groups, self._kernels, step_control, forces)
         self._begin()
 
+    def begin(self) -> None:
+        """Take the bounds of time 0; done when the device was filled."""
+
     def restart(self) -> None:
         """Begin a new run at time 0 with the particles as they are on the device, set from outside."""
         self.state.step_control.measure()
@@ -103,6 +106,21 @@ class Solver(Run):
             self.measure_state(dt)
         elif due:
             self.measure_state(dt, due)
+
+    def advance(self, count: int) -> tuple[int, float]:
+        """Take `count` steps, each the stable one, at most an interval between frames; see `Engine.advance`."""
+        interval = self.scene.time.end / self.scene.time.frames
+        smallest = math.inf
+        for _ in range(count):
+            dt = min(self.stable_step()[0], interval)
+            self.step(dt)
+            smallest = min(smallest, dt)
+        return count, smallest
+
+    def wait(self) -> None:
+        """Wait until the device has taken every step; on the CPU each step waits."""
+        if not self.backend.on_cpu:
+            self.measure_state(self.last_step)
 
     def measure_state(self, dt: float, due: Sequence[int] | None = None) -> None:
         """Measure the device's state, and the limits with it.
