@@ -4,10 +4,10 @@ import time
 from dataclasses import dataclass
 
 from mpmcli.scene import LoadedScene
-from mpmcli.solver.backend import Arch, Backend, start_backend
+from mpmcli.solver.backend import Arch, Backend, start
 from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.engine import Engine, build_engine, choose_engine
 from mpmcli.solver.plan import Plan, make_plan, require_room
-from mpmcli.solver.solver import Solver
 
 # Steps that are not counted: the first compiles, and the next fill the caches of the processor.
 WARM_UP = 3
@@ -21,9 +21,9 @@ class Probe:
         backend: backend of the probe.
         start_seconds: time to start the backend, sample and allocate.
         compile_seconds: time of the first step and frame in excess of later ones.
-        step_seconds: wall time of a step, None if the run became unstable in the first one.
+        step_seconds: wall time of a step, None if the run became unstable before one was measured.
         frame_seconds: time to build a frame and its ledger row.
-        steps: number of measured steps.
+        steps: number of steps taken.
         failure: message of an unstable run, "" otherwise.
     """
 
@@ -37,9 +37,13 @@ class Probe:
 
 
 def probe_scene(
-    loaded: LoadedScene, *, arch: Arch = "auto", threads: int | None = None, seconds: float = 2.0
+    loaded: LoadedScene, steps: int, *, arch: Arch = "auto", threads: int | None = None, seconds: float = 2.0
 ) -> tuple[Probe, Plan]:
-    """Run a scene for `seconds` of wall time; it starts Taichi in this process and writes nothing.
+    """Run a scene as `mpmcli simulate` would; it starts Taichi in this process and writes nothing.
+
+    Args:
+        steps: expected number of steps of the whole run.
+        seconds: wall time of the steps that are measured.
 
     Returns:
         The measured cost, and the plan of a run on the backend that was started.
@@ -49,44 +53,39 @@ def probe_scene(
     """
     scene = loaded.scene
     began = time.perf_counter()
-    backend = start_backend(arch, threads, scene.solver.precision)
+    backend, batched = choose_engine(scene, lambda: steps, arch, threads)
+    start(backend)
     plan = make_plan(scene, backend)
     require_room(plan)
-    solver = Solver(scene, backend)
-    start = time.perf_counter() - began
-    solver.frame(0, [])
-    first_frame = time.perf_counter() - began - start
+    engine = build_engine(scene, backend, batched=batched)
+    started = time.perf_counter() - began
+    engine.begin()
+    engine.frame(0, [])
+    first_frame = time.perf_counter() - began - started
     # The smallest of three: the second frame allocates memory, later ones reuse it.
-    frame = min(_seconds_of_a_frame(solver) for _ in range(3))
+    frame = min(_seconds_of_a_frame(engine) for _ in range(3))
     compiled = max(0.0, first_frame - frame)
-    steps, spent, failure = 0, 0.0, ""
+    measured, spent, failure = 0, 0.0, ""
     try:
         warm = time.perf_counter()
-        for _ in range(WARM_UP):
-            _advance(solver)
-        solver.measure_state(0.0)
+        engine.advance(WARM_UP)
+        engine.wait()
         compiled += time.perf_counter() - warm
+        # A run launches and waits at least once for each frame.
+        chunk, most = 1, max(1, round(steps / scene.time.frames))
         since = time.perf_counter()
-        while steps == 0 or (spent < seconds and solver.time < scene.time.end):
-            _advance(solver)
-            steps += 1
+        while measured == 0 or (spent < seconds and engine.time < scene.time.end):
+            measured += engine.advance(chunk)[0]
+            engine.wait()
             spent = time.perf_counter() - since
-        # A GPU is synchronised only here.
-        solver.measure_state(0.0)
-        spent = time.perf_counter() - since
+            chunk = max(1, min(most, int(measured / spent * (seconds - spent))))
     except UnstableRunError as error:
         failure = str(error)
-    return Probe(backend, start, compiled, spent / steps if steps else None, frame, steps, failure), plan
+    step_seconds = spent / measured if measured else None
+    return Probe(backend, started, compiled, step_seconds, frame, engine.step_count, failure), plan
 
 
-def _advance(solver: Solver) -> None:
-    """Take one step of a run, ignoring the times of frames."""
-    dt, _ = solver.stable_step()
-    interval = solver.scene.time.end / solver.scene.time.frames
-    solver.step(min(dt, interval))
-
-
-def _seconds_of_a_frame(solver: Solver) -> float:
+def _seconds_of_a_frame(engine: Engine) -> float:
     since = time.perf_counter()
-    solver.frame(0, [])
+    engine.frame(0, [])
     return time.perf_counter() - since

@@ -64,7 +64,7 @@ def _of_scene(
     check = check_scene(loaded, plan=make_plan(loaded.scene, backend))
     # A scene that does not fit into memory is not run.
     if probing and not any(finding.rule == "memory" for finding in check.findings):
-        probe, plan = probe_scene(loaded, threads=threads)
+        probe, plan = probe_scene(loaded, check.forecast.steps, threads=threads)
         check = check_scene(loaded, plan=plan, probe=probe)
     return check
 

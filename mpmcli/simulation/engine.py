@@ -15,4 +15,6 @@ def choose_engine(
     Raises:
         InputError: the backend cannot be used, or no step of the scene is stable.
     """
-    return engine.choose_engine(scene, expected_steps(SceneFacts(scene)), arch, threads, compile_cache=compile_cache)
+    return engine.choose_engine(
+        scene, lambda: expected_steps(SceneFacts(scene)), arch, threads, compile_cache=compile_cache
+    )

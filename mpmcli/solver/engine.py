@@ -69,12 +69,17 @@ class Engine(Protocol):
 
 
 def choose_engine(
-    scene: Scene, steps: int, arch: Arch = "auto", threads: int | None = None, *, compile_cache: bool = True
+    scene: Scene,
+    expected_steps: Callable[[], int],
+    arch: Arch = "auto",
+    threads: int | None = None,
+    *,
+    compile_cache: bool = True,
 ) -> tuple[Backend, bool]:
     """Return the backend for a scene, not started, and whether a batch runs it.
 
     Args:
-        steps: expected number of them.
+        expected_steps: their number; called only where a batch runs the scene.
         threads: CPU threads; None for one where a batch runs the scene, and otherwise for all.
 
     Raises:
@@ -87,7 +92,7 @@ def choose_engine(
     batched = can_batch(scene)
     optimisation = "all"
     if batched:
-        optimisation = "few" if particles * steps < LITTLE_WORK else "most"
+        optimisation = "few" if particles * expected_steps() < LITTLE_WORK else "most"
     return choose_backend(
         "cpu", 1, scene.solver.precision, compile_cache=compile_cache, optimisation=optimisation
     ), batched
