@@ -34,6 +34,9 @@ SHORTER = {
     "mpmcli bench --json > results/bench.json": (
         "mpmcli bench --case 2d-64 --seconds 0.1 --blocks 1 --json > results/bench.json"
     ),
+    "mpmcli bench --dataset --json > results/dataset.json": (
+        "mpmcli bench --dataset --threads 1 --seconds 0.1 --blocks 1 --json > results/dataset.json"
+    ),
     "mpmcli bench --materials --json > results/materials.json": (
         "mpmcli bench --materials --case 2d-128 --seconds 0.1 --blocks 1 --json > results/materials.json"
     ),
@@ -303,4 +306,8 @@ def test_the_bench_table_is_written_from_its_json(commands, checkout):
     section = page[page.index("<!-- bench:") : page.index("<!-- end of bench -->")]
     report = json.loads((checkout / "results" / "bench.json").read_text(encoding="utf-8"))
     assert f"**{report['cases'][0]['ratio']:.1f}**" in section
-    assert "| 2d-64 | 5,000 |" in section
+    assert "| 2d-64 | 5,000 | 1 / " in section
+    section = page[page.index("<!-- dataset:") : page.index("<!-- end of dataset -->")]
+    report = json.loads((checkout / "results" / "dataset.json").read_text(encoding="utf-8"))
+    assert f"**{report['results'][0]['ratio']:.1f}**" in section
+    assert "| 1 | 1 |" in section
