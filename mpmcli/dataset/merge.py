@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+from mpmcli.dataset.card import write_card
 from mpmcli.dataset.compute import QUARANTINE
 from mpmcli.dataset.dataset import SHARDS
 from mpmcli.dataset.folder import require_empty
@@ -55,4 +56,5 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
     manifest = Manifest(target)
     manifest.create({**facts[0], "part": [1, 1]})
     manifest.put(row for part in parts for row in Manifest(part).rows())
+    write_card(target)
     return status_of(target)

@@ -6,6 +6,7 @@ from contextlib import ExitStack, nullcontext
 
 from mpmcli import __version__
 from mpmcli.cores import available_cores
+from mpmcli.dataset.card import write_card
 from mpmcli.dataset.cluster import Workers, joined_workers, local_workers
 from mpmcli.dataset.compute import Task
 from mpmcli.dataset.folder import Folder
@@ -75,6 +76,8 @@ def _run(
                         state.particle_steps += row.particles * row.steps
                     state.seconds = time.perf_counter() - since
                     on_progress(state)
+        if settings.part == (1, 1):
+            write_card(settings.directory)
         folder.close()
         state.status = "finished"
     except KeyboardInterrupt:

@@ -1,0 +1,141 @@
+"""The card of a dataset: what it says, that its code runs, and that its bytes depend on the content alone."""
+
+import json
+import re
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_sweep import COUNT, VERDICTS, made_workers, make_dataset  # noqa: F401
+
+import mpmcli.dataset
+from mpmcli.dataset.card import first_paragraph, write_card
+from mpmcli.dataset.drawn_values import DrawnComponent, histogram, values_of
+from mpmcli.dataset.export import ExportSettings, export
+from mpmcli.dataset.manifest import MANIFEST, Manifest
+from mpmcli.dataset.merge import merge
+
+pytestmark = pytest.mark.usefixtures("made_workers")
+
+
+def card_of(dataset: Path) -> str:
+    return (dataset / "README.md").read_text(encoding="utf-8")
+
+
+def table(card: str, head: str) -> list[list[str]]:
+    """Return the rows of the table whose first cell is `head`."""
+    lines = card[card.index(f"| {head} |") :].split("\n\n")[0].splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def test_the_card_says_what_the_dataset_holds():
+    dataset = make_dataset("whole")
+    card, opened = card_of(dataset), mpmcli.dataset.open(dataset)
+    assert f"{COUNT - 2} trajectories in 2D" in card
+    assert "* particles N: 20 to 31" in card and "* frames T: 11" in card
+    assert "* interval between frames: 0.01 s" in card and "* end: 0.1 s" in card
+    assert "* domain: [0.0, 0.0] to [1.0, 1.0] m, cells of 0.05 m" in card
+    assert "`deformation_gradient` (T, N, 2, 2)" in card
+    rows = {row[0]: row[1:] for row in table(card, "split")}
+    assert rows["all"] == ["12", "10", "10", "1", "1"]
+    assert {split: int(rows[split][1]) for split in opened.splits} == {s: len(n) for s, n in opened.splits.items()}
+
+
+def test_the_reasons_are_told_without_paths():
+    card = card_of(make_dataset("whole"))
+    assert "* 4, unstable: it blew up." in card and "* 9, suspect: it blew up." in card
+    assert "sweep.toml:" not in card and str(Path.cwd()) not in card
+
+
+def test_what_was_drawn_is_that_of_the_included_trajectories():
+    dataset = make_dataset("whole")
+    draws = [trajectory.draws for trajectory in mpmcli.dataset.open(dataset)]
+    rows = {row[0].strip("`"): row[1:] for row in table(card_of(dataset), "key")}
+    angles = [drawn["bodies.sand.material.friction_angle"] for drawn in draws]
+    shown = rows["bodies.sand.material.friction_angle"]
+    assert shown[0] == "uniform [25, 40]"
+    assert [float(x) for x in shown[1:4]] == pytest.approx([min(angles), np.mean(angles), max(angles)], rel=1e-3)
+    heights = [body["max"][1] - body["min"][1] for drawn in draws for body in drawn["place.sand"]]
+    shown = rows["place.sand.size.1"]
+    assert [float(x) for x in shown[1:4]] == pytest.approx([min(heights), np.mean(heights), max(heights)], rel=1e-3)
+    counts = [len(drawn["place.sand"]) for drawn in draws]
+    told = dict(one.split(": ") for one in rows["place.sand.count"][4].split(", "))
+    assert told == {str(n): str(counts.count(n)) for n in sorted(set(counts))}
+    assert rows["place.sand.velocity.0"][0] == "uniform [-2.5, 2.5]"
+    assert rows["place.sand.center.0"][0] == "within [0.2, 0.8]"
+
+
+def test_the_bytes_are_those_of_a_resumed_and_of_a_merged_dataset():
+    whole = (make_dataset("whole") / "README.md").read_bytes()
+    assert (make_dataset("resumed", broken_after=2) / "README.md").read_bytes() == whole
+    parts = [make_dataset(f"part{i}", (i, 2)) for i in (1, 2)]
+    assert not any((part / "README.md").exists() for part in parts)
+    merge(parts, Path("merged"))
+    assert Path("merged/README.md").read_bytes() == whole
+
+
+def test_the_code_of_the_card_runs(monkeypatch):
+    dataset = make_dataset("whole")
+    opened = mpmcli.dataset.open(dataset)
+    card = card_of(dataset)
+    for form in re.findall(r"mpmcli export \. --to (\w+) -o \.\./\1", card):
+        export(opened, ExportSettings(form, Path(form)))
+    monkeypatch.chdir(dataset)
+    blocks = re.findall(r"```python\n(.*?)```", card, re.DOTALL)
+    assert len(blocks) == 5 and all(len(block.splitlines()) <= 5 for block in blocks)
+    first = opened.splits["train"][0]
+    expected = mpmcli.dataset.open(".")[first].position
+    for block in blocks:
+        names: dict = {}
+        exec(block, names)
+        np.testing.assert_array_equal(names["position"], expected)
+
+
+def test_the_picture_is_shown_where_it_lies():
+    dataset = make_dataset("whole")
+    assert "montage.png" not in card_of(dataset)
+    (dataset / "montage.png").write_bytes(b"")
+    write_card(dataset)
+    assert "](montage.png)" in card_of(dataset)
+
+
+def test_a_dataset_without_trajectories_has_a_card(monkeypatch):
+    monkeypatch.setattr("made_sweep.VERDICTS", dict.fromkeys(range(COUNT), "unstable"))
+    card = card_of(make_dataset("whole"))
+    assert "No trajectory is included." in card and "* and 2 more;" in card
+    assert "## Loading" not in card
+    assert len(VERDICTS) == 2
+
+
+def test_the_times_of_the_manifest_do_not_matter():
+    dataset = make_dataset("whole")
+    before = card_of(dataset)
+    with sqlite3.connect(dataset / MANIFEST) as manifest:
+        manifest.execute("UPDATE trajectories SET seconds = seconds + 1, arch = 'cuda'")
+    assert Manifest(dataset).rows()[0].arch == "cuda"
+    assert write_card(dataset).read_text(encoding="utf-8") == before
+
+
+def test_a_histogram_counts_every_value():
+    assert histogram([0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]) == "▁········█"
+    assert histogram([k / 10 for k in range(11)]) == "▄▄▄▄▄▄▄▄▄█"
+
+
+def test_texts_and_constants_are_counted():
+    component = DrawnComponent("bodies.ball.material", 'choice ["jelly", "rubber"]')
+    for value in ("jelly", "rubber", "jelly"):
+        component.add(value)
+    assert component.row[2:] == ("", "", "", "jelly: 2, rubber: 1")
+    sweep = {"vary": {"time.end": 2, "domain.gravity": {"uniform": [[0, -10], [0, -9]]}}}
+    told = list(values_of(sweep, json.loads('{"time.end": 2, "domain.gravity": [0, -9.5]}')))
+    assert told == [
+        ("time.end", "2", 2),
+        ("domain.gravity.0", "uniform [0, 0]", 0),
+        ("domain.gravity.1", "uniform [-10, -9]", -9.5),
+    ]
+
+
+def test_the_first_paragraph_of_a_sweep_describes_it():
+    assert first_paragraph("#:schema s\n#\n# One.\n# Two.\n#\n# Three.\nbase = 1\n") == "One.\nTwo."
+    assert first_paragraph("base = 1\n# no\n") == ""
