@@ -43,6 +43,27 @@ def verify(dataset: Path, quiet: bool, as_json: bool) -> int:
     return 1 if found.faults else 0
 
 
+@command.command("card")
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.option("--montage", metavar="CxR", default="4x4", show_default=True, help="Trajectories of the picture.")
+def card(dataset: Path, montage: str) -> None:
+    """Write README.md of DATASET again, with a picture of some trajectories, montage.png, where one can be drawn.
+
+    The text is the one that a finished sweep has, without the picture, on its own.
+    """
+    from mpmcli.dataset.card import write_card
+    from mpmcli.dataset.montage import write_montage
+    from mpmcli.dataset.report import status_of
+    from mpmcli.errors import InputError
+
+    status_of(dataset)
+    try:
+        write_montage(dataset, montage)
+    except InputError as error:
+        click.echo(f"note: the card has no new picture: {error}", err=True)
+    print_text(str(write_card(dataset)))
+
+
 @command.command("merge")
 @click.argument("parts", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="DATASET", required=True)

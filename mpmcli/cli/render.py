@@ -82,11 +82,16 @@ def command(
 ) -> int:
     """Draw frames of a RESULT without a screen: pictures, a film (--movie) or a montage.
 
+    RESULT may be a dataset: its montage shows evenly spaced trajectories at one frame, the middle one or --frame, and
+    goes to montage.png in the dataset.
+
     RESULT is a directory, particles.vtkhdf or particles.pvd, of a run that has ended or goes on. A picture that is
     there and still right is not made again. The path of each picture, or that of the film, and the directory of the
     surfaces are printed on stdout.
     """
     from mpmcli.cli.progress_bar import ProgressBar
+    from mpmcli.dataset.dataset import is_dataset
+    from mpmcli.dataset.montage import plan_montage
     from mpmcli.output import open_result
     from mpmcli.plain_text import counted
     from mpmcli.render.request import Request, plan_render
@@ -96,7 +101,7 @@ def command(
     request = Request(
         output, mode, frames, color, clim, cmap, size, camera, theme, movie, fps, montage, save_surface, overwrite
     )
-    plan = plan_render(open_result(result), request)
+    plan = plan_montage(result, request) if is_dataset(result) else plan_render(open_result(result), request)
     with ProgressBar(plan.due, "frames", quiet=quiet) as bar, interrupts_wait():
         done = plan.carry_out(workers, watch=bar.show, stop=interrupt_came)
     for warning in done.warnings:

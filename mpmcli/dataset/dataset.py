@@ -234,6 +234,11 @@ class Dataset:
         return self[self.numbers[0]].header.dimension
 
 
+def is_dataset(path: Path) -> bool:
+    """Return whether a directory holds the shards of a dataset."""
+    return (path / SHARDS).is_dir()
+
+
 def open_dataset(path: Path | str) -> Dataset:
     """Open a dataset for reading, or the result of a single run as a dataset of one trajectory.
 
@@ -248,12 +253,12 @@ def open_dataset(path: Path | str) -> Dataset:
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path} does not exist: give the directory of a dataset, or a result.")
-    if path.is_dir() and not (path / SHARDS).is_dir():
+    if path.is_dir() and not is_dataset(path):
         if (path / "sweep.toml").exists():
             raise InputError(f"{path} is an empty dataset: it holds no trajectory yet.")
         if not any((path / name).exists() for name in (PACKED, SEGMENTS, SERIES, RECORD)) and path.name != SEGMENTS:
             raise InputError(f"{path} is not a dataset: it has no directory {SHARDS}, and it is no result either.")
-    if not (path / SHARDS).is_dir():
+    if not is_dataset(path):
         return Dataset(path, {0: SPLITS[0]}, open_result(path))
     splits: dict[int, str] = {}
     places: dict[int, Path] = {}

@@ -45,6 +45,7 @@ class RenderSetup:
     Attributes:
         settings: with the limits of the colours filled in.
         colors: explained by a colour bar or a legend; None without either.
+        captions: above the pictures of a montage, by frame; empty for their times.
     """
 
     result: Result
@@ -53,6 +54,7 @@ class RenderSetup:
     colors: Coloring | Categories | None
     layout: PictureLayout
     view: View
+    captions: tuple[str, ...] = ()
 
     def painter(self) -> Painter:
         """Make the painter; it opens a window."""

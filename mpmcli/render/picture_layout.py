@@ -67,7 +67,12 @@ class PictureLayout:
         return max(width, LEAST), max(height, LEAST)
 
     def compose(
-        self, pictures: Sequence[np.ndarray], view: View, times: Sequence[float], missing: int = 0
+        self,
+        pictures: Sequence[np.ndarray],
+        view: View,
+        times: Sequence[float],
+        missing: int = 0,
+        captions: Sequence[str] | None = None,
     ) -> np.ndarray:
         """Return the whole picture, (height, width, 3) uint8.
 
@@ -75,6 +80,7 @@ class PictureLayout:
             pictures: of the scene, of the size of the viewport, row by row.
             times: of each, s.
             missing: particles whose value is not a number.
+            captions: above each picture of a montage, cut where they are too long; None for times.
         """
         from PIL import Image, ImageDraw
 
@@ -84,7 +90,7 @@ class PictureLayout:
             x, y = self._place(k)
             whole.paste(Image.fromarray(picture), (x, y))
             if self._label:
-                self._time(draw, time, (x, y - self._label // 2))
+                self._caption(draw, captions[k] if captions else time, (x, y - self._label // 2))
             if self.walls:
                 self._walls(draw, view, (x, y))
         if self.scale_bar:
@@ -158,10 +164,14 @@ class PictureLayout:
         title = cut(self.scene.title, lambda text: font.getlength(text) <= room)
         draw.text((pad, middle), title, self.theme.text, font, anchor="lm")
 
-    def _time(self, draw: "ImageDraw", time: float, place: tuple[int, int]) -> None:
-        """Draw the time above a picture of a montage, if it fits."""
-        font, told = font_of(self._px(SMALL)), time_text(time, self.times)
-        free = self.viewport_size[0] - font.getlength(told)
+    def _caption(self, draw: "ImageDraw", said: str | float, place: tuple[int, int]) -> None:
+        """Draw what fits of a text above a picture of a montage, or a time if all of it fits."""
+        font, room = font_of(self._px(SMALL)), self.viewport_size[0]
+        if isinstance(said, str):
+            told = cut(said, lambda text: font.getlength(text) <= room)
+        else:
+            told = time_text(said, self.times)
+        free = room - font.getlength(told)
         if free >= 0:
             start = place[0] + min(self._px(PAD), free)
             draw.text((start, place[1]), told, self.theme.text, font, anchor="lm")
@@ -192,7 +202,7 @@ class PictureLayout:
     def _legend(self, draw: "ImageDraw", colors: Categories) -> None:
         font = font_of(self._px(SMALL))
         x = self._scene_box[2] + self._px(PAD)
-        room = self.size[0] - x - self._px(PAD + SWATCH + 8)
+        room = self.size[0] - x - self._px(PAD) - self._px(SWATCH + 8)
         swatch, step = self._px(SWATCH), self._px(SWATCH + 10)
         y = self._scene_box[1] + self._px(PAD)
         rows = max(1, int((self.size[1] - self._px(PAD) - swatch - y) / step) + 1)

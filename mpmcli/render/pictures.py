@@ -93,6 +93,7 @@ class PictureRenderer:
             watch: called with each frame that has been drawn, and its outcome.
         """
         setup, drawn, times, missing = self._setup, [], [], 0
+        captions = [setup.captions[k] for k in ks] if setup.captions else None
         for k in ks:
             frame = setup.result.frame(k, self._painter.fields)
             drawn.append(self._painter.draw(frame))
@@ -100,7 +101,7 @@ class PictureRenderer:
             outcome = Outcome(self._missing(frame), int((~np.isfinite(frame.position).all(axis=1)).sum()))
             missing += outcome.missing
             watch(k, outcome)
-        return setup.layout.compose(drawn, setup.view, times, missing)
+        return setup.layout.compose(drawn, setup.view, times, missing, captions)
 
     def _missing(self, frame: Frame) -> int:
         colors = self._setup.colors

@@ -1,7 +1,7 @@
 """The options of `mpmcli render`, validated before anything is drawn."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mpmcli.errors import InputError
@@ -51,8 +51,11 @@ class Request:
         return USUAL_FPS if self.fps is None else self.fps
 
 
-def plan_render(result: Result, request: Request) -> RenderPlan:
+def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()) -> RenderPlan:
     """Validate a request and return the plan that carries it out.
+
+    Args:
+        captions: of the frames of the result in a montage; empty for their times.
 
     Raises:
         InputError: the request is not possible.
@@ -78,7 +81,7 @@ def plan_render(result: Result, request: Request) -> RenderPlan:
         cmap=request.cmap,
         grid=grid,
     )
-    setup = set_up(result, settings)
+    setup = replace(set_up(result, settings), captions=captions)
     if (request.clim or request.cmap) and not isinstance(setup.colors, Coloring):
         option = "--clim" if request.clim else "--cmap"
         raise InputError(f"{option} is for colours that stand for a value: give --color-by speed, or another one.")

@@ -1,0 +1,191 @@
+"""A montage of a dataset: one frame of each of some trajectories, drawn as the frames of one run."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpmcli.dataset.card import MONTAGE
+from mpmcli.dataset.dataset import Dataset, Trajectory, open_dataset
+from mpmcli.dataset.drawn_values import number_text
+from mpmcli.errors import InputError
+from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.header import BodyHeader, RunHeader
+from mpmcli.output.layout import POSITION, STANDARD, FrameLayout
+from mpmcli.output.result import Result
+from mpmcli.render.appearance import appearance_of
+from mpmcli.render.frame_choice import evenly_spaced
+from mpmcli.render.render_plan import RenderPlan
+from mpmcli.render.request import Request, plan_render
+from mpmcli.render.settings import parse_grid
+
+
+def plan_montage(path: Path, request: Request) -> RenderPlan:
+    """Plan a montage of a dataset: evenly spaced trajectories, each at one frame, under its number and drawn values.
+
+    Args:
+        path: the directory of the dataset.
+        request: its `frames` is N, "first" or "last" for every trajectory, None for the middle one of each; its
+            `output` is montage.png in the dataset where none is given.
+
+    Raises:
+        InputError: the request is not possible.
+    """
+    if request.montage is None or request.movie is not None or request.save_surface is not None:
+        raise InputError(
+            f"{path} is a dataset, of which --montage 4x4 draws sixteen trajectories in one picture; "
+            "`mpmcli export --to vtkhdf --trajectory N` makes a result of one, for pictures and films."
+        )
+    dataset = open_dataset(path)
+    columns, rows = parse_grid(request.montage)
+    numbers = evenly_spaced(dataset.numbers, columns * rows)
+    cells = TrajectoryCells(dataset, numbers, request.frames)
+    # No empty cells, but for those of the last row.
+    columns = min(columns, len(numbers))
+    request = replace(
+        request,
+        frames=None,
+        montage=f"{columns}x{-(-len(numbers) // columns)}",
+        output=request.output or path / MONTAGE,
+    )
+    return plan_render(cells, request, cells.captions)
+
+
+def write_montage(path: Path, grid: str = "4x4") -> Path:
+    """Draw the montage of a dataset, montage.png in its directory, and return its path.
+
+    Raises:
+        InputError: nothing draws on this machine, or a file of this name is there that mpmcli did not make.
+        RunError: the disk is full.
+    """
+    return plan_montage(path, Request(montage=grid)).carry_out().pictures[0]
+
+
+class TrajectoryCells(Result):
+    """One frame of each of some trajectories, as the frames of one run that has the bodies of all of them.
+
+    So they share one camera, one scale and one explanation of colours. The domain is the box around all domains, and
+    materials that look alike are one; fields are those that all trajectories have.
+
+    Args:
+        numbers: of the trajectories, one or more.
+        frame: as of `plan_montage`.
+
+    Attributes:
+        captions: the number of each trajectory, and what it has drawn.
+    """
+
+    kind = "packed"
+
+    def __init__(self, dataset: Dataset, numbers: Sequence[int], frame: str | None) -> None:
+        self._trajectories = [dataset[number] for number in numbers]
+        self._chosen = [_position(frame, each) for each in self._trajectories]
+        headers = [each.header for each in self._trajectories]
+        first = headers[0]
+        if any(header.dimension != first.dimension or header.origin is None for header in headers):
+            raise InputError(f"{dataset.path} has trajectories of 2 and 3 dimensions, or without a domain.")
+        self._first_bodies = np.cumsum([0, *(len(header.bodies) for header in headers)])
+        self.captions = tuple(_caption(each) for each in self._trajectories)
+        pairs = list(zip(self._trajectories, self._chosen, strict=True))
+        times = np.array([each.times[k] for each, k in pairs])
+        index = FrameIndex(
+            _common_layout(self._trajectories),
+            first.stored,
+            times,
+            np.array(numbers),
+            np.array([each.steps[k] for each, k in pairs]),
+            np.zeros(len(pairs), np.int64),
+            np.array([each.particle_count for each in self._trajectories]),
+            [each.ledger[k] for each, k in pairs],
+        )
+        super().__init__(dataset.path, index)
+        title = f"{first.title}, t = {number_text(times[0])} s" if np.ptp(times) == 0 else first.title
+        scenes = [header.stored.get("scene", "") for header in headers]
+        self.header = replace(
+            first,
+            # Pictures are drawn again when this changes.
+            stored={**first.stored, "scene": json.dumps([title, *self.captions, *scenes])},
+            title=title,
+            origin=np.min([header.origin for header in headers], axis=0),
+            upper=np.max([header.upper for header in headers], axis=0),
+            bodies=_all_bodies(headers),
+        )
+
+    def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        trajectory, frame = self._trajectories[k], self._chosen[k]
+        stored = {}
+        for name in names:
+            if name == "id":
+                array = np.arange(trajectory.particle_count)
+            elif name == "body":
+                array = trajectory.body + self._first_bodies[k].astype(np.int32)
+            elif name == "material":
+                array = trajectory.material
+            else:
+                array = trajectory.read("position" if name == POSITION else name, slice(frame, frame + 1))[0]
+            stored[name] = self._index.layout.arrays[name].pad(array)
+        return stored
+
+
+@dataclass(frozen=True)
+class _Body(BodyHeader):
+    """A body with the material of the first one that looks like it, and its own density, kg/m^3."""
+
+    own_density: float | None = None
+
+    @property
+    def density(self) -> float | None:
+        return self.own_density
+
+
+def _all_bodies(headers: Sequence[RunHeader]) -> tuple[BodyHeader, ...]:
+    """Return the bodies of all runs, in the order of the runs."""
+    alike: dict[str, Any] = {}
+    bodies = []
+    for header in headers:
+        # The distance of particles is that of the first grid, however fine this one is.
+        finer = (headers[0].spacing / header.spacing) ** header.dimension
+        for body in header.bodies:
+            name = appearance_of(body.material.get("law", "material"), dict(body.material)).name
+            material = alike.setdefault(name, body.material)
+            bodies.append(_Body(body.name, material, body.volume, body.particles_per_cell * finer, body.density))
+    return tuple(bodies)
+
+
+def _common_layout(trajectories: Sequence[Trajectory]) -> FrameLayout:
+    layouts = [each.layout() for each in trajectories]
+    common = [name for name in layouts[0].arrays if all(name in each.arrays for each in layouts)]
+    names = [*(name for name in (POSITION, *STANDARD) if name in common)]
+    names += [name for name in common if name not in names]
+    return FrameLayout(layouts[0].dimension, {name: layouts[0].arrays[name] for name in names})
+
+
+def _position(frame: str | None, trajectory: Trajectory) -> int:
+    """Return the position of the frame that a text means in a trajectory."""
+    count = trajectory.frame_count
+    named = {None: count // 2, "first": 0, "last": count - 1}
+    if frame in named:
+        return named[frame]
+    try:
+        number = int(frame)
+    except ValueError:
+        raise InputError(f'--frame "{frame}" is no frame of every trajectory: give a number, first or last.') from None
+    if not -count <= number < count:
+        raise InputError(f"--frame {number}: trajectory {trajectory.number} holds frames 0 to {count - 1}.")
+    return number % count
+
+
+def _caption(trajectory: Trajectory) -> str:
+    """Return the number of a trajectory, and its drawn values but for those of placed bodies."""
+    values = []
+    for key, value in trajectory.draws.items():
+        if isinstance(value, list | dict):
+            continue
+        parts = key.split(".")
+        name = ".".join(parts[-2:] if parts[-1].isdecimal() else parts[-1:])
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        values.append(f"{name.replace('_', ' ')} {number_text(value) if number else value}")
+    return f"{trajectory.number}: {', '.join(values)}" if values else str(trajectory.number)
