@@ -92,7 +92,7 @@ def test_the_shorter_demo_is_what_the_readme_says():
 
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory) -> Path:
-    """A copy of the repository, with the installation that scripts/demo would make, and drop.toml of the README."""
+    """A copy of the repository, installed as by scripts/demo, with drop.toml of the README and a sweep of it."""
     directory = tmp_path_factory.mktemp("docs") / "mpmcli"
     directory.mkdir()
     for name in ("configs", "docs", "scripts", "mpmcli", "README.md", "pyproject.toml", "constraints.txt"):
@@ -101,8 +101,8 @@ def checkout(tmp_path_factory) -> Path:
             shutil.copytree(source, directory / name, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(source, directory / name)
-    scene = blocks("toml", "README.md")[0]
-    (directory / "drop.toml").write_text(scene, encoding="utf-8")
+    for name, page in {"drop.toml": "README.md", "drops.toml": "docs/datasets.md"}.items():
+        (directory / name).write_text(blocks("toml", page)[0], encoding="utf-8")
     programs = directory / ".venv" / "bin"
     programs.mkdir(parents=True)
     for name, arguments in {"python": "", "mpmcli": "-m mpmcli"}.items():
