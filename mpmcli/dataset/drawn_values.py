@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-# Of a histogram; with fewer distinct values, each is counted by itself.
+# Of a histogram; where values repeat and there are few, each is counted by itself.
 BINS = 10
 MOST_COUNTED = 6
 LEVELS = "▁▂▃▄▅▆▇█"
@@ -47,7 +47,8 @@ class DrawnComponent:
     def _distribution(self) -> str:
         # Sorted as numbers; a key that draws texts has few of them.
         counts = Counter(map(number_text, sorted(self._numbers))) + self._texts
-        if len(counts) <= MOST_COUNTED or self._texts:
+        repeated = len(counts) < max(len(self._numbers), 2)
+        if (len(counts) <= MOST_COUNTED and repeated) or self._texts:
             told = [f"{value}: {count}" for value, count in list(counts.items())[:MOST_COUNTED]]
             return ", ".join([*told, "..."] if len(counts) > MOST_COUNTED else told)
         return f"`{histogram(self._numbers)}`"
