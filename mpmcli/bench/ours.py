@@ -90,7 +90,8 @@ class Ours:
         self.threads = backend.threads
         self.smallest_step = step
         self.particles: int = self.engine.particle_count
-        self.bytes_per_particle: int | None = make_plan(scene, backend).bytes_per_particle
+        # The plan is that of a solver.
+        self.bytes_per_particle: int | None = None if batched else make_plan(scene, backend).bytes_per_particle
 
     @property
     def watch_seconds(self) -> float:

@@ -14,6 +14,8 @@ from mpmcli.output.layout import FrameLayout
 
 # Bytes of waiting frames above which they are sealed.
 MOST_WAITING = 32 * 1024 * 1024
+# Longest time between the computation of a frame of a run and its seal, s, unless a single step takes longer.
+HOLD = 1.0
 
 
 class Store(ABC):

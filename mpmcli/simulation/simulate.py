@@ -15,7 +15,7 @@ from mpmcli.materials.registry import laws
 from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, check_directory, prepare_directory
 from mpmcli.output.durable import write_text
 from mpmcli.output.header import RunHeader
-from mpmcli.output.store import Store
+from mpmcli.output.store import HOLD, Store
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.engine import choose_engine
 from mpmcli.simulation.stopwatch import Stopwatch
@@ -26,8 +26,6 @@ from mpmcli.solver.engine import Engine, build_engine
 from mpmcli.solver.plan import make_plan, require_room
 
 SCENE = "scene.toml"
-# Longest time between the computation of a frame and its seal, s, unless a single step takes longer.
-HOLD = 1.0
 
 
 @dataclass(frozen=True)
