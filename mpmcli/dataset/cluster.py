@@ -1,9 +1,11 @@
 """Sends tasks to the workers of a Dask cluster, its own or one that runs already."""
 
 import queue
+import signal
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING
 
 from mpmcli.dataset.compute import Task, compute
@@ -107,18 +109,37 @@ def _local_cluster(count: int) -> "LocalCluster":
 
     for left in reversed(range(STARTS)):
         try:
-            return LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                processes=True,
-                memory_limit=None,
-                dashboard_address=LOCAL,
-                silence_logs="CRITICAL",
-            )
+            with _interrupts_blocked():
+                return LocalCluster(
+                    n_workers=count,
+                    threads_per_worker=1,
+                    processes=True,
+                    memory_limit=None,
+                    dashboard_address=LOCAL,
+                    silence_logs="CRITICAL",
+                )
         except (RuntimeError, OSError) as error:
             if not left:
                 raise RunError(f"the workers do not start ({error}); --resume goes on with what is done.") from error
     raise AssertionError
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT for this thread and for what it starts, threads and processes, which keep it blocked.
+
+    Ctrl-C reaches every process of a terminal. Workers would end with a traceback; this process ends them.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    # The first process starts this, which unblocks the signal.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager
