@@ -136,7 +136,7 @@ def check_result(path: Path) -> ResultCheck:
 
 
 def check_kept(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[LedgerRow]) -> ResultCheck:
-    """Check a finished run in memory, as `check_result` checks its files, but for their agreement with the ledger.
+    """Check a finished run in memory, as `check_result` checks its files, but not for changes since the run.
 
     Args:
         frames, ledger: all of the run.
@@ -169,7 +169,9 @@ def _check(opened: OpenedResult, findings: FrameFindings) -> ResultCheck:
 
 def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindings) -> dict[str, float | None]:
     """Read each frame once; check its values, and compare it with the previous frame and the ledger."""
-    state, motion = StateCheck(header, findings), MotionCheck(header, findings)
+    # Only a file can have been changed since the run.
+    stored = opened.kind != "memory"
+    state, motion = StateCheck(header, findings, stored=stored), MotionCheck(header, findings)
     agreement = AgreementCheck(header, findings)
     momentum = MomentumCheck(header, findings, opened.entries[0].row)
     size = 0
@@ -194,7 +196,7 @@ def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindin
             motion.check(number, frame, row, sound)
             if sound is None:
                 steps = frame.step - before[1] if before is not None and before[0] + 1 == number else None
-                if opened.kind != "memory":
+                if stored:
                     agreement.check(number, frame, row, J, steps)
                 momentum.check(number, frame, row)
             else:
@@ -205,7 +207,7 @@ def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindin
         "deformation_max": motion.deformation,
         "momentum_drift": momentum.drift,
         "momentum_frames": momentum.frames,
-        "ledger_difference": None if opened.kind == "memory" else agreement.largest,
+        "ledger_difference": agreement.largest if stored else None,
         "bytes": size,
     }
 

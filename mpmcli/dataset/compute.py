@@ -19,7 +19,7 @@ from mpmcli.check.finding import passes
 from mpmcli.check.scene_check import check_scene
 from mpmcli.dataset.draw import Draw, draw
 from mpmcli.dataset.manifest import Row
-from mpmcli.dataset.shard import TrajectoryData, checksum, group_name, write_trajectory
+from mpmcli.dataset.shard import TrajectoryData, checksum_of, group_name, write_trajectory
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.materials.registry import load_plugins
@@ -167,11 +167,10 @@ def _stored(task: Task, row: Row, drawn: Draw, scene: Scene, run: Recording, ret
         try:
             with sealed(path, data.position.nbytes) as temporary, h5py.File(temporary, "w") as opened:
                 write_trajectory(opened, data, compress=scene.output.compress)
-                found = checksum(opened[group_name(row.number)])
         except (OSError, RuntimeError) as error:
             reason = getattr(error, "strerror", None) or error
             raise RunError(f"trajectory {row.number} could not be written to {path} ({reason}).") from error
-        file = f"{folder}/{path.name}"
+        file, found = f"{folder}/{path.name}", checksum_of(data)
     return replace(
         row,
         scene=hashlib.sha256(scene_to_toml(scene).encode()).hexdigest(),

@@ -9,10 +9,10 @@
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from hashlib import blake2b
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -85,18 +85,48 @@ def write_trajectory(file: h5py.File, data: TrajectoryData, *, compress: bool = 
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     # Fields keep their order.
     group = file.create_group(group_name(data.number), track_order=True)
-    group.attrs["number"], group.attrs["split"] = data.number, data.split
-    group.attrs["draws"], group.attrs["header"] = json.dumps(dict(data.draws)), json.dumps(dict(data.header))
-    for name, array in {"position": data.position, "velocity": data.velocity, **data.fields}.items():
-        options = _storage(array) if compress and array.size else {}
+    group.attrs.update(_attributes(data))
+    for name, array in _arrays(data).items():
+        moves = name in (*MOVING, *data.fields)
+        options = _storage(array) if compress and moves and array.size else {}
         group.create_dataset(name, data=array, track_times=False, **options)
-    tables = {name: (getattr(data, name), np.int32) for name in LABELS}
-    tables |= {"time": (data.time, np.float64), "step": (data.step, np.int64), "frame": (data.frame, np.int64)}
-    for name, (array, dtype) in tables.items():
-        group.create_dataset(name, data=np.asarray(array, dtype), track_times=False)
-    ledger = group.create_group(LEDGER)
-    for name, column in ledger_columns(data.ledger).items():
-        ledger.create_dataset(name, data=column, track_times=False)
+
+
+def _attributes(data: TrajectoryData) -> dict[str, int | str]:
+    draws, header = json.dumps(dict(data.draws)), json.dumps(dict(data.header))
+    return {"number": data.number, "split": data.split, "draws": draws, "header": header}
+
+
+def _arrays(data: TrajectoryData) -> dict[str, np.ndarray]:
+    """Return all arrays as they are stored, by their path in the group."""
+    arrays = {"position": data.position, "velocity": data.velocity, **data.fields}
+    arrays |= {name: np.asarray(getattr(data, name), np.int32) for name in LABELS}
+    for name, dtype in (("time", np.float64), ("step", np.int64), ("frame", np.int64)):
+        arrays[name] = np.asarray(getattr(data, name), dtype)
+    return arrays | {f"{LEDGER}/{name}": column for name, column in ledger_columns(data.ledger).items()}
+
+
+def checksum_of(data: TrajectoryData) -> str:
+    """Return the checksum that the group of a trajectory will have."""
+    arrays = _arrays(data)
+    return _checksum(_attributes(data), ((name, arrays[name]) for name in sorted(arrays)))
+
+
+def checksum(group: h5py.Group) -> str:
+    """Return the SHA-256, hexadecimal, of all that a trajectory's group holds, compressed or not."""
+    names: list[str] = []
+    group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return _checksum(group.attrs, ((name, group[name][...]) for name in sorted(names)))
+
+
+def _checksum(attributes: Mapping[str, Any], arrays: Iterable[tuple[str, np.ndarray]]) -> str:
+    total = sha256()
+    for name in sorted(attributes):
+        total.update(f"{name} = {attributes[name]}\n".encode())
+    for name, array in arrays:
+        total.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        total.update(np.ascontiguousarray(array).data)
+    return total.hexdigest()
 
 
 @contextmanager
@@ -132,22 +162,6 @@ def shard_splits(path: Path) -> dict[int, str]:
         if not set(splits.values()) <= set(SPLITS):
             raise ValueError("a split has another name")
         return splits
-
-
-def checksum(group: h5py.Group) -> str:
-    """Return a BLAKE2b hash, hexadecimal, of all that a trajectory's group holds, compressed or not."""
-    total = blake2b(digest_size=16)
-    for name in sorted(group.attrs):
-        total.update(f"{name} = {group.attrs[name]}\n".encode())
-
-    def add(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        if isinstance(item, h5py.Dataset):
-            array = item[...]
-            total.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-            total.update(np.ascontiguousarray(array).data)
-
-    group.visititems(add)
-    return total.hexdigest()
 
 
 def read_ledger(group: h5py.Group) -> list[LedgerRow]:
