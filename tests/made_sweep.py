@@ -81,7 +81,7 @@ class MadeWorkers:
 def made_workers(tmp_path, monkeypatch) -> None:
     """Let sweeps of this test be computed by nobody, in shards of a few trajectories, in an empty directory."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sweep_run, "_workers", lambda settings, numbers: nullcontext(MadeWorkers()))
+    monkeypatch.setattr(sweep_run, "local_workers", lambda count: nullcontext(MadeWorkers()))
     monkeypatch.setattr(sweep_folder, "_per_shard", lambda size: PER_SHARD)
 
 

@@ -7,9 +7,9 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.materials.law import Law
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.batch import Batch
+from mpmcli.solver.batch_group import BatchGroup
 from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, GOING, IDLE, LIMITS, LOST, MEASURE
 from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.frame_reader import FrameArrays
@@ -27,28 +27,6 @@ from mpmcli.solver.sums import Sums
 
 # Particle-steps of a run in one launch: some tenths of a second, after which the host may stop the run.
 BUDGET = 2_000_000
-
-
-class BatchGroup:
-    """The particles of one law of one run; attributes as of `ParticleGroup`, and its first particle and table row."""
-
-    def __init__(self, batch: Batch, g: int, slot: int, law: Law, bodies: list[int], rows: np.ndarray, count: int):
-        self.law, self.bodies, self.count = law, tuple(bodies), count
-        self.arrays = batch.device.groups[g]
-        self.dimension, self.real, self.internal = self.arrays.dimension, self.arrays.real, self.arrays.internal
-        self.rows = rows.astype(self.real)
-        self.first = slot * batch.kind.particles[g]
-        self.row = slot * batch.kind.bodies[g]
-
-    def to_numpy(self) -> dict[str, np.ndarray]:
-        """Return x, v, C, deformation, internal, (n, k), id and body, (n), in the solver's order."""
-        return self.arrays.read(self.first, self.count, self.bodies, self.row)
-
-    def write(self, found: dict[str, np.ndarray], place: np.ndarray) -> None:
-        """Fill the device with particles, see `initial_state`."""
-        self.arrays.write(self.first, found, self.row + place)
-        for i, row in enumerate(self.rows):
-            self.arrays.table[self.row + i] = row.tolist()
 
 
 class BatchRun(Run):

@@ -1,0 +1,28 @@
+"""The particles of one law of one run of a batch."""
+
+import numpy as np
+
+from mpmcli.materials.law import Law
+from mpmcli.solver.batch import Batch
+
+
+class BatchGroup:
+    """The particles of one law of one run; attributes as of `ParticleGroup`, and its first particle and table row."""
+
+    def __init__(self, batch: Batch, g: int, slot: int, law: Law, bodies: list[int], rows: np.ndarray, count: int):
+        self.law, self.bodies, self.count = law, tuple(bodies), count
+        self.arrays = batch.device.groups[g]
+        self.dimension, self.real, self.internal = self.arrays.dimension, self.arrays.real, self.arrays.internal
+        self.rows = rows.astype(self.real)
+        self.first = slot * batch.kind.particles[g]
+        self.row = slot * batch.kind.bodies[g]
+
+    def to_numpy(self) -> dict[str, np.ndarray]:
+        """Return x, v, C, deformation, internal, (n, k), id and body, (n), in the solver's order."""
+        return self.arrays.read(self.first, self.count, self.bodies, self.row)
+
+    def write(self, found: dict[str, np.ndarray], place: np.ndarray) -> None:
+        """Fill the device with particles, see `initial_state`."""
+        self.arrays.write(self.first, found, self.row + place)
+        for i, row in enumerate(self.rows):
+            self.arrays.table[self.row + i] = row.tolist()
