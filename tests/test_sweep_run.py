@@ -26,7 +26,7 @@ from mpmcli.dataset.draw import draw
 from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import status_of, verify
 from mpmcli.dataset.sweep_run import run_sweep
-from mpmcli.dataset.sweep_state import SweepSettings
+from mpmcli.dataset.sweep_state import SweepSettings, SweepState
 from mpmcli.errors import InputError
 from mpmcli.output import open_result
 from mpmcli.scene import Time
@@ -176,6 +176,17 @@ def test_a_sweep_that_is_killed_and_resumed_makes_the_same_dataset(tmp_path: Pat
     assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
     assert told(tmp_path / "killed") == told(tmp_path / "whole")
     assert run_here("dataset", "verify", tmp_path / "killed", "-q").status == 0
+
+
+def test_the_rate_is_that_since_every_worker_has_ended_a_task() -> None:
+    """10 of 20 trajectories were there; 2 came in the first 5 s, 6 in the next 3."""
+    state = SweepState(Path(), 20, kept=10, seconds=5.0)
+    state.verdicts["stable"] = 12
+    assert state.per_hour == pytest.approx(3600 * 2 / 5)
+    state.settled = 12, 5.0
+    assert state.per_hour == pytest.approx(3600 * 2 / 5)
+    state.verdicts["stable"], state.seconds = 18, 8.0
+    assert state.per_hour == pytest.approx(3600 * 6 / 3)
 
 
 def test_an_interrupt_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,7 +33,7 @@ def run_throughput(
 ) -> ThroughputReport:
     """Compute and store the sweep of `sand_block` with one worker and with `workers` in turn, and mpm88 between.
 
-    Every block is a sweep of its own, in a temporary directory, by new worker processes; their start counts.
+    Every block is a sweep of its own, in a temporary directory, by new worker processes; their start does not count.
 
     Args:
         workers: processes, of one thread each.

@@ -114,7 +114,7 @@ class ThroughputReport:
         title = f"{machine['processor']}, cpu, f32, taichi {machine['taichi']}"
         scene = f"A block of sand: {self.particles:,} particles, 64 x 64 cells, {counted(self.frames, 'frame')}."
         notes = [
-            "per hour: trajectories computed and stored, median of the blocks, the start of the workers included.",
+            "per hour: trajectories computed and stored, median of the blocks, once every worker has ended a task.",
             "s per core: time of a trajectory on each core.",
             "ratio: to the GNS project's generator, one process on each core, with"
             f" {self.generator_seconds:.1f} s for a trajectory. It took {GENERATOR_SECONDS} s",

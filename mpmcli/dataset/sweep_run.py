@@ -68,13 +68,16 @@ def _run(
             with nullcontext(joined) if joined else local_workers(count) as workers:
                 state.start_seconds = time.perf_counter() - began
                 since = time.perf_counter()
-                for task, found in workers.outcomes(_tasks(sweep, settings, numbers, workers.count), stop):
+                outcomes = workers.outcomes(_tasks(sweep, settings, numbers, workers.count), stop)
+                for ended, (task, found) in enumerate(outcomes, 1):
                     new = [_lost(sweep, number) for number in task.numbers] if found is None else found
                     keeper.take(new)
                     for row in new:
                         state.count(row)
                         state.particle_steps += row.particles * row.steps
                     state.seconds = time.perf_counter() - since
+                    if ended == workers.count:
+                        state.settled = state.done, state.seconds
                     on_progress(state)
         if settings.part == (1, 1):
             write_card(settings.directory)

@@ -42,6 +42,7 @@ class SweepState:
         verdicts: count of each verdict so far; accepted: trajectories that the dataset includes.
         particle_steps: of this command.
         seconds: wall time of this command since its workers started; start_seconds: before.
+        settled: done and seconds when each worker had ended a task; until then kernels compile.
         status: "running", "finished" or "interrupted".
     """
 
@@ -53,6 +54,7 @@ class SweepState:
     particle_steps: float = 0.0
     seconds: float = 0.0
     start_seconds: float = 0.0
+    settled: tuple[int, float] | None = None
     status: str = "running"
 
     @property
@@ -62,8 +64,9 @@ class SweepState:
 
     @property
     def per_hour(self) -> float:
-        """Trajectories per hour of this command."""
-        return 3600 * (self.done - self.kept) / self.seconds if self.seconds > 0 else 0.0
+        """Trajectories per hour of this command, since it has settled where it has."""
+        done, seconds = self.settled if self.settled is not None and self.done > self.settled[0] else (self.kept, 0.0)
+        return 3600 * (self.done - done) / (self.seconds - seconds) if self.seconds > seconds else 0.0
 
     def count(self, row: Row) -> None:
         """Count a row."""
