@@ -56,8 +56,13 @@ def run_here(*arguments: object) -> Outcome:
 
 
 @contextmanager
-def started(directory: Path, *arguments: object, ctrl_c_off: bool = False) -> Iterator[subprocess.Popen[str]]:
-    """Start a command in a process of its own, as a shell does; `ctrl_c_off` as with an & at the end."""
+def started(
+    directory: Path, *arguments: object, ctrl_c_off: bool = False, own_group: bool = False
+) -> Iterator[subprocess.Popen[str]]:
+    """Start a command in a process of its own, as a shell does; `ctrl_c_off` as with an & at the end.
+
+    With `own_group` a signal can be sent to it and its children, as a terminal does.
+    """
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     # A process that starts with an ignored signal keeps ignoring it, and so may these tests have been started.
     before = signal.signal(signal.SIGINT, signal.SIG_IGN if ctrl_c_off else signal.default_int_handler)
@@ -69,6 +74,7 @@ def started(directory: Path, *arguments: object, ctrl_c_off: bool = False) -> It
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            start_new_session=own_group,
         )
     finally:
         signal.signal(signal.SIGINT, before)

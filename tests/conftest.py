@@ -21,6 +21,15 @@ settings.register_profile("mpmcli", deadline=None, max_examples=50, print_blob=T
 settings.load_profile("mpmcli")
 
 
+# Files that take longest, which begin first: at the end of a run one core would wait for the other.
+LONG = ("test_docs", "test_sweep_run", "test_solver_paths", "test_batch", "test_knobs", "test_validate_cli")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    places = {name: k for k, name in enumerate(LONG)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(LONG)))
+
+
 @dataclass(frozen=True)
 class PythonRun:
     """What a Python process left: exit status, stdout and stderr as text."""

@@ -25,7 +25,7 @@ SCENES = {name: ((name,), 2, {}) for name in state_run.MATERIALS} | {
     "slip and stick": (("sand",), 2, {"domain": {"walls": {"default": "slip", "y_min": "stick"}}}),
 }
 # Kept in the default suite; the others carry the marker slow.
-USUAL = ("fluid", "snow", "sand", "two laws, two bodies of one", "3D, AFLIP", "slip and stick")
+USUAL = ("sand", "two laws, two bodies of one", "3D, AFLIP")
 Output = list[tuple[Frame, LedgerRow]]
 
 
@@ -116,7 +116,7 @@ def test_runs_of_a_batch_have_the_bytes_of_a_solver(backend_of: Callable, name: 
         assert list(same(outcome, expected)) == []
 
 
-@pytest.mark.parametrize("name", ["two laws, two bodies of one", "3D, AFLIP"])
+@pytest.mark.parametrize("name", ["two laws, two bodies of one", pytest.param("3D, AFLIP", marks=pytest.mark.slow)])
 def test_threads_share_no_memory(backend_of: Callable, name: str) -> None:
     """Many runs at once on three threads, again and again, have the bytes that they have on one."""
     scenes = [scene_named(name, other=k % 2 == 1) for k in range(7)]

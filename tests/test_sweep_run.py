@@ -208,20 +208,12 @@ def test_an_interrupt_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.Mon
 def test_ctrl_c_reaches_all_processes_and_shows_no_traceback(tmp_path: Path) -> None:
     """As a terminal sends it, to the whole group."""
     path = write_sweep(tmp_path, 400, BASE.replace("end = 0.05", "end = 0.5"))
-    words = ["sweep", path, "-o", "dataset", "--workers", "2"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "mpmcli", *map(str, words)],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    words = ("sweep", path, "-o", "dataset", "--workers", 2)
     manifest = tmp_path / "dataset" / "manifest.sqlite"
-    _wait(lambda: manifest.exists() and status_of(tmp_path / "dataset").rows, 120)
-    os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    with started(tmp_path, *words, own_group=True) as process:
+        _wait(lambda: manifest.exists() and status_of(tmp_path / "dataset").rows, 120)
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=60)
     assert process.returncode == 130 and out.startswith("interrupted: "), (out, err)
     assert "Traceback" not in err and "Error" not in err
     assert 0 < len(status_of(tmp_path / "dataset").rows) < 400
