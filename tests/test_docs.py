@@ -43,8 +43,13 @@ SHORTER = {
 }
 # scripts/test is what runs this test.
 NOT_RUN = {"scripts/test"}
-# These are run with -m slow: a minute of compiling each law, and the bar that test_validate_cli.py validates.
+# These are run with -m slow: a minute of compiling each law, the bar that test_validate_cli.py validates, the benchmark
+# of test_bench_dataset.py, and the parts that test_docs_datasets.py computes and merges.
 SLOW = {
+    "mpmcli bench --dataset --json > results/dataset.json",
+    ".venv/bin/python scripts/bench_table results/dataset.json",
+    "mpmcli sweep drops.toml --count 4 -o results/part-1 --shard 1/2",
+    "mpmcli dataset merge results/part-1 -o results/merged",
     "mpmcli bench --materials --json > results/materials.json",
     ".venv/bin/python scripts/materials_table results/materials.json",
     "mpmcli validate bar_fixed_free --levels coarse -o results/bar",
@@ -160,6 +165,11 @@ def test_every_slow_command_runs(checkout):
     section = page[page.index("<!-- materials:") : page.index("<!-- end of materials -->")]
     # Of 2D alone, as it was asked for.
     assert "| `fluid` + `sand` |" in section and "3D" not in section
+    page = (checkout / "docs" / "speed.md").read_text(encoding="utf-8")
+    section = page[page.index("<!-- dataset:") : page.index("<!-- end of dataset -->")]
+    report = json.loads((checkout / "results" / "dataset.json").read_text(encoding="utf-8"))
+    assert f"**{report['results'][0]['ratio']:.1f}**" in section
+    assert "| 1 | 1 |" in section
 
 
 def test_the_commands_make_what_the_readme_says(commands, checkout):
@@ -307,7 +317,3 @@ def test_the_bench_table_is_written_from_its_json(commands, checkout):
     report = json.loads((checkout / "results" / "bench.json").read_text(encoding="utf-8"))
     assert f"**{report['cases'][0]['ratio']:.1f}**" in section
     assert "| 2d-64 | 5,000 | 1 / " in section
-    section = page[page.index("<!-- dataset:") : page.index("<!-- end of dataset -->")]
-    report = json.loads((checkout / "results" / "dataset.json").read_text(encoding="utf-8"))
-    assert f"**{report['results'][0]['ratio']:.1f}**" in section
-    assert "| 1 | 1 |" in section
