@@ -12,9 +12,10 @@ from good_sweep import BASE, SWEEP, sweep_of
 from made_dataset import made_trajectory
 
 from mpmcli.dataset import sweep_folder, sweep_run
-from mpmcli.dataset.compute import PENDING, QUARANTINE, Task, file_name
+from mpmcli.dataset.compute import Task
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.manifest import Row
+from mpmcli.dataset.paths import PENDING, QUARANTINE, file_name
 from mpmcli.dataset.shard import checksum, group_name, write_trajectory
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_run import run_sweep

@@ -248,6 +248,21 @@ def test_a_bad_trajectory_is_tried_again_and_then_left_out(tmp_path: Path) -> No
     assert "0 of 2 trajectories included" in status and "000001" in status
 
 
+def test_a_fault_in_one_trajectory_does_not_end_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It gets a row that says so, and the next ones are computed."""
+
+    def faulty(*_: object) -> None:
+        raise ZeroDivisionError("division by zero")
+
+    sweep = tiny_sweep(tmp_path, 2)
+    with monkeypatch.context() as patch:
+        patch.setattr("mpmcli.simulation.runner.record", faulty)
+        (row,) = compute(Task(tmp_path / "dataset", sweep, (0,)))
+    assert (row.number, row.verdict, row.accepted) == (0, "failed", 0)
+    assert row.reason == "ZeroDivisionError: division by zero (a fault of mpmcli)."
+    assert [row.verdict for row in compute(Task(tmp_path / "dataset", sweep, (0, 1)))] == ["stable"] * 2
+
+
 @pytest.mark.parametrize("count", [60, pytest.param(500, marks=pytest.mark.slow)])
 def test_memory_stays_flat(tmp_path: Path, count: int) -> None:
     """Of the process of a worker, over trajectories of many sizes."""

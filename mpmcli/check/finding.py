@@ -7,6 +7,8 @@ from typing import Literal
 from mpmcli.plain_text import counted
 
 Severity = Literal["error", "warning", "note"]
+# Of a run; a check of its files finds the first three, the others stopped it.
+Verdict = Literal["stable", "suspect", "unstable", "escaped", "failed"]
 # In decreasing order of severity.
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 

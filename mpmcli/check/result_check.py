@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from mpmcli.check.finding import Finding, FrameFindings, passes
+from mpmcli.check.finding import Finding, FrameFindings, Verdict, passes
 from mpmcli.check.result_agreement import AgreementCheck
 from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, arrays_of, kept_entries, open_entries
 from mpmcli.check.result_ledger import check_ledger
@@ -21,7 +20,6 @@ from mpmcli.output.header import RunHeader
 from mpmcli.output.segments import PACKED
 from mpmcli.plain_json import finite_json
 
-Verdict = Literal["stable", "suspect", "unstable"]
 # Labels of the figures in text.
 TOLD = {
     "energy_growth": "energy growth / turned over",

@@ -12,6 +12,7 @@ import numpy as np
 
 from mpmcli.dataset.drawn_values import DrawnComponent, values_of
 from mpmcli.dataset.manifest import VERDICTS, Manifest, Row
+from mpmcli.dataset.paths import BASE, SWEEP
 from mpmcli.dataset.report import MOST_NAMED
 from mpmcli.dataset.shard import LABELS, LEDGER, SPLITS, TABLES, group_name, open_shard
 from mpmcli.errors import RunError
@@ -33,9 +34,9 @@ def write_card(directory: Path) -> Path:
     """
     manifest = Manifest(directory)
     facts, rows = manifest.facts(), manifest.rows()
-    sweep_text = (directory / "sweep.toml").read_text(encoding="utf-8")
+    sweep_text = (directory / SWEEP).read_text(encoding="utf-8")
     sweep = tomllib.loads(sweep_text)
-    base = tomllib.loads((directory / "base.toml").read_text(encoding="utf-8"))
+    base = tomllib.loads((directory / BASE).read_text(encoding="utf-8"))
     included = [row for row in rows if row.accepted]
     found = _Found.of(directory, included)
     sections = [

@@ -8,18 +8,17 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 
 import h5py
 import numpy as np
 
-from mpmcli import __version__
 from mpmcli.check.finding import passes
 from mpmcli.check.scene_check import check_scene
 from mpmcli.dataset.draw import Draw, draw
 from mpmcli.dataset.manifest import Row
-from mpmcli.dataset.shard import TrajectoryData, checksum_of, group_name, write_trajectory
+from mpmcli.dataset.paths import PENDING, QUARANTINE, file_name
+from mpmcli.dataset.shard import TrajectoryData, checksum_of, write_trajectory
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.materials.registry import load_plugins
@@ -29,7 +28,6 @@ from mpmcli.simulation.engine import Arch
 from mpmcli.simulation.recording import Recording
 from mpmcli.simulation.runner import Runner
 
-PENDING, QUARANTINE = "pending", "quarantine"
 # Runs of a trajectory with half the step of the one before, after the first.
 RETRIES = 2
 # Trajectories that a worker draws before its first run, to know how many particles it needs room for.
@@ -53,11 +51,6 @@ class Task:
     arch: Arch = "auto"
     threads: int | None = 1
     plugins: tuple[Path, ...] = ()
-
-
-def file_name(number: int) -> str:
-    """Return the name of the file of a single trajectory."""
-    return f"{group_name(number)}.h5"
 
 
 def compute(task: Task) -> list[Row]:
@@ -96,33 +89,13 @@ def _runner(task: Task) -> Runner:
 
 
 def _compute(task: Task) -> list[Row]:
-    runner = _runner(task)
-    return [_trajectory(task, runner, number) for number in task.numbers]
+    return [_trajectory(task, _runner(task), number) for number in task.numbers]
 
 
 def _trajectory(task: Task, runner: Runner, number: int) -> Row:
     """Draw and run a trajectory until its verdict is accepted, or no retry is left, and store it."""
     began = time.perf_counter()
-    row = Row(
-        number=number,
-        split=task.sweep.split_of(number),
-        draws="{}",
-        scene="",
-        verdict="failed",
-        reason="",
-        accepted=0,
-        retries=0,
-        steps=0,
-        frames=0,
-        particles=0,
-        seconds=0.0,
-        arch="",
-        precision="",
-        version=__version__,
-        taichi=version("taichi"),
-        file="",
-        checksum="",
-    )
+    row = Row.failed(number, task.sweep.split_of(number))
     try:
         drawn = draw(task.sweep, number)
         row = replace(row, draws=json.dumps(drawn.values, sort_keys=True))
@@ -137,6 +110,12 @@ def _trajectory(task: Task, runner: Runner, number: int) -> Row:
         row = _stored(task, row, drawn, scene, recording, retries, accepted)
     except InputError as error:
         row = replace(row, reason=str(error))
+    except RunError:
+        raise
+    except Exception as error:
+        # One trajectory must not end thousands. What it has left on the device is dropped.
+        row = replace(row, reason=f"{type(error).__name__}: {error} (a fault of mpmcli).")
+        _kept.known = None
     return replace(row, seconds=time.perf_counter() - began)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mpmcli.dataset.paths import SHARDS, SWEEP
 from mpmcli.dataset.shard import (
     LABELS,
     LEDGER,
@@ -30,7 +31,6 @@ from mpmcli.output.run_record import RECORD
 from mpmcli.output.segments import PACKED, SEGMENTS
 from mpmcli.output.series import SERIES
 
-SHARDS = "shards"
 Particles = slice | np.ndarray
 ALL = slice(None)
 
@@ -254,7 +254,7 @@ def open_dataset(path: Path | str) -> Dataset:
     if not path.exists():
         raise InputError(f"{path} does not exist: give the directory of a dataset, or a result.")
     if path.is_dir() and not is_dataset(path):
-        if (path / "sweep.toml").exists():
+        if (path / SWEEP).exists():
             raise InputError(f"{path} is an empty dataset: it holds no trajectory yet.")
         if not any((path / name).exists() for name in (PACKED, SEGMENTS, SERIES, RECORD)) and path.name != SEGMENTS:
             raise InputError(f"{path} is not a dataset: it has no directory {SHARDS}, and it is no result either.")

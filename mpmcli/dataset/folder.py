@@ -7,9 +7,8 @@ from pathlib import Path
 
 import h5py
 
-from mpmcli.dataset.compute import PENDING
-from mpmcli.dataset.dataset import SHARDS
 from mpmcli.dataset.manifest import Row
+from mpmcli.dataset.paths import PENDING, SHARDS, file_name
 from mpmcli.dataset.shard import FORMAT, VERSION, checksum, group_name
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.directory import check_directory
@@ -100,7 +99,7 @@ class Folder:
     def clear(self, rows: Sequence[Row]) -> None:
         """Remove the files of single trajectories that shards hold."""
         for row in rows:
-            (self.path / PENDING / f"{group_name(row.number)}.h5").unlink(missing_ok=True)
+            (self.path / PENDING / file_name(row.number)).unlink(missing_ok=True)
 
     def close(self) -> None:
         """Remove what unfinished work has left."""

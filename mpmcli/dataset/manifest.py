@@ -5,15 +5,18 @@ import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import astuple, dataclass, fields
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
+from mpmcli import __version__
+from mpmcli.check.finding import Verdict
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.durable import sealed
 
 MANIFEST = "manifest.sqlite"
 FORMAT = 1
-VERDICTS = ("stable", "suspect", "unstable", "escaped", "failed")
+VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,13 @@ class Row:
     taichi: str
     file: str
     checksum: str
+
+    @classmethod
+    def failed(cls, number: int, split: str, reason: str = "") -> "Row":
+        """Return the row of a trajectory of which nothing is known but that it failed."""
+        values: dict[str, Any] = {f.name: f.type() for f in fields(cls)}
+        values |= {"number": number, "split": split, "draws": "{}", "verdict": "failed", "reason": reason}
+        return cls(**{**values, "version": __version__, "taichi": version("taichi")})
 
 
 COLUMNS = tuple(f.name for f in fields(Row))

@@ -5,10 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mpmcli.dataset.card import write_card
-from mpmcli.dataset.compute import QUARANTINE
-from mpmcli.dataset.dataset import SHARDS
 from mpmcli.dataset.folder import require_empty
 from mpmcli.dataset.manifest import Manifest
+from mpmcli.dataset.paths import BASE, QUARANTINE, SHARDS, SWEEP
 from mpmcli.dataset.report import Status, status_of, verify
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.durable import require_free_space, sync_directory, sync_file, write_text
@@ -49,7 +48,7 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
             shutil.copyfile(file, copy)
             sync_file(copy)
             sync_directory(copy.parent)
-        for name in ("sweep.toml", "base.toml"):
+        for name in (SWEEP, BASE):
             write_text(target / name, (parts[0] / name).read_text(encoding="utf-8"))
     except OSError as error:
         raise RunError(f"{target} could not be written ({error.strerror}); the parts are kept.") from error

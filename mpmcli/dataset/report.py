@@ -5,9 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mpmcli.dataset.dataset import SHARDS
 from mpmcli.dataset.folder import Folder
 from mpmcli.dataset.manifest import VERDICTS, Manifest, Row
+from mpmcli.dataset.paths import SHARDS
 from mpmcli.dataset.shard import checksum, group_name, open_shard
 from mpmcli.errors import InputError
 from mpmcli.plain_text import counted

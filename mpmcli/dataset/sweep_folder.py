@@ -11,6 +11,7 @@ from mpmcli.check.forecast import layout_of
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.folder import SHARD_BYTES, Folder, require_empty
 from mpmcli.dataset.manifest import MANIFEST, Manifest
+from mpmcli.dataset.paths import BASE, SWEEP
 from mpmcli.dataset.shard import LABELS
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_state import SweepSettings
@@ -20,7 +21,6 @@ from mpmcli.output.durable import SPACE_MARGIN, TEMPORARY_SUFFIX, write_text
 from mpmcli.plain_text import counted, size_text
 from mpmcli.scene import Scene, estimate_particles
 
-SWEEP, BASE = "sweep.toml", "base.toml"
 # Trajectories whose sizes give the size of all.
 SAMPLE = 16
 # Bytes of a trajectory beside its arrays: headers of HDF5 and the scene; times and ledger of a frame.

@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
 
-from mpmcli import __version__
 from mpmcli.cores import available_cores
 from mpmcli.dataset.card import write_card
 from mpmcli.dataset.cluster import Workers, joined_workers, local_workers
@@ -17,6 +16,8 @@ from mpmcli.dataset.sweep_state import SweepSettings, SweepState
 
 # Most trajectories of a task, and tasks per worker below which they become shorter.
 TASK, ROUNDS = 8, 8
+# Why a trajectory has failed that no worker survived.
+LOST = "every worker that computed it was killed, perhaps for want of memory."
 
 
 def run_sweep(
@@ -70,7 +71,7 @@ def _run(
                 since = time.perf_counter()
                 outcomes = workers.outcomes(_tasks(sweep, settings, numbers, workers.count), stop)
                 for ended, (task, found) in enumerate(outcomes, 1):
-                    new = [_lost(sweep, number) for number in task.numbers] if found is None else found
+                    new = [Row.failed(n, sweep.split_of(n), LOST) for n in task.numbers] if found is None else found
                     keeper.take(new)
                     for row in new:
                         state.count(row)
@@ -108,23 +109,6 @@ class _Keeper:
             self._manifest.put(changed)
             self._rows.update((row.number, row) for row in changed)
             self._folder.clear(changed)
-
-
-def _lost(sweep: Sweep, number: int) -> Row:
-    """Return the row of a trajectory that no worker survived."""
-    reason = "every worker that computed it was killed, perhaps for want of memory."
-    empty = {"draws": "{}", "scene": "", "arch": "", "precision": "", "taichi": "", "file": "", "checksum": ""}
-    counts = dict.fromkeys(("accepted", "retries", "steps", "frames", "particles"), 0)
-    return Row(
-        number=number,
-        split=sweep.split_of(number),
-        verdict="failed",
-        reason=reason,
-        seconds=0.0,
-        version=__version__,
-        **empty,
-        **counts,
-    )
 
 
 def _tasks(sweep: Sweep, settings: SweepSettings, numbers: Sequence[int], workers: int) -> list[Task]:

@@ -2,9 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
-from mpmcli.check.finding import Finding
+from mpmcli.check.finding import Finding, Verdict
 from mpmcli.check.result_check import check_kept
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -14,8 +13,6 @@ from mpmcli.scene import Scene, scene_to_toml
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import LEFT, OUTRAN, UnstableRunError
 from mpmcli.solver.engine import Engine
-
-Verdict = Literal["stable", "suspect", "unstable", "escaped", "failed"]
 
 
 @dataclass(frozen=True)
