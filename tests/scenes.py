@@ -7,8 +7,9 @@ import numpy as np
 from solver_state import scene_of
 
 from mpmcli.scene import BodyParticles, Scene
-from mpmcli.solver.snapshot import measure, read_group
+from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.solver import Solver
+from mpmcli.solver.sums import ledger_sums
 
 GRAVITY = 9.81
 
@@ -79,9 +80,12 @@ def restart(solver: Solver, sample: BodyParticles, end: float) -> None:
 
 def sums(solver: Solver) -> dict:
     """Return what the ledger sums at this moment, in float64."""
-    snapshots = [read_group(group) for group in solver.groups]
-    seen = [solver._observe(g, snapshot, stress=False) for g, snapshot in enumerate(snapshots)]
-    return measure(snapshots, seen, np.array(solver.scene.domain.gravity), solver.spacing, solver.last_step)
+    internal = max(len(group.law.internal) for group in solver.groups)
+    arrays = FrameArrays(solver.particle_count, solver.scene.dimension, internal, solver.groups[0].real)
+    # As on a GPU: in numpy.
+    found, ratios = solver._observe(arrays), solver._constants.volume_ratios(arrays)
+    gravity = np.array(solver.scene.domain.gravity)
+    return ledger_sums(found, ratios, gravity, solver.spacing, solver.last_step)
 
 
 def total_energy(solver: Solver) -> float:

@@ -11,7 +11,8 @@ from solver_state import bodies_of, scene_of
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver.snapshot import build_arrays, read_group
+from mpmcli.solver.frame_arrays import FrameArrays
+from mpmcli.solver.snapshot import read_group
 from mpmcli.solver.solver import Solver
 
 H = 0.1
@@ -95,11 +96,23 @@ def test_one_launch_reads_what_the_fields_hold(solver: Solver, frames: Run) -> N
 def test_a_kernel_sums_and_orders_as_numpy_does(solver: Solver, frames: Run) -> None:
     """The frame by one launch against the arrays of the groups, and the ledger against sums in numpy."""
     frame, row = solver.frame(7, [])
-    snapshots = [read_group(group) for group in solver.groups]
-    arrays = build_arrays(snapshots, np.float64)
-    assert np.array_equal(frame.velocity, arrays.v)
-    assert np.array_equal(frame.position, arrays.x + np.array(solver.scene.domain.origin))
-    assert np.array_equal(frame.body, arrays.labels[:, 0]) and np.array_equal(frame.material, arrays.labels[:, 1])
+    names = ("stress", "affine", "deformation_gradient")
+    by_kernel, by_numpy = (FrameArrays(len(frame.body), 2, 2, np.float64, names) for _ in range(2))
+    for arrays in (by_kernel, by_numpy):
+        arrays.reals.fill(0.0)
+    solver._observe(by_numpy)
+    for g, group in enumerate(solver.groups):
+        solver._read(g, by_kernel)
+        assert len(group.law.internal) <= 2
+    scale = np.abs(by_numpy.reals).max(axis=0)
+    assert (scale[[0, 1, 2, 3, by_numpy.first["tau"]]] > 0).all()
+    np.testing.assert_allclose(by_kernel.reals / (scale + 1e-300), by_numpy.reals / (scale + 1e-300), atol=1e-13)
+    assert np.array_equal(frame.velocity, by_numpy["v"])
+    assert np.array_equal(frame.position, by_numpy["x"] + np.array(solver.scene.domain.origin))
+    for group in solver.groups:
+        own = read_group(group)
+        assert np.array_equal(frame.body[own.id], own.body)
+        assert {solver.laws[m] for m in frame.material[own.id]} == {group.law.name}
     for name, expected in sums(solver).items():
         np.testing.assert_allclose(getattr(row, name), expected, rtol=1e-12, err_msg=name)
     assert np.abs(frames[-1][1].angular_momentum[0]) > 0 and row.elastic > 0

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
+from math import isfinite
 
 import numpy as np
 
@@ -61,7 +62,8 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
 def _not_finite(row: LedgerRow) -> str:
     for entry in fields(row):
         value = getattr(row, entry.name)
-        if not isinstance(value, str) and not np.isfinite(value).all():
+        numbers = () if isinstance(value, str) else value if isinstance(value, tuple) else (value,)
+        if not all(map(isfinite, numbers)):
             return entry.name
     return ""
 

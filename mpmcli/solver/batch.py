@@ -22,7 +22,6 @@ from mpmcli.solver.batch_layout import Layout
 from mpmcli.solver.frame_reader import build_frame_reader
 from mpmcli.solver.grid import DRIFT, Grid, node_width
 from mpmcli.solver.nodes import NodeUpdate
-from mpmcli.solver.observe import build_observation
 from mpmcli.solver.ordering import SortBuffers, TileOrder
 from mpmcli.solver.particle_arrays import CONSTANTS, ParticleArrays
 from mpmcli.solver.particle_update import ParticleUpdate
@@ -102,7 +101,7 @@ class Batch:
         device: all of it.
         layout: columns of `numbers`, (runs, k) float64, and `counts`, (runs, l) int32, which the kernel reads and
             changes.
-        observations, readers: per law.
+        readers: of frames, per law.
         seconds: wall time of all launches; first_seconds: of the first, which compiles the kernel.
     """
 
@@ -149,7 +148,6 @@ class Batch:
         constants = {"drift_allowed": DRIFT, "easing": EASING, "slack": 1e-6, "infinity": math.inf}
         for name, value in constants.items():
             self.numbers[:, getattr(self.layout.real, name)] = value
-        self.observations = [build_observation(group) for group in groups]
         self.readers = [build_frame_reader(group) for group in groups]
         self.seconds = self.first_seconds = 0.0
         self._launch = build_batch_kernel(self.device, self.layout)

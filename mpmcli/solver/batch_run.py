@@ -12,14 +12,12 @@ from mpmcli.solver.batch import Batch
 from mpmcli.solver.batch_group import BatchGroup
 from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, GOING, IDLE, LIMITS, LOST, MEASURE
 from mpmcli.solver.external_forces import ExternalForces
-from mpmcli.solver.frame_reader import FrameArrays
+from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.groups import require_inside
-from mpmcli.solver.observe import Observation
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.particles import initial_state, table_of
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.run import COLLAPSE, Run
-from mpmcli.solver.snapshot import Snapshot
 from mpmcli.solver.state import Progress
 from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
 from mpmcli.solver.step_control import StepControl, StepCounters
@@ -275,11 +273,6 @@ class BatchRun(Run):
             if self.step_count and stop():
                 raise KeyboardInterrupt
 
-    def _observe(self, g: int, snapshot: Snapshot, *, stress: bool) -> Observation:
-        group, stored = self.groups[g], (snapshot.deformation, snapshot.internal)
-        return self.batch.observations[g](self.last_step, group.first, group.count, stress=stress, stored=stored)
-
-    def _read(self, g: int, arrays: FrameArrays) -> tuple[Sums, np.ndarray]:
+    def _read(self, g: int, arrays: FrameArrays) -> Sums:
         group = self.groups[g]
-        places = np.array(group.bodies, np.int32)
-        return self.batch.readers[g](self.last_step, group.first, group.count, places, g, arrays, group.row)
+        return self.batch.readers[g](self.last_step, group.first, group.count, arrays)

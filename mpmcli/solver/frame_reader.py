@@ -1,50 +1,30 @@
-"""Reads a frame on the CPU by one launch per law: what every frame has, in the order of the ids, and the ledger's sums.
+"""Reads a frame on the CPU by one launch per law: what the particles show, and the ledger's sums.
 
-`snapshot.build_frame` and `snapshot.measure` do the same with numpy, for a GPU, which has no double precision
-everywhere; of few particles they take several times as long.
+`snapshot.fill` and `snapshot.sums_of` do the same with numpy, for a GPU, which has no double precision everywhere; of
+few particles they take several times as long.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
 
+from mpmcli.solver.frame_arrays import FrameArrays, stress_entries
+from mpmcli.solver.observe import respond_later
 from mpmcli.solver.particle_arrays import MASS, VOLUME, ParticleArrays
 from mpmcli.solver.sums import Sums, axis_pairs
 
 
-@dataclass(frozen=True)
-class FrameArrays:
-    """What every frame has, for all n particles, row i being particle i.
+def build_frame_reader(group: ParticleArrays) -> Callable[[float, int, int, FrameArrays], Sums]:
+    """Return the reader of a range of particles: a function (dt, first, count, arrays).
 
-    Attributes:
-        x: (n, d) relative to the origin of the domain, m; v: (n, d), m/s.
-        labels: (n, 2) int32, body and material.
-    """
-
-    x: np.ndarray
-    v: np.ndarray
-    labels: np.ndarray
-
-    @staticmethod
-    def empty(count: int, dimension: int, real: type) -> "FrameArrays":
-        """Return arrays to be filled."""
-        return FrameArrays(
-            np.empty((count, dimension), real), np.empty((count, dimension), real), np.empty((count, 2), np.int32)
-        )
-
-
-def build_frame_reader(group: ParticleArrays) -> Callable[..., tuple[Sums, np.ndarray]]:
-    """Return the reader of a range of particles: a function (dt, first, count, places, material, arrays, row).
-
-    Its `dt` is the last step, s. `places` holds the index in the scene of the body in each row of the table from `row`
-    on, and `arrays` the FrameArrays to be filled. It returns the sums, and J or det F and the internal variables after
-    plastic flow, (n, 1 + k) in the solver's order. The device's state does not change: the next step applies that flow.
+    Its `dt` is the last step, s. It fills the rows of those particles in `arrays`, and returns the sums. The device's
+    state does not change: the next step applies the plastic flow that the frame shows.
     """
     d, law, serial = group.dimension, group.law, group.serial
     keeps_F = law.deformation == "F"
     inner_count = len(group.internal)
+    entries = tuple(enumerate(stress_entries(d)))
     pairs = axis_pairs(d)
     turns = len(pairs)
     width = 5 + 2 * d + 2 * turns
@@ -53,55 +33,57 @@ def build_frame_reader(group: ParticleArrays) -> Callable[..., tuple[Sums, np.nd
     def read(
         dt: float,
         first: int,
-        material: int,
-        first_row: int,
-        places: ti.types.ndarray(),
-        x: ti.types.ndarray(),
-        v: ti.types.ndarray(),
-        labels: ti.types.ndarray(),
-        volumes: ti.types.ndarray(),
-        energies: ti.types.ndarray(),
+        count: int,
+        affine_at: ti.template(),
+        gradient_at: ti.template(),
+        tau_at: ti.template(),
+        reals: ti.types.ndarray(),
         sums: ti.types.ndarray(),
     ):
         ti.loop_config(serialize=serial)
-        for q in range(energies.shape[0]):
+        for q in range(count):
             p = first + q
             row = group.id[p]
             velocity, C = group.motion(p)
             for c in ti.static(range(d)):
-                x[row, c] = group.x[p][c]
-                v[row, c] = velocity[c]
-            labels[row, 0] = places[0]
-            if ti.static(group.several):
-                labels[row, 0] = places[group.body[p] - first_row]
-            labels[row, 1] = material
-            constants = group.constants(p)
+                reals[row, c] = group.x[p][c]
+                reals[row, d + c] = velocity[c]
+            if ti.static(affine_at >= 0):
+                for i, j in ti.static(ti.ndrange(d, d)):
+                    reals[row, affine_at + i * d + j] = C[i, j]
             # Half a step back, where the velocities are, and now: a loop, so that the law is compiled once.
-            for k in range(ti.static(2 if law.projects else 1)):
-                back = 0.5 * (k - 1) * dt
-                stored = group.stored(p)
-                if ti.static(keeps_F):
-                    stored += back * (C @ stored)
-                else:
-                    stored *= 1.0 + back * C.trace()
-                _, _, deformation, inner = law.respond(stored, group.inner(p), C, dt, constants)
+            for k in range(ti.static(2 if law.projects or tau_at >= 0 else 1)):
+                tau, tau_zz, deformation, inner = respond_later(group, p, 0.5 * (k - 1) * dt, dt)
                 if k == 0:
-                    energies[q] = law.energy(deformation, inner, constants)
+                    reals[row, 2 * d] = law.energy(deformation, inner, group.constants(p))
                 if ti.static(not law.projects):
                     deformation = group.stored(p)
                     inner = group.inner(p)
                 if ti.static(keeps_F):
-                    volumes[q, 0] = deformation.determinant()
+                    reals[row, 2 * d + 1] = deformation.determinant()
                 else:
-                    volumes[q, 0] = deformation
+                    reals[row, 2 * d + 1] = deformation
                 for i in ti.static(range(inner_count)):
-                    volumes[q, 1 + i] = inner[i]
+                    reals[row, 2 * d + 2 + i] = inner[i]
+                if ti.static(gradient_at >= 0):
+                    for i, j in ti.static(ti.ndrange(d, d)):
+                        if ti.static(keeps_F):
+                            reals[row, gradient_at + i * d + j] = deformation[i, j]
+                        else:
+                            # The isotropic F of this volume.
+                            reals[row, gradient_at + i * d + j] = deformation ** (1.0 / d) if ti.static(i == j) else 0.0
+                if ti.static(tau_at >= 0):
+                    for column, place in ti.static(entries):
+                        if ti.static(place[0] < d and place[1] < d):
+                            reals[row, tau_at + column] = tau[place[0], place[1]]
+                        else:
+                            reals[row, tau_at + column] = tau_zz
         # In one order on any number of threads.
         ti.loop_config(serialize=True)
         for _ in range(1):
             total = ti.Vector.zero(ti.f64, width)
             fastest = 0.0
-            for q in range(energies.shape[0]):
+            for q in range(count):
                 p = first + q
                 row = group.row(p)
                 m = ti.cast(row[MASS], ti.f64)
@@ -112,7 +94,7 @@ def build_frame_reader(group: ParticleArrays) -> Callable[..., tuple[Sums, np.nd
                 total[0] += m
                 total[1] += m * speed.norm_sqr()
                 total[2] += m * affine.norm_sqr()
-                total[3] += ti.cast(row[VOLUME], ti.f64) * ti.cast(energies[q], ti.f64)
+                total[3] += ti.cast(row[VOLUME], ti.f64) * ti.cast(reals[group.id[p], 2 * d], ti.f64)
                 for c in ti.static(range(d)):
                     total[5 + c] += m * place[c]
                     total[5 + d + c] += m * speed[c]
@@ -125,14 +107,12 @@ def build_frame_reader(group: ParticleArrays) -> Callable[..., tuple[Sums, np.nd
             for k in ti.static(range(width)):
                 sums[k] = total[k]
 
-    def reader(
-        dt: float, first: int, count: int, places: np.ndarray, material: int, arrays: FrameArrays, row: int = 0
-    ) -> tuple[Sums, np.ndarray]:
-        volumes, energies = np.empty((count, 1 + inner_count), group.real), np.empty(count, group.real)
-        sums = np.empty(width)
-        read(dt, first, material, row, places, arrays.x, arrays.v, arrays.labels, volumes, energies, sums)
-        mass, motion, affine, elastic, speed = sums[:5].tolist()
-        place, momentum, turning, spin = np.split(sums[5:], [d, 2 * d, 2 * d + turns])
-        return Sums(mass, place, momentum, motion, affine, turning, spin, elastic, speed), volumes
+    def reader(dt: float, first: int, count: int, arrays: FrameArrays) -> Sums:
+        found = np.empty(width)
+        at = arrays.first
+        read(dt, first, count, at["affine"], at["gradient"], at["tau"], arrays.reals, found)
+        mass, motion, affine, elastic, speed = found[:5].tolist()
+        place, momentum, turning, spin = np.split(found[5:], [d, 2 * d, 2 * d + turns])
+        return Sums(mass, place, momentum, motion, affine, turning, spin, elastic, speed)
 
     return reader

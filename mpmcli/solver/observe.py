@@ -6,10 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
+from mpmcli.solver.frame_arrays import stress_entries
 from mpmcli.solver.particle_arrays import ParticleArrays
-
-# Rows and columns of the entries of a symmetric 3 x 3 matrix, in the order of the arrays below; 2D leaves two out.
-ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
 
 @dataclass(frozen=True)
@@ -17,7 +15,7 @@ class Observation:
     """What one law gives for its n particles, in the solver's order.
 
     Attributes:
-        tau: Kirchhoff stress, (n, 3, 3), Pa; None where it was not requested.
+        tau: Kirchhoff stress, (n, k), Pa, see `stress_entries`; None where it was not requested.
         energy: stored energy per volume at rest, (n,), J/m^3, half a step earlier: where the velocities are.
         deformation: J, (n,), or F, (n, d, d), after plastic flow.
         internal: internal variables after plastic flow, (n,) each, by name.
@@ -29,6 +27,18 @@ class Observation:
     internal: dict[str, np.ndarray]
 
 
+@ti.func
+def respond_later(group: ti.template(), p: int, later: float, dt: float):
+    """Return what the law of particle p gives in the next step, dt (s), if it deforms on for a time `later`, s."""
+    _, C = group.motion(p)
+    stored = group.stored(p)
+    if ti.static(group.law.deformation == "F"):
+        stored += later * (C @ stored)
+    else:
+        stored *= 1.0 + later * C.trace()
+    return group.law.respond(stored, group.inner(p), C, dt, group.constants(p))
+
+
 def build_observation(group: ParticleArrays) -> Callable[..., Observation]:
     """Return the observation of a range of particles: a function (dt, first, count) of the last step, s, and the range.
 
@@ -36,8 +46,7 @@ def build_observation(group: ParticleArrays) -> Callable[..., Observation]:
     read from the device. The device's state does not change: the next step applies plastic flow.
     """
     d, law, serial = group.dimension, group.law, group.serial
-    kept = [e for e, (i, j) in enumerate(ENTRIES) if d == 3 or {i, j} <= {0, 1} or i == j == 2]
-    placed = tuple((column, *ENTRIES[e]) for column, e in enumerate(kept))
+    placed = tuple(enumerate(stress_entries(d)))
     keeps_F = law.deformation == "F"
     inner_count = len(group.internal)
 
@@ -53,24 +62,16 @@ def build_observation(group: ParticleArrays) -> Callable[..., Observation]:
         ti.loop_config(serialize=serial)
         for q in range(energy.shape[0]):
             p = first + q
-            _, C = group.motion(p)
-            constants = group.constants(p)
             # Once for the state half a step back and once for the state: a loop, so that the law is compiled once.
             for k in range(2):
-                back = 0.5 * (k - 1) * dt
-                stored = group.stored(p)
-                if ti.static(keeps_F):
-                    stored += back * (C @ stored)
-                else:
-                    stored *= 1.0 + back * C.trace()
-                stress, stress_zz, deformation, inner = law.respond(stored, group.inner(p), C, dt, constants)
+                stress, stress_zz, deformation, inner = respond_later(group, p, 0.5 * (k - 1) * dt, dt)
                 if k == 0:
-                    energy[q] = law.energy(deformation, inner, constants)
+                    energy[q] = law.energy(deformation, inner, group.constants(p))
                 else:
                     if ti.static(with_stress):
-                        for column, i, j in ti.static(placed):
-                            if ti.static(i < d and j < d):
-                                tau[q, column] = stress[i, j]
+                        for column, place in ti.static(placed):
+                            if ti.static(place[0] < d and place[1] < d):
+                                tau[q, column] = stress[place[0], place[1]]
                             else:
                                 tau[q, column] = stress_zz
                     if ti.static(law.projects):
@@ -84,23 +85,16 @@ def build_observation(group: ParticleArrays) -> Callable[..., Observation]:
 
     def observed(dt: float, first: int, n: int, *, stress: bool, stored: tuple[np.ndarray, np.ndarray]) -> Observation:
         real, width = group.real, d * d if keeps_F else 1
-        entries = np.empty((n if stress else 1, len(kept)), real)
+        entries = np.empty((n if stress else 1, len(placed)), real)
         energy = np.empty(n, real)
         state = np.empty((n if law.projects else 1, width + inner_count), real)
         observe(dt, first, stress, entries, energy, state)
-        tau = None
-        if stress:
-            tau = np.zeros((n, 3, 3), real)
-            # The sign of a zero depends on how far a kernel was optimised.
-            entries += 0.0
-            for column, i, j in placed:
-                tau[:, i, j] = tau[:, j, i] = entries[:, column]
         if not law.projects:
             deformation, internal = stored[0], list(stored[1].T)
         else:
             internal = list(state[:, width:].T)
             deformation = state[:, :width].reshape(n, d, d) if keeps_F else state[:, 0]
         names = [variable.name for variable in law.internal]
-        return Observation(tau, energy, deformation, dict(zip(names, internal, strict=True)))
+        return Observation(entries if stress else None, energy, deformation, dict(zip(names, internal, strict=True)))
 
     return observed

@@ -2,28 +2,19 @@
 
 import time
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.materials.law import Law
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError, cause_of, diagnose, first_unsound, rate_of_change
-from mpmcli.solver.frame_reader import FrameArrays
-from mpmcli.solver.observe import Observation
-from mpmcli.solver.snapshot import (
-    STRESSES,
-    Snapshot,
-    build_arrays,
-    build_fields,
-    ledger_row,
-    measure,
-    read_group,
-)
+from mpmcli.solver.frame_arrays import FrameArrays, ParticleConstants
+from mpmcli.solver.snapshot import Snapshot, read_group
 from mpmcli.solver.state import Progress
-from mpmcli.solver.sums import Sums, ledger_sums
+from mpmcli.solver.sums import Sums, ledger_row, ledger_sums
 from mpmcli.stability.limits import Limit, force_limit, speed_limit
 from mpmcli.stability.transfer_factors import affine_moment
 
@@ -173,49 +164,41 @@ class Run:
         """Return the state as a frame, and the ledger row for the steps (size, Courant number, limit) taken."""
         began = time.perf_counter()
         names = [name for name in self.scene.output.fields if name not in ("velocity", "initial_position")]
-        on_cpu, real = self.backend.on_cpu, self.groups[0].real
-        snapshots, seen = [], []
-        if names or not on_cpu:
-            stress = any(name in STRESSES for name in names)
-            snapshots = [read_group(group) for group in self.groups]
-            seen = [self._observe(g, snapshot, stress=stress) for g, snapshot in enumerate(snapshots)]
-        gravity, moment = self.state.external_forces.gravity_at(self.time), affine_moment(self.scene.solver)
-        physics = (gravity, self.spacing, self.last_step, moment)
-        if on_cpu:
-            arrays = FrameArrays.empty(self.particle_count, self.scene.dimension, real)
-            found = [self._read(g, arrays) for g in range(len(self.groups))]
-            ratios = [_total_ratios(group.law, J) for group, (_, J) in zip(self.groups, found, strict=True)]
-            sums = ledger_sums([own for own, _ in found], ratios, *physics)
+        internal = max(len(group.law.internal) for group in self.groups)
+        arrays = FrameArrays(self.particle_count, self.scene.dimension, internal, self.groups[0].real, names)
+        if self.backend.on_cpu:
+            sums = [self._read(g, arrays) for g in range(len(self.groups))]
         else:
-            arrays = build_arrays(snapshots, real)
-            sums = measure(snapshots, seen, *physics)
-        fields = build_fields(snapshots, seen, names, real) if names else {}
+            sums = self._observe(arrays)
+        particles = self._constants
+        ratios = particles.volume_ratios(arrays)
+        gravity, moment = self.state.external_forces.gravity_at(self.time), affine_moment(self.scene.solver)
+        fields = particles.fields(arrays, ratios, names)
         if self._initial is not None:
             fields["initial_position"] = self._initial.astype(self._position_type)
         frame = Frame(
             index=index,
             time=self.time,
             step=self.step_count,
-            position=(arrays.x + self._origin).astype(self._position_type),
-            velocity=arrays.v,
-            body=np.ascontiguousarray(arrays.labels[:, 0]),
-            material=np.ascontiguousarray(arrays.labels[:, 1]),
+            position=(arrays["x"] + self._origin).astype(self._position_type),
+            velocity=np.ascontiguousarray(arrays["v"]),
+            body=particles.body,
+            material=particles.material,
             fields={name: fields[name] for name in self.scene.output.fields if name != "velocity"},
         )
-        row = ledger_row(sums, self.time, taken)
+        conserved = ledger_sums(sums, ratios, gravity, self.spacing, self.last_step, moment)
+        row = ledger_row(conserved, self.time, taken)
         self.frame_seconds += time.perf_counter() - began
         return frame, row
 
-    def _observe(self, g: int, snapshot: Snapshot, *, stress: bool) -> Observation:
-        """Evaluate the law of the g-th group for its particles."""
+    @cached_property
+    def _constants(self) -> ParticleConstants:
+        return ParticleConstants.of(self.groups, [len(b.position) for b in self._particles])
+
+    def _observe(self, arrays: FrameArrays) -> list[Sums]:
+        """Fill all rows of a frame on a GPU; return the sums of each group."""
         raise NotImplementedError
 
-    def _read(self, g: int, arrays: FrameArrays) -> tuple[Sums, np.ndarray]:
-        """Fill the rows of the g-th group; see `build_frame_reader`."""
+    def _read(self, g: int, arrays: FrameArrays) -> Sums:
+        """Fill the rows of the g-th group on the CPU; see `build_frame_reader`."""
         raise NotImplementedError
-
-
-def _total_ratios(law: Law, volumes: np.ndarray) -> np.ndarray:
-    """Return volume over volume at rest, (n,), from J and the internal variables, (n, 1 + k)."""
-    internal = {variable.name: volumes[:, 1 + i] for i, variable in enumerate(law.internal)}
-    return law.total_volume_ratio(volumes[:, 0], internal)

@@ -4,20 +4,19 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 
-import numpy as np
-
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.external_forces import ExternalForces
-from mpmcli.solver.frame_reader import FrameArrays, build_frame_reader
+from mpmcli.solver.frame_arrays import FrameArrays
+from mpmcli.solver.frame_reader import build_frame_reader
 from mpmcli.solver.groups import build_groups
 from mpmcli.solver.kernels import Kernels
-from mpmcli.solver.observe import Observation, build_observation
+from mpmcli.solver.observe import build_observation
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.run import COLLAPSE, Run
-from mpmcli.solver.snapshot import Snapshot
+from mpmcli.solver.snapshot import fill, read_group, sums_of
 from mpmcli.solver.state import State
 from mpmcli.solver.state_bounds import build_measurement
 from mpmcli.solver.step_control import StepControl
@@ -153,13 +152,19 @@ class Solver(Run):
         """Return a lost particle of each group, in solver order, None where none is known."""
         return [None if p == NOT_LOST else int(p) for p in self._kernels.particles.lost.to_numpy()]
 
-    def _observe(self, g: int, snapshot: Snapshot, *, stress: bool) -> Observation:
-        stored = snapshot.deformation, snapshot.internal
-        return self._observations[g](self.last_step, 0, self.groups[g].count, stress=stress, stored=stored)
+    def _observe(self, arrays: FrameArrays) -> list[Sums]:
+        snapshots = [read_group(group) for group in self.groups]
+        stress = arrays.first["tau"] >= 0
+        seen = [
+            observation(self.last_step, 0, len(s.id), stress=stress, stored=(s.deformation, s.internal))
+            for observation, s in zip(self._observations, snapshots, strict=True)
+        ]
+        for snapshot, observed in zip(snapshots, seen, strict=True):
+            fill(arrays, snapshot, observed)
+        return sums_of(snapshots, seen)
 
-    def _read(self, g: int, arrays: FrameArrays) -> tuple[Sums, np.ndarray]:
-        group = self.groups[g]
-        return self._readers[g](self.last_step, 0, group.count, np.array(group.bodies, np.int32), g, arrays)
+    def _read(self, g: int, arrays: FrameArrays) -> Sums:
+        return self._readers[g](self.last_step, 0, self.groups[g].count, arrays)
 
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield the state as it is and then one frame for each output time to come, with its ledger row.

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpmcli.frames.ledger import LedgerRow
+
 
 @dataclass(frozen=True)
 class Sums:
@@ -35,7 +37,7 @@ def axis_pairs(dimension: int) -> tuple[tuple[int, int], ...]:
 
 def ledger_sums(
     sums: Sequence[Sums],
-    volume_ratios: Sequence[np.ndarray],
+    volume_ratios: np.ndarray,
     gravity: np.ndarray,
     spacing: float,
     dt: float,
@@ -48,7 +50,7 @@ def ledger_sums(
     the positions as they are it would swing by v dt/2 times the force.
 
     Args:
-        sums, volume_ratios: of each law.
+        sums: of each law; volume_ratios: of each particle, (n,).
         moment: D / h^2, see `stability.transfer_factors.affine_moment`.
     """
     inertia = moment * spacing**2
@@ -63,6 +65,20 @@ def ledger_sums(
         "linear_momentum": tuple(momentum.tolist()),
         "angular_momentum": tuple(angular.tolist()),
         "speed_max": float(np.sqrt(max(one.speed_squared for one in sums))),
-        "volume_ratio_min": float(min(J.min() for J in volume_ratios)),
-        "volume_ratio_max": float(max(J.max() for J in volume_ratios)),
+        "volume_ratio_min": float(volume_ratios.min()),
+        "volume_ratio_max": float(volume_ratios.max()),
     }
+
+
+def ledger_row(sums: dict, time: float, taken: Sequence[tuple[float, float, str]]) -> LedgerRow:
+    """Return the row of a frame: the result of `ledger_sums`, and the steps (size, Courant number, limit) to it."""
+    smallest = min(taken, default=(0.0, 0.0, ""))
+    return LedgerRow(
+        time=time,
+        steps=len(taken),
+        step_min=smallest[0],
+        step_max=max(taken, default=(0.0,))[0],
+        limit=smallest[2],
+        courant_max=max((courant for _, courant, _ in taken), default=0.0),
+        **sums,
+    )

@@ -1,0 +1,157 @@
+"""What the particles show at an output time, row i being particle i, and the fields of a frame made of it."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.materials.law import Law
+from mpmcli.solver.particle_arrays import MASS, VOLUME
+
+# Fields that need the stress of every particle.
+STRESSES = ("stress", "pressure")
+# Rows and columns of the entries of a symmetric 3 x 3 matrix; 2D leaves out those that vanish.
+ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
+
+
+def stress_entries(dimension: int) -> tuple[tuple[int, int], ...]:
+    """Return row and column of each stored entry of tau."""
+    return ENTRIES if dimension == 3 else ENTRIES[:4]
+
+
+class FrameArrays:
+    """What n particles show at one time.
+
+    Attributes:
+        reals: (n, k), in columns: x relative to the origin of the domain, m, and v, m/s, d each; the stored energy per
+            volume at rest, J/m^3, half a step earlier, where the velocities are; J or det F and the internal variables
+            of the law after plastic flow; and, where a field needs it, C, F after plastic flow, d^2 each, and tau, Pa,
+            see `stress_entries`.
+        first: the first column of each, by name: "x", "v", "energy", "J", "internal", "affine", "gradient", "tau"; -1
+            where it is left out.
+    """
+
+    def __init__(self, count: int, dimension: int, internal: int, real: type, fields: Collection[str] = ()) -> None:
+        """Allocate; the content is arbitrary.
+
+        Args:
+            internal: most internal variables of a law of the run.
+            fields: of the frame.
+        """
+        d = dimension
+        widths = {"x": d, "v": d, "energy": 1, "J": 1, "internal": internal}
+        if "affine" in fields:
+            widths["affine"] = d * d
+        if "deformation_gradient" in fields:
+            widths["gradient"] = d * d
+        if not set(STRESSES).isdisjoint(fields):
+            widths["tau"] = len(stress_entries(d))
+        self.dimension, self._widths, end = d, widths, 0
+        self.first = dict.fromkeys(("affine", "gradient", "tau"), -1)
+        for name, width in widths.items():
+            self.first[name] = end
+            end += width
+        self.reals = np.empty((count, end), real)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return the columns of a name, a view of `reals`: (n,) of the energy and of J, else (n, columns)."""
+        first = self.first[name]
+        return self.reals[:, first] if name in ("energy", "J") else self.reals[:, first : first + self._widths[name]]
+
+
+@dataclass(frozen=True)
+class ParticleConstants:
+    """What never changes of the particles of a run, n in all, row i being particle i.
+
+    Attributes:
+        body, material: (n,) int32, index into the scene's bodies and into the run's laws.
+        mass, volume: (n,) float64, kg and m^3 at rest.
+        members: of each law, itself and the rows of its particles.
+    """
+
+    body: np.ndarray
+    material: np.ndarray
+    mass: np.ndarray
+    volume: np.ndarray
+    members: tuple[tuple[Law, slice | np.ndarray], ...]
+
+    @staticmethod
+    def of(groups: Sequence, counts: Sequence[int]) -> "ParticleConstants":
+        """Return those of a run.
+
+        Args:
+            groups: particles of each law, with `law`, `bodies` and `rows` as `ParticleGroup` has them.
+            counts: particles of each body of the scene.
+        """
+        per_body = np.zeros((len(counts), 3))
+        for g, group in enumerate(groups):
+            per_body[list(group.bodies)] = np.column_stack(
+                [np.full(len(group.bodies), g), group.rows[:, [MASS, VOLUME]]]
+            )
+        body = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+        material, mass, volume = per_body[body].T
+        material = material.astype(np.int32)
+        rows = [slice(None)] if len(groups) == 1 else [np.flatnonzero(material == g) for g in range(len(groups))]
+        # Every frame shares them.
+        for array in (body, material):
+            array.flags.writeable = False
+        members = tuple((group.law, own) for group, own in zip(groups, rows, strict=True))
+        return ParticleConstants(body, material, mass, volume, members)
+
+    def volume_ratios(self, arrays: FrameArrays) -> np.ndarray:
+        """Return volume over volume at rest, (n,)."""
+        J, internal = arrays["J"], arrays["internal"]
+        if not any(law.internal for law, _ in self.members):
+            return J
+        ratios = np.empty_like(J)
+        for law, rows in self.members:
+            own = internal[rows]
+            named = {variable.name: own[:, i] for i, variable in enumerate(law.internal)}
+            ratios[rows] = law.total_volume_ratio(J[rows], named)
+        return ratios
+
+    def fields(self, arrays: FrameArrays, ratios: np.ndarray, names: Collection[str]) -> dict[str, np.ndarray]:
+        """Return fields of a frame by name.
+
+        Args:
+            ratios: see `volume_ratios`.
+            names: of output fields, other than the velocity and the initial position.
+        """
+        real = arrays.reals.dtype
+        return {name: np.ascontiguousarray(self._field(name, arrays, ratios), real) for name in names}
+
+    def _field(self, name: str, arrays: FrameArrays, ratios: np.ndarray) -> np.ndarray:
+        match name:
+            case "volume_ratio":
+                return ratios
+            case "density":
+                return self.mass / self.volume / ratios
+            case "mass":
+                return self.mass
+            case "affine":
+                return arrays["affine"]
+            case "deformation_gradient":
+                return arrays["gradient"]
+            case "stress":
+                return self._stress(arrays) / ratios[:, None]
+            case "pressure":
+                return arrays["tau"][:, :3].sum(axis=1) / (-3 * ratios)
+        return self._internal(name, arrays)
+
+    def _stress(self, arrays: FrameArrays) -> np.ndarray:
+        tau = np.zeros((len(arrays.reals), 9), arrays.reals.dtype)
+        # The sign of a zero depends on how far a kernel was optimised.
+        entries = arrays["tau"] + 0.0
+        for column, (i, j) in enumerate(stress_entries(arrays.dimension)):
+            tau[:, 3 * i + j] = tau[:, 3 * j + i] = entries[:, column]
+        return tau
+
+    def _internal(self, name: str, arrays: FrameArrays) -> np.ndarray:
+        """Return an internal variable; particles of other laws show it at rest."""
+        variables = [variable for law, _ in self.members for variable in law.internal if variable.name == name]
+        values = np.full(len(arrays.reals), variables[-1].at_rest, arrays.reals.dtype)
+        for law, rows in self.members:
+            for i, variable in enumerate(law.internal):
+                if variable.name == name:
+                    values[rows] = arrays["internal"][rows, i]
+        return values
