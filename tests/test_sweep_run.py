@@ -30,6 +30,7 @@ from mpmcli.dataset.sweep_state import SweepSettings, SweepState
 from mpmcli.errors import InputError
 from mpmcli.output import open_result
 from mpmcli.scene import Time
+from mpmcli.simulation.recording import Recording, record
 
 # A law that is stable by its own word, and in truth is not: its pressure pulls.
 WRONG_LAW = LAW.replace("spherical = constants[0]", "spherical = -constants[0]")
@@ -251,16 +252,20 @@ def test_a_bad_trajectory_is_tried_again_and_then_left_out(tmp_path: Path) -> No
 def test_a_fault_in_one_trajectory_does_not_end_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It gets a row that says so, and the next ones are computed."""
 
-    def faulty(*_: object) -> None:
-        raise ZeroDivisionError("division by zero")
+    calls = []
 
-    sweep = tiny_sweep(tmp_path, 2)
-    with monkeypatch.context() as patch:
-        patch.setattr("mpmcli.simulation.runner.record", faulty)
-        (row,) = compute(Task(tmp_path / "dataset", sweep, (0,)))
-    assert (row.number, row.verdict, row.accepted) == (0, "failed", 0)
-    assert row.reason == "ZeroDivisionError: division by zero (a fault of mpmcli)."
-    assert [row.verdict for row in compute(Task(tmp_path / "dataset", sweep, (0, 1)))] == ["stable"] * 2
+    def faulty(*arguments: object) -> Recording:
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise ZeroDivisionError("division by zero")
+        return record(*arguments)
+
+    sweep = tiny_sweep(tmp_path, 3)
+    monkeypatch.setattr("mpmcli.simulation.runner.record", faulty)
+    first, second, third = compute(Task(tmp_path / "dataset", sweep, (0, 1, 2)))
+    assert (second.number, second.verdict, second.accepted) == (1, "failed", 0)
+    assert second.reason == "ZeroDivisionError: division by zero (a fault of mpmcli)."
+    assert first.verdict == third.verdict == "stable" and len(calls) == 3
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(500, marks=pytest.mark.slow)])

@@ -88,35 +88,73 @@ def _runner(task: Task) -> Runner:
     return _kept.runner
 
 
+@dataclass
+class _Trial:
+    """A trajectory under way: its row as far as known, its draw, and its scene."""
+
+    row: Row
+    drawn: Draw
+    scene: Scene
+
+
 def _compute(task: Task) -> list[Row]:
-    return [_trajectory(task, _runner(task), number) for number in task.numbers]
-
-
-def _trajectory(task: Task, runner: Runner, number: int) -> Row:
-    """Draw and run a trajectory until its verdict is accepted, or no retry is left, and store it."""
+    """Draw trajectories, run each until its verdict is accepted or no retry is left, and store them."""
     began = time.perf_counter()
-    row = Row.failed(number, task.sweep.split_of(number))
-    try:
-        drawn = draw(task.sweep, number)
-        row = replace(row, draws=json.dumps(drawn.values, sort_keys=True))
-        loaded = drawn.scene(_kept.laws)
-        _require_sound(loaded)
-        for retries in range(RETRIES + 1):
-            scene = _with_step(loaded.scene, 0.5**retries)
-            recording = runner.run(scene)
-            accepted = recording.verdict == "stable" or recording.verdict == task.sweep.accept
-            if accepted:
+    rows: dict[int, Row] = {}
+    waiting: list[_Trial] = []
+    for number in task.numbers:
+        row = Row.failed(number, task.sweep.split_of(number))
+        try:
+            _runner(task)
+            drawn = draw(task.sweep, number)
+            row = replace(row, draws=json.dumps(drawn.values, sort_keys=True))
+            loaded = drawn.scene(_kept.laws)
+            _require_sound(loaded)
+        except Exception as error:
+            rows[number] = _failed(row, error)
+        else:
+            waiting.append(_Trial(row, drawn, loaded.scene))
+    retries = 0
+    while waiting:
+        scenes = [_with_step(trial.scene, 0.5**retries) for trial in waiting]
+        ended: set[int] = set()
+        for place, outcome in _runner(task).run_all(scenes):
+            trial = waiting[place]
+            now = time.perf_counter()
+            # Of several at once each has its share.
+            trial.row = replace(trial.row, seconds=trial.row.seconds + now - began)
+            began = now
+            if isinstance(outcome, Recording):
+                accepted = outcome.verdict in ("stable", task.sweep.accept)
+                if not accepted and retries < RETRIES:
+                    continue
+                try:
+                    trial.row = _stored(task, trial.row, trial.drawn, scenes[place], outcome, retries, accepted)
+                except RunError:
+                    raise
+                except Exception as error:
+                    outcome = error
+            ended.add(place)
+            if isinstance(outcome, Exception):
+                trial.row = _failed(trial.row, outcome)
+            rows[trial.row.number] = trial.row
+            if isinstance(outcome, Exception) and not isinstance(outcome, InputError):
                 break
-        row = _stored(task, row, drawn, scene, recording, retries, accepted)
-    except InputError as error:
-        row = replace(row, reason=str(error))
-    except RunError:
-        raise
-    except Exception as error:
-        # One trajectory must not end thousands. What it has left on the device is dropped.
-        row = replace(row, reason=f"{type(error).__name__}: {error} (a fault of mpmcli).")
-        _kept.known = None
-    return replace(row, seconds=time.perf_counter() - began)
+        else:
+            retries += 1
+        waiting = [trial for place, trial in enumerate(waiting) if place not in ended]
+    return [rows[number] for number in task.numbers]
+
+
+def _failed(row: Row, error: Exception) -> Row:
+    """Return the row of a trajectory that has none, for want of a scene or by a fault.
+
+    One trajectory must not end thousands. What a fault has left on the device is dropped.
+    """
+    if isinstance(error, InputError):
+        return replace(row, reason=str(error))
+    _kept.known = None
+    return replace(row, reason=f"{type(error).__name__}: {error} (a fault of mpmcli).")
 
 
 def _require_sound(loaded: LoadedScene) -> None:

@@ -15,7 +15,7 @@ from mpmcli.dataset.sweep_folder import open_folder
 from mpmcli.dataset.sweep_state import SweepSettings, SweepState
 
 # Most trajectories of a task, and tasks per worker below which they become shorter.
-TASK, ROUNDS = 8, 8
+TASK, GPU_TASK, ROUNDS = 8, 128, 8
 # Why a trajectory has failed that no worker survived.
 LOST = "every worker that computed it was killed, perhaps for want of memory."
 
@@ -113,7 +113,9 @@ class _Keeper:
 
 def _tasks(sweep: Sweep, settings: SweepSettings, numbers: Sequence[int], workers: int) -> list[Task]:
     """Split the work: tasks of several trajectories, so that sending takes no time, but enough for all workers."""
-    size = max(1, min(TASK, len(numbers) // (ROUNDS * workers)))
+    # A GPU computes the trajectories of a task at once.
+    most = GPU_TASK if settings.arch not in ("auto", "cpu") else TASK
+    size = max(1, min(most, len(numbers) // (ROUNDS * workers)))
     directory = settings.directory.resolve()
     plugins = tuple(path.resolve() for path in settings.plugins)
     return [

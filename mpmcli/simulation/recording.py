@@ -36,28 +36,51 @@ class Recording:
     reason: str
 
 
+class Recorder:
+    """Keeps the frames of a run while it goes on."""
+
+    def __init__(self, engine: Engine, scene: Scene, backend: Backend) -> None:
+        facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
+        self._header = RunHeader.of(scene, scene_to_toml(scene), [laws()[name] for name in engine.laws], facts)
+        self._engine = engine
+        self._frames: list[Frame] = []
+        self._ledger: list[LedgerRow] = []
+
+    def take(self, frame: Frame, row: LedgerRow) -> None:
+        """Keep a frame."""
+        self._frames.append(frame)
+        self._ledger.append(row)
+
+    def finished(self) -> Recording:
+        """Return the recording of a run that has reached its end."""
+        check = check_kept(self._header, self._frames, self._ledger)
+        return self._recording(check.verdict, _first(check.findings))
+
+    def stopped(self, error: UnstableRunError) -> Recording:
+        """Return the recording of a run that became unstable."""
+        escaped = error.diagnosis.cause.startswith((LEFT, OUTRAN))
+        return self._recording("escaped" if escaped else "unstable", str(error))
+
+    def _recording(self, verdict: Verdict, reason: str) -> Recording:
+        engine = self._engine
+        return Recording(
+            self._header, self._frames, self._ledger, engine.step_count, engine.particle_count, verdict, reason
+        )
+
+
 def record(engine: Engine, scene: Scene, backend: Backend, stop: Callable[[], bool] = lambda: False) -> Recording:
     """Run a scene to its end or to where it stops.
 
     Raises:
         KeyboardInterrupt: `stop` returned True.
     """
-    facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
-    header = RunHeader.of(scene, scene_to_toml(scene), [laws()[name] for name in engine.laws], facts)
-    frames: list[Frame] = []
-    ledger: list[LedgerRow] = []
-    verdict: Verdict
+    recorder = Recorder(engine, scene, backend)
     try:
         for frame, row in engine.frames(stop):
-            frames.append(frame)
-            ledger.append(row)
+            recorder.take(frame, row)
     except UnstableRunError as error:
-        verdict = "escaped" if error.diagnosis.cause.startswith((LEFT, OUTRAN)) else "unstable"
-        reason = str(error)
-    else:
-        check = check_kept(header, frames, ledger)
-        verdict, reason = check.verdict, _first(check.findings)
-    return Recording(header, frames, ledger, engine.step_count, engine.particle_count, verdict, reason)
+        return recorder.stopped(error)
+    return recorder.finished()
 
 
 def _first(findings: Sequence[Finding]) -> str:

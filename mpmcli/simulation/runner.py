@@ -1,20 +1,24 @@
 """Computes many scenes, one after another, in one process: scenes of one kind share the device and its kernels."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
-from mpmcli.scene import Scene, sample_bodies
-from mpmcli.simulation.recording import Recording, record
+from mpmcli.errors import MpmcliError
+from mpmcli.scene import BodyParticles, Scene, sample_bodies
+from mpmcli.simulation.recording import Recorder, Recording, record
 from mpmcli.solver.backend import Arch, Backend, Optimisation, choose_backend, start, stop_backend
 from mpmcli.solver.batch import Batch, Kind
 from mpmcli.solver.batch_run import BatchRun
+from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.engine import suits_batch
 from mpmcli.solver.plan import make_plan, require_room
 from mpmcli.solver.solver import Solver
 
 # Kinds whose kernels are kept at once.
 MOST_KINDS = 8
+# Runs that advance at once on a GPU.
+MOST_RUNS = 256
 
 
 class Runner:
@@ -41,7 +45,7 @@ class Runner:
         for scene in scenes:
             particles = sample_bodies(scene)
             backend = self._choose(scene)
-            if not suits_batch(scene, sum(len(b.position) for b in particles), backend):
+            if not backend.on_cpu or not suits_batch(scene, sum(len(b.position) for b in particles), backend):
                 continue
             kind = Kind.of(scene, particles)
             place = next((i for i, known in enumerate(kinds) if known.joined(kind) is not None), None)
@@ -62,13 +66,83 @@ class Runner:
         particles = sample_bodies(scene)
         backend = self._choose(scene)
         if suits_batch(scene, sum(len(b.position) for b in particles), backend):
-            backend = replace(backend, threads=1)
+            backend = replace(backend, threads=1) if backend.on_cpu else backend
             engine = BatchRun(self._batch_for(Kind.of(scene, particles), backend), 0, scene, particles)
         else:
             require_room(make_plan(scene, backend))
             self._restart(backend)
             engine = Solver(scene, backend, particles)
         return record(engine, scene, backend, stop)
+
+    def run_all(self, scenes: Sequence[Scene]) -> Iterator[tuple[int, Recording | Exception]]:
+        """Yield the place of each scene with its recording, or with the error that it ended with, as they end.
+
+        On a GPU those of a kind with few particles advance at once.
+        """
+        alone: list[int] = []
+        kinds: list[tuple[Kind, list[int]]] = []
+        sampled: dict[int, list[BodyParticles]] = {}
+        for place, scene in enumerate(scenes):
+            try:
+                particles = sample_bodies(scene)
+                backend = self._choose(scene)
+            except MpmcliError as error:
+                yield place, error
+                continue
+            if backend.on_cpu or not suits_batch(scene, sum(len(b.position) for b in particles), backend):
+                alone.append(place)
+                continue
+            sampled[place] = particles
+            kind = Kind.of(scene, particles)
+            for i, (known, own) in enumerate(kinds):
+                if len(own) < MOST_RUNS and (joined := known.joined(kind)):
+                    kinds[i] = joined, [*own, place]
+                    break
+            else:
+                kinds.append((kind, [place]))
+        for place in alone:
+            try:
+                outcome = self.run(scenes[place])
+            except Exception as error:
+                outcome = error
+            yield place, outcome
+        for kind, places in kinds:
+            yield from self._run_together(kind, {place: (scenes[place], sampled[place]) for place in places})
+
+    def _run_together(
+        self, kind: Kind, scenes: Mapping[int, tuple[Scene, list[BodyParticles]]]
+    ) -> Iterator[tuple[int, Recording | Exception]]:
+        """Advance scenes of a kind at once; see `run_all`."""
+        backend = self._choose(next(iter(scenes.values()))[0])
+        batch = self._batch_for(kind, backend, len(scenes))
+        runs: dict[int, tuple[Recorder, Iterator]] = {}
+        for slot, (place, (scene, particles)) in enumerate(scenes.items()):
+            try:
+                run = BatchRun(batch, slot, scene, particles)
+                runs[place] = Recorder(run, scene, backend), run.events()
+            except Exception as error:
+                yield place, error
+        while runs:
+            for place, (recorder, events) in list(runs.items()):
+                outcome: Recording | Exception | None = None
+                try:
+                    while (event := next(events)) is not None:
+                        recorder.take(*event)
+                except StopIteration:
+                    outcome = recorder.finished()
+                except UnstableRunError as error:
+                    outcome = recorder.stopped(error)
+                except Exception as error:
+                    outcome = error
+                if outcome is not None:
+                    del runs[place]
+                    yield place, outcome
+            if runs:
+                try:
+                    batch.launch()
+                except Exception as error:
+                    yield from ((place, error) for place in runs)
+                    return
 
     def _choose(self, scene: Scene) -> Backend:
         return choose_backend(self._arch, self._threads, scene.solver.precision, optimisation=self._optimisation)
@@ -78,19 +152,19 @@ class Runner:
         stop_backend()
         self._backend = start(backend)
 
-    def _batch_for(self, kind: Kind, backend: Backend) -> Batch:
-        """Return a batch with room for a run of this kind."""
+    def _batch_for(self, kind: Kind, backend: Backend, runs: int = 1) -> Batch:
+        """Return a batch with room for so many runs of this kind."""
         if self._backend != backend:
             self._restart(backend)
         wanted = kind
         for batch in self._batches:
             joined = batch.kind.joined(kind)
-            if joined == batch.kind:
+            if joined == batch.kind and runs <= batch.runs:
                 return batch
             wanted = joined or wanted
         if wanted is not kind or len(self._batches) == MOST_KINDS:
             self._restart(backend)
-        self._batches.append(Batch(_roomy(wanted), backend))
+        self._batches.append(Batch(_roomy(wanted), backend, _power(runs)))
         return self._batches[-1]
 
 

@@ -17,11 +17,13 @@ from mpmcli.scene import BodyParticles, Scene
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.batch_device import Device
+from mpmcli.solver.batch_gpu import build_gpu_launch
 from mpmcli.solver.batch_kernel import build_batch_kernel
 from mpmcli.solver.batch_layout import Layout
 from mpmcli.solver.frame_reader import build_frame_reader
 from mpmcli.solver.grid import DRIFT, Grid, node_width
 from mpmcli.solver.nodes import NodeUpdate
+from mpmcli.solver.observe import build_observation
 from mpmcli.solver.ordering import SortBuffers, TileOrder
 from mpmcli.solver.particle_arrays import CONSTANTS, ParticleArrays
 from mpmcli.solver.particle_update import ParticleUpdate
@@ -101,14 +103,15 @@ class Batch:
         device: all of it.
         layout: columns of `numbers`, (runs, k) float64, and `counts`, (runs, l) int32, which the kernel reads and
             changes.
-        readers: of frames, per law.
+        readers: of frames, per law, on the CPU; observations: per law, on a GPU.
         seconds: wall time of all launches; first_seconds: of the first, which compiles the kernel.
     """
 
     def __init__(self, kind: Kind, backend: Backend, runs: int = 1) -> None:
         d = kind.dimension
         self.kind, self.runs, self.backend = kind, runs, backend
-        width = node_width(d, on_cpu=True)
+        on_cpu = backend.on_cpu
+        width = node_width(d, on_cpu=on_cpu)
         grid = Grid(d, 1.0, kind.cells, width, scheme_of(kind.settings), runs)
         groups = [
             ParticleArrays(
@@ -116,10 +119,10 @@ class Batch:
                 d,
                 runs * room,
                 (runs * bodies, CONSTANTS + len(law.constants(law.members[0]))),
-                width,
-                ti.Layout.AOS,
+                width if on_cpu else d,
+                ti.Layout.AOS if on_cpu else ti.Layout.SOA,
                 several=True,
-                serial=True,
+                serial=on_cpu,
             )
             for law, room, bodies in zip(kind.members, kind.particles, kind.bodies, strict=True)
         ]
@@ -129,8 +132,10 @@ class Batch:
         else:
             walls = Walls(kind.faces, PAD, grid.cells, grid.shape, runs)
             images = MirrorImages(walls)
-        buffers = SortBuffers(groups, runs)
-        orders = [TileOrder(group, grid, buffers, 1, True, runs) for group in groups]
+        orders = []
+        if on_cpu:
+            buffers = SortBuffers(groups, runs)
+            orders = [TileOrder(group, grid, buffers, 1, True, runs) for group in groups]
         self.device = Device(
             runs,
             kind.particles,
@@ -148,9 +153,11 @@ class Batch:
         constants = {"drift_allowed": DRIFT, "easing": EASING, "slack": 1e-6, "infinity": math.inf}
         for name, value in constants.items():
             self.numbers[:, getattr(self.layout.real, name)] = value
-        self.readers = [build_frame_reader(group) for group in groups]
+        self.readers = [build_frame_reader(group) for group in groups] if on_cpu else []
+        self.observations = [] if on_cpu else [build_observation(group) for group in groups]
         self.seconds = self.first_seconds = 0.0
-        self._launch = build_batch_kernel(self.device, self.layout)
+        build = build_batch_kernel if on_cpu else build_gpu_launch
+        self._launch = build(self.device, self.layout)
 
     def launch(self) -> None:
         """Advance every run until its host has to attend to it, or its budget of steps is spent."""

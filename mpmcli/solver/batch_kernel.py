@@ -12,7 +12,8 @@ import numpy as np
 import taichi as ti
 
 from mpmcli.solver.batch_device import Device, views
-from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, GOING, LIMITS, LOST, MEASURE, Layout
+from mpmcli.solver.batch_layout import ATTEND, GOING, MEASURE, Layout
+from mpmcli.solver.batch_steps import BatchSteps
 from mpmcli.solver.box import box_of
 from mpmcli.solver.cpu_loops import clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.grid import DRIFT
@@ -21,9 +22,6 @@ from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.sorting import sort_serially, tiles_in_use
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
-from mpmcli.stability.limits import COURANT, DEFORMATION
-
-DEFORMING, FORCED, MAXIMUM, CROSSING = (LIMITS.index(name) for name in ("deformation", "forced", "maximum", "speed"))
 
 
 def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, np.ndarray], None]:
@@ -32,6 +30,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
     groups, room, threads = tuple(device.groups), tuple(device.room), device.threads
     members = tuple(enumerate(groups))
     real, count = layout.real, layout.count
+    steps = BatchSteps(layout, [group.law for group in groups])
     lost = device.particles.lost
     alone = threads == 1
     next_run = ti.field(int, shape=())
@@ -48,40 +47,6 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
                 widen_state(group, own, p)
             for k in ti.static(range(entries(group))):
                 numbers[w, real.maxima[g] + k] = ti.cast(own[k], ti.f64)
-
-    @ti.func
-    def stable_step(w: int, numbers: ti.template(), counts: ti.template()):
-        """Return the step, s, and the code of its bound, as `Run.stable_step` does, and the bound by deformation, s."""
-        value = numbers[w, real.stiffness]
-        limit = counts[w, count.stiffness_limit]
-        sharpest = numbers[w, real.rate[0]]
-        for g in ti.static(range(1, len(groups))):
-            sharpest = ti.max(sharpest, numbers[w, real.rate[g]])
-        deformation = numbers[w, real.infinity]
-        if sharpest > 0:
-            deformation = DEFORMATION / sharpest
-        if deformation < value or (deformation == value and limit > DEFORMING):
-            value = deformation
-            limit = DEFORMING
-        value = ti.min(value, numbers[w, real.eased])
-        speed = numbers[w, real.speed]
-        pull = numbers[w, real.pull]
-        h = numbers[w, real.spacing]
-        crossing = numbers[w, real.infinity]
-        if speed != 0 or pull != 0:
-            crossing = 2 * COURANT * h / (speed + ti.sqrt(speed * speed + 4 * pull * COURANT * h))
-        if crossing < value or (crossing == value and limit > CROSSING):
-            value = crossing
-            limit = CROSSING
-        value = numbers[w, real.safety] * value
-        maximum = numbers[w, real.maximum]
-        if maximum < value:
-            value = maximum
-            limit = MAXIMUM
-        elif counts[w, count.forced] == 1:
-            value = maximum
-            limit = FORCED
-        return value, limit, deformation
 
     @ti.func
     def sort(
@@ -142,35 +107,6 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
         return speed
 
     @ti.func
-    def control(w: int, dt: ti.f64, numbers: ti.template(), counts: ti.template()):
-        """Count a step, as `StepControl.after_step` does; return whether the host must measure."""
-        due = False
-        for g in ti.static(range(len(groups))):
-            counts[w, count.unwatched[g]] += 1
-            strain = dt * numbers[w, real.rate[g]]
-            numbers[w, real.change[g]] = numbers[w, real.change[g]] + strain * numbers[w, real.sensitivity[g]]
-            numbers[w, real.hardened[g]] = numbers[w, real.hardened[g]] + strain * numbers[w, real.hardening[g]]
-            allowed = numbers[w, real.growth_allowed]
-            if counts[w, count.unwatched[g]] >= counts[w, count.longest]:
-                due = True
-            if numbers[w, real.change[g]] >= allowed or numbers[w, real.hardened[g]] >= allowed:
-                due = True
-        return due
-
-    @ti.func
-    def book(w: int, dt: ti.f64, courant: ti.f64, limit: int, numbers: ti.template(), counts: ti.template()):
-        """Keep the smallest step with its bound, the largest one, and the largest Courant number, for the ledger."""
-        smallest = numbers[w, real.smallest]
-        between = numbers[w, real.smallest_courant]
-        same = dt == smallest and (courant < between or (courant == between and limit < counts[w, count.limit]))
-        if dt < smallest or same:
-            numbers[w, real.smallest] = dt
-            numbers[w, real.smallest_courant] = courant
-            counts[w, count.limit] = limit
-        numbers[w, real.largest] = ti.max(numbers[w, real.largest], dt)
-        numbers[w, real.largest_courant] = ti.max(numbers[w, real.largest_courant], courant)
-
-    @ti.func
     def advance(w: int, numbers: ti.template(), counts: ti.template()):
         """Take the steps of one run."""
         h = ti.cast(numbers[w, real.spacing], float)
@@ -188,37 +124,12 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
         while counts[w, count.status] == GOING and counts[w, count.budget] > 0:
             if numbers[w, real.drift] >= numbers[w, real.drift_allowed]:
                 sort(w, box, last, orders, numbers, counts)
-            largest, limit, deformation = stable_step(w, numbers, counts)
-            left = numbers[w, real.target] - numbers[w, real.time]
-            if largest < numbers[w, real.collapse]:
-                counts[w, count.status] = COLLAPSED
-            else:
-                splits = ti.max(ti.ceil(left / largest - numbers[w, real.slack]), 1.0)
-                dt = left / splits
-                kick = ti.min(0.5 * (numbers[w, real.last_step] + dt), dt / numbers[w, real.safety_squared])
-                speed = ti.cast(
-                    move(w, grid, nodes, particles, orders, ti.cast(dt, float), ti.cast(kick, float), numbers, counts),
-                    ti.f64,
+            dt, kick, splits, limit, deformation = steps.begin(w, numbers, counts)
+            if dt > 0:
+                speed = move(
+                    w, grid, nodes, particles, orders, ti.cast(dt, float), ti.cast(kick, float), numbers, counts
                 )
-                numbers[w, real.time] = numbers[w, real.time] + dt
-                numbers[w, real.last_step] = dt
-                counts[w, count.steps] += 1
-                counts[w, count.budget] -= 1
-                if speed >= 0:
-                    courant = dt * speed / numbers[w, real.spacing]
-                    numbers[w, real.speed] = speed
-                    numbers[w, real.courant] = courant
-                    numbers[w, real.drift] = numbers[w, real.drift] + courant
-                    eased = ti.min(numbers[w, real.easing] * numbers[w, real.eased], numbers[w, real.stiffness])
-                    numbers[w, real.eased] = ti.min(eased, deformation)
-                    due = control(w, dt, numbers, counts)
-                    book(w, dt, courant, limit, numbers, counts)
-                    if splits == 1:
-                        counts[w, count.arrived] = 1
-                    if due or splits == 1:
-                        counts[w, count.status] = ATTEND
-                else:
-                    counts[w, count.status] = LOST
+                steps.end(w, dt, splits, limit, deformation, ti.cast(speed, ti.f64), numbers, counts)
         for a in ti.static(range(d)):
             for i in ti.static(range(2)):
                 device.grid.box[w * 2 + i, a] = box[i, a]

@@ -18,6 +18,7 @@ from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.particles import initial_state, table_of
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.run import COLLAPSE, Run
+from mpmcli.solver.snapshot import fill, read_group
 from mpmcli.solver.state import Progress
 from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
 from mpmcli.solver.step_control import StepControl, StepCounters
@@ -272,6 +273,15 @@ class BatchRun(Run):
             # Frame 0 is always there.
             if self.step_count and stop():
                 raise KeyboardInterrupt
+
+    def _observe(self, arrays: FrameArrays) -> list[Sums]:
+        snapshots = [read_group(group) for group in self.groups]
+        stress = arrays.first["tau"] >= 0
+        seen = [
+            observation(self.last_step, group.first, group.count, stress=stress, stored=(s.deformation, s.internal))
+            for observation, group, s in zip(self.batch.observations, self.groups, snapshots, strict=True)
+        ]
+        return fill(arrays, snapshots, seen)
 
     def _read(self, g: int, arrays: FrameArrays) -> Sums:
         group = self.groups[g]

@@ -17,6 +17,8 @@ from mpmcli.solver.solver import Solver
 # Particles, by dimension, below which one thread is faster than two: the hand-over to a pool of threads takes
 # about 0.4 ms of each step.
 FEW_PARTICLES = {2: 20_000, 3: 10_000}
+# On a GPU, where runs advance at once; its kernels count time in double precision, which Metal lacks.
+FEW_ON_GPU, BATCHING_GPUS = 100_000, ("cuda", "vulkan")
 # Particle-steps below which the time to optimise kernels exceeds what faster steps save.
 LITTLE_WORK = 1e8
 
@@ -99,8 +101,9 @@ def choose_engine(
 
 
 def suits_batch(scene: Scene, particles: int, backend: Backend) -> bool:
-    """Return whether a batch can run a scene of so many particles, and faster than a `Solver`."""
-    return _is_small(scene, particles, backend) and can_batch(scene)
+    """Return whether a batch can run a scene of so many particles, and, of many runs, faster than a `Solver`."""
+    few = _is_small(scene, particles, backend) or (backend.arch in BATCHING_GPUS and particles < FEW_ON_GPU)
+    return few and can_batch(scene)
 
 
 def _is_small(scene: Scene, particles: int, backend: Backend) -> bool:

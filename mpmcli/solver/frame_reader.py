@@ -1,6 +1,6 @@
 """Reads a frame on the CPU by one launch per law: what the particles show, and the ledger's sums.
 
-`snapshot.fill` and `snapshot.sums_of` do the same with numpy, for a GPU, which has no double precision everywhere; of
+`snapshot.fill` does the same with numpy, for a GPU, which has no double precision everywhere; of
 few particles they take several times as long.
 """
 

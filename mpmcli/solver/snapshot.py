@@ -51,8 +51,14 @@ def read_group(group: ParticleGroup) -> Snapshot:
     return Snapshot(group, **group.to_numpy())
 
 
-def fill(arrays: FrameArrays, snapshot: Snapshot, seen: Observation) -> None:
-    """Fill the rows of a law's particles, as `build_frame_reader` does."""
+def fill(arrays: FrameArrays, snapshots: Sequence[Snapshot], seen: Sequence[Observation]) -> list[Sums]:
+    """Fill all rows, and return the sums over the particles of each law, as `build_frame_reader` does."""
+    for snapshot, observed in zip(snapshots, seen, strict=True):
+        _fill(arrays, snapshot, observed)
+    return [_sums(s, o) for s, o in zip(snapshots, seen, strict=True)]
+
+
+def _fill(arrays: FrameArrays, snapshot: Snapshot, seen: Observation) -> None:
     rows, d = snapshot.id, arrays.dimension
     keeps_F = seen.deformation.ndim == 3
     arrays["x"][rows], arrays["v"][rows], arrays["energy"][rows] = snapshot.x, snapshot.v, seen.energy
@@ -66,11 +72,6 @@ def fill(arrays: FrameArrays, snapshot: Snapshot, seen: Observation) -> None:
         arrays["gradient"][rows] = F.reshape(-1, d * d)
     if arrays.first["tau"] >= 0:
         arrays["tau"][rows] = seen.tau
-
-
-def sums_of(snapshots: Sequence[Snapshot], seen: Sequence[Observation]) -> list[Sums]:
-    """Return the sums over the particles of each law."""
-    return [_sums(s, o) for s, o in zip(snapshots, seen, strict=True)]
 
 
 def _sums(snapshot: Snapshot, seen: Observation) -> Sums:

@@ -16,7 +16,7 @@ from mpmcli.solver.kernels import Kernels
 from mpmcli.solver.observe import build_observation
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.run import COLLAPSE, Run
-from mpmcli.solver.snapshot import fill, read_group, sums_of
+from mpmcli.solver.snapshot import fill, read_group
 from mpmcli.solver.state import State
 from mpmcli.solver.state_bounds import build_measurement
 from mpmcli.solver.step_control import StepControl
@@ -159,9 +159,7 @@ class Solver(Run):
             observation(self.last_step, 0, len(s.id), stress=stress, stored=(s.deformation, s.internal))
             for observation, s in zip(self._observations, snapshots, strict=True)
         ]
-        for snapshot, observed in zip(snapshots, seen, strict=True):
-            fill(arrays, snapshot, observed)
-        return sums_of(snapshots, seen)
+        return fill(arrays, snapshots, seen)
 
     def _read(self, g: int, arrays: FrameArrays) -> Sums:
         return self._readers[g](self.last_step, 0, self.groups[g].count, arrays)

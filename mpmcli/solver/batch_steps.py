@@ -1,0 +1,141 @@
+"""What the kernels of a batch compute of a run as a whole: its next step, and what follows from the last one.
+
+The same as `Run.stable_step`, `Solver.step` and `StepControl.after_step`, in the same order and precision.
+"""
+
+from collections.abc import Sequence
+
+import taichi as ti
+
+from mpmcli.materials.law import Law
+from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, LIMITS, LOST, Layout
+from mpmcli.stability.limits import COURANT, DEFORMATION
+
+DEFORMING, FORCED, MAXIMUM, CROSSING = (LIMITS.index(name) for name in ("deformation", "forced", "maximum", "speed"))
+
+
+@ti.data_oriented
+class BatchSteps:
+    """The steps of the runs of a batch, w being the number of a run; numbers and counts as of `batch_layout`."""
+
+    def __init__(self, layout: Layout, laws: Sequence[Law]) -> None:
+        self.real, self.count = layout.real, layout.count
+        self.laws = tuple(laws)
+
+    @ti.func
+    def begin(self, w: int, numbers: ti.template(), counts: ti.template()):
+        """Choose the next step.
+
+        Returns:
+            The step and the kick, s, float64, and the step is 0 where it collapsed; the number of such steps to the
+            target; the code of the bound that sets the step, and the bound by deformation, s.
+        """
+        largest, limit, deformation = self.stable_step(w, numbers, counts)
+        left = numbers[w, self.real.target] - numbers[w, self.real.time]
+        splits = ti.max(ti.ceil(left / largest - numbers[w, self.real.slack]), 1.0)
+        dt = left / splits
+        kick = ti.min(0.5 * (numbers[w, self.real.last_step] + dt), dt / numbers[w, self.real.safety_squared])
+        if largest < numbers[w, self.real.collapse]:
+            counts[w, self.count.status] = COLLAPSED
+            dt = 0.0 * dt
+        return dt, kick, splits, limit, deformation
+
+    @ti.func
+    def end(
+        self,
+        w: int,
+        dt: ti.f64,
+        splits: ti.f64,
+        limit: int,
+        deformation: ti.f64,
+        speed: ti.f64,
+        numbers: ti.template(),
+        counts: ti.template(),
+    ):
+        """Count a step with this largest speed of a node, m/s, -1 where a particle was lost. Its rates are stored."""
+        numbers[w, self.real.time] = numbers[w, self.real.time] + dt
+        numbers[w, self.real.last_step] = dt
+        counts[w, self.count.steps] += 1
+        counts[w, self.count.budget] -= 1
+        if speed >= 0:
+            courant = dt * speed / numbers[w, self.real.spacing]
+            numbers[w, self.real.speed] = speed
+            numbers[w, self.real.courant] = courant
+            numbers[w, self.real.drift] = numbers[w, self.real.drift] + courant
+            eased = ti.min(numbers[w, self.real.easing] * numbers[w, self.real.eased], numbers[w, self.real.stiffness])
+            numbers[w, self.real.eased] = ti.min(eased, deformation)
+            due = self.control(w, dt, numbers, counts)
+            self.book(w, dt, courant, limit, numbers, counts)
+            if splits == 1:
+                counts[w, self.count.arrived] = 1
+            if due or splits == 1:
+                counts[w, self.count.status] = ATTEND
+        else:
+            counts[w, self.count.status] = LOST
+
+    @ti.func
+    def stable_step(self, w: int, numbers: ti.template(), counts: ti.template()):
+        """Return the step, s, and the code of its bound, as `Run.stable_step` does, and the bound by deformation, s."""
+        value = numbers[w, self.real.stiffness]
+        limit = counts[w, self.count.stiffness_limit]
+        sharpest = numbers[w, self.real.rate[0]]
+        for g in ti.static(range(1, len(self.laws))):
+            sharpest = ti.max(sharpest, numbers[w, self.real.rate[g]])
+        deformation = numbers[w, self.real.infinity]
+        if sharpest > 0:
+            deformation = DEFORMATION / sharpest
+        if deformation < value or (deformation == value and limit > DEFORMING):
+            value = deformation
+            limit = DEFORMING
+        value = ti.min(value, numbers[w, self.real.eased])
+        speed = numbers[w, self.real.speed]
+        pull = numbers[w, self.real.pull]
+        h = numbers[w, self.real.spacing]
+        crossing = numbers[w, self.real.infinity]
+        if speed != 0 or pull != 0:
+            crossing = 2 * COURANT * h / (speed + ti.sqrt(speed * speed + 4 * pull * COURANT * h))
+        if crossing < value or (crossing == value and limit > CROSSING):
+            value = crossing
+            limit = CROSSING
+        value = numbers[w, self.real.safety] * value
+        maximum = numbers[w, self.real.maximum]
+        if maximum < value:
+            value = maximum
+            limit = MAXIMUM
+        elif counts[w, self.count.forced] == 1:
+            value = maximum
+            limit = FORCED
+        return value, limit, deformation
+
+    @ti.func
+    def control(self, w: int, dt: ti.f64, numbers: ti.template(), counts: ti.template()):
+        """Count a step, as `StepControl.after_step` does; return whether the host must measure."""
+        due = False
+        for g in ti.static(range(len(self.laws))):
+            counts[w, self.count.unwatched[g]] += 1
+            strain = dt * numbers[w, self.real.rate[g]]
+            numbers[w, self.real.change[g]] = (
+                numbers[w, self.real.change[g]] + strain * numbers[w, self.real.sensitivity[g]]
+            )
+            numbers[w, self.real.hardened[g]] = (
+                numbers[w, self.real.hardened[g]] + strain * numbers[w, self.real.hardening[g]]
+            )
+            allowed = numbers[w, self.real.growth_allowed]
+            if counts[w, self.count.unwatched[g]] >= counts[w, self.count.longest]:
+                due = True
+            if numbers[w, self.real.change[g]] >= allowed or numbers[w, self.real.hardened[g]] >= allowed:
+                due = True
+        return due
+
+    @ti.func
+    def book(self, w: int, dt: ti.f64, courant: ti.f64, limit: int, numbers: ti.template(), counts: ti.template()):
+        """Keep the smallest step with its bound, the largest one, and the largest Courant number, for the ledger."""
+        smallest = numbers[w, self.real.smallest]
+        between = numbers[w, self.real.smallest_courant]
+        same = dt == smallest and (courant < between or (courant == between and limit < counts[w, self.count.limit]))
+        if dt < smallest or same:
+            numbers[w, self.real.smallest] = dt
+            numbers[w, self.real.smallest_courant] = courant
+            counts[w, self.count.limit] = limit
+        numbers[w, self.real.largest] = ti.max(numbers[w, self.real.largest], dt)
+        numbers[w, self.real.largest_courant] = ti.max(numbers[w, self.real.largest_courant], courant)

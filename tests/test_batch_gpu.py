@@ -1,0 +1,73 @@
+"""Runs of a batch on a GPU follow those on the CPU, which chooses the same steps; a sweep computes many at once."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_batch import batch_of, outputs_of, scene_named
+from tiny_sweep import tiny_sweep
+
+from mpmcli.dataset.compute import Task, compute
+from mpmcli.solver.batch_run import BatchRun
+from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.solver import Solver
+
+pytestmark = pytest.mark.gpu
+
+
+@pytest.mark.parametrize(
+    "name", ["two laws, two bodies of one", *(pytest.param(n, marks=pytest.mark.slow) for n in ("3D, AFLIP", "snow"))]
+)
+def test_runs_follow_those_on_the_cpu(backend_of: Callable, name: str) -> None:
+    """Two runs in which all numbers differ: as many steps, and what sums in another order changes by round-off."""
+    scenes = [scene_named(name), scene_named(name, other=True)]
+    backend = backend_of("f32", 1, "vulkan")
+    found = outputs_of(batch_of(scenes, backend), scenes)
+    cpu = backend_of("f32", 1)
+    for outcome, scene in zip(found, scenes, strict=True):
+        expected = list(Solver(scene, cpu).frames())
+        assert [row.steps for _, row in outcome] == [row.steps for _, row in expected]
+        steps = expected[-1][0].step
+        assert steps > 15
+        for (frame, row), (other, other_row) in zip(outcome, expected, strict=True):
+            assert np.abs(frame.position - other.position).max() < steps * np.finfo(np.float32).eps
+            assert row.energy == pytest.approx(other_row.energy, rel=1e-5)
+            assert row.step_max == pytest.approx(other_row.step_max, rel=1e-4) and row.limit == other_row.limit
+            scale = np.abs(other.fields["stress"]).max()
+            assert np.abs(frame.fields["stress"] - other.fields["stress"]).max() <= 1e-3 * scale
+            assert np.array_equal(frame.body, other.body) and np.array_equal(frame.material, other.material)
+
+
+def test_an_unstable_run_stops_alone(backend_of: Callable) -> None:
+    sound = scene_named("neo_hookean")
+    time = sound.time.model_copy(update={"step": 0.004, "end": 0.4})
+    wild = sound.model_copy(update={"time": time})
+    batch = batch_of([sound, wild], backend_of("f32", 1, "vulkan"))
+    streams, frames = [BatchRun(batch, 0, sound).events(), BatchRun(batch, 1, wild, force=True).events()], []
+    with pytest.raises(UnstableRunError, match="the run became unstable at step"):
+        for _ in range(200):
+            list(iter(lambda: next(streams[1]), None))
+            frames += iter(lambda: next(streams[0], None), None)
+            batch.launch()
+    for _ in range(20):
+        frames += iter(lambda: next(streams[0], None), None)
+        batch.launch()
+    assert [frame.index for frame, _ in frames] == [0, 1, 2, 3]
+    # The place serves the next run.
+    (again,) = outputs_of(batch, [sound])
+    assert len(again) == 4
+
+
+@pytest.mark.slow
+def test_a_sweep_computes_many_at_once(tmp_path: Path) -> None:
+    """All trajectories of a task, stored as on the CPU."""
+    sweep = tiny_sweep(tmp_path, 6)
+    found = {}
+    for arch in ("vulkan", "cpu"):
+        rows = compute(Task(tmp_path / arch, sweep, tuple(range(6)), arch))
+        assert [row.verdict for row in rows] == ["stable"] * 6 and {row.arch for row in rows} == {arch}
+        assert all((tmp_path / arch / row.file).exists() and row.seconds > 0 for row in rows)
+        found[arch] = rows
+    for row, other in zip(found["vulkan"], found["cpu"], strict=True):
+        assert (row.steps, row.particles, row.frames) == (other.steps, other.particles, other.frames)
