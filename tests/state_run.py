@@ -9,10 +9,11 @@ from mpmcli.solver.backend import start_backend
 from mpmcli.solver.solver import Solver
 from mpmcli.solver.state import SavedState
 
-BEFORE, AFTER = 30, 50
+# Not a multiple of the steps between two relaxations of volume.
+BEFORE, AFTER = 33, 50
 SOFT = {"density": 1000.0, "youngs_modulus": 2e5, "poissons_ratio": 0.3}
 MATERIALS = {
-    "fluid": {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4, "viscosity": 0.5},
+    "fluid": {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4, "viscosity": 0.5, "volume_correction": True},
     "viscoplastic": {
         "law": "viscoplastic",
         "density": 1000.0,

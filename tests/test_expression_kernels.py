@@ -38,7 +38,7 @@ def evaluated(real):
         field.from_numpy(values)
     clock = Clock()
     nodes = tuple(enumerate(node_of(parse(text, NAMES).tree, ORIGIN, clock) for text in texts))
-    set_time = clock.allocate()
+    set_time = clock.allocate(1.0)
     found = ti.field(float, shape=(n, len(texts)))
 
     @ti.kernel
@@ -47,7 +47,7 @@ def evaluated(real):
             for k, node in ti.static(some):
                 found[p, k] = node.evaluate(fields[0][p], fields[1][p])
 
-    set_time(TIME)
+    set_time(TIME, TIME)
     # Taichi warns of kernels with more than 32 copies of a loop.
     for first in range(0, len(nodes), 30):
         run(nodes[first : first + 30])

@@ -117,16 +117,20 @@ def test_viscous_stress_is_newtonian(probes: Probes, d: int) -> None:
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_tension_cutoff(probes: Probes, d: int) -> None:
-    """J > 1: no stress, J back to 1, no energy, settled at once; without the cut-off suction K (J - 1), J kept."""
+    """J > 1: no stress and no energy; J is kept up to e^2, and falls back to 1 at once without volume correction.
+
+    Without the cut-off there is suction K (J - 1), and J is kept.
+    """
     J = np.array([1 + 1e-3, 1.5, 27.0])
-    cut = probes(d)(swollen(J, d))
-    assert not cut.tau.any()
-    assert not cut.energy.any()
-    assert np.array_equal(cut.deformation, np.ones(3))
+    for correction, kept in ((True, np.minimum(J, np.exp(2.0))), (False, np.ones(3))):
+        cut = probes(d, volume_correction=correction)(swollen(J, d))
+        assert not cut.tau.any()
+        assert not cut.energy.any()
+        assert cut.deformation == pytest.approx(kept, rel=2 * probes.epsilon)
     held = probes(d, exponent=1.0, tension_cutoff=False)(swollen(J, d))
     assert spherical(held.tau) == pytest.approx(K * (J - 1), rel=1e-6 if probes.real == np.float64 else 1e-3)
     assert held.deformation == pytest.approx(J, rel=2 * probes.epsilon)
-    below = probes(d)(swollen(cut.deformation * 0.99, d))
+    below = probes(d, volume_correction=False)(swollen(cut.deformation * 0.99, d))
     assert spherical(below.tau) == pytest.approx(-0.01 * K, rel=100 * probes.epsilon)
 
 
@@ -196,7 +200,10 @@ def test_what_is_not_asked_for_is_not_compiled() -> None:
     assert (Fluid([WATER], 2).linear, Fluid([WATER], 2).viscous, Fluid([WATER], 2).projects) == (True, False, True)
     mixed = Fluid([WATER, fluid(exponent=7.0, viscosity=1.0, tension_cutoff=False)], 2)
     assert (mixed.linear, mixed.viscous, mixed.projects) == (False, True, True)
-    assert not Fluid([fluid(tension_cutoff=False)], 2).projects
+    held = Fluid([fluid(tension_cutoff=False)], 2)
+    assert not held.projects
+    tied = fluid(volume_correction=True)
+    assert (Fluid([WATER], 2).relaxes, Fluid([tied], 2).relaxes, held.relaxes) == (False, True, False)
 
 
 def test_stiffest_state_follows_the_scene() -> None:

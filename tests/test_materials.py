@@ -324,6 +324,20 @@ def test_elastic_moduli(probes: Probes) -> None:
         assert np.abs(tau - hooke).max() < 1e-6 * np.abs(hooke).max()
 
 
+@EVERY
+@BOTH
+def test_the_energy_of_a_start_bounds_the_law_s(name: str, dimension: int, probes: Probes) -> None:
+    """`stored_energy` on the host: that of the kernels where the law is elastic throughout, and never less."""
+    F = gradients(5, dimension, 200, 0.5, 1.6)
+    probe, parameters = probes(name, dimension), parameters_of(name)
+    energy = probe(F).energy
+    given = F if probe.law.deformation == "F" else np.linalg.det(F)
+    bound = probe.law.stored_energy(parameters, given)
+    assert (bound >= energy * (1 - 1e-9)).all()
+    if not CASES[name].elastic and name != "sand":
+        np.testing.assert_allclose(bound, energy, rtol=1e-7)
+
+
 def test_single_precision_agrees(backend_of: Callable) -> None:
     """f32 gives the same stress and energy to 3e-6 of the scale, elastic and flowing, and the same flow.
 

@@ -282,7 +282,10 @@ def test_cohesion(probes: Probes, dimension: int) -> None:
 
 @BOTH
 def test_modes_are_the_tangent(probes: Probes, dimension: int) -> None:
-    """Inside the cone the stiffest tangent is the stiffest mode of that very state, whatever its pressure."""
+    """Inside the cone the stiffest tangent is the stiffest mode of that very state, whatever its pressure.
+
+    The last mode is that of bulk: the tangent of a plane wave and 1.2 times the largest pressure (docs/theory.md, 6.6).
+    """
     d, parameters = dimension, sand(**KINDS["dry"])
     pressed = np.full((8, d), -np.logspace(-4, 0, 8)[:, None])
     pressed[4:, 0] *= 1.2
@@ -291,9 +294,14 @@ def test_modes_are_the_tangent(probes: Probes, dimension: int) -> None:
     law = Sand([parameters], d)
     for k in range(8):
         J, largest = float(np.linalg.det(F[k])), float(np.linalg.norm(F[k], 2) ** 2)
-        stated = max(mode.stiffness for mode in law.modes(parameters, StateBound(J, J, largest)))
+        *lone, bulk = (mode.stiffness for mode in law.modes(parameters, StateBound(J, J, largest)))
+        stated = max(lone)
         assert stated == pytest.approx(found[k], rel=1e-5)
         assert stated == pytest.approx(d * parameters.lame_lambda + 2 * parameters.shear_modulus)
+        pressure = -probes("dry", d)(F[k : k + 1]).tau[0, :d, :d].diagonal().min()
+        least = parameters.lame_lambda + 2 * parameters.shear_modulus + 1.2 * pressure
+        # The bound knows no more of the least stretch than J and the largest one.
+        assert least * (1 - 1e-9) <= bulk <= 1.2 * least
 
 
 def wild(d: int) -> np.ndarray:

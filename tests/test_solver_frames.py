@@ -193,7 +193,7 @@ def test_fields_are_their_formulas(frames: Run, solver: Solver) -> None:
         assert fields["mass"] == pytest.approx(np.repeat([s.mass for s in samples], counts), rel=1e-15)
         assert fields["pressure"] == pytest.approx(-np.trace(sigma, axis1=1, axis2=2) / 3, abs=1e-9 * K)
         fluid = np.isin(frame.body, [0, 2])
-        pressure = K * (1 / J[fluid] - 1)
+        pressure = K * np.maximum(1 / J[fluid] - 1, 0)
         assert np.abs(fields["pressure"][fluid] - pressure).max() < 1e-9 * K
         mu, lam = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
         b = np.tile(np.eye(3), (n, 1, 1))

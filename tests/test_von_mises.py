@@ -219,8 +219,9 @@ def test_modes_are_the_tangent(probes: Probes, dimension: int) -> None:
     shear = np.where(x > 0, 2 * MU * x / np.tanh(np.maximum(x, 1e-9)), 2 * MU)
     assert found == pytest.approx(np.maximum(shear, d * LAMBDA + 2 * MU), rel=1e-6)
     for k in range(5):
-        normal, tangential = law.modes(metal("elastic"), StateBound(1.0, 1.0, float(np.exp(x[k]))))
+        normal, tangential, bulk = law.modes(metal("elastic"), StateBound(1.0, 1.0, float(np.exp(x[k]))))
         assert normal.stiffness == pytest.approx(d * LAMBDA + 2 * MU)
+        assert bulk.stiffness >= LAMBDA + 2 * MU * (1 + 1.2 * x[k] / 2) * (1 - 1e-12)
         # In 3D two stretches may be the largest together, and the third makes up for both.
         bound = x[k] * (1.0 if d == 2 else 1.5)
         assert tangential.stiffness == pytest.approx(2 * MU * (bound / math.tanh(bound) if bound else 1.0))

@@ -8,9 +8,10 @@ import numpy as np
 
 from mpmcli.check.extent import height_along, spanned_axes, thickness
 from mpmcli.check.flight import Arrival, arrivals
-from mpmcli.check.scene_limits import SceneLimit, law_of, scene_limits, smallest
+from mpmcli.check.scene_limits import SceneLimit, scene_limits, smallest
+from mpmcli.check.start import joined, law_of, reachable, starts_of
 from mpmcli.materials.law import Law, StateBound
-from mpmcli.scene import Body, Scene, SceneBounds, scene_bounds
+from mpmcli.scene import Body, Scene, SceneBounds
 
 # Lower bound on a thickness, m. A process that runs Taichi flushes smaller numbers to 0.
 SMALLEST = float(np.finfo(np.float64).tiny)
@@ -74,6 +75,7 @@ class SceneFacts:
     Attributes:
         scene: the scene.
         bounds: largest speed, gravity, height and density that the scene can reach.
+        starts: the deformation that each body starts with.
         limits: all bounds on the step.
         bodies: quantities of each body, in the order of the scene.
         binding, binding_at_start: smallest bound throughout, and at the start.
@@ -81,8 +83,9 @@ class SceneFacts:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
-        self.bounds: SceneBounds = scene_bounds(scene)
-        self.limits: tuple[SceneLimit, ...] = tuple(scene_limits(scene, self.bounds))
+        self.starts = starts_of(scene)
+        self.bounds: SceneBounds = reachable(scene, self.starts)
+        self.limits: tuple[SceneLimit, ...] = tuple(scene_limits(scene, self.bounds, self.starts))
         self.binding = smallest(self.limits)
         self.binding_at_start = smallest(self.limits, at_rest=True)
 
@@ -93,9 +96,10 @@ class SceneFacts:
         down = np.nan_to_num(self.scene.domain.gravity_at(0.0))
         g = float(np.linalg.norm(down))
         found = []
-        for body, arrival in zip(self.scene.bodies, arrivals(self.scene), strict=True):
+        arriving = arrivals(self.scene, self.bounds.speed, pressed=any(start.deformed for start in self.starts))
+        for body, arrival, start in zip(self.scene.bodies, arriving, self.starts, strict=True):
             law, form = law_of(body, self.scene.dimension), body.shape.form
-            states = (StateBound(), law.stiffest(body.material, self.bounds))
+            states = (StateBound(), joined(start.bound, law.stiffest(body.material, self.bounds)))
             stiffness, stiffest = (max(mode.stiffness for mode in law.modes(body.material, s)) for s in states)
             height = height_along(form, down / g) if g > 0 else float(np.max(np.ptp(form.bounds(), axis=0)))
             found.append(
@@ -120,6 +124,18 @@ class SceneFacts:
     def step_at_start(self) -> float:
         """safety times the smallest bound at the start, s."""
         return self.scene.time.safety * self.binding_at_start.value
+
+    @property
+    def step_expected(self) -> float:
+        """Step of most of the run after the first contact, s: `step` where nothing stored or forced drives the scene.
+
+        What a start or a force can give to the fastest particle anywhere lasts a moment or does not happen: then the
+        bounds of motion count as at the start.
+        """
+        if not self.scene.forces and not any(start.deformed for start in self.starts):
+            return self.step
+        lasting = [limit.value for limit in self.limits if limit.bound is not None or limit.state == "rest"]
+        return self.scene.time.safety * min(lasting)
 
     def taken(self, step: float) -> float:
         """Return the step of a run in which `step` (s) is stable: at most time.step and the interval of the frames."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.scene import Scene, scene_bounds
+from mpmcli.scene import Scene
 from mpmcli.scene.initial import moves_unevenly
 
 # Distance, in cells, below which two bodies, or a body and a wall, interact through the grid.
@@ -25,14 +25,20 @@ class Arrival:
     speed: float
 
 
-def arrivals(scene: Scene) -> list[Arrival]:
+def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> list[Arrival]:
     """Return the arrival of the bounding box of each body, from velocities, gravity, walls and the other bodies.
 
     All bodies have the same acceleration, so that two approach each other at constant velocity. Rotation and
-    deformation are ignored. If forces act, or gravity or a velocity is an expression, all bodies arrive at time 0.
+    deformation are ignored. If forces act, gravity or a velocity is an expression, or bodies start deformed, all bodies
+    arrive at time 0.
+
+    Args:
+        scene: whose bodies.
+        fastest: speed at which all arrive in those cases, m/s.
+        pressed: whether any body starts deformed.
     """
-    if scene.forces or not scene.domain.steady or any(moves_unevenly(body) for body in scene.bodies):
-        return [Arrival(0.0, scene_bounds(scene).speed)] * len(scene.bodies)
+    if pressed or scene.forces or not scene.domain.steady or any(moves_unevenly(body) for body in scene.bodies):
+        return [Arrival(0.0, fastest)] * len(scene.bodies)
     reach = CONTACT * scene.domain.spacing
     gravity = np.array(scene.domain.gravity)
     walls = np.array(scene.domain.origin), np.array(scene.domain.upper)

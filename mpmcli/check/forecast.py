@@ -120,7 +120,7 @@ def expected_steps(facts: SceneFacts) -> int:
     """
     frames = facts.scene.time.frames
     free = min(1.0, facts.first_contact / facts.scene.time.end)
-    before, after = (steps_at(facts, step) / frames for step in (facts.step_at_start, facts.step))
+    before, after = (steps_at(facts, step) / frames for step in (facts.step_at_start, facts.step_expected))
     whole = math.floor(free * frames)
     mixed = (free * frames - whole) * before + (1 - free * frames + whole) * after if whole < frames else 0.0
     return round(whole * before + mixed + max(0, frames - whole - 1) * after)

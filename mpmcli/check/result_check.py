@@ -32,6 +32,7 @@ TOLD = {
     "speed_max": "largest speed, m/s",
     "volume_ratio_min": "smallest J",
     "volume_ratio_max": "largest J",
+    "volume_error": "lasting volume error",
     "step_min": "smallest step, s",
     "step_max": "largest step, s",
 }
@@ -56,8 +57,8 @@ class ResultCheck:
             (number of frames compared), courant_max (cells), deformation_max (in a step, if affine is stored),
             displacement_ratio (largest displacement between frames over the largest that the ledger allows),
             ledger_difference (largest relative difference between ledger and frames), speed_max (m/s),
-            volume_ratio_min, volume_ratio_max, step_min, step_max (s), step_ratio (smallest over first),
-            bytes (of particle data read).
+            volume_ratio_min, volume_ratio_max, volume_error (that lasts to the end), step_min, step_max (s), step_ratio
+            (smallest over first), bytes (of particle data read).
     """
 
     path: Path

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
-from math import isfinite
+from math import isfinite, isnan
 
 import numpy as np
 
@@ -20,6 +20,9 @@ ENERGY_SUSPECT, ENERGY_WRONG = 1e-2, 1e-1
 ENERGY_ROUNDING = 1e-4
 # Masses are summed in double precision and never change.
 MASS_ERROR = 1e-9
+# Volume that liquids and grains fill beyond that of their particles, or lack, as a fraction, in every frame of the last
+# quarter: in flight it may be more for a moment.
+VOLUME_ERROR, QUARTER = 0.05, 4
 # A bound may be exceeded by this factor in an impact; time.safety allows for it.
 MARGIN = 1.1
 # Smallest accepted ratio of a step to the first one.
@@ -35,7 +38,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
 
     Returns:
         Figures by name: energy_growth, energy_lost, mass_change, courant_max, speed_max, volume_ratio_min,
-        volume_ratio_max, step_min, step_max, step_ratio; None if not available.
+        volume_ratio_max, volume_error, step_min, step_max, step_ratio; None if not available.
     """
     rows: list[tuple[int, LedgerRow]] = []
     for entry in entries:
@@ -55,6 +58,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     figures["volume_ratio_min"] = min(row.volume_ratio_min for _, row in rows)
     figures["volume_ratio_max"] = max(row.volume_ratio_max for _, row in rows)
     _volume(rows, header, findings)
+    figures["volume_error"] = _volume_error(rows, findings)
     figures |= _steps(rows, findings)
     return figures
 
@@ -62,6 +66,9 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
 def _not_finite(row: LedgerRow) -> str:
     for entry in fields(row):
         value = getattr(row, entry.name)
+        # Files written before it was stored have no volume error.
+        if entry.name == "volume_error" and isnan(value):
+            continue
         numbers = () if isinstance(value, str) else value if isinstance(value, tuple) else (value,)
         if not all(map(isfinite, numbers)):
             return entry.name
@@ -136,6 +143,23 @@ def _volume(rows: list[tuple[int, LedgerRow]], header: RunHeader, findings: Fram
         if high > BLOWN_UP and coherent:
             what = f"In frame {number} a particle is blown up: the largest J is {high:.4g}"
             findings.add("warning", "volume", number, what, fix, value=high, kind="ledger high")
+
+
+def _volume_error(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> float | None:
+    """Return the volume error that lasts to the end: the smallest one of the last quarter, 0 where its sign changes."""
+    last = rows[-max(len(rows) // QUARTER, 1) :]
+    errors = np.array([row.volume_error for _, row in last])
+    if np.isnan(errors).any():
+        return None
+    lasting = float(errors[np.abs(errors).argmin()]) if abs(np.sign(errors).sum()) == len(errors) else 0.0
+    if abs(lasting) > VOLUME_ERROR:
+        what = (
+            f"From frame {last[0][0]} to the end liquids and grains fill {100 * abs(lasting):.3g} % "
+            f"{'more' if lasting > 0 else 'less'} than the volume of their particles"
+        )
+        fix = "Set volume_correction = true in the materials, or refine the domain."
+        findings.add("note", "volume-error", last[0][0], what, fix, value=lasting)
+    return lasting
 
 
 def _steps(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> dict[str, float | None]:

@@ -166,7 +166,7 @@ def shard_splits(path: Path) -> dict[int, str]:
 
 def read_ledger(group: h5py.Group) -> list[LedgerRow]:
     """Read the ledger of a trajectory."""
-    return ledger_rows({name: group[LEDGER][name][:] for name in COLUMNS})
+    return ledger_rows({name: group[LEDGER][name][:] for name in COLUMNS if name in group[LEDGER]})
 
 
 def _fault(data: TrajectoryData) -> str:

@@ -23,6 +23,8 @@ class LedgerRow:
         linear_momentum: sum m v, kg m/s, one number per axis.
         angular_momentum: sum m x cross v + m h^2/4 axl(C) about the origin of the domain,
             kg m^2/s, one number in 2D and three in 3D.
+        volume_error: volume of the cells inside liquids and grains over that of the particles in them, less 1; 0 where
+            hardly any cell is inside, nan in files written before it was stored.
 
     Velocities are those of the middle of the last step before `time`.
     """
@@ -42,6 +44,7 @@ class LedgerRow:
     potential: float
     linear_momentum: tuple[float, ...]
     angular_momentum: tuple[float, ...]
+    volume_error: float = 0.0
 
     @property
     def energy(self) -> float:

@@ -3,10 +3,11 @@
 import math
 from typing import Literal
 
+import numpy as np
 import taichi as ti
 
 from mpmcli.materials.elasticity import ElasticParameters
-from mpmcli.materials.law import Law, Mode, StateBound
+from mpmcli.materials.law import Law, Mode, StateBound, principal
 from mpmcli.materials.polar import polar_rotation
 from mpmcli.materials.tensors import volume_strain
 
@@ -38,6 +39,15 @@ class FixedCorotated(Law):
 
     def modes(self, parameters: FixedCorotatedParameters, bound: StateBound) -> list[Mode]:
         return [Mode(corotated_stiffness(parameters.shear_modulus, parameters.lame_lambda, self.dimension, bound))]
+
+    def opened(self, J: float) -> float:
+        """Return 2 - J, as the energy of volume is that of J - 1."""
+        return 2 - J
+
+    def stored_energy(self, parameters: FixedCorotatedParameters, deformation: np.ndarray) -> np.ndarray:
+        s = principal(deformation, self.dimension)
+        stretch, volume = ((s - 1) ** 2).sum(axis=1), s.prod(axis=1) - 1
+        return parameters.shear_modulus * stretch + 0.5 * parameters.lame_lambda * volume**2
 
     @ti.func
     def respond(

@@ -1,29 +1,30 @@
 """Weakly compressible fluid: pressure as a function of the volume ratio, and Newtonian viscosity."""
 
+import math
+from dataclasses import replace
 from typing import Annotated, Literal, Self
 
 import numpy as np
 import taichi as ti
 from pydantic import Field
 
-from mpmcli.materials.law import Law, Mode, StateBound
+from mpmcli.materials.law import CARRIED, Law, Mode, StateBound
+from mpmcli.materials.volume_relaxation import DEAD_BAND, SCATTERED, volume_change
 from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import MaterialParameters, SceneBounds
 from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
 
 # Places in the vector of constants.
-BULK_MODULUS, EXPONENT, VISCOSITY, SECOND_VISCOSITY, LARGEST_J = range(5)
+BULK_MODULUS, EXPONENT, VISCOSITY, SECOND_VISCOSITY, LARGEST_J, SOUND_SPEED = range(6)
 
 # Speed that "auto" assumes if nothing in the scene moves or falls, m/s.
 QUIET_SPEED = 1.0
 # The pressure of a nonlinear equation of state is constant below this J, so that J^-g stays within single precision for
 # the largest exponent. The value is far outside weak compressibility; it keeps crushed particles finite.
 CRUSHED = 0.05
-# In bulk the pressure itself adds stiffness, because particles carry it with them: pressure waves see the sum of the
-# tangent modulus and the pressure, which is K at any J for p = K (1/J - 1) (docs/theory.md, 6.6). At J = 0.5 and 0.3,
-# where the sum exceeds the tangent modulus of a lone particle, one particle per cell at a random position becomes
-# unstable at 0.956 and 0.969 of h/c, c = sqrt(K / density). The factor covers that (`scripts/stable_step_study`).
-CARRIED = 1.2
+# Share of the difference between J and what the grid sees that is made up while sound crosses a cell: 2 % in ten steps
+# in 2D. Twice as much takes 4 % from the loss of a sloshing wave; half as much leaves a tossed pool 1.4 % too deep.
+RELAXATION = 0.0035
 # Limit on Newton iterations; about six suffice for any load.
 ITERATIONS_MAX = 100
 
@@ -81,6 +82,18 @@ class FluidParameters(WeaklyCompressibleParameters):
             "False holds droplets together by suction."
         ),
     ] = True
+    volume_correction: Annotated[
+        Flag,
+        Field(
+            description="Whether fluid without tension follows the density that the grid sees, and must close up again "
+            "before it bears pressure. Otherwise it gains volume in splashes and loses it when it is stirred."
+        ),
+    ] = False
+
+    @property
+    def relaxes(self) -> bool:
+        """Whether J follows the density of the grid: suction holds to the volume as it is."""
+        return self.tension_cutoff and self.volume_correction
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
         """Replace "auto" by K = density v^2 / compressibility, where v is the highest speed of the scene."""
@@ -126,19 +139,23 @@ def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBound
 class Fluid(Law):
     """p = K/g (J^-g - 1) and tau = -J p I + viscosity (C + C^T - (2/3) tr C I) + bulk_viscosity tr C I.
 
-    With tension_cutoff the stored J is at most 1: fluid that expands in a splash has no pressure, and regains it as
-    soon as it is compressed. Source: docs/theory.md, 5.2.
+    With tension_cutoff fluid that expands in a splash, J > 1, has no pressure; with volume_correction J then follows
+    the density of the grid, and without it J falls back to 1, so that pressure is regained as soon as the fluid is
+    compressed. Source: docs/theory.md, 5.2 and 5.11.
     """
 
     name = "fluid"
     parameters = FluidParameters
     deformation = "J"
     coherent = True
+    flows = True
 
     def __init__(self, members: tuple[FluidParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)
         self.linear = all(member.exponent == 1 for member in members)
         self.viscous = any(member.viscosity > 0 or member.bulk_viscosity > 0 for member in members)
+        self.relaxes = any(member.relaxes for member in members)
+        self.all_relax = all(member.relaxes for member in members)
         self.projects = any(member.tension_cutoff for member in members)
         softens = self.linear and all(member.tension_cutoff for member in members)
         self.sensitivity = 0.0 if softens else max(member.exponent for member in members)
@@ -150,7 +167,8 @@ class Fluid(Law):
             parameters.exponent,
             parameters.viscosity,
             parameters.bulk_viscosity - 2 / 3 * parameters.viscosity,
-            largest,
+            math.exp(SCATTERED) if parameters.relaxes else largest,
+            (parameters.bulk_modulus / parameters.density) ** 0.5 if parameters.relaxes else 0.0,
         )
 
     def modes(self, parameters: FluidParameters, bound: StateBound) -> list[Mode]:
@@ -167,6 +185,25 @@ class Fluid(Law):
         volumetric = (2 - 2 * d / 3) * parameters.viscosity + d * parameters.bulk_viscosity
         modes = [Mode(stiffness, volumetric)]
         return modes + [Mode(0.0, 2 * parameters.viscosity)] * (parameters.viscosity > 0)
+
+    def swung(self, bound: StateBound) -> StateBound:
+        """Return the bound with what tension pulls back: J = 1.1 to about 1 / 1.1."""
+        if self.projects or not bound.volume_ratio_max > 1:
+            return super().swung(bound)
+        smallest = min(bound.volume_ratio_min, 1 / bound.volume_ratio_max)
+        return super().swung(replace(bound, volume_ratio_min=smallest))
+
+    def opened(self, J: float) -> float:
+        """Return a bound on the J > 1 at which x - 1 - ln x is that of J: 1 + W + sqrt(2 W)."""
+        W = J - 1 - math.log(J)
+        return min(1 / J, 1 + W + math.sqrt(2 * W)) if self.linear else 1 / J
+
+    def stored_energy(self, parameters: FluidParameters, deformation: np.ndarray) -> np.ndarray:
+        J, g = np.maximum(deformation, CRUSHED), parameters.exponent
+        if parameters.tension_cutoff:
+            J = np.minimum(J, 1.0)
+        other = -np.log(J) if g == 1 else (J ** (1 - g) - 1) / (g - 1)
+        return parameters.bulk_modulus * (J - 1 + other) / g
 
     def stiffest(self, parameters: FluidParameters, bounds: SceneBounds) -> StateBound:
         """Return the compression by water hammer, density c v, and by the weight of the column."""
@@ -191,6 +228,11 @@ class Fluid(Law):
             spherical = (
                 constants[BULK_MODULUS] * crushed * (1.0 - crushed ** (-constants[EXPONENT])) / constants[EXPONENT]
             )
+        if ti.static(self.relaxes):
+            if ti.static(self.all_relax):
+                spherical = ti.min(spherical, 0.0)
+            elif constants[SOUND_SPEED] > 0.0:
+                spherical = ti.min(spherical, 0.0)
         if ti.static(self.viscous):
             spherical += constants[SECOND_VISCOSITY] * C.trace()
         tau = spherical * ti.Matrix.identity(float, C.n)
@@ -199,9 +241,26 @@ class Fluid(Law):
         return tau, spherical, J, internal
 
     @ti.func
+    def relax(
+        self,
+        deformation: ti.template(),
+        internal: ti.template(),
+        seen: float,
+        opens: float,
+        time: float,
+        constants: ti.template(),
+    ):
+        """Move J towards what the grid sees."""
+        change = volume_change(deformation, seen, constants[SOUND_SPEED] * time, RELAXATION, DEAD_BAND, opens)
+        return deformation + change, internal, ti.abs(change) / deformation
+
+    @ti.func
     def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
-        """K/g (J - 1 + (J^(1-g) - 1)/(g - 1)), and K (J - 1 - ln J) for g = 1."""
+        """K/g (J - 1 + (J^(1-g) - 1)/(g - 1)), and K (J - 1 - ln J) for g = 1; 0 without tension."""
         J = deformation
+        if ti.static(self.relaxes):
+            if constants[SOUND_SPEED] > 0.0:
+                J = ti.min(J, 1.0)
         result = volume_energy(J)
         if ti.static(not self.linear):
             g = constants[EXPONENT]

@@ -3,12 +3,13 @@
 import math
 from typing import Annotated, Literal
 
+import numpy as np
 import taichi as ti
 from pydantic import Field
 
 from mpmcli.materials.elasticity import ElasticParameters, lame_lambda, shear_modulus
 from mpmcli.materials.fluid import QUIET_SPEED
-from mpmcli.materials.law import Law, Mode, StateBound
+from mpmcli.materials.law import Law, Mode, StateBound, carried_stiffness, principal
 from mpmcli.materials.principal import from_principal
 from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import SceneBounds
@@ -68,24 +69,34 @@ class HenckyLaw(Law):
     """
 
     deformation = "F"
-    # d lambda + 2 mu at any strain; x coth x = 1 + x^2/3 for shear.
+    # d lambda + 2 mu at any strain; x coth x = 1 + x^2/3 for shear. Bulk is stiffer than that below J = 0.4 or so only,
+    # which measurements at the longest interval find.
     sensitivity = 0.0
 
     def modes(self, parameters: HenckyParameters, bound: StateBound) -> list[Mode]:
-        """Return d lambda + 2 mu for normal strain, in any state, and 2 mu x coth x for shear, x = ln(s_i / s_j).
+        """Return d lambda + 2 mu for normal strain, 2 mu x coth x for shear, x = ln(s_i / s_j), and that of bulk.
 
         Under C dt the normal strains change by the normal entries of C dt. In a pair of shear entries
         tau_ij = (tau_i - tau_j) / (s_i^2 - s_j^2) b_ij, where b_ij changes by (C_ij s_j^2 + C_ji s_i^2) dt.
-        Plastic flow only reduces the differences tau_i - tau_j.
+        Plastic flow only reduces the differences tau_i - tau_j. A particle alone is as stiff in any state; in bulk
+        waves see the pressure too (`carried_stiffness`): -tau_i = -2 mu e_i - lambda ln J.
         """
-        mu, d = parameters.shear_modulus, self.dimension
+        lam, mu, d = max(parameters.lame_lambda, 0.0), parameters.shear_modulus, self.dimension
         largest = max(math.sqrt(bound.stretch_squared_max), STRETCH_MIN)
         smallest = min(max(bound.volume_ratio_min / largest ** (d - 1), STRETCH_MIN), largest)
         x = math.log(largest / smallest)
+        J = min(max(bound.volume_ratio_min, STRETCH_MIN**d), 1.0)
+        pressure = -2 * mu * math.log(min(smallest, 1.0)) - lam * math.log(J)
         return [
-            Mode(d * max(parameters.lame_lambda, 0.0) + 2 * mu),
+            Mode(d * lam + 2 * mu),
             Mode(2 * mu * (x / math.tanh(x) if x > 0 else 1.0)),
+            Mode(carried_stiffness(lam + 2 * mu, pressure)),
         ]
+
+    def stored_energy(self, parameters: HenckyParameters, deformation: np.ndarray) -> np.ndarray:
+        """Return mu |e|^2 + lambda/2 (tr e)^2, before plastic flow takes a part of it."""
+        e = np.log(np.maximum(principal(deformation, self.dimension), STRETCH_MIN))
+        return parameters.shear_modulus * (e**2).sum(axis=1) + 0.5 * parameters.lame_lambda * e.sum(axis=1) ** 2
 
 
 @ti.func

@@ -3,13 +3,22 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 import taichi as ti
 
 from mpmcli.scene.material import Internal, MaterialParameters, SceneBounds
+
+# In bulk the pressure itself adds stiffness, because particles carry it with them: pressure waves see the sum of the
+# tangent modulus and the pressure (docs/theory.md, 6.6). For a fluid of p = K (1/J - 1) that is K at any J. At J = 0.5
+# and 0.3, where the sum exceeds the tangent modulus of a lone particle, one particle per cell at a random position
+# becomes unstable at 0.956 and 0.969 of h/c, c = sqrt(K / density). The factor covers that
+# (`scripts/stable_step_study`).
+CARRIED = 1.2
+# Lower bound on J and on stretches, which keeps their logarithms finite.
+SMALLEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -40,6 +49,31 @@ class Mode(NamedTuple):
     viscosity: float = 0.0
 
 
+def least_stretch(bound: StateBound, dimension: int) -> float:
+    """Return a lower bound on the stretches within `bound`: the smallest J over the largest stretches."""
+    largest = max(math.sqrt(max(bound.stretch_squared_max, 0.0)), SMALLEST)
+    return min(max(bound.volume_ratio_min / largest ** (dimension - 1), SMALLEST), largest)
+
+
+def principal(deformation: np.ndarray, dimension: int) -> np.ndarray:
+    """Return the principal stretches, (n, d), of J, (n,), or F, (n, d, d): those of J are J^(1/d) each."""
+    if deformation.ndim == 1:
+        s = np.repeat(np.maximum(deformation, 0.0)[:, None] ** (1 / dimension), dimension, axis=1)
+    else:
+        s = np.linalg.svd(deformation, compute_uv=False)
+    return np.maximum(s, SMALLEST)
+
+
+def carried_stiffness(tangent: float, pressure: float) -> float:
+    """Return the stiffness that a wave in compressed bulk sees, Pa: tangent modulus and pressure (docs/theory.md, 6.6).
+
+    Args:
+        tangent: of a plane wave, d tau / d strain along its direction, Pa.
+        pressure: the largest -tau_i, Pa.
+    """
+    return tangent + CARRIED * max(pressure, 0.0)
+
+
 class Law(ABC):
     """One constitutive law for the particles of some bodies.
 
@@ -55,9 +89,11 @@ class Law(ABC):
         parameters: pydantic model of the parameters, which also lists the internal variables.
         deformation: stored deformation, "J" (volume ratio) or "F" (deformation gradient).
         projects: whether `respond` may change the state.
+        relaxes: whether `relax` moves the volume towards what the grid sees (docs/theory.md, 5.11).
         stiffness_parameters, viscosity_parameters: names of the parameters that set the stiffness and the viscosity;
             messages name the first that is a positive number. A law that calls them otherwise lists its own.
         coherent: whether the material resists being pulled apart, so that `check` reports a J far above 1.
+        flows: whether it is a liquid or grains, whose volume the ledger compares with what they fill on the grid.
         sensitivity: growth of the logarithm of the largest stiffness per stored strain, dimensionless. It sets how
             often the state is measured during a run; 0 if no state is stiffer than rest (docs/theory.md, 6.7).
         hardening: the same growth caused by the internal variables, which are measured separately; 0 without any.
@@ -70,7 +106,10 @@ class Law(ABC):
     parameters: ClassVar[type[MaterialParameters]]
     deformation: ClassVar[Literal["J", "F"]]
     projects: bool = False
+    relaxes: bool = False
+    relaxes: bool = False
     coherent: ClassVar[bool] = False
+    flows: ClassVar[bool] = False
     stiffness_parameters: ClassVar[tuple[str, ...]] = ("bulk_modulus", "youngs_modulus", "shear_modulus")
     viscosity_parameters: ClassVar[tuple[str, ...]] = ("viscosity", "consistency", "bulk_viscosity")
     sensitivity: float = 1.0
@@ -110,6 +149,41 @@ class Law(ABC):
         The step is stable if dt^2 stiffness + 2 dt viscosity <= density h^2 for each mode (docs/theory.md, 6.1).
         """
 
+    def swung(self, bound: StateBound) -> StateBound:
+        """Return the bound that contains what springs back as well.
+
+        A particle alone that is compressed to J and let go opens to `opened` and oscillates between the two for ever:
+        its step must suit both (docs/theory.md, 6.8).
+        """
+        if not 0 < bound.volume_ratio_min < 1:
+            return bound
+        opened = self.opened(bound.volume_ratio_min)
+        return replace(
+            bound,
+            volume_ratio_max=max(bound.volume_ratio_max, opened),
+            stretch_squared_max=max(bound.stretch_squared_max, opened ** (2 / self.dimension)),
+        )
+
+    def opened(self, J: float) -> float:
+        """Return the J > 1 of about the energy of a volume ratio J, 0 < J < 1: 1 / J where energy is that of ln J."""
+        return 1 / J
+
+    def stored_energy(self, parameters: MaterialParameters, deformation: np.ndarray) -> np.ndarray:
+        """Return a bound on the energy that states hold at the start, (n,), J/m^3 of volume at rest, on the host.
+
+        It is S |e|^2 / 2 with the largest stiffness S between rest and the state, and e the logarithms of its
+        stretches. A law whose energy has a short formula overrides this method.
+
+        Args:
+            parameters: of the body.
+            deformation: J, (n,), or F, (n, d, d), finite.
+        """
+        s = principal(deformation, self.dimension)
+        J = s.prod(axis=1)
+        ends = (min(1.0, J.min(initial=1.0)), max(1.0, J.max(initial=1.0)), max(1.0, s.max(initial=1.0) ** 2))
+        stiffness = max(mode.stiffness for mode in self.modes(parameters, StateBound(*map(float, ends))))
+        return 0.5 * stiffness * (np.log(s) ** 2).sum(axis=1)
+
     def stiffest(self, parameters: MaterialParameters, bounds: SceneBounds) -> StateBound:
         """Return bounds on the state that the scene can reach, for limits before the run.
 
@@ -146,6 +220,29 @@ class Law(ABC):
         Returns:
             Kirchhoff stress tau = J sigma, d x d, Pa; its out-of-plane component (0.0 in 3D), Pa; the deformation
             and the internal variables, as given or projected.
+        """
+        raise NotImplementedError
+
+    @ti.func
+    def relax(
+        self,
+        deformation: ti.template(),
+        internal: ti.template(),
+        seen: float,
+        opens: float,
+        time: float,
+        constants: ti.template(),
+    ):
+        """Return (deformation, internal, |change of the logarithm of the volume|), moved towards what the grid sees.
+
+        Only laws with `relaxes` have it. It changes no momentum and no mass.
+
+        Args:
+            deformation, internal, constants: as of `respond`.
+            seen: volume ratio that the density of the grid around the particle amounts to.
+            opens: 1 where the volume may grow: 0 near a free surface, where the grid sees less than what is there.
+            time: since the last relaxation over the cell's width, s/m: times the speed of sound it counts the cells
+                that sound crossed.
         """
         raise NotImplementedError
 

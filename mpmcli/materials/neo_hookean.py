@@ -1,11 +1,13 @@
 """Compressible neo-Hookean solid, for large elastic deformation."""
 
+import math
 from typing import Literal
 
+import numpy as np
 import taichi as ti
 
 from mpmcli.materials.elasticity import ElasticParameters
-from mpmcli.materials.law import Law, Mode, StateBound
+from mpmcli.materials.law import SMALLEST, Law, Mode, StateBound, carried_stiffness, least_stretch, principal
 from mpmcli.materials.tensors import log_ratio, volume_strain
 
 # Places in the vector of constants.
@@ -34,15 +36,25 @@ class NeoHookean(Law):
         return (parameters.shear_modulus, parameters.lame_lambda)
 
     def modes(self, parameters: NeoHookeanParameters, bound: StateBound) -> list[Mode]:
-        """Return d lambda + 2 mu s^2, where s is the largest stretch.
+        """Return d lambda + 2 mu s^2, where s is the largest stretch, and what bulk under pressure adds.
 
         Under C dt, tau changes by mu (C b + b C^T) dt + lambda tr(C) dt I. In the principal frame of
         b = F F^T the normal entries see the matrix 2 mu diag(s_i^2) + lambda (1 1^T), the pairs of
         shear entries mu (s_i^2 + s_j^2): no eigenvalue exceeds the sum above, which is exact at rest.
-        Compression adds no stiffness, as lambda ln(J) I changes by lambda tr(C) dt at any J.
+        Compression adds none to a particle alone, as lambda ln(J) I changes by lambda tr(C) dt at any J. In bulk
+        waves see the pressure too (`carried_stiffness`): -tau_i = mu (1 - s_i^2) - lambda ln J.
         """
-        volumetric = self.dimension * max(parameters.lame_lambda, 0.0)
-        return [Mode(volumetric + 2 * parameters.shear_modulus * bound.stretch_squared_max)]
+        lam, mu = max(parameters.lame_lambda, 0.0), parameters.shear_modulus
+        shear = 2 * mu * bound.stretch_squared_max
+        low, J = least_stretch(bound, self.dimension), min(max(bound.volume_ratio_min, SMALLEST), 1.0)
+        pressure = mu * (1 - min(low, 1.0) ** 2) - lam * math.log(J)
+        return [Mode(max(self.dimension * lam + shear, carried_stiffness(lam + shear, pressure)))]
+
+    def stored_energy(self, parameters: NeoHookeanParameters, deformation: np.ndarray) -> np.ndarray:
+        s = principal(deformation, self.dimension)
+        log_volume = np.log(s).sum(axis=1)
+        shear = 0.5 * (s**2 - 1).sum(axis=1) - log_volume
+        return parameters.shear_modulus * shear + 0.5 * parameters.lame_lambda * log_volume**2
 
     @ti.func
     def respond(

@@ -118,6 +118,7 @@ class Sand(HenckyLaw):
     name = "sand"
     parameters = SandParameters
     projects = True
+    flows = True
 
     def __init__(self, members: tuple[SandParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)

@@ -1,12 +1,13 @@
 """Viscoplastic fluid: elastic below its yield stress, viscous above; lava, mud, paste."""
 
+import math
 from typing import Annotated, Literal, Self
 
 import taichi as ti
 from pydantic import Field
 
-from mpmcli.materials.fluid import CARRIED, WeaklyCompressibleParameters, soft_bulk_modulus, volume_energy
-from mpmcli.materials.law import Law, Mode, StateBound
+from mpmcli.materials.fluid import WeaklyCompressibleParameters, soft_bulk_modulus, volume_energy
+from mpmcli.materials.law import CARRIED, Law, Mode, StateBound
 from mpmcli.materials.polar import rounding
 from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import SceneBounds
@@ -93,6 +94,7 @@ class Viscoplastic(Law):
     deformation = "F"
     projects = True
     coherent = True
+    flows = True
 
     def __init__(self, members: tuple[ViscoplasticParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)
@@ -115,7 +117,7 @@ class Viscoplastic(Law):
         The two do not couple: C = c I does not change the isochoric b, and the rest of C changes dev b only, by
         G (b_i + b_j) at most for a pair of shear entries and by diag(2 G b_i) without its trace for the normal ones.
         Relaxation reduces the result for any step. Strongly compressed matter in bulk is stiffer: K, see
-        `fluid.CARRIED`.
+        `law.CARRIED`.
         """
         largest = min(bound.volume_ratio_max, 1.0) if parameters.tension_cutoff else bound.volume_ratio_max
         smallest = max(bound.volume_ratio_min, CRUSHED)
@@ -123,6 +125,11 @@ class Viscoplastic(Law):
         isochoric = min(max(isochoric, 1.0), self.dimension * FLAT)
         bulk = max(self.dimension * largest, CARRIED) * parameters.bulk_modulus
         return [Mode(bulk), Mode(2 * parameters.shear_modulus * isochoric)]
+
+    def opened(self, J: float) -> float:
+        """Return a bound on the J > 1 at which x - 1 - ln x is that of J: 1 + W + sqrt(2 W)."""
+        W = J - 1 - math.log(J)
+        return min(1 / J, 1 + W + math.sqrt(2 * W))
 
     @ti.func
     def respond(

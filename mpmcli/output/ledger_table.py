@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 
@@ -14,6 +15,8 @@ COLUMNS = tuple(f.name for f in fields(LedgerRow))
 VECTORS = ("linear_momentum", "angular_momentum")
 INTEGERS = ("steps",)
 TEXT = "limit"
+# Columns that files written before them lack; they are read as nan.
+LATER = ("volume_error",)
 # Columns of each frame in the CSV: its number, time steps since the start, particles.
 FRAME_COLUMNS = ("frame", "step", "particles")
 
@@ -37,9 +40,12 @@ def ledger_columns(rows: Sequence[LedgerRow]) -> dict[str, np.ndarray]:
 
 
 def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:
-    """Undo `ledger_columns`."""
+    """Undo `ledger_columns`; a column of LATER may be absent."""
     lists = []
     for name in COLUMNS:
+        if name in LATER and name not in columns:
+            lists.append([math.nan] * len(columns["time"]))
+            continue
         values = np.asarray(columns[name]).tolist()
         if name == TEXT:
             values = [text.decode("utf-8") for text in values]
@@ -85,6 +91,8 @@ def parse_ledger_csv(text: str) -> tuple[list[LedgerRow], dict[str, list[int]]]:
                 values[name] = tuple(float(record[key]) for key in keys)
             elif name == TEXT:
                 values[name] = record[name]
+            elif name in LATER and name not in record:
+                values[name] = math.nan
             else:
                 values[name] = int(record[name]) if name in INTEGERS else float(record[name])
         rows.append(LedgerRow(**values))

@@ -191,7 +191,7 @@ def read_index(file: h5py.File) -> FrameIndex:
         steps=group["step"][:],
         offsets=steps["PointOffsets"][:],
         counts=file["VTKHDF/NumberOfPoints"][:],
-        ledger=ledger_rows({name: file["ledger"][name][:] for name in COLUMNS}),
+        ledger=ledger_rows({name: file["ledger"][name][:] for name in COLUMNS if name in file["ledger"]}),
     )
 
 

@@ -4,18 +4,16 @@ from itertools import product
 
 import numpy as np
 
-from mpmcli.scene.entry import value_of, varies
-from mpmcli.scene.expression import INITIAL, POSITION
+from mpmcli.scene.drive import Drive, force_drive, gravity_drive
 from mpmcli.scene.initial import initial_motion, moves_unevenly
 from mpmcli.scene.material import SceneBounds
-from mpmcli.scene.schema import Body, Force, Scene
+from mpmcli.scene.sampling import estimate_body, particle_places
+from mpmcli.scene.schema import Body, Scene
 
-# Where expressions are looked at: instants of a run; points along each axis of a box, 2D and 3D, corners included;
-# and for forces, which depend on both, fewer of either.
-INSTANTS = 257
+# Points along each axis of a box at which the velocity of a body is looked at, 2D and 3D, corners included.
 POINTS = {2: 65, 3: 17}
-FORCE_INSTANTS = 33
-FORCE_POINTS = {2: 17, 3: 9}
+# Particles up to which a body is looked at where its particles are; a larger one on a lattice.
+MOST_LOOKED_AT = 500_000
 
 
 def scene_bounds(scene: Scene) -> SceneBounds:
@@ -25,69 +23,35 @@ def scene_bounds(scene: Scene) -> SceneBounds:
     highest matter above the lowest point of the domain, both measured against gravity; v0 alone where
     there is no gravity. height = H, or the largest extent of the matter where there is no gravity.
 
-    For gravity that depends on time, the strongest counts, and the largest H of any instant. Forces of magnitude a add
-    min(2 a L, (a T)^2) to the square of the speed, L the largest extent of the domain and T the end of the run, and a
-    to the gravity that presses. Both are found at sampled instants and places.
+    For gravity that depends on time, the strongest counts, and the largest H of any instant; its impulse bounds the
+    speed too. Forces of magnitude a add min(2 a L, I^2) to the square of the speed, L the largest extent of the domain
+    and I their impulse over the run, and a to the gravity that presses. See `drive` for where they are looked at.
     """
-    gravities, push = gravity_samples(scene), force_bound(scene)
-    g = max(float(np.linalg.norm(gravity)) for gravity in gravities)
+    pull, gravities = gravity_drive(scene)
+    push = Drive()
+    if scene.forces:
+        drives = [
+            force_drive(scene, body, body_places(body, index, scene.domain.spacing), highest_speed(body), pull)
+            for index, body in enumerate(scene.bodies)
+        ]
+        push = Drive(max(one.largest for one in drives), max(one.impulse for one in drives))
+    g = pull.largest
     initial = max(highest_speed(body) for body in scene.bodies)
     corners = np.concatenate([_corners(*body.shape.form.bounds()) for body in scene.bodies])
     if g > 0:
         height = max(_height(scene, corners, gravity) for gravity in gravities if gravity.any())
     else:
         height = float(np.max(np.ptp(corners, axis=0)))
-    pushed = min(2 * push * max(scene.domain.size), (push * scene.time.end) ** 2)
+    fallen = 2 * g * height if scene.domain.steady else min(2 * g * height, pull.impulse**2)
+    pushed = min(2 * push.largest * max(scene.domain.size), push.impulse**2)
     return SceneBounds(
         dimension=scene.dimension,
         spacing=scene.domain.spacing,
-        gravity=g + push,
-        speed=float(np.sqrt(initial**2 + 2 * g * height + pushed)),
+        gravity=g + push.largest,
+        speed=float(np.sqrt(initial**2 + fallen + pushed)),
         height=height,
         density=max(body.material.density for body in scene.bodies),
     )
-
-
-def gravity_samples(scene: Scene) -> list[np.ndarray]:
-    """Return gravity, (d,), m/s^2, at instants of the run; at one where it stays the same."""
-    if scene.domain.steady:
-        return [scene.domain.gravity_at(0.0)]
-    times = np.linspace(0.0, scene.time.end, INSTANTS)
-    return [np.nan_to_num(scene.domain.gravity_at(float(time))) for time in times]
-
-
-def force_bound(scene: Scene) -> float:
-    """Return the largest acceleration that forces add up to on one body, m/s^2, at sampled instants and places."""
-    largest = max((_push(scene, body) for body in scene.bodies), default=0.0)
-    return float(largest)
-
-
-def _push(scene: Scene, body: Body) -> float:
-    return sum(_magnitude(scene, body, force) for force in scene.forces if force.body in (None, body.name))
-
-
-def _magnitude(scene: Scene, body: Body, force: Force) -> float:
-    """Return the largest acceleration of one force: anywhere in the domain, of particles from anywhere in the body."""
-    d = scene.dimension
-    if not varies(*force.acceleration):
-        return float(np.linalg.norm(force.acceleration))
-    places = _lattice(np.array(scene.domain.origin), np.array(scene.domain.upper), FORCE_POINTS[d])
-    starts = _lattice(*body.shape.form.bounds(), FORCE_POINTS[d])
-    values = {name: column[:, None] for name, column in zip(POSITION, places.T, strict=False)}
-    # A force of x and X is asked for all of both only where it depends on both.
-    names = frozenset().union(*(entry.names for entry in force.acceleration if varies(entry)))
-    both = names & set(POSITION) and names & set(INITIAL)
-    values |= {
-        name: column[None, :: len(starts) // 81 + 1] if both else column[:, None]
-        for name, column in zip(INITIAL, starts.T, strict=False)
-    }
-    times = np.linspace(0.0, scene.time.end, FORCE_INSTANTS) if "t" in names else [0.0]
-    largest = 0.0
-    for time in times:
-        squares = sum(np.square(value_of(entry, t=float(time), **values)) for entry in force.acceleration)
-        # What is not finite somewhere is so for no particle, or stops the run.
-        largest = max(largest, float(np.max(squares, initial=0.0, where=np.isfinite(squares))))
-    return largest**0.5
 
 
 def highest_speed(body: Body) -> float:
@@ -112,6 +76,14 @@ def body_points(body: Body) -> np.ndarray:
     points = _lattice(*form.bounds(), POINTS[len(body.velocity)])
     inside = form.contains(points)
     return points[inside] if inside.any() else points
+
+
+def body_places(body: Body, index: int, h: float) -> np.ndarray:
+    """Return where the particles of a body start, (n, d), m; points of a lattice in it where there are too many."""
+    if estimate_body(body, h) > MOST_LOOKED_AT:
+        return body_points(body)
+    found = particle_places(body, index, h)
+    return found if len(found) else body_points(body)
 
 
 def _height(scene: Scene, corners: np.ndarray, gravity: np.ndarray) -> float:

@@ -22,6 +22,7 @@ from mpmcli.solver.batch_kernel import build_batch_kernel
 from mpmcli.solver.batch_layout import Layout
 from mpmcli.solver.frame_reader import build_frame_reader
 from mpmcli.solver.grid import DRIFT, Grid, node_width
+from mpmcli.solver.held_bound import HOLD, RISE
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.observe import build_observation
 from mpmcli.solver.ordering import SortBuffers, TileOrder
@@ -29,8 +30,8 @@ from mpmcli.solver.particle_arrays import CONSTANTS, ParticleArrays
 from mpmcli.solver.particle_update import ParticleUpdate
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.splines import PAD
-from mpmcli.solver.step_control import EASING
 from mpmcli.solver.transfer_scheme import scheme_of
+from mpmcli.solver.volume_relaxation import needs_filling
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Kind:
         faces: words of the walls, per axis.
         flags: of each law in the order of their names, the name and the terms that it has.
         cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
+        keeps_filling: whether nodes keep the volume scattered to them.
         members: the laws.
     """
 
@@ -54,6 +56,7 @@ class Kind:
     cells: tuple[int, ...]
     particles: tuple[int, ...]
     bodies: tuple[int, ...]
+    keeps_filling: bool
     members: tuple[Law, ...] = field(compare=False, repr=False)
 
     @staticmethod
@@ -74,6 +77,7 @@ class Kind:
             tuple(scene.domain.cells),
             tuple(sum(len(particles[i].position) for i in own) for own in places),
             tuple(len(own) for own in places),
+            needs_filling(scene, members),
             members,
         )
 
@@ -112,7 +116,7 @@ class Batch:
         self.kind, self.runs, self.backend = kind, runs, backend
         on_cpu = backend.on_cpu
         width = node_width(d, on_cpu=on_cpu)
-        grid = Grid(d, 1.0, kind.cells, width, scheme_of(kind.settings), runs)
+        grid = Grid(d, 1.0, kind.cells, width, scheme_of(kind.settings), runs, keeps_filling=kind.keeps_filling)
         groups = [
             ParticleArrays(
                 law,
@@ -150,7 +154,7 @@ class Batch:
         self.layout = Layout(d, [len(law.internal) for law in kind.members])
         self.numbers = np.zeros((runs, self.layout.reals))
         self.counts = np.zeros((runs, self.layout.counts), np.int32)
-        constants = {"drift_allowed": DRIFT, "easing": EASING, "slack": 1e-6, "infinity": math.inf}
+        constants = {"drift_allowed": DRIFT, "hold": HOLD, "rise": RISE, "slack": 1e-6, "infinity": math.inf}
         for name, value in constants.items():
             self.numbers[:, getattr(self.layout.real, name)] = value
         self.readers = [build_frame_reader(group) for group in groups] if on_cpu else []

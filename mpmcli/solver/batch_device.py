@@ -64,6 +64,6 @@ def views(
         walls.first_plane = w * len(walls.separating)
         images = _changed(images, walls=walls)
     nodes = _changed(device.nodes, grid=grid, images=images, boundaries=(walls,))
-    particles = _changed(device.particles, grid=grid, extent=extent, first_lost=w * len(device.groups))
+    particles = _changed(device.particles, grid=grid, extent=extent, last=last, first_lost=w * len(device.groups))
     orders = tuple(_changed(order, grid=grid, first_tile=w * (order.tiles + 1)) for order in device.orders)
     return grid, nodes, particles, orders

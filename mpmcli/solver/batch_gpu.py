@@ -20,7 +20,7 @@ from mpmcli.solver.state_bounds import NOTHING, deformation_rate, entries, widen
 STEPS = 32
 # Of a run under way, per run: columns of float64, and of the precision of particles before gravity's step and extent.
 DT, SPLITS, DEFORMATION, WIDTH = range(4)
-SPACING, INVERSE, SCALE, STEP, KICK, VECTORS = range(6)
+SPACING, INVERSE, SCALE, STEP, KICK, RELAXED, VECTORS = range(7)
 
 
 def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np.ndarray], None]:
@@ -35,7 +35,7 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     limits, stepping = ti.field(int, shape=runs), ti.field(int, shape=runs)
     constants = ti.Vector.field(VECTORS + 2 * d, float, shape=runs)
     speed_squared = ti.field(float, shape=runs)
-    rates = ti.field(float, shape=(runs, len(groups)))
+    rates, changes = (ti.field(float, shape=(runs, len(groups))) for _ in range(2))
     widest = max(entries(group) for group in groups)
     maxima = ti.field(float, shape=(runs, len(groups), widest))
     on_device = (ti.ndarray(ti.f64, (runs, layout.reals)), ti.ndarray(ti.i32, (runs, layout.counts)))
@@ -78,12 +78,14 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
                 own[SCALE] = ti.cast(numbers[w, real.gradient_scale], float)
                 own[STEP] = ti.cast(dt, float)
                 own[KICK] = ti.cast(kick, float)
+                own[RELAXED] = ti.cast(steps.relaxed_in(w, dt, numbers, counts), float)
                 for a in ti.static(range(d)):
                     own[VECTORS + a] = own[KICK] * ti.cast(numbers[w, real.gravity[a]], float)
                     own[VECTORS + d + a] = ti.cast(numbers[w, real.extent[a]], float)
                 constants[w] = own
                 for g in ti.static(range(len(groups))):
                     rates[w, g] = NOTHING
+                    changes[w, g] = 0.0
 
     @ti.func
     def clear(w: int, q: int, counts: ti.template()):
@@ -96,7 +98,15 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     def scatter(g: ti.template(), group: ti.template(), w: int, p: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
         _grid, _nodes, particles, _orders = ti.static(views(device, w, h, inverse, scale, box, last, extent))
-        particles.scatter(g, group, p, constants[w][KICK], True)
+        particles.scatter(g, group, p, constants[w][KICK], constants[w][RELAXED], True)
+
+    @ti.func
+    def relax(g: ti.template(), group: ti.template(), w: int, p: int, counts: ti.template()):
+        h, inverse, scale, box, last, extent = place(w, counts)
+        _grid, _nodes, particles, _orders = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        change = particles.relax(group, p, constants[w][RELAXED])
+        if change > changes[w, g]:
+            ti.atomic_max(changes[w, g], change)
 
     @ti.func
     def find_contact(w: int, q: int, counts: ti.template()):
@@ -128,7 +138,9 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
         """Count the step of a run."""
         speed = ti.sqrt(speed_squared[w])
         for g in ti.static(range(len(groups))):
-            numbers[w, real.rate[g]] = ti.cast(rates[w, g], ti.f64)
+            # What the relaxation of volumes adds to the rate of deformation.
+            added = ti.cast(changes[w, g], ti.f64) / under_way[w][DT]
+            numbers[w, real.rate[g]] = ti.cast(rates[w, g], ti.f64) + added
             if lost[w * ti.static(len(groups)) + g] != NOT_LOST:
                 speed = -1.0
         dt, splits, deformation = under_way[w][DT], under_way[w][SPLITS], under_way[w][DEFORMATION]
@@ -146,6 +158,13 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
                 w = p // room[g]
                 if stepping[w] == 1 and p % room[g] < counts[w, count.particles[g]]:
                     scatter(g, group, w, p, counts)
+        for g, group in ti.static(members):
+            if ti.static(group.law.relaxes):
+                for p in range(runs * room[g]):
+                    w = p // room[g]
+                    relaxes = stepping[w] == 1 and constants[w][RELAXED] > 0.0
+                    if relaxes and p % room[g] < counts[w, count.particles[g]]:
+                        relax(g, group, w, p, counts)
         if ti.static(contact):
             for q in range(runs * node_count):
                 if stepping[q // node_count] == 1:

@@ -77,8 +77,10 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
         nodes: ti.template(),
         particles: ti.template(),
         orders: ti.template(),
-        dt: float,
+        dt: ti.f64,
+        moved: float,
         kick: float,
+        relaxed: float,
         numbers: ti.template(),
         counts: ti.template(),
     ):
@@ -91,7 +93,16 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
         for g, group in ti.static(members):
             for colour in range(ti.static(device.orders[g].colours)):
                 pencils = orders[g].pencil_count(colour)
-                scatter_pencils(particles, g, group, orders[g], colour, 0, pencils, kick)
+                scatter_pencils(particles, g, group, orders[g], colour, 0, pencils, kick, relaxed)
+        for g, group in ti.static(members):
+            relaxation = 0.0
+            if ti.static(group.law.relaxes):
+                if relaxed > 0.0:
+                    first = w * room[g]
+                    for p in range(first, first + counts[w, count.particles[g]]):
+                        relaxation = ti.max(relaxation, particles.relax(group, p, relaxed))
+            # What the relaxation adds to the rate of deformation.
+            numbers[w, real.rate[g]] = ti.cast(relaxation, ti.f64) / dt
         if ti.static(nodes.needs_contact):
             for q in range(nodes.images.plane_nodes(grid)):
                 nodes.images.find_contact(grid, q, gravity_step)
@@ -100,8 +111,8 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
             sharpest = NOTHING
             first = w * room[g]
             for p in range(first, first + counts[w, count.particles[g]]):
-                sharpest = ti.max(sharpest, particles.advance(g, group, p, dt))
-            numbers[w, real.rate[g]] = ti.cast(sharpest, ti.f64)
+                sharpest = ti.max(sharpest, particles.advance(g, group, p, moved))
+            numbers[w, real.rate[g]] = numbers[w, real.rate[g]] + ti.cast(sharpest, ti.f64)
             if lost[particles.first_lost + g] != NOT_LOST:
                 speed = -1.0
         return speed
@@ -126,9 +137,9 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
                 sort(w, box, last, orders, numbers, counts)
             dt, kick, splits, limit, deformation = steps.begin(w, numbers, counts)
             if dt > 0:
-                speed = move(
-                    w, grid, nodes, particles, orders, ti.cast(dt, float), ti.cast(kick, float), numbers, counts
-                )
+                relaxed = ti.cast(steps.relaxed_in(w, dt, numbers, counts), float)
+                moved, kicked = ti.cast(dt, float), ti.cast(kick, float)
+                speed = move(w, grid, nodes, particles, orders, dt, moved, kicked, relaxed, numbers, counts)
                 steps.end(w, dt, splits, limit, deformation, ti.cast(speed, ti.f64), numbers, counts)
         for a in ti.static(range(d)):
             for i in ti.static(range(2)):

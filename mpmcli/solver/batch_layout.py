@@ -11,16 +11,19 @@ IDLE, MEASURE, GOING, ATTEND, LOST, COLLAPSED = range(6)
 # Bounds on the step by their code; of equal ones the lower code counts, as in a comparison of `Limit`s.
 LIMITS = ("", "deformation", "force", "forced", "maximum", "speed", "viscosity", "wave")
 
+# Columns of a `HeldBound`, in its order.
+HELD = ("held", "low", "low_before", "held_steps")
 # Columns of the numbers, float64. The last four are constants: a literal in a kernel has the precision of particles.
 REALS = (
-    *("time", "target", "last_step", "speed", "courant", "drift", "eased", "stiffness"),
+    *("time", "target", "last_step", "unrelaxed", "speed", "courant", "drift", "owed", "stiffness"),
+    *HELD,
     *("smallest", "smallest_courant", "largest", "largest_courant"),
-    *("growth_allowed", "safety", "safety_squared", "maximum", "pull", "collapse"),
+    *("growth_allowed", "safety", "maximum", "pull", "collapse"),
     *("spacing", "inverse_spacing", "gradient_scale"),
-    *("drift_allowed", "easing", "slack", "infinity"),
+    *("drift_allowed", "hold", "rise", "slack", "infinity"),
 )
 # Columns of the counts, int32.
-COUNTS = ("status", "arrived", "steps", "budget", "limit", "stiffness_limit", "forced", "longest")
+COUNTS = ("status", "arrived", "steps", "unrelaxed_steps", "budget", "limit", "stiffness_limit", "forced", "longest")
 
 
 def _columns(first: int, names: Iterable[str]) -> dict[str, int]:

@@ -10,10 +10,11 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.batch import Batch
 from mpmcli.solver.batch_group import BatchGroup
-from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, GOING, IDLE, LIMITS, LOST, MEASURE
+from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, GOING, HELD, IDLE, LIMITS, LOST, MEASURE
 from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.groups import require_inside
+from mpmcli.solver.held_bound import HeldBound
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.particles import initial_state, table_of
 from mpmcli.solver.plan import members_of
@@ -24,6 +25,8 @@ from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
 from mpmcli.solver.step_control import StepControl, StepCounters
 from mpmcli.solver.sums import Sums
 
+# Numbers of `Progress` that the kernel changes.
+FOLLOWED = ("time", "last_step", "unrelaxed", "speed", "courant", "drift", "owed")
 # Particle-steps of a run in one launch: some tenths of a second, after which the host may stop the run.
 BUDGET = 2_000_000
 
@@ -111,7 +114,6 @@ class BatchRun(Run):
             inverse_spacing=1 / h,
             gradient_scale=self.batch.device.grid.scheme.spline.inverse_moment / h,
             safety=scene.time.safety,
-            safety_squared=scene.time.safety**2,
             maximum=maximum,
         )
         self._set_counts(forced=self._forced)
@@ -171,7 +173,7 @@ class BatchRun(Run):
         self._begin()
         self._set(
             growth_allowed=control.growth_allowed,
-            pull=self.state.external_forces.pull(0.0),
+            pull=self.state.external_forces.pull(0.0, 0.0),
             collapse=COLLAPSE * self.state.first_stable_step,
         )
         self._set_counts(longest=control.longest)
@@ -226,7 +228,7 @@ class BatchRun(Run):
 
         return StepCounters(
             self.state.step_control.counters().stiffness_limit,
-            self._get("eased"),
+            HeldBound(*(self._get(name) for name in HELD)),
             numbers(self._real.rate),
             tuple(self._counts[list(self._count.unwatched)].tolist()),
             numbers(self._real.change),
@@ -235,16 +237,18 @@ class BatchRun(Run):
 
     def _pull(self) -> None:
         """Read what the kernel has changed."""
-        for name in ("time", "last_step", "speed", "courant", "drift"):
+        for name in FOLLOWED:
             setattr(self.state, name, self._get(name))
+        self.state.unrelaxed_steps = self._get_count("unrelaxed_steps")
         self.state.step_count += self._get_count("steps")
 
     def _push(self) -> None:
         """Write what the host has changed."""
-        for name in ("time", "last_step", "speed", "courant", "drift"):
+        for name in FOLLOWED:
             self._set(**{name: getattr(self.state, name)})
+        self._set_counts(unrelaxed_steps=self.state.unrelaxed_steps)
         counters = self.state.step_control.counters()
-        self._set(stiffness=counters.stiffness_limit.value, eased=counters.eased)
+        self._set(stiffness=counters.stiffness_limit.value, **dict(zip(HELD, counters.held, strict=True)))
         self._set_counts(stiffness_limit=LIMITS.index(counters.stiffness_limit.name))
         for g in range(len(self.groups)):
             self._numbers[self._real.rate[g]] = counters.rates[g]

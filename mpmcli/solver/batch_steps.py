@@ -9,6 +9,7 @@ import taichi as ti
 
 from mpmcli.materials.law import Law
 from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, LIMITS, LOST, Layout
+from mpmcli.solver.volume_relaxation import INTERVAL
 from mpmcli.stability.limits import COURANT, DEFORMATION
 
 DEFORMING, FORCED, MAXIMUM, CROSSING = (LIMITS.index(name) for name in ("deformation", "forced", "maximum", "speed"))
@@ -34,10 +35,13 @@ class BatchSteps:
         left = numbers[w, self.real.target] - numbers[w, self.real.time]
         splits = ti.max(ti.ceil(left / largest - numbers[w, self.real.slack]), 1.0)
         dt = left / splits
-        kick = ti.min(0.5 * (numbers[w, self.real.last_step] + dt), dt / numbers[w, self.real.safety_squared])
+        due_kick = numbers[w, self.real.owed] + 0.5 * (numbers[w, self.real.last_step] + dt)
+        kick = ti.min(due_kick, dt / numbers[w, self.real.safety])
         if largest < numbers[w, self.real.collapse]:
             counts[w, self.count.status] = COLLAPSED
             dt = 0.0 * dt
+        else:
+            numbers[w, self.real.owed] = due_kick - kick
         return dt, kick, splits, limit, deformation
 
     @ti.func
@@ -62,8 +66,7 @@ class BatchSteps:
             numbers[w, self.real.speed] = speed
             numbers[w, self.real.courant] = courant
             numbers[w, self.real.drift] = numbers[w, self.real.drift] + courant
-            eased = ti.min(numbers[w, self.real.easing] * numbers[w, self.real.eased], numbers[w, self.real.stiffness])
-            numbers[w, self.real.eased] = ti.min(eased, deformation)
+            self.hold(w, ti.min(numbers[w, self.real.stiffness], deformation), numbers)
             due = self.control(w, dt, numbers, counts)
             self.book(w, dt, courant, limit, numbers, counts)
             if splits == 1:
@@ -87,7 +90,7 @@ class BatchSteps:
         if deformation < value or (deformation == value and limit > DEFORMING):
             value = deformation
             limit = DEFORMING
-        value = ti.min(value, numbers[w, self.real.eased])
+        value = ti.min(value, numbers[w, self.real.held])
         speed = numbers[w, self.real.speed]
         pull = numbers[w, self.real.pull]
         h = numbers[w, self.real.spacing]
@@ -106,6 +109,36 @@ class BatchSteps:
             value = maximum
             limit = FORCED
         return value, limit, deformation
+
+    @ti.func
+    def relaxed_in(self, w: int, dt: ti.f64, numbers: ti.template(), counts: ti.template()):
+        """Count a step and return the time over which it relaxes volumes, s, as `Progress.relaxed_in` does."""
+        relaxed = numbers[w, self.real.unrelaxed] + dt
+        if counts[w, self.count.unrelaxed_steps] + 1 < INTERVAL:
+            counts[w, self.count.unrelaxed_steps] += 1
+            numbers[w, self.real.unrelaxed] = relaxed
+            relaxed = ti.cast(0.0, ti.f64)
+        else:
+            counts[w, self.count.unrelaxed_steps] = 0
+            numbers[w, self.real.unrelaxed] = ti.cast(0.0, ti.f64)
+        return relaxed
+
+    @ti.func
+    def hold(self, w: int, bound: ti.f64, numbers: ti.template()):
+        """Keep the smallest bound of the last steps, as `HeldBound.after` does."""
+        low = ti.min(numbers[w, self.real.low], bound)
+        held = ti.min(numbers[w, self.real.held], bound)
+        steps = numbers[w, self.real.held_steps] + 1
+        if steps >= numbers[w, self.real.hold]:
+            lowest = ti.min(numbers[w, self.real.low_before], low)
+            if lowest > numbers[w, self.real.rise] * held:
+                held = lowest
+            numbers[w, self.real.low_before] = low
+            low = numbers[w, self.real.infinity]
+            steps -= steps
+        numbers[w, self.real.held] = held
+        numbers[w, self.real.low] = low
+        numbers[w, self.real.held_steps] = steps
 
     @ti.func
     def control(self, w: int, dt: ti.f64, numbers: ti.template(), counts: ti.template()):

@@ -22,12 +22,13 @@ def scatter_pencils(
     first: int,
     last: int,
     kick: float,
+    relaxed: float,
 ):
     """Scatter the particles of the g-th group in pencils first to last - 1 of a colour."""
     for r in range(first, last):
         tile = order.first_tile + order.pencil_start(colour, r)
         for p in range(order.start[tile], order.start[tile + order.pencil]):
-            particles.scatter(g, group, p, kick, False)
+            particles.scatter(g, group, p, kick, relaxed, False)
 
 
 @ti.func

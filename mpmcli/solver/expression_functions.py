@@ -99,6 +99,13 @@ def _choose(condition, a, b):
     return ti.select(condition != 0, a, b)
 
 
+@ti.func
+def blend(share, a, b):
+    """Return a, b, or their mean where a condition holds for a share of the kick between 0 and 1."""
+    # A branch that does not count may be infinite.
+    return ti.select(share >= 1, a, ti.select(share <= 0, b, share * a + (1 - share) * b))
+
+
 # By atan2: a device's own asin and acos may be no better than 1e-4.
 @ti.func
 def _asin(a):

@@ -1,7 +1,8 @@
 """Expressions inside kernels: each node of a tree is an object whose `evaluate` is inlined where it is called.
 
-What depends on time alone is no part of a kernel: the host computes it once per step, in double precision, and the
-kernel reads it from the clock. Conditions are integers, 0 or 1, and both branches of `a if c else b` are computed.
+What depends on time alone is no part of a kernel: the host computes its mean over the kick once per step, in double
+precision, and the kernel reads it from the clock. Conditions are integers, 0 or 1, or for a condition of time the share
+of the kick for which it holds. Both branches of `a if c else b` are computed.
 """
 
 from collections.abc import Callable
@@ -9,8 +10,9 @@ from collections.abc import Callable
 import numpy as np
 import taichi as ti
 
-from mpmcli.scene.expression import INITIAL, POSITION, Apply, Name, Number, Tree, evaluate, kind_of, names_in
-from mpmcli.solver.expression_functions import KERNELS
+from mpmcli.scene.expression import INITIAL, POSITION, Apply, Name, Number, Tree, names_in
+from mpmcli.scene.quadrature import Mean, telling_times
+from mpmcli.solver.expression_functions import KERNELS, blend
 
 # Whole exponents up to this one are products: a power of a negative number is undefined on some devices.
 LARGEST_PRODUCT = 64
@@ -18,7 +20,7 @@ LARGEST_PRODUCT = 64
 
 @ti.data_oriented
 class Clock:
-    """Values that depend on time alone, one set per step.
+    """Values that depend on time alone, one set per step: their means over the kick, so that no pulse is skipped.
 
     Attributes:
         trees: what the values are.
@@ -35,22 +37,26 @@ class Clock:
             self.trees.append(tree)
         return self.trees.index(tree)
 
-    def allocate(self) -> Callable[[float], None]:
-        """Allocate the values, and return what sets them to those of a time (s)."""
+    def allocate(self, end: float) -> Callable[[float, float], None]:
+        """Allocate the values, and return what sets them to their means between two times of a run of `end` seconds."""
         if not self.trees:
-            return lambda time: None
+            return lambda start, end: None
         count = len(self.trees)
-        vector = ti.types.vector(count, float)
+        vector, means = ti.types.vector(count, float), [Mean(tree, end) for tree in self.trees]
         values = self.values = ti.Vector.field(count, float, shape=())
 
         @ti.kernel
         def write(now: vector):
             values[None] = now
 
-        def set_time(time: float) -> None:
-            write(vector([float(evaluate(tree, {"t": time})) for tree in self.trees]))
+        def set_times(start: float, end: float) -> None:
+            write(vector([mean(start, end) for mean in means]))
 
-        return set_time
+        return set_times
+
+    def telling_times(self, start: float, end: float) -> list[float]:
+        """Return the times between two (s) at which any of the values is smallest or largest."""
+        return [time for tree in self.trees for time in telling_times(tree, start, end)]
 
 
 @ti.data_oriented
@@ -86,17 +92,15 @@ class Coordinate:
 
 @ti.data_oriented
 class Reading:
-    """A value of the clock; a condition where `truth`."""
+    """A value of the clock; of a condition the share of the kick for which it is true."""
 
-    def __init__(self, clock: Clock, index: int, *, truth: bool) -> None:
+    def __init__(self, clock: Clock, index: int) -> None:
         self.clock = clock
         self.index = index
-        self.truth = truth
 
     @ti.func
     def evaluate(self, x: ti.template(), X: ti.template()):
-        value = self.clock.values[None][self.index]
-        return ti.cast(value, int) if ti.static(self.truth) else value
+        return self.clock.values[None][self.index]
 
 
 @ti.data_oriented
@@ -171,7 +175,7 @@ def node_of(tree: Tree, origin: np.ndarray, clock: Clock) -> object:
     if isinstance(tree, Number):
         return Constant(tree.value)
     if names_in(tree) == {"t"}:
-        return Reading(clock, clock.place_of(tree), truth=kind_of(tree) == "truth")
+        return Reading(clock, clock.place_of(tree))
     if isinstance(tree, Name):
         names = INITIAL if tree.name in INITIAL else POSITION
         axis = names.index(tree.name)
@@ -185,7 +189,9 @@ def _applied(tree: Apply, origin: np.ndarray, clock: Clock) -> object:
         exponent = arguments[1].value
         if exponent == int(exponent) and abs(exponent) <= LARGEST_PRODUCT:
             return Power(node_of(arguments[0], origin, clock), int(exponent))
-    function = KERNELS[tree.function]
+    # A condition of time may hold for a part of the kick.
+    shared = tree.function == "if" and "t" in names_in(arguments[0])
+    function = blend if shared else KERNELS[tree.function]
     nodes = [node_of(argument, origin, clock) for argument in arguments]
     if tree.function in ("min", "max"):
         result = nodes[0]

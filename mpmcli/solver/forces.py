@@ -1,7 +1,7 @@
 """Gravity, which may depend on time, and external forces, which are expressions.
 
-Leapfrog evaluates both at the start of a step, at t_n and x_n: they advance the velocity from the middle of the last
-step to that of this one, which moves particles to x_(n+1) (docs/theory.md, 7.1).
+They advance the velocity from the middle of the last step to that of this one, which moves particles to x_(n+1)
+(docs/theory.md, 7.1). Leapfrog evaluates a force at x_n; what depends on time alone is its mean over that time.
 Gravity acts on the nodes; a force acts on its particles, before their momentum is scattered.
 """
 

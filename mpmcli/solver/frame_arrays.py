@@ -66,6 +66,7 @@ class ParticleConstants:
     Attributes:
         body, material: (n,) int32, index into the scene's bodies and into the run's laws.
         mass, volume: (n,) float64, kg and m^3 at rest.
+        flows: (n,) bool, whether the law is a liquid or grains.
         members: of each law, itself and the rows of its particles.
     """
 
@@ -73,6 +74,7 @@ class ParticleConstants:
     material: np.ndarray
     mass: np.ndarray
     volume: np.ndarray
+    flows: np.ndarray
     members: tuple[tuple[Law, slice | np.ndarray], ...]
 
     @staticmethod
@@ -96,7 +98,8 @@ class ParticleConstants:
         for array in (body, material):
             array.flags.writeable = False
         members = tuple((group.law, own) for group, own in zip(groups, rows, strict=True))
-        return ParticleConstants(body, material, mass, volume, members)
+        flows = np.array([group.law.flows for group in groups])[material]
+        return ParticleConstants(body, material, mass, volume, flows, members)
 
     def volume_ratios(self, arrays: FrameArrays) -> np.ndarray:
         """Return volume over volume at rest, (n,)."""

@@ -49,6 +49,9 @@ class Grid:
         nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update.
         before: Vector(width) field: momentum, later velocity, without stress and forces of this step; None in schemes
             that do not keep it.
+        filling: Vector(width) field: where the mass is in `nodes` it has the volume of particles at rest, m^3, in the
+            steps that relax volumes; None where the mass says as much. keeps_filling: whether it is there.
+        holding: `filling`, or else `nodes`.
         box: (2, d) ints: first node in use and number of nodes in use, per axis.
     """
 
@@ -60,6 +63,8 @@ class Grid:
         width: int,
         scheme: TransferScheme,
         runs: int = 1,
+        *,
+        keeps_filling: bool = False,
     ) -> None:
         """Allocate nodes for a number of runs, the nodes of one after those of another."""
         self.dimension = dimension
@@ -82,6 +87,9 @@ class Grid:
         self.node_count = int(np.prod(self.shape))
         self.nodes = ti.Vector.field(width, float, shape=runs * self.node_count)
         self.before = ti.Vector.field(width, float, shape=runs * self.node_count) if scheme.keeps_before else None
+        self.keeps_filling = keeps_filling
+        self.filling = ti.Vector.field(width, float, shape=runs * self.node_count) if keeps_filling else None
+        self.holding = self.filling if keeps_filling else self.nodes
         self.box = ti.field(int, shape=(2 * runs, dimension))
 
     @staticmethod
@@ -100,6 +108,8 @@ class Grid:
         self.nodes[node] = ti.Vector.zero(float, self.width)
         if ti.static(self.scheme.keeps_before):
             self.before[node] = ti.Vector.zero(float, self.width)
+        if ti.static(self.keeps_filling):
+            self.filling[node] = ti.Vector.zero(float, self.width)
 
     @ti.func
     def linear_index(self, base: ti.template()):

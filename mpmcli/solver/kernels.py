@@ -20,6 +20,7 @@ from mpmcli.solver.splines import PAD
 from mpmcli.solver.step_cpu import build_cpu_step
 from mpmcli.solver.step_gpu import build_gpu_step
 from mpmcli.solver.transfer_scheme import scheme_of
+from mpmcli.solver.volume_relaxation import needs_filling
 
 
 class Kernels:
@@ -31,13 +32,21 @@ class Kernels:
         particles: the update of particles, with the record of lost ones.
         drift_allowed: cells that a particle may move until particles are sorted again: without atomics only as far as
             its tile's colour allows.
-        step: (dt, kick) -> what it read back, a `StepResult`; None on a GPU. Positions move on by dt, s, velocities by
-            kick, s: from the middle of the last step to the middle of this one (docs/theory.md, 7.1).
+        step: (dt, kick, relaxed) -> what it read back, a `StepResult`; None on a GPU. Positions move on by dt, s,
+            velocities by kick, s: from the middle of the last step to the middle of this one (docs/theory.md, 7.1).
+            Volumes relax over the time `relaxed`, s.
     """
 
     def __init__(self, scene: Scene, backend: Backend, groups: Sequence[ParticleGroup], gravity: Gravity) -> None:
         width = node_width(scene.dimension, on_cpu=backend.on_cpu)
-        self.grid = Grid(scene.dimension, scene.domain.spacing, scene.domain.cells, width, scheme_of(scene.solver))
+        self.grid = Grid(
+            scene.dimension,
+            scene.domain.spacing,
+            scene.domain.cells,
+            width,
+            scheme_of(scene.solver),
+            keeps_filling=needs_filling(scene, [group.law for group in groups]),
+        )
         faces = scene.domain.walls.faces(scene.dimension)
         if scene.solver.walls == "zeroed":
             images, walls = None, ZeroedWalls(faces, PAD, self.grid.cells)

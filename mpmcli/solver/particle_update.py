@@ -3,8 +3,11 @@
 import taichi as ti
 
 from mpmcli.solver.grid import Grid
+from mpmcli.solver.particle_arrays import VOLUME
+from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import deformation_rate, volume_growth, volume_ratio
-from mpmcli.solver.transfer import gather, scatter
+from mpmcli.solver.transfer import gather, scatter, scatter_volume
+from mpmcli.solver.volume_relaxation import relax_volume
 
 NOT_LOST = 2**31 - 1
 # A particle crushed to less than this fraction of its volume is lost: near zero J is round-off, not physics.
@@ -16,7 +19,7 @@ class ParticleUpdate:
     """Both halves of a step of a particle.
 
     Attributes:
-        extent: size of the domain, m.
+        extent: size of the domain, m; last: node of the upper walls, per axis.
         watches_box: whether a particle whose stencil has left the nodes in use is lost: on a GPU, where speeds are not
             read back at every step.
         lost: per group, the first particle (in solver order) that left the domain, was inverted or is not finite, or
@@ -27,6 +30,7 @@ class ParticleUpdate:
         self.grid = grid
         self.dimension = grid.dimension
         self.extent = tuple(n * grid.spacing for n in grid.cells)
+        self.last = tuple(PAD + n for n in grid.cells)
         self.watches_box = watches_box
         self.lost = ti.field(int, shape=group_count)
         self.lost.fill(NOT_LOST)
@@ -37,12 +41,27 @@ class ParticleUpdate:
         return bool((self.lost.to_numpy() != NOT_LOST).any())
 
     @ti.func
-    def scatter(self, g: ti.template(), group: ti.template(), p: int, kick: float, atomic: ti.template()):
+    def scatter(
+        self, g: ti.template(), group: ti.template(), p: int, kick: float, relaxed: float, atomic: ti.template()
+    ):
         """Scatter one particle, unless it is crushed or inverted: its stress would spread NaN over the grid."""
         if volume_ratio(group, group.stored(p)) > SMALLEST_J:
             scatter(group, self.grid, p, kick, atomic)
         else:
             ti.atomic_min(self.lost[self.first_lost + g], p)
+        if ti.static(self.grid.keeps_filling):
+            if relaxed > 0.0:
+                scatter_volume(group.x[p], group.row(p)[VOLUME], self.grid, atomic)
+
+    @ti.func
+    def relax(self, group: ti.template(), p: int, relaxed: float):
+        """Relax the volume of one particle over a time, s, after P2G; return the change of its logarithm."""
+        change = 0.0
+        _v, C = group.motion(p)
+        # What is at rest stays as it is.
+        if deformation_rate(group, C) > 0.0:
+            change = relax_volume(group, self.grid, self.last, p, group.x[p], relaxed)
+        return change
 
     @ti.func
     def advance(self, g: ti.template(), group: ti.template(), p: int, dt: float):

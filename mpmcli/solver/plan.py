@@ -17,6 +17,7 @@ from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import Grid, node_width, tile_edge
 from mpmcli.solver.ordering import TileOrder
 from mpmcli.solver.transfer_scheme import scheme_of
+from mpmcli.solver.volume_relaxation import needs_filling
 
 # Taichi addresses fields with 32-bit integers, and a particle has at most 3 x 4 numbers in one field.
 LARGEST_INDEX = 2**31 - 1
@@ -155,7 +156,10 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     scheme = scheme_of(scene.solver)
     stencil = scheme.spline.nodes
     nodes = Grid.nodes_needed(cells, stencil)
-    node_bytes = real * width * (2 if scheme.keeps_before else 1)
+    members = [
+        laws()[name]([scene.bodies[i].material for i in members_of(scene, name)], dimension) for name in sorted(bodies)
+    ]
+    node_bytes = real * width * (1 + scheme.keeps_before + needs_filling(scene, members))
     tables = len(groups) * TileOrder.bytes_needed(cells, stencil, backend.threads) + _contact_bytes(scene, nodes)
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
     host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)

@@ -15,6 +15,7 @@ from mpmcli.solver.frame_arrays import FrameArrays, ParticleConstants
 from mpmcli.solver.snapshot import Snapshot, read_group
 from mpmcli.solver.state import Progress
 from mpmcli.solver.sums import Sums, ledger_row, ledger_sums
+from mpmcli.solver.volume_error import volume_error
 from mpmcli.stability.limits import Limit, force_limit, speed_limit
 from mpmcli.stability.transfer_factors import affine_moment
 
@@ -104,8 +105,13 @@ class Run:
         return [*self._fast_limits(), *self.state.step_control.limits()]
 
     def _fast_limits(self) -> list[Limit]:
-        forces = self.state.external_forces
-        limits = [Limit(speed_limit(self.spacing, self.state.speed, forces.pull(self.time)), "speed", "")]
+        forces, state = self.state.external_forces, self.state
+        ahead = 0.0
+        if not self.scene.domain.steady:
+            # The next kick ends in the middle of a step that is no longer than the other bounds allow.
+            ahead = min(self.scene.time.safety * state.step_control.nearest.value, self.scene.time.end)
+        pull = forces.pull(state.velocity_time, state.time + ahead)
+        limits = [Limit(speed_limit(self.spacing, state.speed, pull), "speed", "")]
         if forces.pushes:
             limits.append(Limit(force_limit(forces.slope), "force", ""))
         return limits
@@ -187,6 +193,10 @@ class Run:
             fields={name: fields[name] for name in self.scene.output.fields if name != "velocity"},
         )
         conserved = ledger_sums(sums, ratios, gravity, self.spacing, self.last_step, moment)
+        cells = self.scene.domain.cells
+        conserved["volume_error"] = volume_error(
+            arrays["x"], ratios * particles.volume, particles.flows, self.spacing, cells
+        )
         row = ledger_row(conserved, self.time, taken)
         self.frame_seconds += time.perf_counter() - began
         return frame, row

@@ -79,11 +79,13 @@ class Solver(Run):
             self._kernels.sort()
             state.drift = 0.0
         # Velocities belong to the middle of steps. They advance from the middle of the last step to that of this one,
-        # at the start by half a step. A kick beyond dt / safety^2 might be unstable: kick dt <= (dt / safety)^2.
-        kick = min(0.5 * (state.last_step + dt), dt / self.scene.time.safety**2)
-        pull = state.external_forces.pull(state.time)
-        state.external_forces.begin_step(state.time)
-        result = self._kernels.step(dt, kick)
+        # at the start by half a step, with what an earlier step had to leave: a kick beyond dt / safety might be
+        # unstable (docs/theory.md, 7.1).
+        due_kick, since = state.owed + 0.5 * (state.last_step + dt), state.velocity_time
+        kick = min(due_kick, dt / self.scene.time.safety)
+        state.owed = due_kick - kick
+        state.external_forces.begin_step(since, since + kick)
+        result = self._kernels.step(dt, kick, state.relaxed_in(dt))
         state.time += dt
         state.last_step = dt
         state.step_count += 1
@@ -95,7 +97,7 @@ class Solver(Run):
             state.speed = result.speed
         else:
             # Not read back: bounded by what gravity and forces add.
-            state.speed += kick * pull
+            state.speed += kick * state.external_forces.pull(since, since + kick)
         state.courant = dt * state.speed / self.spacing
         # On a GPU stress may double the speed; `ParticleUpdate.advance` flags particles that went further.
         unseen = 2 * state.courant + UNSEEN if result is None else 0.0

@@ -13,6 +13,7 @@ from mpmcli.solver.kernels import Kernels
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.step_control import StepControl
+from mpmcli.solver.volume_relaxation import INTERVAL
 
 
 @dataclass(frozen=True)
@@ -36,10 +37,13 @@ class Progress:
         speed: bound on the speed of every particle, m/s; courant: cells that the fastest one moved in the last step.
         drift: cells that a particle may have moved since particles were sorted; infinite before the first sort.
         first_stable_step: s, at the start of the run.
+        owed: time by which velocities lag behind the middle of the last step, s, after a step that fell steeply.
+        unrelaxed: s since volumes were last relaxed, in unrelaxed_steps steps.
         step_control, external_forces: what is known of the bounds on the next step.
     """
 
-    NUMBERS = ("time", "step_count", "last_step", "speed", "courant", "drift", "first_stable_step")
+    NUMBERS = ("time", "step_count", "last_step", "speed", "courant", "drift", "first_stable_step", "owed")
+    RELAXATION = ("unrelaxed", "unrelaxed_steps")
 
     def __init__(self, step_control: StepControl, external_forces: ExternalForces) -> None:
         self.step_control = step_control
@@ -55,7 +59,24 @@ class Progress:
         self.courant = 0.0
         self.drift = math.inf
         self.first_stable_step = 0.0
+        self.owed = 0.0
+        self.unrelaxed = 0.0
+        self.unrelaxed_steps = 0
         self.step_control.begin()
+
+    @property
+    def velocity_time(self) -> float:
+        """Time to which velocities have advanced, s: the middle of the last step, less what is owed."""
+        return self.time - 0.5 * self.last_step - self.owed
+
+    def relaxed_in(self, dt: float) -> float:
+        """Count a step of dt, s, and return the time over which it relaxes volumes, s: 0 in all but one of INTERVAL."""
+        self.unrelaxed += dt
+        self.unrelaxed_steps += 1
+        if self.unrelaxed_steps < INTERVAL:
+            return 0.0
+        relaxed, self.unrelaxed, self.unrelaxed_steps = self.unrelaxed, 0.0, 0
+        return relaxed
 
 
 class State(Progress):
@@ -81,7 +102,7 @@ class State(Progress):
 
     def save(self) -> SavedState:
         """Copy the state to the host."""
-        numbers = {name: getattr(self, name) for name in self.NUMBERS}
+        numbers = {name: getattr(self, name) for name in (*self.NUMBERS, *self.RELAXATION)}
         numbers["step_control"] = self.step_control.save()
         numbers["external_forces"] = self.external_forces.save()
         return SavedState(numbers, {name: field.to_numpy() for name, field in self._fields().items()})
@@ -100,6 +121,9 @@ class State(Progress):
             field.from_numpy(saved.arrays[name])
         for name in self.NUMBERS:
             setattr(self, name, saved.numbers[name])
+        # States written before volumes were relaxed lack these.
+        for name in self.RELAXATION:
+            setattr(self, name, saved.numbers.get(name, 0))
         self.step_control.load(saved.numbers["step_control"])
         self.external_forces.load(saved.numbers["external_forces"])
         self._kernels.particles.lost.fill(NOT_LOST)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from mpmcli.materials.law import StateBound
 from mpmcli.scene import Scene
+from mpmcli.solver.held_bound import HeldBound
 from mpmcli.solver.particle_update import SMALLEST_J
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.state_bounds import Measurement, StateBounds
@@ -24,16 +25,13 @@ MOST_BLIND_STEPS, BLIND_SHARE = 16, 0.75
 # Cells per step below which a sudden stop, which turns speed into a velocity gradient of up to two speeds a cell,
 # stays clear of the bound on the deformation in a step.
 SLOW = 0.1
-# A bound falls at once and rises by this factor per step at most. A step that follows the oscillation of a lone
-# particle excites it: at 1.01 one of fourteen trials became unstable, at 1.001 none.
-EASING = 1.001
 
 
 class StepCounters(NamedTuple):
     """What decides on the steps between two measurements.
 
     Attributes:
-        stiffness_limit: the smallest bound by the stiffness of the laws; eased: the bound that rises slowly, s.
+        stiffness_limit: the smallest bound by the stiffness of the laws; held: the bound that rises late.
         rates: per group, the largest rate of deformation in the last step, 1/s.
         unwatched: per group, the steps since its last measurement.
         change, hardened: per group, the growth of the logarithm of its stiffness since then, by deformation and by
@@ -41,7 +39,7 @@ class StepCounters(NamedTuple):
     """
 
     stiffness_limit: Limit
-    eased: float
+    held: HeldBound
     rates: tuple[float, ...]
     unwatched: tuple[int, ...]
     change: tuple[float, ...]
@@ -83,13 +81,15 @@ class StepControl:
         # A step of safety times the limit is stable until the stiffness has grown to safety^-2 of what it was.
         self.growth_allowed = -2 * share * math.log(scene.time.safety)
         self.seconds = 0.0
+        # Per group, whether it has not been measured since the start.
+        self._at_start = [True] * len(groups)
         self._limits = [self._limits_of(g, bounds) for g, bounds in enumerate(self._bounds)]
-        self._eased = math.inf
+        self._held = HeldBound()
         self._take_limits()
 
     def begin(self) -> None:
         """Let the first step of a run be as large as the bounds allow."""
-        self._eased = math.inf
+        self._held = HeldBound()
 
     def save(self) -> dict[str, object]:
         """Return what was measured and counted of each group, as plain numbers, lists and dictionaries."""
@@ -99,11 +99,13 @@ class StepControl:
             "unwatched": list(self._unwatched),
             "change": list(self._change),
             "hardened": list(self._hardened),
-            "eased": self._eased,
+            "held": list(self._held),
+            "at_start": list(self._at_start),
         }
 
     def load(self, saved: dict) -> None:
         """Take what `save` returned."""
+        self._at_start = list(saved["at_start"])
         for g, bounds in enumerate(saved["bounds"]):
             internal = {name: tuple(pair) for name, pair in bounds["bound"]["internal"].items()}
             bound = StateBound(**bounds["bound"] | {"internal": internal})
@@ -111,7 +113,7 @@ class StepControl:
             self._limits[g] = self._limits_of(g, self._bounds[g])
         self._rates, self._unwatched = list(saved["rates"]), list(saved["unwatched"])
         self._change, self._hardened = list(saved["change"]), list(saved["hardened"])
-        self._eased = saved["eased"]
+        self._held = HeldBound(*saved["held"])
         self._take_limits()
 
     @property
@@ -138,7 +140,7 @@ class StepControl:
     def nearest(self) -> Limit:
         """The smallest bound on the next step."""
         limit = min(self._stiffness_limit, self._deformation_limit)
-        return limit._replace(value=min(limit.value, self._eased))
+        return limit._replace(value=min(limit.value, self._held.value))
 
     def after_step(self, dt: float, courant: float, result: StepResult | None) -> list[int]:
         """Count a step and return the groups to measure now.
@@ -151,7 +153,7 @@ class StepControl:
             result: what it read back, None where that was not read back.
         """
         began = time.perf_counter()
-        self._eased = min(EASING * self._eased, self._stiffness_limit.value, self._deformation_limit.value)
+        self._held = self._held.after(min(self._stiffness_limit.value, self._deformation_limit.value))
         if result is not None:
             self._rates[:] = result.deformation_rates
             self._deformation_limit = _deformation_limit(self._rates)
@@ -199,7 +201,7 @@ class StepControl:
         """Return what decides on the next steps until the next measurement."""
         return StepCounters(
             self._stiffness_limit,
-            self._eased,
+            self._held,
             *map(tuple, (self._rates, self._unwatched, self._change, self._hardened)),
         )
 
@@ -209,7 +211,7 @@ class StepControl:
         Groups that harden are measured after every such series: their bounds count as read back.
         """
         began = time.perf_counter()
-        self._eased = counters.eased
+        self._held = counters.held
         self._rates[:], self._unwatched[:] = counters.rates, counters.unwatched
         self._change[:], self._hardened[:] = counters.change, counters.hardened
         self._deformation_limit = _deformation_limit(self._rates)
@@ -237,6 +239,7 @@ class StepControl:
     def _take(self, g: int, bounds: StateBounds) -> None:
         """Store the bounds of a group's state, and the limits that follow from them."""
         self._bounds[g] = bounds
+        self._at_start[g] = False
         self._rates[g] = bounds.deformation_rate
         self._change[g] = self._hardened[g] = 0.0
         self._limits[g] = self._limits_of(g, bounds)
@@ -252,10 +255,13 @@ class StepControl:
 
     def _limits_of(self, g: int, bounds: StateBounds) -> list[Limit]:
         """Return the limits that the stiffness of the g-th group sets within these bounds of its state."""
-        group = self._groups[g]
+        group, bound = self._groups[g], bounds.bound
+        if self._at_start[g]:
+            # What starts deformed springs back; later the bound is held through all phases of an oscillation.
+            bound = group.law.swung(bound)
         limits = []
         for place, parameters in zip(group.bodies, group.law.members, strict=True):
-            for mode in group.law.modes(parameters, bounds.bound):
+            for mode in group.law.modes(parameters, bound):
                 value, cause = mode_limit(
                     self._spacing, parameters.density, mode.stiffness, mode.viscosity, self._inertia
                 )

@@ -13,17 +13,22 @@ from mpmcli.solver.particles import ParticleGroup
 
 def build_gpu_step(
     grid: Grid, nodes: NodeUpdate, particles: ParticleUpdate, groups: Sequence[ParticleGroup], gravity: Gravity
-) -> Callable[[float, float], None]:
-    """Build the kernel of a step (dt, kick) for these groups and nothing else."""
+) -> Callable[[float, float, float], None]:
+    """Build the kernel of a step (dt, kick, relaxed) for these groups and nothing else."""
     numbered = tuple(enumerate(groups))
 
     @ti.kernel
-    def step(dt: float, kick: float):
+    def step(dt: float, kick: float, relaxed: float):
         for q in range(grid.box_nodes()):
             grid.clear(grid.linear_index(grid.box_node(q)))
         for g, group in ti.static(numbered):
             for p in range(group.count):
-                particles.scatter(g, group, p, kick, True)
+                particles.scatter(g, group, p, kick, relaxed, True)
+        for g, group in ti.static(numbered):
+            if ti.static(group.law.relaxes):
+                for p in range(group.count):
+                    if relaxed > 0.0:
+                        particles.relax(group, p, relaxed)
         if ti.static(nodes.needs_contact):
             for q in range(nodes.images.plane_nodes(grid)):
                 nodes.images.find_contact(grid, q, gravity.in_step(kick))

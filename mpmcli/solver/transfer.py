@@ -81,6 +81,17 @@ def scatter_before(
 
 
 @ti.func
+def scatter_volume(x: ti.template(), volume: float, grid: ti.template(), atomic: ti.template()):
+    """Add the volume of a particle at rest, m^3, to `grid.filling`."""
+    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
+    w = grid.scheme.spline.weights(distance)
+    middle = ti.Vector.zero(float, grid.width)
+    middle[ti.static(grid.dimension)] = volume
+    change = ti.Matrix.zero(float, ti.static(grid.dimension), grid.width)
+    add_linear(grid.filling, grid, grid.linear_index(base), w, middle, change, atomic)
+
+
+@ti.func
 def add_linear(
     field: ti.template(),
     grid: ti.template(),

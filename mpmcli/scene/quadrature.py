@@ -1,0 +1,192 @@
+"""Integrals and extremes of what depends on time alone, which miss no pulse, however short it is.
+
+An interval of time is halved until the bounds of interval arithmetic agree with samples: a pulse between two samples
+shows in the bounds.
+"""
+
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.scene.expression import Tree, evaluate
+from mpmcli.scene.intervals import bounds_of
+
+# Nodes and weights of Gauss and Legendre's rule on (-1, 1).
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
+# A part is fine where the bounds are no wider than this many times the range of the samples (an expression in which
+# time occurs once has 1, and samples miss a tenth of it), or where all that they leave open is this share of the whole:
+# of an integral, and of a search.
+RATIO, OPEN, SEEN = 16.0, 1e-13, 1e-7
+# And where the rule of its halves differs from its own by no more than this share of the whole.
+AGREEMENT = 1e-13
+# The first parts, and where a part is cut in two: uneven, as a rule agrees with that of even halves by chance where
+# a jump lies in the middle.
+FIRST, CUT = np.array([0.0, 0.23, 0.48, 0.77, 1.0]), 0.46
+# Halvings at most: the edge of a pulse is found to rounding. Parts at most, after which the samples must do.
+DEPTH, MOST_PARTS = 60, 2048
+# Windows of a run that are subdivided for means, and windows kept.
+WINDOWS, KEPT = 128, 8
+
+
+@dataclass(frozen=True)
+class Parts:
+    """A subdivision of an interval of time.
+
+    Attributes:
+        low, high: ends of the parts, (n,), s.
+        values: at the nodes of each, (n, NODES).
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    values: np.ndarray
+
+    def times(self) -> np.ndarray:
+        """Return the times of the nodes, (n, NODES), s."""
+        return 0.5 * (self.low + self.high)[:, None] + 0.5 * (self.high - self.low)[:, None] * NODES
+
+
+def parts_of(tree: Tree, start: float, end: float, *, precise: bool = True) -> Parts:
+    """Subdivide the time from `start` to `end` (s) so that every part of a tree of t is resolved.
+
+    Args:
+        tree: of the name t alone; a condition counts 1 or 0.
+        start, end: of the interval, s.
+        precise: whether the parts suit an integral; otherwise every feature is found and no more.
+    """
+    with np.errstate(all="ignore"):
+        return _divided(tree, start, end, precise=precise)
+
+
+def _divided(tree: Tree, start: float, end: float, *, precise: bool) -> Parts:
+    edges = start + (end - start) * FIRST
+    low, high = edges[:-1], edges[1:]
+    done: list[tuple[np.ndarray, ...]] = []
+    count, whole = 0, 0.0
+    for depth in range(DEPTH):
+        middle = low + CUT * (high - low)
+        # Of each part, and of its halves.
+        values, first, second = _values(tree, (low, low, middle), (high, middle, high))
+        least, most = (np.broadcast_to(side, low.shape) for side in bounds_of(tree, {"t": (low, high)}))
+        width = np.where(np.isfinite(most - least), most - least, np.inf)
+        if depth == 0:
+            sizes = np.abs(np.concatenate([values.ravel(), least, most]))
+            whole = float(np.max(sizes, initial=1e-300, where=np.isfinite(sizes))) * (end - start)
+        fine = (width <= RATIO * np.ptp(values, axis=1)) | (width * (high - low) <= (OPEN if precise else SEEN) * whole)
+        if precise:
+            halves = _rule(first, low, middle) + _rule(second, middle, high)
+            fine &= np.abs(halves - _rule(values, low, high)) <= AGREEMENT * whole
+        fine |= ~np.isfinite(values).all(axis=1)
+        if depth == DEPTH - 1 or count + 2 * len(low) > MOST_PARTS:
+            fine = np.ones_like(fine)
+        done.append((low[fine], high[fine], values[fine]))
+        count += int(fine.sum())
+        low, middle, high = low[~fine], middle[~fine], high[~fine]
+        if not len(low):
+            break
+        low, high = np.concatenate([low, middle]), np.concatenate([middle, high])
+    order = np.argsort(np.concatenate([entry[0] for entry in done]), kind="stable")
+    return Parts(*(np.concatenate(column)[order] for column in zip(*done, strict=True)))
+
+
+def _antiderivatives() -> np.ndarray:
+    """Return the integral from -1 of each node's Lagrange polynomial, as coefficients of powers, (NODES, NODES + 1)."""
+    powers = np.linalg.inv(np.vander(NODES, increasing=True)).T
+    integrals = np.concatenate([np.zeros((len(NODES), 1)), powers / np.arange(1, len(NODES) + 1)], axis=1)
+    integrals[:, 0] = -(integrals * (-1.0) ** np.arange(len(NODES) + 1)).sum(axis=1)
+    return integrals
+
+
+ANTIDERIVATIVES = _antiderivatives()
+
+
+class _Window:
+    """The integral of a tree of t from one time on, by the polynomials of its parts."""
+
+    def __init__(self, tree: Tree, start: float, end: float) -> None:
+        parts = parts_of(tree, start, end)
+        half = 0.5 * (parts.high - parts.low)
+        coefficients = parts.values @ ANTIDERIVATIVES * half[:, None]
+        self._low, self._middle, self._half = parts.low.tolist(), (parts.low + half).tolist(), half.tolist()
+        before = np.concatenate([[0.0], np.cumsum(_rule(parts.values, parts.low, parts.high))[:-1]])
+        coefficients[:, 0] += before
+        self._coefficients = coefficients[:, ::-1].tolist()
+
+    def __call__(self, time: float) -> float:
+        """Return the integral up to a time, s."""
+        k = max(0, bisect_right(self._low, time) - 1)
+        place = (time - self._middle[k]) / self._half[k]
+        result = 0.0
+        for coefficient in self._coefficients[k]:
+            result = result * place + coefficient
+        return result
+
+
+class Mean:
+    """Means of a tree of t over intervals of a run.
+
+    The run is divided into WINDOWS, each of which is subdivided once, so that a mean costs some microseconds. It does
+    not depend on what was asked for before.
+    """
+
+    def __init__(self, tree: Tree, end: float) -> None:
+        """Prepare for a run of `end` seconds."""
+        self._tree = tree
+        self._width = end / WINDOWS
+        self._kept: dict[int, _Window] = {}
+
+    def __call__(self, start: float, end: float) -> float:
+        """Return the mean between two times, s; the value where they are the same."""
+        if not end > start:
+            return float(evaluate(self._tree, {"t": start}))
+        first, last = (math.floor(time / self._width) for time in (start, end))
+        total = 0.0
+        for k in range(first, last + 1):
+            window = self._window(k)
+            low, high = max(start, k * self._width), min(end, (k + 1) * self._width)
+            if high > low:
+                total += window(high) - window(low)
+        return total / (end - start)
+
+    def _window(self, k: int) -> _Window:
+        if k not in self._kept:
+            if len(self._kept) >= KEPT:
+                self._kept.clear()
+            self._kept[k] = _Window(self._tree, k * self._width, (k + 1) * self._width)
+        return self._kept[k]
+
+
+def largest_of(tree: Tree, start: float, end: float) -> float:
+    """Return a bound on |value| of a tree of t between two times, s; of the samples where bounds are not known."""
+    low, high = bounds_of(tree, {"t": (np.float64(start), np.float64(max(start, end)))})
+    largest = float(max(-low, high))
+    if math.isfinite(largest):
+        return largest
+    found = [abs(float(evaluate(tree, {"t": time}))) for time in (start, *telling_times(tree, start, end))]
+    return max((value for value in found if math.isfinite(value)), default=0.0)
+
+
+def telling_times(tree: Tree, start: float, end: float) -> list[float]:
+    """Return the times between `start` and `end`, s, at which a tree of t is smallest and largest."""
+    if not end > start:
+        return [start]
+    parts = parts_of(tree, start, end, precise=False)
+    times = parts.times()
+    values = np.where(np.isfinite(parts.values), parts.values, np.nan)
+    if np.isnan(values).all():
+        return [start]
+    return sorted({float(times.flat[np.nanargmin(values)]), float(times.flat[np.nanargmax(values)])})
+
+
+def _values(tree: Tree, low: Sequence[np.ndarray], high: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the values at the nodes of each part of each series, (series, n, NODES); a condition is 1 or 0."""
+    a, b = np.stack(low), np.stack(high)
+    times = 0.5 * (a + b)[..., None] + 0.5 * (b - a)[..., None] * NODES
+    return np.broadcast_to(evaluate(tree, {"t": times}), times.shape).astype(np.float64)
+
+
+def _rule(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    return 0.5 * (high - low) * (values @ WEIGHTS)

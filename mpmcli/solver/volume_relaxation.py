@@ -1,0 +1,156 @@
+"""Relaxes the volumes of particles towards those that the grid sees (docs/theory.md, 5.11).
+
+Only laws that ask for it (`Law.relaxes`) have any of this compiled, and only one step in INTERVAL does it.
+"""
+
+from collections.abc import Sequence
+
+import taichi as ti
+
+from mpmcli.materials.law import Law
+from mpmcli.materials.volume_relaxation import FULL
+from mpmcli.scene import Scene
+from mpmcli.solver.particle_arrays import MASS, VOLUME
+from mpmcli.solver.splines import PAD
+
+# Steps from one relaxation to the next.
+INTERVAL = 50
+
+
+def needs_filling(scene: Scene, laws: Sequence[Law]) -> bool:
+    """Return whether nodes keep the volume scattered to them: with one density alone it follows from their mass."""
+    return any(law.relaxes for law in laws) and len({body.material.density for body in scene.bodies}) > 1
+
+
+@ti.func
+def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(), p: int, x: ti.template(), time: float):
+    """Relax the volume of particle p, at x, towards what the nodes hold, over a time, s.
+
+    Args:
+        last: node of the upper walls per axis.
+
+    Returns:
+        The change of the logarithm of its volume, without sign.
+    """
+    row = group.row(p)
+    # Fraction of a cell that a node's mass fills, or its volume where nodes keep that.
+    scale = row[VOLUME] / row[MASS]
+    if ti.static(grid.keeps_filling):
+        scale = 1.0
+    for _ in ti.static(range(grid.dimension)):
+        scale *= grid.inverse_spacing
+    held, least = held_around(x, grid, last)
+    change = 0.0
+    if least * scale > FULL:
+        deformation, inner, change = group.law.relax(
+            group.stored(p),
+            group.inner(p),
+            1.0 / (held * scale),
+            ti.select(held_beside(x, grid, last) * scale > FULL, 1.0, 0.0),
+            time * grid.inverse_spacing,
+            group.constants(p),
+        )
+        group.store(p, deformation, inner)
+    return change
+
+
+@ti.func
+def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
+    """Return the mean over the stencil of a point, by its weights, of the mass of nodes, kg, and the smallest of them.
+
+    Where nodes keep the volume scattered to them that is taken instead, m^3. The nodes are as P2G left them.
+    """
+    d = ti.static(grid.dimension)
+    # Nodes inside a wall, and behind it, that particles beyond them reach.
+    reach = ti.static(grid.scheme.spline.nodes - 2)
+    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
+    w = grid.scheme.spline.weights(distance)
+    first = grid.linear_index(base)
+    near_wall = False
+    for a in ti.static(range(d)):
+        near_wall = near_wall or base[a] <= PAD + reach or base[a] + 1 + 2 * reach >= last[a]
+    mean = 0.0
+    least = 1e30
+    if near_wall:
+        for o, _line_node in ti.static(grid.lines):
+            for k in ti.static(range(grid.scheme.spline.nodes)):
+                weight = w[k][d - 1]
+                node = base
+                node[d - 1] += k
+                for a in ti.static(range(d - 1)):
+                    weight *= w[o[a]][a]
+                    node[a] += o[a]
+                held = mirrored_sum(node, grid, last, reach)
+                mean += held * weight
+                least = ti.min(least, held)
+    else:
+        # All numbers of a node at once, which the compiler turns into vector instructions.
+        total = ti.Vector.zero(float, grid.width)
+        smallest = grid.holding[first]
+        for o, line_node in ti.static(grid.lines):
+            line_weight = 1.0
+            for a in ti.static(range(d - 1)):
+                line_weight *= w[o[a]][a]
+            for k in ti.static(range(grid.scheme.spline.nodes)):
+                held = grid.holding[first + line_node + k]
+                total += held * (line_weight * w[k][d - 1])
+                smallest = ti.min(smallest, held)
+        mean = total[d]
+        least = smallest[d]
+    return mean, least
+
+
+@ti.func
+def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
+    """Return the least that the nodes beside the stencil of a point hold, two along each axis.
+
+    Where there is air the stencil reaches the surface, and the kernel sees less than what is there.
+    """
+    d = ti.static(grid.dimension)
+    base, _ = grid.scheme.spline.stencil(x, grid.inverse_spacing)
+    least = 1e30
+    for a in ti.static(range(d)):
+        for offset in ti.static((-1, grid.scheme.spline.nodes)):
+            node = base
+            for b in ti.static(range(d)):
+                node[b] += offset if ti.static(b == a) else 1
+            share = 1.0
+            used = True
+            for b in ti.static(range(d)):
+                if node[b] < PAD:
+                    node[b] = 2 * PAD - node[b]
+                elif node[b] > last[b]:
+                    node[b] = 2 * last[b] - node[b]
+                if node[b] == PAD or node[b] == last[b]:
+                    share *= 2.0
+                # Nodes that are not in use hold what was there before.
+                used = used and node[b] >= grid.box[0, b] and node[b] < grid.box[0, b] + grid.box[1, b]
+            held = 0.0
+            if used:
+                held = grid.holding[grid.linear_index(node)][d] * share
+            least = ti.min(least, held)
+    return least
+
+
+@ti.func
+def mirrored_sum(node: ti.template(), grid: ti.template(), last: ti.template(), reach: ti.template()):
+    """Return what a node and its mirror images behind walls hold; one on a wall, half of whose cell is inside, twice.
+
+    It is a matter of geometry: a wall that has let go mirrors, too, as do those that set velocities to zero.
+    """
+    d = ti.static(grid.dimension)
+    total = 0.0
+    for images in range(ti.static(2**d)):
+        place = node
+        exists = True
+        for a in ti.static(range(d)):
+            if images >> a & 1 == 1:
+                if node[a] <= PAD + reach:
+                    place[a] = 2 * PAD - node[a]
+                elif node[a] >= last[a] - reach:
+                    place[a] = 2 * last[a] - node[a]
+                else:
+                    exists = False
+        if exists:
+            total += grid.holding[grid.linear_index(place)][d]
+    return total

@@ -1,0 +1,49 @@
+"""What the check makes of bodies that start deformed, against the first step of the run."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from check_scenes import FLUID, SOLID, box, check, loaded
+
+from mpmcli.check.facts import SceneFacts
+from mpmcli.check.start import starts_of
+from mpmcli.solver.solver import Solver
+
+FREE = {"domain": {"gravity": [0.0, 0.0]}, "shape": box([0.3, 0.3], [0.5, 0.5])}
+SUCKING = FLUID | {"tension_cutoff": False}
+CASES = {
+    "a stretched solid": {"material": SOLID, "deformation": [[4.0, 0.0], [0.0, 0.25]]},
+    "a solid pressed unevenly": {"material": SOLID, "deformation": [["0.9 - 0.2 * X", 0.0], [0.1, 0.8]]},
+    "compressed gas": {"material": FLUID, "deformation": 0.2},
+    "a fluid let go under tension": {"material": SUCKING, "deformation": "1.1 + 0.1 * sin(40 * X)"},
+    "a column at rest": {"material": FLUID, "initial_pressure": "hydrostatic", "domain": {"gravity": [0.0, -10.0]}},
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_first_step_is_the_run_s(name: str, backend_of: Callable) -> None:
+    """The check's step at the start is that of the solver, which measures every particle."""
+    asked = FREE | CASES[name]
+    checked = check(**asked)
+    backend = backend_of("f64")
+    solver = Solver(loaded(**asked, solver={"precision": "f64"}).scene, backend)
+    assert checked.step_at_start == pytest.approx(solver.stable_step()[0], rel=1e-9)
+    assert checked.step <= checked.step_at_start
+    assert "at-rest" not in [finding.rule for finding in checked.findings]
+
+
+def test_deformation_is_found_where_particles_are() -> None:
+    """A narrow peak of J on a single row of particles: the lattice of the check is that of the sampling."""
+    start = starts_of(loaded(**FREE, material=SUCKING, deformation="3 if abs(X - 0.30390625) < 1e-4 else 1").scene)[0]
+    assert (start.bound.volume_ratio_min, start.bound.volume_ratio_max) == (1.0, 3.0)
+    nowhere = starts_of(loaded(**FREE, material=SUCKING, deformation="3 if abs(X - 0.3) < 1e-4 else 1").scene)[0]
+    assert not nowhere.deformed
+
+
+def test_stored_energy_becomes_speed() -> None:
+    """(1/2) density v^2 = W; for p = K (1/J - 1), W = K (J - 1 - ln J)."""
+    facts = SceneFacts(loaded(**FREE, material=FLUID, deformation=0.2).scene)
+    expected = np.sqrt(2 * FLUID["bulk_modulus"] * (0.2 - 1 - np.log(0.2)) / FLUID["density"])
+    assert facts.bounds.speed == pytest.approx(expected)
+    assert facts.first_contact == 0.0
