@@ -41,12 +41,11 @@ def volume_error(x: np.ndarray, volume: np.ndarray, flows: np.ndarray, spacing: 
     inside = held > 0
     if some:
         inside &= np.bincount(index[~flows], minlength=held.size).reshape(shape) == 0
+    before = ((), (slice(None),), (slice(None), slice(None)))
     for axis, count in enumerate(cells):
-        line = np.moveaxis(inside, axis, 0)
-        line[0], line[-1] = low[axis] == 0, high[axis] == count - 1
-    for axis in range(len(cells)):
-        line = np.moveaxis(inside, axis, 0)
-        inside = np.moveaxis(line[:-2] & line[1:-1] & line[2:], 0, axis)
+        inside[(*before[axis], 0)], inside[(*before[axis], -1)] = low[axis] == 0, high[axis] == count - 1
+    for own in before[: len(cells)]:
+        inside = inside[(*own, slice(-2))] & inside[(*own, slice(1, -1))] & inside[(*own, slice(2, None))]
     count = int(inside.sum())
     if count < FEWEST:
         return 0.0
