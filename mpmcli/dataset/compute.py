@@ -100,12 +100,13 @@ class _Trial:
 def _compute(task: Task) -> list[Row]:
     """Draw trajectories, run each until its verdict is accepted or no retry is left, and store them."""
     began = time.perf_counter()
+    # A backend that is not there ends the sweep, not a trajectory.
+    _runner(task)
     rows: dict[int, Row] = {}
     waiting: list[_Trial] = []
     for number in task.numbers:
         row = Row.failed(number, task.sweep.split_of(number))
         try:
-            _runner(task)
             drawn = draw(task.sweep, number)
             row = replace(row, draws=json.dumps(drawn.values, sort_keys=True))
             loaded = drawn.scene(_kept.laws)

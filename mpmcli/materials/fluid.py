@@ -9,7 +9,7 @@ import taichi as ti
 from pydantic import Field
 
 from mpmcli.materials.law import CARRIED, Law, Mode, StateBound
-from mpmcli.materials.volume_relaxation import DEAD_BAND, SCATTERED, volume_change
+from mpmcli.materials.volume_relaxation import SCATTERED, volume_change
 from mpmcli.scene.knobs import Knob
 from mpmcli.scene.material import MaterialParameters, SceneBounds
 from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
@@ -251,7 +251,7 @@ class Fluid(Law):
         constants: ti.template(),
     ):
         """Move J towards what the grid sees."""
-        change = volume_change(deformation, seen, constants[SOUND_SPEED] * time, RELAXATION, DEAD_BAND, opens)
+        change = volume_change(deformation, seen, constants[SOUND_SPEED] * time, RELAXATION, opens)
         return deformation + change, internal, ti.abs(change) / deformation
 
     @ti.func

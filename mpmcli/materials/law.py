@@ -107,7 +107,6 @@ class Law(ABC):
     deformation: ClassVar[Literal["J", "F"]]
     projects: bool = False
     relaxes: bool = False
-    relaxes: bool = False
     coherent: ClassVar[bool] = False
     flows: ClassVar[bool] = False
     stiffness_parameters: ClassVar[tuple[str, ...]] = ("bulk_modulus", "youngs_modulus", "shear_modulus")

@@ -13,15 +13,14 @@ SCATTERED = 2.0
 
 
 @ti.func
-def volume_change(J: float, seen: float, crossings: float, rate: float, opening: float, opens: float):
+def volume_change(J: float, seen: float, crossings: float, rate: float, opens: float):
     """Return by how much the volume ratio J changes where the grid sees `seen`.
 
     Args:
         crossings: of a cell by sound, in the time since the last relaxation.
         rate: share of the difference that is made up while sound crosses a cell.
-        opening: the dead band where the grid sees a larger volume; elsewhere it is DEAD_BAND.
         opens: 1 where the volume may grow, else 0.
     """
     gap = seen - J
-    change = opens * ti.max(gap - opening, 0.0) + ti.min(gap + DEAD_BAND, 0.0)
+    change = opens * ti.max(gap - DEAD_BAND, 0.0) + ti.min(gap + DEAD_BAND, 0.0)
     return change * (rate * crossings / (1.0 + rate * crossings))

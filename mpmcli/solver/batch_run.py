@@ -12,18 +12,15 @@ from mpmcli.solver.batch import Batch
 from mpmcli.solver.batch_group import BatchGroup
 from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, GOING, HELD, IDLE, LIMITS, LOST, MEASURE
 from mpmcli.solver.external_forces import ExternalForces
-from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.groups import require_inside
 from mpmcli.solver.held_bound import HeldBound
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.particles import initial_state, table_of
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.run import COLLAPSE, Run
-from mpmcli.solver.snapshot import fill, read_group
 from mpmcli.solver.state import Progress
 from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
 from mpmcli.solver.step_control import StepControl, StepCounters
-from mpmcli.solver.sums import Sums
 
 # Numbers of `Progress` that the kernel changes.
 FOLLOWED = ("time", "last_step", "unrelaxed", "speed", "courant", "drift", "owed")
@@ -56,6 +53,7 @@ class BatchRun(Run):
         super().__init__(scene, batch.backend, particles, force=force)
         require_inside(scene, self._particles)
         self.batch, self.slot = batch, slot
+        self._readers, self._observations = batch.readers, batch.observations
         self._begun = False
         self._numbers, self._counts = batch.numbers[slot], batch.counts[slot]
         self._real, self._count = batch.layout.real, batch.layout.count
@@ -277,16 +275,3 @@ class BatchRun(Run):
             # Frame 0 is always there.
             if self.step_count and stop():
                 raise KeyboardInterrupt
-
-    def _observe(self, arrays: FrameArrays) -> list[Sums]:
-        snapshots = [read_group(group) for group in self.groups]
-        stress = arrays.first["tau"] >= 0
-        seen = [
-            observation(self.last_step, group.first, group.count, stress=stress, stored=(s.deformation, s.internal))
-            for observation, group, s in zip(self.batch.observations, self.groups, snapshots, strict=True)
-        ]
-        return fill(arrays, snapshots, seen)
-
-    def _read(self, g: int, arrays: FrameArrays) -> Sums:
-        group = self.groups[g]
-        return self.batch.readers[g](self.last_step, group.first, group.count, arrays)

@@ -48,7 +48,7 @@ class ParticleGroup(ParticleArrays):
 
     Attributes:
         bodies: index in the scene of each body of the group.
-        count: number of particles n.
+        first: index of its first particle in the fields; count: number of particles n.
         rows: host copy of `table`.
     """
 
@@ -66,7 +66,7 @@ class ParticleGroup(ParticleArrays):
         keeps_initial: bool = False,
     ) -> None:
         self.bodies = tuple(bodies)
-        self.count = sum(len(b.position) for b in particles)
+        self.first, self.count = 0, sum(len(b.position) for b in particles)
         rows = table_of(law, particles)
         super().__init__(
             law,

@@ -1,7 +1,7 @@
 """What any run has on the host: its limits, its frames, and how it stops when it becomes unstable."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,8 @@ from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError, cause_of, diagnose, first_unsound, rate_of_change
 from mpmcli.solver.frame_arrays import FrameArrays, ParticleConstants
-from mpmcli.solver.snapshot import Snapshot, read_group
+from mpmcli.solver.observe import Observation
+from mpmcli.solver.snapshot import Snapshot, fill, read_group
 from mpmcli.solver.state import Progress
 from mpmcli.solver.sums import Sums, ledger_row, ledger_sums
 from mpmcli.solver.volume_error import volume_error
@@ -39,6 +40,9 @@ class Run:
 
     groups: Sequence
     state: Progress
+    # What reads frames of each group: on the CPU, and on a GPU.
+    _readers: Sequence[Callable[..., Sums]]
+    _observations: Sequence[Callable[..., Observation]]
 
     def __init__(
         self, scene: Scene, backend: Backend, particles: list[BodyParticles] | None = None, *, force: bool = False
@@ -206,9 +210,16 @@ class Run:
         return ParticleConstants.of(self.groups, [len(b.position) for b in self._particles])
 
     def _observe(self, arrays: FrameArrays) -> list[Sums]:
-        """Fill all rows of a frame on a GPU; return the sums of each group."""
-        raise NotImplementedError
+        """Fill all rows of a frame with numpy, as on a GPU; return the sums of each group."""
+        snapshots = [read_group(group) for group in self.groups]
+        stress = arrays.first["tau"] >= 0
+        seen = [
+            observation(self.last_step, group.first, group.count, stress=stress, stored=(s.deformation, s.internal))
+            for observation, group, s in zip(self._observations, self.groups, snapshots, strict=True)
+        ]
+        return fill(arrays, snapshots, seen)
 
     def _read(self, g: int, arrays: FrameArrays) -> Sums:
         """Fill the rows of the g-th group on the CPU; see `build_frame_reader`."""
-        raise NotImplementedError
+        group = self.groups[g]
+        return self._readers[g](self.last_step, group.first, group.count, arrays)

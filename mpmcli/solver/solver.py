@@ -9,18 +9,15 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.external_forces import ExternalForces
-from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.frame_reader import build_frame_reader
 from mpmcli.solver.groups import build_groups
 from mpmcli.solver.kernels import Kernels
 from mpmcli.solver.observe import build_observation
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.run import COLLAPSE, Run
-from mpmcli.solver.snapshot import fill, read_group
 from mpmcli.solver.state import State
 from mpmcli.solver.state_bounds import build_measurement
 from mpmcli.solver.step_control import StepControl
-from mpmcli.solver.sums import Sums
 
 # Cells that a particle of a GPU run may move in a step beyond the estimate.
 UNSEEN = 0.05
@@ -153,18 +150,6 @@ class Solver(Run):
     def _lost(self) -> list[int | None]:
         """Return a lost particle of each group, in solver order, None where none is known."""
         return [None if p == NOT_LOST else int(p) for p in self._kernels.particles.lost.to_numpy()]
-
-    def _observe(self, arrays: FrameArrays) -> list[Sums]:
-        snapshots = [read_group(group) for group in self.groups]
-        stress = arrays.first["tau"] >= 0
-        seen = [
-            observation(self.last_step, 0, len(s.id), stress=stress, stored=(s.deformation, s.internal))
-            for observation, s in zip(self._observations, snapshots, strict=True)
-        ]
-        return fill(arrays, snapshots, seen)
-
-    def _read(self, g: int, arrays: FrameArrays) -> Sums:
-        return self._readers[g](self.last_step, 0, self.groups[g].count, arrays)
 
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield the state as it is and then one frame for each output time to come, with its ledger row.

@@ -42,8 +42,10 @@ class Progress:
         step_control, external_forces: what is known of the bounds on the next step.
     """
 
-    NUMBERS = ("time", "step_count", "last_step", "speed", "courant", "drift", "first_stable_step", "owed")
-    RELAXATION = ("unrelaxed", "unrelaxed_steps")
+    NUMBERS = (
+        *("time", "step_count", "last_step", "speed", "courant", "drift", "first_stable_step"),
+        *("owed", "unrelaxed", "unrelaxed_steps"),
+    )
 
     def __init__(self, step_control: StepControl, external_forces: ExternalForces) -> None:
         self.step_control = step_control
@@ -102,7 +104,7 @@ class State(Progress):
 
     def save(self) -> SavedState:
         """Copy the state to the host."""
-        numbers = {name: getattr(self, name) for name in (*self.NUMBERS, *self.RELAXATION)}
+        numbers = {name: getattr(self, name) for name in self.NUMBERS}
         numbers["step_control"] = self.step_control.save()
         numbers["external_forces"] = self.external_forces.save()
         return SavedState(numbers, {name: field.to_numpy() for name, field in self._fields().items()})
@@ -121,9 +123,6 @@ class State(Progress):
             field.from_numpy(saved.arrays[name])
         for name in self.NUMBERS:
             setattr(self, name, saved.numbers[name])
-        # States written before volumes were relaxed lack these.
-        for name in self.RELAXATION:
-            setattr(self, name, saved.numbers.get(name, 0))
         self.step_control.load(saved.numbers["step_control"])
         self.external_forces.load(saved.numbers["external_forces"])
         self._kernels.particles.lost.fill(NOT_LOST)
