@@ -11,12 +11,13 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene, sample_bodies
-from mpmcli.solver.batch import Batch, Kind, can_batch
+from mpmcli.solver.batch import Batch, Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.solver import Solver
 
 # By name: materials, dimension, and further tables of the scene.
+DRIVEN = ("gravity of time", "a force of the place", "forces on one body of two")
 SCENES = {name: ((name,), 2, {}) for name in state_run.MATERIALS} | {
     "two laws, two bodies of one": (("sand", "fluid", "sand"), 2, {}),
     "3D, AFLIP": (("snow",), 3, {"solver": {"transfer": "aflip", "flip": 0.9}}),
@@ -24,14 +25,32 @@ SCENES = {name: ((name,), 2, {}) for name in state_run.MATERIALS} | {
     "zeroed walls, PIC": (("fluid",), 2, {"solver": {"walls": "zeroed", "transfer": "pic"}}),
     "slip and stick": (("sand",), 2, {"domain": {"walls": {"default": "slip", "y_min": "stick"}}}),
 }
+
+
+def driven(k: int) -> dict[str, tuple]:
+    """Return materials, gravity and forces by name, with numbers that depend on k."""
+    gravity = [f"{k} * sin(40 * t)", f"-9.81 * {k} - (3000 if t % 0.03 < {0.0005 * k} else 0)"]
+    everywhere = [f"-{50 * k} * (x - 0.{3 + k})", f"{9 * k} * cos(30 * t) if x > {0.1 * k} else {k}"]
+    swirl = [f"{20 * k} * (Y - 0.3)", f"-{20 * k} * (X - x) * (1 if t < {0.02 * k} else 0.5)**2"]
+    return {
+        "gravity of time": (("fluid",), gravity, []),
+        "a force of the place": (("neo_hookean",), [0.0, -9.81], [(None, everywhere)]),
+        "forces on one body of two": (("sand", "fluid", "sand"), gravity, [("body 2", swirl), (None, everywhere)]),
+    }
+
+
 # Kept in the default suite; the others carry the marker slow.
-USUAL = ("sand", "two laws, two bodies of one", "3D, AFLIP")
+USUAL = ("sand", "two laws, two bodies of one", "3D, AFLIP", "forces on one body of two")
 Output = list[tuple[Frame, LedgerRow]]
 
 
 def scene_named(name: str, other: bool = False) -> Scene:
     """Return blocks that hit a floor; the `other` one has other cells, parameters, gravity, sizes and times."""
-    materials, d, more = SCENES[name]
+    if name in DRIVEN:
+        materials, gravity, forces = driven(1 + other)[name]
+        d, more = 2, {"domain": {"gravity": gravity, "origin": [-0.1 * other, -0.02]}}
+    else:
+        (materials, d, more), forces = SCENES[name], []
     width = 0.8 / len(materials)
     bodies = [
         {
@@ -54,6 +73,7 @@ def scene_named(name: str, other: bool = False) -> Scene:
         "time": {"end": 0.05 if other else 0.06, "frames": 3, "safety": 0.7 if other else 0.8},
         "output": {"fields": ["velocity", "stress", "volume_ratio", "deformation_gradient"]},
         "bodies": bodies,
+        "forces": [{"acceleration": a} | ({"body": body} if body else {}) for body, a in forces],
         "solver": more.get("solver", {}),
     }
     return parse_scene(data, laws=parameter_models(), source=name).scene
@@ -171,15 +191,12 @@ def test_what_is_compiled_decides_on_the_kind() -> None:
         scene = scene_named(name).model_copy(update=changes)
         return Kind.of(scene, sample_bodies(scene))
 
-    sand = scene_named("sand")
     wide = kind_of("sand").joined(Kind.of(other := scene_named("sand", other=True), sample_bodies(other)))
     assert wide.cells == (20, 20)
     assert wide.particles == kind_of("sand").particles
     assert kind_of("sand").joined(kind_of("fluid")) is None
     assert kind_of("sand").joined(kind_of("slip and stick")) is None
     assert kind_of("sand").joined(kind_of("two laws, two bodies of one")) is None
-    assert can_batch(sand)
-    assert not can_batch(state_run.scene_named("forces"))
 
 
 def test_kinds_are_equal_where_flags_are() -> None:

@@ -16,10 +16,10 @@ from mpmcli.solver.solver import Solver
 pytestmark = pytest.mark.gpu
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["neo_hookean", *(pytest.param(n, marks=pytest.mark.slow) for n in ("two laws, two bodies of one", "3D, AFLIP"))],
-)
+SLOW = ("neo_hookean", "two laws, two bodies of one", "3D, AFLIP", "forces on one body of two")
+
+
+@pytest.mark.parametrize("name", ["a force of the place", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)])
 def test_runs_follow_those_on_the_cpu(backend_of: Callable, name: str) -> None:
     """Two runs in which all numbers differ: as many steps, and what sums in another order changes by round-off."""
     scenes = [scene_named(name), scene_named(name, other=True)]

@@ -103,17 +103,33 @@ def _antiderivatives() -> np.ndarray:
 ANTIDERIVATIVES = _antiderivatives()
 
 
+# Columns of the rows of a window: start, middle and half length of a part, s; a bound on |value| in it; coefficients of
+# the integral from the start of the window in powers of the place within the part, -1 to 1, the highest first.
+LOW, MIDDLE, HALF, BOUND, COEFFICIENTS = range(5)
+COLUMNS = COEFFICIENTS + len(NODES) + 1
+
+
+def window_rows(tree: Tree, start: float, end: float) -> np.ndarray:
+    """Return the integral of a tree of t from `start` to `end`, s, by the polynomials of its parts, (n, COLUMNS)."""
+    parts = parts_of(tree, start, end)
+    half = 0.5 * (parts.high - parts.low)
+    coefficients = parts.values @ ANTIDERIVATIVES * half[:, None]
+    before = np.concatenate([[0.0], np.cumsum(_rule(parts.values, parts.low, parts.high))[:-1]])
+    coefficients[:, 0] += before
+    low, high = (np.broadcast_to(side, half.shape) for side in bounds_of(tree, {"t": (parts.low, parts.high)}))
+    bound = np.maximum(np.abs(low), np.abs(high))
+    sampled = np.abs(np.where(np.isfinite(parts.values), parts.values, 0.0)).max(axis=1)
+    bound = np.where(np.isfinite(bound), bound, sampled)
+    return np.column_stack([parts.low, parts.low + half, half, bound, coefficients[:, ::-1]])
+
+
 class _Window:
-    """The integral of a tree of t from one time on, by the polynomials of its parts."""
+    """The integral of a tree of t from one time on."""
 
     def __init__(self, tree: Tree, start: float, end: float) -> None:
-        parts = parts_of(tree, start, end)
-        half = 0.5 * (parts.high - parts.low)
-        coefficients = parts.values @ ANTIDERIVATIVES * half[:, None]
-        self._low, self._middle, self._half = parts.low.tolist(), (parts.low + half).tolist(), half.tolist()
-        before = np.concatenate([[0.0], np.cumsum(_rule(parts.values, parts.low, parts.high))[:-1]])
-        coefficients[:, 0] += before
-        self._coefficients = coefficients[:, ::-1].tolist()
+        self.rows = window_rows(tree, start, end)
+        self._low, self._middle, self._half = self.rows[:, [LOW, MIDDLE, HALF]].T.tolist()
+        self._coefficients = self.rows[:, COEFFICIENTS:].tolist()
 
     def __call__(self, time: float) -> float:
         """Return the integral up to a time, s."""
@@ -142,20 +158,32 @@ class Mean:
         """Return the mean between two times, s; the value where they are the same."""
         if not end > start:
             return float(evaluate(self._tree, {"t": start}))
-        first, last = (math.floor(time / self._width) for time in (start, end))
+        first, last = self.window_at(start), self.window_at(end)
         total = 0.0
         for k in range(first, last + 1):
             window = self._window(k)
-            low, high = max(start, k * self._width), min(end, (k + 1) * self._width)
+            low, high = max(start, self.start_of(k)), min(end, self.start_of(k + 1))
             if high > low:
                 total += window(high) - window(low)
         return total / (end - start)
+
+    def window_at(self, time: float) -> int:
+        """Return the window in which a time, s, lies."""
+        return math.floor(time / self._width)
+
+    def start_of(self, k: int) -> float:
+        """Return the time at which a window begins, s."""
+        return k * self._width
+
+    def rows(self, k: int) -> np.ndarray:
+        """Return what a window consists of, see `window_rows`."""
+        return self._window(k).rows
 
     def _window(self, k: int) -> _Window:
         if k not in self._kept:
             if len(self._kept) >= KEPT:
                 self._kept.clear()
-            self._kept[k] = _Window(self._tree, k * self._width, (k + 1) * self._width)
+            self._kept[k] = _Window(self._tree, self.start_of(k), self.start_of(k + 1))
         return self._kept[k]
 
 

@@ -20,6 +20,9 @@ from mpmcli.solver.batch_device import Device
 from mpmcli.solver.batch_gpu import build_gpu_launch
 from mpmcli.solver.batch_kernel import build_batch_kernel
 from mpmcli.solver.batch_layout import Layout
+from mpmcli.solver.batch_values import BatchValues, Drives
+from mpmcli.solver.external_forces import push_on
+from mpmcli.solver.forces import Gravity
 from mpmcli.solver.frame_reader import build_frame_reader
 from mpmcli.solver.grid import DRIFT, Grid, node_width
 from mpmcli.solver.held_bound import HOLD, RISE
@@ -45,6 +48,7 @@ class Kind:
         flags: of each law in the order of their names, the name and the terms that it has.
         cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
         keeps_filling: whether nodes keep the volume scattered to them.
+        drives: gravity that varies, and forces.
         members: the laws.
     """
 
@@ -57,6 +61,7 @@ class Kind:
     particles: tuple[int, ...]
     bodies: tuple[int, ...]
     keeps_filling: bool
+    drives: Drives
     members: tuple[Law, ...] = field(compare=False, repr=False)
 
     @staticmethod
@@ -78,6 +83,7 @@ class Kind:
             tuple(sum(len(particles[i].position) for i in own) for own in places),
             tuple(len(own) for own in places),
             needs_filling(scene, members),
+            Drives.of(scene, places)[0],
             members,
         )
 
@@ -93,11 +99,6 @@ class Kind:
         return wide if replace(other, **room) == wide else None
 
 
-def can_batch(scene: Scene) -> bool:
-    """Return whether a scene can run in a batch: gravity is steady, and no forces act."""
-    return scene.domain.steady and not scene.forces
-
-
 class Batch:
     """Room on the device for some runs of one kind, and the kernels that advance them.
 
@@ -107,7 +108,9 @@ class Batch:
         device: all of it.
         layout: columns of `numbers`, (runs, k) float64, and `counts`, (runs, l) int32, which the kernel reads and
             changes.
+        values: numbers that expressions read.
         readers: of frames, per law, on the CPU; observations: per law, on a GPU.
+        pushes: measurements of the forces on each law, None where there are none.
         seconds: wall time of all launches; first_seconds: of the first, which compiles the kernel.
     """
 
@@ -127,8 +130,16 @@ class Batch:
                 ti.Layout.AOS if on_cpu else ti.Layout.SOA,
                 several=True,
                 serial=on_cpu,
+                keeps_initial=forces.initial,
             )
-            for law, room, bodies in zip(kind.members, kind.particles, kind.bodies, strict=True)
+            for law, room, bodies, forces in zip(
+                kind.members, kind.particles, kind.bodies, kind.drives.forces, strict=True
+            )
+        ]
+        self.values = BatchValues(kind.drives, runs)
+        self.pushes = [
+            push_on(group, forces, bodies, self.values.device, backend)
+            for group, bodies, forces in zip(groups, kind.bodies, kind.drives.forces, strict=True)
         ]
         images = None
         if kind.settings.walls == "zeroed":
@@ -150,6 +161,8 @@ class Batch:
             walls,
             NodeUpdate(grid, images, [walls]),
             ParticleUpdate(grid, runs * len(groups), watches_box=False),
+            self.values,
+            Gravity(kind.drives.gravity, [0.0] * d, self.values.device),
         )
         self.layout = Layout(d, [len(law.internal) for law in kind.members])
         self.numbers = np.zeros((runs, self.layout.reals))

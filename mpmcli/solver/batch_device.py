@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from mpmcli.boundaries.walls import Walls
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
+from mpmcli.solver.batch_values import BatchValues
+from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.ordering import TileOrder
@@ -20,6 +22,7 @@ class Device:
     Attributes:
         runs: number of runs; room: particles of each, per group.
         groups, orders: of each law, with the particles of all runs.
+        values, gravity: numbers that expressions read, and gravity where it varies.
     """
 
     runs: int
@@ -31,6 +34,8 @@ class Device:
     walls: Walls | ZeroedWalls
     nodes: NodeUpdate
     particles: ParticleUpdate
+    values: BatchValues
+    gravity: Gravity
 
 
 def _changed(thing: object, **attributes: object) -> object:
@@ -42,8 +47,8 @@ def _changed(thing: object, **attributes: object) -> object:
 
 def views(
     device: Device, w: object, h: object, inverse: object, scale: object, box: object, last: object, extent: object
-) -> tuple[Grid, NodeUpdate, ParticleUpdate, tuple[TileOrder, ...]]:
-    """Return the grid, the updates and the orders of one run.
+) -> tuple[Grid, NodeUpdate, ParticleUpdate, tuple[TileOrder, ...], tuple[ParticleArrays, ...]]:
+    """Return the grid, the updates, the orders and the groups of one run.
 
     Args:
         w: its number. This and what follows are variables of the kernel.
@@ -66,4 +71,5 @@ def views(
     nodes = _changed(device.nodes, grid=grid, images=images, boundaries=(walls,))
     particles = _changed(device.particles, grid=grid, extent=extent, last=last, first_lost=w * len(device.groups))
     orders = tuple(_changed(order, grid=grid, first_tile=w * (order.tiles + 1)) for order in device.orders)
-    return grid, nodes, particles, orders
+    groups = tuple(group.seen_from(w) if group.pushed else group for group in device.groups)
+    return grid, nodes, particles, orders, groups

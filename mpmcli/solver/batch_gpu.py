@@ -29,7 +29,7 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     groups, room = tuple(device.groups), tuple(device.room)
     members = tuple(enumerate(groups))
     real, count = layout.real, layout.count
-    steps = BatchSteps(layout, [group.law for group in groups])
+    steps = BatchSteps(layout, [group.law for group in groups], device.values)
     lost, node_count, contact = device.particles.lost, device.grid.node_count, device.nodes.needs_contact
     under_way = ti.Vector.field(WIDTH, ti.f64, shape=runs)
     limits, stepping = ti.field(int, shape=runs), ti.field(int, shape=runs)
@@ -80,8 +80,13 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
                 own[KICK] = ti.cast(kick, float)
                 own[RELAXED] = ti.cast(steps.relaxed_in(w, dt, numbers, counts), float)
                 for a in ti.static(range(d)):
-                    own[VECTORS + a] = own[KICK] * ti.cast(numbers[w, real.gravity[a]], float)
+                    if ti.static(not device.values.gravity_varies):
+                        own[VECTORS + a] = own[KICK] * ti.cast(numbers[w, real.gravity[a]], float)
                     own[VECTORS + d + a] = ti.cast(numbers[w, real.extent[a]], float)
+                if ti.static(device.values.gravity_varies):
+                    pulled = device.gravity.in_step(own[KICK], w)
+                    for a in ti.static(range(d)):
+                        own[VECTORS + a] = pulled[a]
                 constants[w] = own
                 for g in ti.static(range(len(groups))):
                     rates[w, g] = NOTHING
@@ -90,20 +95,20 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     @ti.func
     def clear(w: int, q: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
-        grid, _nodes, _particles, _orders = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        grid, _nodes, _particles, _orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
         if q < grid.box_nodes():
             grid.clear(grid.linear_index(grid.box_node(q)))
 
     @ti.func
-    def scatter(g: ti.template(), group: ti.template(), w: int, p: int, counts: ti.template()):
+    def scatter(g: ti.template(), w: int, p: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
-        _grid, _nodes, particles, _orders = ti.static(views(device, w, h, inverse, scale, box, last, extent))
-        particles.scatter(g, group, p, constants[w][KICK], constants[w][RELAXED], True)
+        _grid, _nodes, particles, _orders, seen = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        particles.scatter(g, seen[g], p, constants[w][KICK], constants[w][RELAXED], True)
 
     @ti.func
     def relax(g: ti.template(), group: ti.template(), w: int, p: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
-        _grid, _nodes, particles, _orders = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        _grid, _nodes, particles, _orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
         change = particles.relax(group, p, constants[w][RELAXED])
         if change > changes[w, g]:
             ti.atomic_max(changes[w, g], change)
@@ -111,14 +116,14 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     @ti.func
     def find_contact(w: int, q: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
-        grid, nodes, _particles, _orders = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        grid, nodes, _particles, _orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
         if q < nodes.images.plane_nodes(grid):
             nodes.images.find_contact(grid, q, pull(w))
 
     @ti.func
     def update(w: int, q: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
-        grid, nodes, _particles, _orders = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        grid, nodes, _particles, _orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
         if q < grid.box_nodes():
             node = grid.box_node(q)
             squared = nodes.update(node, grid.linear_index(node), pull(w))
@@ -128,7 +133,7 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     @ti.func
     def advance(g: ti.template(), group: ti.template(), w: int, p: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
-        _grid, _nodes, particles, _orders = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        _grid, _nodes, particles, _orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
         rate = particles.advance(g, group, p, constants[w][STEP])
         if rate > rates[w, g]:
             ti.atomic_max(rates[w, g], rate)
@@ -157,7 +162,7 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
             for p in range(runs * room[g]):
                 w = p // room[g]
                 if stepping[w] == 1 and p % room[g] < counts[w, count.particles[g]]:
-                    scatter(g, group, w, p, counts)
+                    scatter(g, w, p, counts)
         for g, group in ti.static(members):
             if ti.static(group.law.relaxes):
                 for p in range(runs * room[g]):

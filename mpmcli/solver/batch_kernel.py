@@ -30,7 +30,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
     groups, room, threads = tuple(device.groups), tuple(device.room), device.threads
     members = tuple(enumerate(groups))
     real, count = layout.real, layout.count
-    steps = BatchSteps(layout, [group.law for group in groups])
+    steps = BatchSteps(layout, [group.law for group in groups], device.values)
     lost = device.particles.lost
     alone = threads == 1
     next_run = ti.field(int, shape=())
@@ -77,6 +77,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
         nodes: ti.template(),
         particles: ti.template(),
         orders: ti.template(),
+        seen: ti.template(),
         dt: ti.f64,
         moved: float,
         kick: float,
@@ -86,11 +87,14 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
     ):
         """Take a step; return the largest speed of a node, -1 where a particle was lost. Rates are stored."""
         gravity_step = ti.Vector.zero(float, d)
-        for a in ti.static(range(d)):
-            gravity_step[a] = kick * ti.cast(numbers[w, real.gravity[a]], float)
+        if ti.static(device.values.gravity_varies):
+            gravity_step = device.gravity.in_step(kick, w)
+        else:
+            for a in ti.static(range(d)):
+                gravity_step[a] = kick * ti.cast(numbers[w, real.gravity[a]], float)
         rows = grid.row_count()
         clear_rows(grid, 0, rows)
-        for g, group in ti.static(members):
+        for g, group in ti.static(enumerate(seen)):
             for colour in range(ti.static(device.orders[g].colours)):
                 pencils = orders[g].pencil_count(colour)
                 scatter_pencils(particles, g, group, orders[g], colour, 0, pencils, kick, relaxed)
@@ -131,7 +135,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
             extent[a] = ti.cast(numbers[w, real.extent[a]], float)
             for i in ti.static(range(2)):
                 box[i, a] = device.grid.box[w * 2 + i, a]
-        grid, nodes, particles, orders = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        grid, nodes, particles, orders, seen = ti.static(views(device, w, h, inverse, scale, box, last, extent))
         while counts[w, count.status] == GOING and counts[w, count.budget] > 0:
             if numbers[w, real.drift] >= numbers[w, real.drift_allowed]:
                 sort(w, box, last, orders, numbers, counts)
@@ -139,7 +143,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
             if dt > 0:
                 relaxed = ti.cast(steps.relaxed_in(w, dt, numbers, counts), float)
                 moved, kicked = ti.cast(dt, float), ti.cast(kick, float)
-                speed = move(w, grid, nodes, particles, orders, dt, moved, kicked, relaxed, numbers, counts)
+                speed = move(w, grid, nodes, particles, orders, seen, dt, moved, kicked, relaxed, numbers, counts)
                 steps.end(w, dt, splits, limit, deformation, ti.cast(speed, ti.f64), numbers, counts)
         for a in ti.static(range(d)):
             for i in ti.static(range(2)):

@@ -3,11 +3,13 @@
 from collections.abc import Iterable, Sequence
 from types import SimpleNamespace
 
+import numpy as np
+
 from mpmcli.solver.state_bounds import ENTRIES
 
 # Status of a run: free, or waiting for the host; to be measured; advancing; measured, as a bound on its step requires;
-# with lost particles; with a stable step that collapsed.
-IDLE, MEASURE, GOING, ATTEND, LOST, COLLAPSED = range(6)
+# with lost particles; with a stable step that collapsed; before a kick that ends beyond its time tables.
+IDLE, MEASURE, GOING, ATTEND, LOST, COLLAPSED, BEYOND = range(7)
 # Bounds on the step by their code; of equal ones the lower code counts, as in a comparison of `Limit`s.
 LIMITS = ("", "deformation", "force", "forced", "maximum", "speed", "viscosity", "wave")
 
@@ -18,7 +20,7 @@ REALS = (
     *("time", "target", "last_step", "unrelaxed", "speed", "courant", "drift", "owed", "stiffness"),
     *HELD,
     *("smallest", "smallest_courant", "largest", "largest_courant"),
-    *("growth_allowed", "safety", "maximum", "pull", "collapse"),
+    *("growth_allowed", "safety", "maximum", "pull", "force", "collapse", "horizon", "end"),
     *("spacing", "inverse_spacing", "gradient_scale"),
     *("drift_allowed", "hold", "rise", "slack", "infinity"),
 )
@@ -64,3 +66,29 @@ class Layout:
             columns[name], end = _blocks(end, groups)
         self.counts = end
         self.count = SimpleNamespace(**columns)
+
+
+class Row:
+    """The numbers and counts of one run by their names in REALS and COUNTS."""
+
+    def __init__(self, layout: Layout, numbers: np.ndarray, counts: np.ndarray) -> None:
+        self._real, self._count = layout.real, layout.count
+        self._numbers, self._counts = numbers, counts
+
+    def set(self, **values: float) -> None:
+        """Set numbers."""
+        for name, value in values.items():
+            self._numbers[getattr(self._real, name)] = value
+
+    def set_counts(self, **values: int) -> None:
+        """Set counts."""
+        for name, value in values.items():
+            self._counts[getattr(self._count, name)] = value
+
+    def number(self, name: str) -> float:
+        """Return a number."""
+        return float(self._numbers[getattr(self._real, name)])
+
+    def count(self, name: str) -> int:
+        """Return a count."""
+        return int(self._counts[getattr(self._count, name)])

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 
@@ -10,7 +11,8 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.batch import Batch
 from mpmcli.solver.batch_group import BatchGroup
-from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, GOING, HELD, IDLE, LIMITS, LOST, MEASURE
+from mpmcli.solver.batch_layout import ATTEND, BEYOND, COLLAPSED, GOING, HELD, IDLE, LIMITS, LOST, MEASURE, Row
+from mpmcli.solver.batch_values import Drives
 from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.groups import require_inside
 from mpmcli.solver.held_bound import HeldBound
@@ -18,9 +20,11 @@ from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.particles import initial_state, table_of
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.run import COLLAPSE, Run
+from mpmcli.solver.run_values import RunValues
 from mpmcli.solver.state import Progress
 from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
 from mpmcli.solver.step_control import StepControl, StepCounters
+from mpmcli.stability.limits import force_limit
 
 # Numbers of `Progress` that the kernel changes.
 FOLLOWED = ("time", "last_step", "unrelaxed", "speed", "courant", "drift", "owed")
@@ -57,6 +61,7 @@ class BatchRun(Run):
         self._begun = False
         self._numbers, self._counts = batch.numbers[slot], batch.counts[slot]
         self._real, self._count = batch.layout.real, batch.layout.count
+        self._row = Row(batch.layout, self._numbers, self._counts)
         first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in self._particles])])
         self.groups = []
         for g, shared in enumerate(batch.kind.members):
@@ -71,8 +76,12 @@ class BatchRun(Run):
             lost = batch.device.particles.lost
             if lost[slot * len(batch.kind.members) + g] != NOT_LOST:
                 lost[slot * len(batch.kind.members) + g] = NOT_LOST
+        entries = Drives.of(scene, [group.bodies for group in self.groups])[1]
+        self._values = RunValues(batch.values.device, slot, entries, scene.time.end)
+        self._tables, self._means = batch.values.tables, list(self._values.means.values())
+        self._filled_since = -math.inf
         self._set_constants()
-        self._set_counts(status=MEASURE)
+        self._row.set_counts(status=MEASURE)
 
     @property
     def step_count(self) -> int:
@@ -84,20 +93,6 @@ class BatchRun(Run):
         """Wall time spent so far on measuring the state for the limits."""
         return self.state.step_control.seconds if self._begun else 0.0
 
-    def _set(self, **values: float) -> None:
-        for name, value in values.items():
-            self._numbers[getattr(self._real, name)] = value
-
-    def _set_counts(self, **values: int) -> None:
-        for name, value in values.items():
-            self._counts[getattr(self._count, name)] = value
-
-    def _get(self, name: str) -> float:
-        return float(self._numbers[getattr(self._real, name)])
-
-    def _get_count(self, name: str) -> int:
-        return int(self._counts[getattr(self._count, name)])
-
     def _set_constants(self) -> None:
         """Store what does not change during the run."""
         scene, h = self.scene, self.spacing
@@ -107,14 +102,17 @@ class BatchRun(Run):
             self._numbers[self._real.extent[a]] = n * h
             self._counts[self._count.cells[a]] = n
         maximum = math.inf if scene.time.step == "auto" else scene.time.step
-        self._set(
+        self._row.set(
             spacing=h,
             inverse_spacing=1 / h,
             gradient_scale=self.batch.device.grid.scheme.spline.inverse_moment / h,
             safety=scene.time.safety,
             maximum=maximum,
+            end=scene.time.end,
+            horizon=-math.inf if self._means else math.inf,
+            force=math.inf,
         )
-        self._set_counts(forced=self._forced)
+        self._row.set_counts(forced=self._forced)
 
     def _measurement(self, g: int) -> Measurement:
         first = self._real.maxima[g]
@@ -155,7 +153,7 @@ class BatchRun(Run):
         step = min(self.stable_step()[0], self.scene.time.end / self.scene.time.frames)
         for _ in self._reach(self.time + count * step):
             self.batch.launch()
-        return self.step_count - before, self._get("smallest")
+        return self.step_count - before, self._row.number("smallest")
 
     def wait(self) -> None:
         """Wait until the device has taken every step; each launch waits."""
@@ -166,15 +164,19 @@ class BatchRun(Run):
         control = StepControl(
             self.scene, self.groups, [self._measurement(g) for g in range(len(self.groups))], on_cpu=True
         )
-        self.state = Progress(control, ExternalForces(self.scene, self.groups, self.backend))
+        measures = [
+            partial(push, group.first, group.count, self.slot)
+            for push, group in zip(self.batch.pushes, self.groups, strict=True)
+            if push is not None
+        ]
+        self.state = Progress(control, ExternalForces(self.scene, self._values, measures))
         self._begun = True
         self._begin()
-        self._set(
+        self._row.set(
             growth_allowed=control.growth_allowed,
-            pull=self.state.external_forces.pull(0.0, 0.0),
             collapse=COLLAPSE * self.state.first_stable_step,
         )
-        self._set_counts(longest=control.longest)
+        self._row.set_counts(longest=control.longest)
         for g, group in enumerate(self.groups):
             self._numbers[self._real.sensitivity[g]] = group.law.sensitivity
             self._numbers[self._real.hardening[g]] = group.law.hardening
@@ -182,21 +184,23 @@ class BatchRun(Run):
 
     def _reach(self, target: float) -> Iterator[None]:
         """Let the batch launch until the run has reached a time, s."""
-        self._set(target=target, smallest=math.inf, largest=0.0, largest_courant=0.0)
-        self._set_counts(arrived=0, limit=0)
+        self._row.set(target=target, smallest=math.inf, largest=0.0, largest_courant=0.0)
+        self._row.set_counts(arrived=0, limit=0)
         arrived = False
         while not arrived:
-            self._set_counts(status=GOING, budget=max(1, BUDGET // self.particle_count), steps=0)
+            self._row.set_counts(status=GOING, budget=max(1, BUDGET // self.particle_count), steps=0)
             yield None
             self._pull()
-            arrived = self._get_count("arrived") == 1
-            status = self._get_count("status")
+            arrived = self._row.count("arrived") == 1
+            status = self._row.count("status")
             if status == LOST:
-                self._set_counts(status=IDLE)
+                self._row.set_counts(status=IDLE)
                 self._stop(self.last_step, self._lost())
             if status == COLLAPSED:
-                self._set_counts(status=IDLE)
+                self._row.set_counts(status=IDLE)
                 self._stop_collapsed(self.stable_step()[0])
+            if status == BEYOND:
+                self._fill_tables()
             if status == ATTEND:
                 due = self.state.step_control.take_counters(self._counters())
                 # At a frame all are measured.
@@ -211,8 +215,17 @@ class BatchRun(Run):
         """Take the measurement of some groups that the kernel has made after the last step."""
         if not self.state.step_control.measure(due):
             self._stop(self.last_step, self._lost())
+        forces = self.state.external_forces
+        forces.measure(self.time, self.state.step_control.longest * self.last_step)
         if self.state.step_control.fresh:
             self.state.speed = self.state.step_control.speed
+
+    def _fill_tables(self) -> None:
+        """Let the kernel go on from the time that velocities have."""
+        since = self.state.velocity_time
+        # The same time again: the next kick takes more windows than found room.
+        self._row.set(horizon=self._tables.fill(self.slot, self._means, since, coarse=since == self._filled_since))
+        self._filled_since = since
 
     def _lost(self) -> list[int | None]:
         """Return a lost particle of each group, in solver order, None where none is known."""
@@ -226,7 +239,7 @@ class BatchRun(Run):
 
         return StepCounters(
             self.state.step_control.counters().stiffness_limit,
-            HeldBound(*(self._get(name) for name in HELD)),
+            HeldBound(*(self._row.number(name) for name in HELD)),
             numbers(self._real.rate),
             tuple(self._counts[list(self._count.unwatched)].tolist()),
             numbers(self._real.change),
@@ -236,18 +249,22 @@ class BatchRun(Run):
     def _pull(self) -> None:
         """Read what the kernel has changed."""
         for name in FOLLOWED:
-            setattr(self.state, name, self._get(name))
-        self.state.unrelaxed_steps = self._get_count("unrelaxed_steps")
-        self.state.step_count += self._get_count("steps")
+            setattr(self.state, name, self._row.number(name))
+        self.state.unrelaxed_steps = self._row.count("unrelaxed_steps")
+        self.state.step_count += self._row.count("steps")
 
     def _push(self) -> None:
         """Write what the host has changed."""
         for name in FOLLOWED:
-            self._set(**{name: getattr(self.state, name)})
-        self._set_counts(unrelaxed_steps=self.state.unrelaxed_steps)
+            self._row.set(**{name: getattr(self.state, name)})
+        self._row.set_counts(unrelaxed_steps=self.state.unrelaxed_steps)
+        forces = self.state.external_forces
+        self._row.set(pull=forces.steady_pull)
+        if forces.pushes:
+            self._row.set(force=force_limit(forces.slope))
         counters = self.state.step_control.counters()
-        self._set(stiffness=counters.stiffness_limit.value, **dict(zip(HELD, counters.held, strict=True)))
-        self._set_counts(stiffness_limit=LIMITS.index(counters.stiffness_limit.name))
+        self._row.set(stiffness=counters.stiffness_limit.value, **dict(zip(HELD, counters.held, strict=True)))
+        self._row.set_counts(stiffness_limit=LIMITS.index(counters.stiffness_limit.name))
         for g in range(len(self.groups)):
             self._numbers[self._real.rate[g]] = counters.rates[g]
             self._numbers[self._real.change[g]] = counters.change[g]
@@ -256,9 +273,9 @@ class BatchRun(Run):
 
     def _taken(self, before: int) -> list[tuple[float, float, str]]:
         """Return the steps since the step `before` as `ledger_row` counts them: the smallest one, and the largest."""
-        smallest = self._get("smallest"), self._get("smallest_courant"), LIMITS[self._get_count("limit")]
+        smallest = self._row.number("smallest"), self._row.number("smallest_courant"), LIMITS[self._row.count("limit")]
         steps = self.step_count - before
-        return [smallest] + [(self._get("largest"), self._get("largest_courant"), "")] * (steps - 1)
+        return [smallest] + [(self._row.number("largest"), self._row.number("largest_courant"), "")] * (steps - 1)
 
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield as `Solver.frames`, where this is the only run of its batch.

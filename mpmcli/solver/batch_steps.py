@@ -8,19 +8,23 @@ from collections.abc import Sequence
 import taichi as ti
 
 from mpmcli.materials.law import Law
-from mpmcli.solver.batch_layout import ATTEND, COLLAPSED, LIMITS, LOST, Layout
+from mpmcli.solver.batch_layout import ATTEND, BEYOND, COLLAPSED, LIMITS, LOST, Layout
+from mpmcli.solver.batch_values import BatchValues
 from mpmcli.solver.volume_relaxation import INTERVAL
 from mpmcli.stability.limits import COURANT, DEFORMATION
 
-DEFORMING, FORCED, MAXIMUM, CROSSING = (LIMITS.index(name) for name in ("deformation", "forced", "maximum", "speed"))
+DEFORMING, FORCE, FORCED, MAXIMUM, CROSSING = (
+    LIMITS.index(name) for name in ("deformation", "force", "forced", "maximum", "speed")
+)
 
 
 @ti.data_oriented
 class BatchSteps:
     """The steps of the runs of a batch, w being the number of a run; numbers and counts as of `batch_layout`."""
 
-    def __init__(self, layout: Layout, laws: Sequence[Law]) -> None:
+    def __init__(self, layout: Layout, laws: Sequence[Law], values: BatchValues) -> None:
         self.real, self.count = layout.real, layout.count
+        self.values = values
         self.laws = tuple(laws)
 
     @ti.func
@@ -28,8 +32,9 @@ class BatchSteps:
         """Choose the next step.
 
         Returns:
-            The step and the kick, s, float64, and the step is 0 where it collapsed; the number of such steps to the
-            target; the code of the bound that sets the step, and the bound by deformation, s.
+            The step and the kick, s, float64, and the step is 0 where it collapsed or the host must fill time tables;
+            the number of such steps to the target; the code of the bound that sets the step, and the bound by
+            deformation, s.
         """
         largest, limit, deformation = self.stable_step(w, numbers, counts)
         left = numbers[w, self.real.target] - numbers[w, self.real.time]
@@ -37,12 +42,23 @@ class BatchSteps:
         dt = left / splits
         due_kick = numbers[w, self.real.owed] + 0.5 * (numbers[w, self.real.last_step] + dt)
         kick = ti.min(due_kick, dt / numbers[w, self.real.safety])
+        since = self.velocity_time(w, numbers)
         if largest < numbers[w, self.real.collapse]:
             counts[w, self.count.status] = COLLAPSED
             dt = 0.0 * dt
+        elif since + kick > numbers[w, self.real.horizon]:
+            counts[w, self.count.status] = BEYOND
+            dt = 0.0 * dt
         else:
             numbers[w, self.real.owed] = due_kick - kick
+            self.values.set_means(w, since, since + kick)
         return dt, kick, splits, limit, deformation
+
+    @ti.func
+    def velocity_time(self, w: int, numbers: ti.template()):
+        """Return the time to which velocities have advanced, s, float64, as `Progress.velocity_time`."""
+        # A literal has the precision of particles; 0.5 is exact in it.
+        return numbers[w, self.real.time] - 0.5 * numbers[w, self.real.last_step] - numbers[w, self.real.owed]
 
     @ti.func
     def end(
@@ -93,6 +109,10 @@ class BatchSteps:
         value = ti.min(value, numbers[w, self.real.held])
         speed = numbers[w, self.real.speed]
         pull = numbers[w, self.real.pull]
+        if ti.static(self.values.gravity_varies):
+            # The next kick ends in the middle of a step that is no longer than the other bounds allow.
+            ahead = ti.min(numbers[w, self.real.safety] * value, numbers[w, self.real.end])
+            pull += self.values.largest_gravity(w, self.velocity_time(w, numbers), numbers[w, self.real.time] + ahead)
         h = numbers[w, self.real.spacing]
         crossing = numbers[w, self.real.infinity]
         if speed != 0 or pull != 0:
@@ -100,6 +120,10 @@ class BatchSteps:
         if crossing < value or (crossing == value and limit > CROSSING):
             value = crossing
             limit = CROSSING
+        force = numbers[w, self.real.force]
+        if force < value or (force == value and limit > FORCE):
+            value = force
+            limit = FORCE
         value = numbers[w, self.real.safety] * value
         maximum = numbers[w, self.real.maximum]
         if maximum < value:

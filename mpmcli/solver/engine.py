@@ -10,7 +10,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene, estimate_particles, sample_bodies
 from mpmcli.solver.backend import Arch, Backend, choose_backend
-from mpmcli.solver.batch import Batch, Kind, can_batch
+from mpmcli.solver.batch import Batch, Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.solver import Solver
 
@@ -91,19 +91,15 @@ def choose_engine(
     particles = estimate_particles(scene)
     if not _is_small(scene, particles, backend) or threads not in (None, 1):
         return backend, False
-    batched = can_batch(scene)
-    optimisation = "all"
-    if batched:
-        optimisation = "few" if particles * expected_steps() < LITTLE_WORK else "most"
+    optimisation = "few" if particles * expected_steps() < LITTLE_WORK else "most"
     return choose_backend(
         "cpu", 1, scene.solver.precision, compile_cache=compile_cache, optimisation=optimisation
-    ), batched
+    ), True
 
 
 def suits_batch(scene: Scene, particles: int, backend: Backend) -> bool:
     """Return whether a batch can run a scene of so many particles, and, of many runs, faster than a `Solver`."""
-    few = _is_small(scene, particles, backend) or (backend.arch in BATCHING_GPUS and particles < FEW_ON_GPU)
-    return few and can_batch(scene)
+    return _is_small(scene, particles, backend) or (backend.arch in BATCHING_GPUS and particles < FEW_ON_GPU)
 
 
 def _is_small(scene: Scene, particles: int, backend: Backend) -> bool:

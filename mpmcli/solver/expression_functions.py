@@ -100,7 +100,7 @@ def _choose(condition, a, b):
 
 
 @ti.func
-def blend(share, a, b):
+def _blend(share, a, b):
     """Return a, b, or their mean where a condition holds for a share of the kick between 0 and 1."""
     # A branch that does not count may be infinite.
     return ti.select(share >= 1, a, ti.select(share <= 0, b, share * a + (1 - share) * b))
@@ -182,6 +182,8 @@ KERNELS: dict[str, Callable] = {
     "or": _either,
     "not": _not,
     "if": _choose,
+    # A condition of time.
+    "blend": _blend,
     "sin": ti.sin,
     "cos": ti.cos,
     "tan": ti.tan,

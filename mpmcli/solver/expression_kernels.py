@@ -1,62 +1,17 @@
 """Expressions inside kernels: each node of a tree is an object whose `evaluate` is inlined where it is called.
 
-What depends on time alone is no part of a kernel: the host computes its mean over the kick once per step, in double
-precision, and the kernel reads it from the clock. Conditions are integers, 0 or 1, or for a condition of time the share
-of the kick for which it holds. Both branches of `a if c else b` are computed.
+What depends on time alone is no part of a kernel, which reads its mean over the kick from the numbers of the run.
+Conditions are integers, 0 or 1, or for a condition of time the share of the kick for which it holds. Both branches of
+`a if c else b` are computed.
 """
 
 from collections.abc import Callable
 
-import numpy as np
 import taichi as ti
 
-from mpmcli.scene.expression import INITIAL, POSITION, Apply, Name, Number, Tree, names_in
-from mpmcli.scene.quadrature import Mean, telling_times
-from mpmcli.solver.expression_functions import KERNELS, blend
-
-# Whole exponents up to this one are products: a power of a negative number is undefined on some devices.
-LARGEST_PRODUCT = 64
-
-
-@ti.data_oriented
-class Clock:
-    """Values that depend on time alone, one set per step: their means over the kick, so that no pulse is skipped.
-
-    Attributes:
-        trees: what the values are.
-        values: (k) vector field of them, None as long as it was not allocated.
-    """
-
-    def __init__(self) -> None:
-        self.trees: list[Tree] = []
-        self.values: ti.Field | None = None
-
-    def place_of(self, tree: Tree) -> int:
-        """Return the index of a value, which is added where it is new."""
-        if tree not in self.trees:
-            self.trees.append(tree)
-        return self.trees.index(tree)
-
-    def allocate(self, end: float) -> Callable[[float, float], None]:
-        """Allocate the values, and return what sets them to their means between two times of a run of `end` seconds."""
-        if not self.trees:
-            return lambda start, end: None
-        count = len(self.trees)
-        vector, means = ti.types.vector(count, float), [Mean(tree, end) for tree in self.trees]
-        values = self.values = ti.Vector.field(count, float, shape=())
-
-        @ti.kernel
-        def write(now: vector):
-            values[None] = now
-
-        def set_times(start: float, end: float) -> None:
-            write(vector([mean(start, end) for mean in means]))
-
-        return set_times
-
-    def telling_times(self, start: float, end: float) -> list[float]:
-        """Return the times between two (s) at which any of the values is smallest or largest."""
-        return [time for tree in self.trees for time in telling_times(tree, start, end)]
+from mpmcli.scene.expression import INITIAL, POSITION, Name, Number, Tree
+from mpmcli.solver.expression_functions import KERNELS
+from mpmcli.solver.run_values import DeviceValues, Place, whole_power
 
 
 @ti.data_oriented
@@ -67,40 +22,37 @@ class Constant:
         self.value = value
 
     @ti.func
-    def evaluate(self, x: ti.template(), X: ti.template()):
+    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
         return ti.cast(self.value, float)
 
 
 @ti.data_oriented
 class Coordinate:
-    """A coordinate of the position, or of the initial one, in the coordinates of the scene."""
+    """A coordinate of the position, or of the initial one."""
 
-    def __init__(self, axis: int, origin: float, *, initial: bool) -> None:
+    def __init__(self, axis: int, *, initial: bool) -> None:
         self.axis = axis
-        self.origin = origin
         self.initial = initial
 
     @ti.func
-    def evaluate(self, x: ti.template(), X: ti.template()):
+    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
         value = x[self.axis]
         if ti.static(self.initial):
             value = X[self.axis]
-        if ti.static(self.origin != 0):
-            value += ti.static(self.origin)
         return value
 
 
 @ti.data_oriented
 class Reading:
-    """A value of the clock; of a condition the share of the kick for which it is true."""
+    """A number of the run; of a condition of time the share of the kick for which it is true."""
 
-    def __init__(self, clock: Clock, index: int) -> None:
-        self.clock = clock
+    def __init__(self, values: DeviceValues, index: int) -> None:
+        self.values = values
         self.index = index
 
     @ti.func
-    def evaluate(self, x: ti.template(), X: ti.template()):
-        return self.clock.values[None][self.index]
+    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
+        return self.values.field[run, self.index]
 
 
 @ti.data_oriented
@@ -113,8 +65,8 @@ class Power:
         self.bits = tuple(bit == "1" for bit in bin(abs(exponent))[2:])
 
     @ti.func
-    def evaluate(self, x: ti.template(), X: ti.template()):
-        base = self.base.evaluate(x, X)
+    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
+        base = self.base.evaluate(x, X, run)
         result = ti.cast(1.0, float)
         for bit in ti.static(self.bits):
             result *= result
@@ -134,8 +86,8 @@ class Unary:
         self.a = a
 
     @ti.func
-    def evaluate(self, x: ti.template(), X: ti.template()):
-        return self.function(self.a.evaluate(x, X))
+    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
+        return self.function(self.a.evaluate(x, X, run))
 
 
 @ti.data_oriented
@@ -148,8 +100,8 @@ class Binary:
         self.b = b
 
     @ti.func
-    def evaluate(self, x: ti.template(), X: ti.template()):
-        return self.function(self.a.evaluate(x, X), self.b.evaluate(x, X))
+    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
+        return self.function(self.a.evaluate(x, X, run), self.b.evaluate(x, X, run))
 
 
 @ti.data_oriented
@@ -163,36 +115,27 @@ class Ternary:
         self.c = c
 
     @ti.func
-    def evaluate(self, x: ti.template(), X: ti.template()):
-        return self.function(self.a.evaluate(x, X), self.b.evaluate(x, X), self.c.evaluate(x, X))
+    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
+        return self.function(self.a.evaluate(x, X, run), self.b.evaluate(x, X, run), self.c.evaluate(x, X, run))
 
 
 NODES = (None, Unary, Binary, Ternary)
 
 
-def node_of(tree: Tree, origin: np.ndarray, clock: Clock) -> object:
-    """Return the node that evaluates a tree at positions relative to `origin`, (d,), m; its times go to the clock."""
+def node_of(tree: "Tree | Place", values: DeviceValues | None) -> object:
+    """Return the node that evaluates a tree of `Entries` at x and X, (d,), m, with the numbers of a run."""
+    if isinstance(tree, Place):
+        return Reading(values, tree.index)
     if isinstance(tree, Number):
         return Constant(tree.value)
-    if names_in(tree) == {"t"}:
-        return Reading(clock, clock.place_of(tree))
     if isinstance(tree, Name):
         names = INITIAL if tree.name in INITIAL else POSITION
-        axis = names.index(tree.name)
-        return Coordinate(axis, float(origin[axis]), initial=names is INITIAL)
-    return _applied(tree, origin, clock)
-
-
-def _applied(tree: Apply, origin: np.ndarray, clock: Clock) -> object:
-    arguments = tree.arguments
-    if tree.function in ("**", "pow") and isinstance(arguments[1], Number):
-        exponent = arguments[1].value
-        if exponent == int(exponent) and abs(exponent) <= LARGEST_PRODUCT:
-            return Power(node_of(arguments[0], origin, clock), int(exponent))
-    # A condition of time may hold for a part of the kick.
-    shared = tree.function == "if" and "t" in names_in(arguments[0])
-    function = blend if shared else KERNELS[tree.function]
-    nodes = [node_of(argument, origin, clock) for argument in arguments]
+        return Coordinate(names.index(tree.name), initial=names is INITIAL)
+    exponent = whole_power(tree)
+    if exponent is not None:
+        return Power(node_of(tree.arguments[0], values), exponent)
+    function = KERNELS[tree.function]
+    nodes = [node_of(argument, values) for argument in tree.arguments]
     if tree.function in ("min", "max"):
         result = nodes[0]
         for node in nodes[1:]:

@@ -5,10 +5,11 @@ They advance the velocity from the middle of the last step to that of this one, 
 Gravity acts on the nodes; a force acts on its particles, before their momentum is scattered.
 """
 
+import math
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
-import numpy as np
 import taichi as ti
 
 from mpmcli.scene import Scene
@@ -16,8 +17,9 @@ from mpmcli.scene.entry import Entry
 from mpmcli.scene.expression import INITIAL, POSITION, Number, Tree, names_in
 from mpmcli.scene.schema import Force
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.expression_kernels import Clock, node_of
-from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.expression_kernels import node_of
+from mpmcli.solver.particle_arrays import ParticleArrays
+from mpmcli.solver.run_values import DeviceValues, Entries, Place
 from mpmcli.solver.state_bounds import build_maxima
 
 # Half of the distance of the differences for the slope of a force, cells.
@@ -45,35 +47,85 @@ def needs_initial(scene: Scene, members: Sequence[int]) -> bool:
     return any(names_in(tree) & set(INITIAL) for tree in trees)
 
 
+@dataclass(frozen=True)
+class Term:
+    """A force on particles of one law.
+
+    Attributes:
+        place: of its body in the group, -1 for all of them.
+        axes: each axis along which it acts, with its tree.
+    """
+
+    place: int
+    axes: tuple[tuple[int, Tree | Place], ...]
+
+
+@dataclass(frozen=True)
+class ForceTerms:
+    """Forces on particles of one law, as a kernel computes them; runs for which they are equal share kernels.
+
+    Attributes:
+        terms: the forces.
+        moves: whether any of them depends on the position.
+        initial: whether any of them depends on the initial position.
+        reach, slope: half of the distance of differences, m, and the inverse of the distance.
+    """
+
+    terms: tuple[Term, ...]
+    moves: bool
+    initial: bool
+    reach: Tree | Place
+    slope: Tree | Place
+
+    @staticmethod
+    def of(scene: Scene, members: Sequence[int], entries: Entries, *, several: bool) -> "ForceTerms":
+        """Return the forces on some bodies, given by their indices, with the numbers that they add to `entries`.
+
+        Args:
+            several: whether particles know their body.
+        """
+        forces = forces_on(scene, members)
+        names = [scene.bodies[i].name for i in members]
+        terms, found = [], frozenset()
+        for force in forces:
+            trees = [tree_of(entry) for entry in force.acceleration]
+            axes = tuple((axis, entries.placed(tree)) for axis, tree in enumerate(trees) if tree != Number(0.0))
+            everywhere = force.body is None or not several
+            terms.append(Term(-1 if everywhere else names.index(force.body), axes))
+            found |= frozenset().union(*map(names_in, trees))
+        reach = REACH * scene.domain.spacing if forces else math.inf
+        # Without forces there is nothing to read.
+        number = entries.number if forces else Number
+        return ForceTerms(
+            tuple(terms), bool(found & set(POSITION)), bool(found & set(INITIAL)), number(reach), number(0.5 / reach)
+        )
+
+
+def gravity_terms(scene: Scene, entries: Entries) -> tuple[Tree | Place, ...]:
+    """Return gravity along each axis, with the numbers that it adds to `entries`; nothing where it is steady."""
+    return () if scene.domain.steady else tuple(entries.placed(tree_of(entry)) for entry in scene.domain.gravity)
+
+
 @ti.data_oriented
 class Gravity:
-    """Gravity: a constant of the kernels where it is steady, otherwise a value of the clock."""
+    """Gravity: a constant of the kernels where it is steady, otherwise numbers of the run."""
 
-    def __init__(self, scene: Scene, clock: Clock) -> None:
-        self.dimension = scene.dimension
-        self.steady = scene.domain.steady
-        self.constant = scene.domain.gravity_at(0.0).tolist()
-        self.clock = clock
-        self.places = () if self.steady else tuple(clock.place_of(tree_of(entry)) for entry in scene.domain.gravity)
+    def __init__(self, terms: Sequence[Tree | Place], constant: Sequence[float], values: DeviceValues | None) -> None:
+        self.dimension = len(constant)
+        self.steady = not terms
+        self.constant = list(constant)
+        self.nodes = tuple((axis, node_of(tree, values)) for axis, tree in enumerate(terms))
 
     @ti.func
-    def in_step(self, kick: float):
+    def in_step(self, kick: float, run: int):
         """Return the change of velocity by gravity in `kick` seconds, m/s."""
         result = ti.Vector.zero(float, self.dimension)
-        for a in ti.static(range(self.dimension)):
-            if ti.static(self.steady):
+        if ti.static(self.steady):
+            for a in ti.static(range(self.dimension)):
                 result[a] = kick * self.constant[a]
-            else:
-                result[a] = kick * self.clock.values[None][ti.static(self.places[a])]
+        for a, node in ti.static(self.nodes):
+            result[a] = kick * node.evaluate(result, result, run)
         return result
-
-
-class _Term:
-    """One force: the place of its body in the group, -1 for all of them, and a node per axis, None for a zero."""
-
-    def __init__(self, place: int, nodes: tuple[object, ...]) -> None:
-        self.place = place
-        self.nodes = tuple((axis, node) for axis, node in enumerate(nodes) if node is not None)
 
 
 @ti.data_oriented
@@ -81,41 +133,33 @@ class GroupForce:
     """All forces on one group of particles.
 
     Attributes:
-        terms: the forces.
-        moves: whether any of them depends on the position.
-        spreads: whether their slope is known: no force depends on the initial position, whose own slope is that of the
-            motion so far.
+        spreads: whether their slope is known: they depend on the position, and none on the initial position, whose own
+            slope is that of the motion so far.
     """
 
-    def __init__(self, scene: Scene, group: ParticleGroup, clock: Clock) -> None:
-        self.dimension = scene.dimension
-        origin = np.array(scene.domain.origin)
-        names = [scene.bodies[i].name for i in group.bodies]
-        terms, trees = [], []
-        for force in forces_on(scene, group.bodies):
-            own = [tree_of(entry) for entry in force.acceleration]
-            nodes = tuple(None if tree == Number(0.0) else node_of(tree, origin, clock) for tree in own)
-            everywhere = force.body is None or not group.several
-            terms.append(_Term(-1 if everywhere else names.index(force.body), nodes))
-            trees += own
-        self.terms = tuple(terms)
-        self.moves = any(names_in(tree) & set(POSITION) for tree in trees)
-        self.spreads = self.moves and not needs_initial(scene, group.bodies)
-        self.reach = REACH * scene.domain.spacing
+    def __init__(self, dimension: int, forces: ForceTerms, values: DeviceValues | None, room: int) -> None:
+        """Build the nodes; `room` is the number of bodies that each run may have in the group."""
+        self.dimension = dimension
+        self.terms = tuple(
+            (term.place, tuple((axis, node_of(tree, values)) for axis, tree in term.axes)) for term in forces.terms
+        )
+        self.moves, self.spreads = forces.moves, forces.moves and not forces.initial
+        self.reach, self.slope = node_of(forces.reach, values), node_of(forces.slope, values)
+        self.room = room
         sys.setrecursionlimit(max(sys.getrecursionlimit(), RECURSION))
 
     @ti.func
     def at(self, group: ti.template(), p: int, x: ti.template(), X: ti.template()):
         """Return the acceleration of particle p, m/s^2, if it were at x."""
         result = ti.Vector.zero(float, self.dimension)
-        for term in ti.static(self.terms):
-            if ti.static(term.place < 0):
-                for axis, node in ti.static(term.nodes):
-                    result[axis] += node.evaluate(x, X)
+        for place, axes in ti.static(self.terms):
+            if ti.static(place < 0):
+                for axis, node in ti.static(axes):
+                    result[axis] += node.evaluate(x, X, group.run)
             else:
-                if group.body[p] == ti.static(term.place):
-                    for axis, node in ti.static(term.nodes):
-                        result[axis] += node.evaluate(x, X)
+                if group.body[p] - group.run * self.room == ti.static(place):
+                    for axis, node in ti.static(axes):
+                        result[axis] += node.evaluate(x, X, group.run)
         return result
 
     @ti.func
@@ -135,21 +179,22 @@ class GroupForce:
             if ti.static(group.keeps_initial):
                 X[c] = group.initial[p][c]
         if ti.static(self.moves and with_slope):
+            reach, inverse = self.reach.evaluate(x, X, group.run), self.slope.evaluate(x, X, group.run)
             # In a loop, so that the expressions are compiled once: up and down along each axis, then in place.
             for k in range(2 * d + 1):
                 place = x
                 for b in ti.static(range(d)):
                     if k == 2 * b:
-                        place[b] += ti.static(self.reach)
+                        place[b] += reach
                     if k == 2 * b + 1:
-                        place[b] -= ti.static(self.reach)
+                        place[b] -= reach
                 value = self.at(group, p, place, X)
                 for b in ti.static(range(d)):
                     for c in ti.static(range(d)):
                         if k == 2 * b:
-                            slope[c, b] += value[c] * ti.static(0.5 / self.reach)
+                            slope[c, b] += value[c] * inverse
                         if k == 2 * b + 1:
-                            slope[c, b] -= value[c] * ti.static(0.5 / self.reach)
+                            slope[c, b] -= value[c] * inverse
                 if k == 2 * d:
                     a = value
             for b in ti.static(range(d)):
@@ -160,23 +205,31 @@ class GroupForce:
         return a, slope
 
 
-def build_push(group: ParticleGroup, backend: Backend) -> Callable[[], tuple[float, float]]:
-    """Compile-ready measurement of the force on a group: largest |a|, m/s^2, and largest row sum of |da/dx|, 1/s^2."""
+def build_push(group: ParticleArrays, backend: Backend) -> Callable[[int, int, int], tuple[float, float]]:
+    """Compile-ready measurement of the force on particles of a run: largest |a|, m/s^2, and row sum of |da/dx|, 1/s^2.
+
+    It takes the first particle, their number, and the number of the run.
+    """
 
     @ti.func
-    def widen(own: ti.template(), p: int):
-        a, slope = group.force.acceleration(group, p, True)
+    def widen_one(own: ti.template(), view: ti.template(), p: int):
+        a, slope = view.force.acceleration(view, p, True)
         own[0] = ti.max(own[0], a.norm_sqr())
-        for c in ti.static(range(group.dimension)):
+        for c in ti.static(range(view.dimension)):
             row = 0.0
-            for b in ti.static(range(group.dimension)):
+            for b in ti.static(range(view.dimension)):
                 row += ti.abs(slope[c, b])
             own[1] = ti.max(own[1], row)
 
-    measure = build_maxima(group.count, 2, widen, backend)
+    @ti.func
+    def widen(own: ti.template(), p: int, run: int):
+        for view in ti.static((group.seen_from(run),)):
+            widen_one(own, view, p)
 
-    def largest() -> tuple[float, float]:
-        square, slope = measure()
+    measure = build_maxima(2, widen, backend)
+
+    def largest(first: int, count: int, run: int) -> tuple[float, float]:
+        square, slope = measure(first, count, run)
         return float(square**0.5), slope
 
     return largest

@@ -1,6 +1,7 @@
 """The fields of particles of one law on the device, and what kernels read of a particle."""
 
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 import taichi as ti
@@ -30,7 +31,7 @@ class ParticleArrays:
         several: whether particles may belong to more than one body.
         serial: whether loops that copy particles from and to the host run on one thread, which few particles need.
         initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force.
-        force: what acts on the particles of groups that are `pushed`.
+        force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
         table: per body a row of particle mass, particle volume and the constants of the law.
         real: numpy's type of the real fields.
     """
@@ -71,8 +72,19 @@ class ParticleArrays:
         self.initial = ti.Vector.field(d, float, shape=count, layout=layout) if keeps_initial else None
         self.pushed = False
         self.force = None
+        self.run = 0
         self.table = ti.Vector.field(table[1], float, shape=table[0])
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
+
+    def push_by(self, force: object) -> None:
+        """Let a force act on the particles, see `forces.GroupForce`."""
+        self.pushed, self.force = True, force
+
+    def seen_from(self, run: object) -> "ParticleArrays":
+        """Return the view that a run has: its number, a variable of a kernel, counts where forces are evaluated."""
+        view = copy(self)
+        view.run = run
+        return view
 
     @property
     def state(self) -> tuple[ti.Field, ...]:
@@ -112,7 +124,7 @@ class ParticleArrays:
         return found
 
     def write(self, first: int, found: dict[str, np.ndarray], row: np.ndarray) -> None:
-        """Set a range of particles to what `read` returned, by one launch.
+        """Set a range of particles to what `read` returned, and to their initial positions if it keeps them.
 
         Args:
             row: of the body of each particle in the table, (n) int, in place of `found["body"]`.
@@ -120,6 +132,8 @@ class ParticleArrays:
         count = len(found["x"])
         rest = np.eye(self.dimension) if self.J_minus_1 is None else 1.0
         parts = (found["x"], found["v"], found["C"], found["deformation"] - rest, found["internal"])
+        if self.keeps_initial:
+            parts = (*parts, found["initial"])
         reals = np.concatenate([part.reshape(count, -1).astype(self.real) for part in parts], axis=1)
         labels = np.stack([found["id"], row], axis=1).astype(np.int32)
         self._write(first, np.ascontiguousarray(reals), np.ascontiguousarray(labels))
@@ -178,6 +192,9 @@ class ParticleArrays:
                 self.J_minus_1[p] = reals[q, start]
             for i in ti.static(range(len(self.internal))):
                 self.internal[i][p] = reals[q, start + self._deformation_width + i]
+            if ti.static(self.keeps_initial):
+                for c in ti.static(range(d)):
+                    self.initial[p][c] = reals[q, start + self._deformation_width + ti.static(len(self.internal)) + c]
             self.id[p] = labels[q, 0]
             if ti.static(self.several):
                 self.body[p] = labels[q, 1]

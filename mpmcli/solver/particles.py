@@ -33,6 +33,7 @@ def initial_state(
     ]
     found = {
         "x": np.concatenate([b.position - origin for b in particles]),
+        "initial": np.concatenate([(b.position if b.initial is None else b.initial) - origin for b in particles]),
         "v": np.concatenate([b.velocity for b in particles]),
         "C": np.concatenate([b.affine for b in particles]),
         "deformation": np.concatenate(deformation),
@@ -82,9 +83,6 @@ class ParticleGroup(ParticleArrays):
         self.rows = rows.astype(self.real)
         self.table.from_numpy(self.rows)
         self.write(0, *initial_state(law, particles, first_ids, origin))
-        if self.initial is not None:
-            initial = [b.position if b.initial is None else b.initial for b in particles]
-            self.initial.from_numpy((np.concatenate(initial) - origin).astype(self.real))
 
     def fields(self) -> dict[str, ti.Field]:
         """Return every field of the particles that changes during a run or is sorted, by name."""
@@ -92,10 +90,6 @@ class ParticleGroup(ParticleArrays):
         initial = ["initial_position"] * self.keeps_initial
         labels = ["id", "body"][: len(self.labels)]
         return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
-
-    def push_by(self, force: object) -> None:
-        """Let a force act on the particles, see `forces.GroupForce`."""
-        self.pushed, self.force = True, force
 
     def set_motion(self, velocity: np.ndarray, C: np.ndarray) -> None:
         """Set the velocity, (n, d), and the affine velocity C, (n, d, d), of all particles."""

@@ -8,7 +8,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.external_forces import ExternalForces
+from mpmcli.solver.external_forces import drive
 from mpmcli.solver.frame_reader import build_frame_reader
 from mpmcli.solver.groups import build_groups
 from mpmcli.solver.kernels import Kernels
@@ -46,8 +46,8 @@ class Solver(Run):
         """
         super().__init__(scene, backend, particles, force=force)
         self.groups = build_groups(scene, backend, self._particles)
-        forces = ExternalForces(scene, self.groups, backend)
-        self._kernels = Kernels(scene, backend, self.groups, forces.gravity)
+        gravity, forces = drive(scene, self.groups, backend)
+        self._kernels = Kernels(scene, backend, self.groups, gravity)
         self.grid = self._kernels.grid
         self._observations = [build_observation(group) for group in self.groups]
         self._readers = [build_frame_reader(group) for group in self.groups]

@@ -164,24 +164,28 @@ def build_measurement(group: ParticleGroup, backend: Backend) -> Measurement:
     """Compile-ready measurements of a group."""
 
     @ti.func
-    def widen_all(own: ti.template(), p: int):
+    def widen_all(own: ti.template(), p: int, run: int):
         v, C = group.motion(p)
         widen_motion(own, v, deformation_rate(group, C))
         widen_state(group, own, p)
 
     @ti.func
-    def widen_inner(own: ti.template(), p: int):
+    def widen_inner(own: ti.template(), p: int, run: int):
         widen_internal(group, own, p, 0)
 
-    state = build_maxima(group.count, entries(group), widen_all, backend)
-    internal = build_maxima(group.count, 2 * len(group.internal), widen_inner, backend)
-    return Measurement(lambda: state_bounds_of(group, state()), lambda: _ranges(group, internal()))
+    state = build_maxima(entries(group), widen_all, backend)
+    internal = build_maxima(2 * len(group.internal), widen_inner, backend)
+    own = group.first, group.count, 0
+    return Measurement(lambda: state_bounds_of(group, state(*own)), lambda: _ranges(group, internal(*own)))
 
 
-def build_maxima(count: int, size: int, widen: Callable, backend: Backend) -> Callable[[], list[float]]:
-    """Compile-ready reduction over particles: `widen` (own, p) raises the maxima `own` to those of particle p."""
+def build_maxima(size: int, widen: Callable, backend: Backend) -> Callable[[int, int, int], list[float]]:
+    """Compile-ready reduction over particles of a run, from (the first one, their number, the number of the run).
+
+    `widen` (own, p, run) raises the maxima `own` to those of particle p.
+    """
     if size == 0:
-        return list
+        return lambda first, count, run: []
     vector = ti.types.vector(size, float)
     found = ti.field(float, shape=size)
     # Each worker keeps its own maxima and merges them once: an atomic per particle takes longer than everything else.
@@ -189,7 +193,7 @@ def build_maxima(count: int, size: int, widen: Callable, backend: Backend) -> Ca
     on_cpu = backend.on_cpu
 
     @ti.kernel
-    def reduce() -> vector:
+    def reduce(first: int, count: int, run: int) -> vector:
         for i in ti.static(range(size)):
             found[i] = NOTHING
         for q in range(workers):
@@ -199,14 +203,14 @@ def build_maxima(count: int, size: int, widen: Callable, backend: Backend) -> Ca
                     t = q // CHUNK
                     start = share_start(count, t, backend.threads)
                     for p in range(start, share_start(count, t + 1, backend.threads)):
-                        widen(own, p)
+                        widen(own, first + p, run)
                     for i in ti.static(range(size)):
                         ti.atomic_max(found[i], own[i])
             else:
                 own = ti.Vector([NOTHING] * size)
                 p = q
                 while p < count:
-                    widen(own, p)
+                    widen(own, first + p, run)
                     p += workers
                 for i in ti.static(range(size)):
                     ti.atomic_max(found[i], own[i])
@@ -215,4 +219,4 @@ def build_maxima(count: int, size: int, widen: Callable, backend: Backend) -> Ca
             result[i] = found[i]
         return result
 
-    return lambda: [float(value) for value in reduce()]
+    return lambda first, count, run: [float(value) for value in reduce(first, count, run)]

@@ -131,13 +131,15 @@ def build_cpu_step(
         if ti.static(nodes.needs_contact):
             ti.loop_config(serialize=alone)
             for q in range(nodes.images.plane_nodes(grid)):
-                nodes.images.find_contact(grid, q, gravity.in_step(kick))
+                nodes.images.find_contact(grid, q, gravity.in_step(kick, 0))
         ti.loop_config(serialize=alone)
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
                 rows, t = grid.row_count(), q // CHUNK
                 first, last = share_start(rows, t, threads), share_start(rows, t + 1, threads)
-                ti.atomic_max(largest_speed_squared[None], update_rows(grid, nodes, first, last, gravity.in_step(kick)))
+                ti.atomic_max(
+                    largest_speed_squared[None], update_rows(grid, nodes, first, last, gravity.in_step(kick, 0))
+                )
         for g, group, _order in ti.static(pairs):
             ti.loop_config(serialize=alone)
             for q in range(CHUNK * threads):

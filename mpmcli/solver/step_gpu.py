@@ -31,10 +31,10 @@ def build_gpu_step(
                         particles.relax(group, p, relaxed)
         if ti.static(nodes.needs_contact):
             for q in range(nodes.images.plane_nodes(grid)):
-                nodes.images.find_contact(grid, q, gravity.in_step(kick))
+                nodes.images.find_contact(grid, q, gravity.in_step(kick, 0))
         for q in range(grid.box_nodes()):
             node = grid.box_node(q)
-            nodes.update(node, grid.linear_index(node), gravity.in_step(kick))
+            nodes.update(node, grid.linear_index(node), gravity.in_step(kick, 0))
         for g, group in ti.static(numbered):
             for p in range(group.count):
                 particles.advance(g, group, p, dt)
