@@ -31,7 +31,7 @@ def evaluate(name: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             base[p] = first
             for k in ti.static(range(spline.nodes)):
                 for a in ti.static(range(d)):
-                    weight[p][k, a] = w[k][a]
+                    weight[p][k, a] = w[k, a]
 
     run()
     return base.to_numpy(), weight.to_numpy().astype(np.float64)

@@ -84,7 +84,7 @@ class Ours:
         backend = choose_backend(arch, threads, precision, compile_cache=False)
         batched = serial and suits_batch(scene, sum(body.count for body in particles or ()), backend)
         if batched:
-            backend = replace(backend, threads=1, optimisation="most")
+            backend = replace(backend, threads=1)
         start(backend)
         self.engine = build_engine(scene, backend, particles, batched=batched, force=force)
         self.threads = backend.threads

@@ -8,6 +8,7 @@ import numpy as np
 import taichi as ti
 from pydantic import Field
 
+from mpmcli.materials.elementary import exp_minus_1, log
 from mpmcli.materials.law import CARRIED, Law, Mode, StateBound
 from mpmcli.materials.volume_relaxation import SCATTERED, volume_change
 from mpmcli.scene.knobs import Knob
@@ -225,9 +226,9 @@ class Fluid(Law):
             crushed = J
             if J < CRUSHED:
                 crushed = CRUSHED
-            spherical = (
-                constants[BULK_MODULUS] * crushed * (1.0 - crushed ** (-constants[EXPONENT])) / constants[EXPONENT]
-            )
+            # 1 - J^-g, as the exponential of a small number.
+            excess = -exp_minus_1(-constants[EXPONENT] * log(crushed))
+            spherical = constants[BULK_MODULUS] * crushed * excess / constants[EXPONENT]
         if ti.static(self.relaxes):
             if ti.static(self.all_relax):
                 spherical = ti.min(spherical, 0.0)
@@ -268,7 +269,7 @@ class Fluid(Law):
                 if J < CRUSHED:
                     J = CRUSHED
                 # J^(1-g) - 1, as the exponential of a small number.
-                power = exponential_strain((1.0 - g) * ti.log(J))
+                power = exp_minus_1((1.0 - g) * log(J))
                 result = (J - 1.0 + power / (g - 1.0)) / g
         return constants[BULK_MODULUS] * result
 
@@ -277,20 +278,11 @@ class Fluid(Law):
 def volume_energy(J: float):
     """Return J - 1 - ln J, without its cancellation near 1: with y = x/(2 + x), ln(1 + x) = 2 (y + y^3/3 + ...)."""
     x = J - 1.0
-    result = x - ti.log(ti.max(J, 1e-9))
+    result = x - log(ti.max(J, 1e-9))
     if ti.abs(x) < 0.05:
         y = x / (2.0 + x)
         square = y * y
         result = y * (x - square * (2.0 / 3.0 + square * (2.0 / 5.0 + square * (2.0 / 7.0 + square * (2.0 / 9.0)))))
-    return result
-
-
-@ti.func
-def exponential_strain(x: float):
-    """Return exp(x) - 1, accurate for small x too."""
-    result = ti.exp(x) - 1.0
-    if ti.abs(x) < 0.02:
-        result = x * (1.0 + x / 2.0 * (1.0 + x / 3.0 * (1.0 + x / 4.0 * (1.0 + x / 5.0))))
     return result
 
 

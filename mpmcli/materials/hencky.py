@@ -8,6 +8,7 @@ import taichi as ti
 from pydantic import Field
 
 from mpmcli.materials.elasticity import ElasticParameters, lame_lambda, shear_modulus
+from mpmcli.materials.elementary import exp_minus_1, log
 from mpmcli.materials.fluid import QUIET_SPEED
 from mpmcli.materials.law import Law, Mode, StateBound, carried_stiffness, principal
 from mpmcli.materials.principal import from_principal
@@ -102,10 +103,16 @@ class HenckyLaw(Law):
 @ti.func
 def hencky_strains(s: ti.template()):
     """Return ln s_i of the principal stretches."""
-    return ti.log(ti.max(s, STRETCH_MIN))
+    strains = s
+    for i in ti.static(range(s.n)):
+        strains[i] = log(ti.max(s[i], STRETCH_MIN))
+    return strains
 
 
 @ti.func
 def stretch_tensor(Q: ti.template(), strains: ti.template()):
     """Return Q diag(exp e_i) Q^T, which is I exactly where the strains are 0."""
-    return ti.Matrix.identity(float, Q.n) + from_principal(Q, ti.exp(strains) - 1.0)
+    extensions = strains
+    for i in ti.static(range(strains.n)):
+        extensions[i] = exp_minus_1(strains[i])
+    return ti.Matrix.identity(float, Q.n) + from_principal(Q, extensions)

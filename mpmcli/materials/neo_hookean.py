@@ -7,6 +7,7 @@ import numpy as np
 import taichi as ti
 
 from mpmcli.materials.elasticity import ElasticParameters
+from mpmcli.materials.elementary import log
 from mpmcli.materials.law import SMALLEST, Law, Mode, StateBound, carried_stiffness, least_stretch, principal
 from mpmcli.materials.tensors import log_ratio, volume_strain
 
@@ -62,7 +63,7 @@ class NeoHookean(Law):
     ):
         identity = ti.Matrix.identity(float, C.n)
         left_cauchy_green = deformation @ deformation.transpose()
-        pressure_part = constants[LAMBDA] * ti.log(deformation.determinant())
+        pressure_part = constants[LAMBDA] * log(deformation.determinant())
         tau = constants[MU] * (left_cauchy_green - identity) + pressure_part * identity
         # Out of plane F is 1, so that b - I vanishes there.
         return tau, pressure_part, deformation, internal

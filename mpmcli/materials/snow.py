@@ -9,6 +9,7 @@ import taichi as ti
 from pydantic import Field
 
 from mpmcli.materials.elasticity import ElasticParameters, PoissonsRatio
+from mpmcli.materials.elementary import exp
 from mpmcli.materials.fixed_corotated import corotated_energy, corotated_stiffness
 from mpmcli.materials.law import Law, Mode, StateBound
 from mpmcli.materials.polar import rounding
@@ -191,7 +192,7 @@ class Snow(Law):
             variables[0] = ti.max(
                 ti.min(variables[0] * lost, constants[LARGEST_PLASTIC_J]), constants[SMALLEST_PLASTIC_J]
             )
-        hardness = ti.exp(constants[HARDENING] * (1.0 - variables[0]))
+        hardness = exp(constants[HARDENING] * (1.0 - variables[0]))
         J = s[0]
         for i in ti.static(range(1, F.n)):
             J *= s[i]
@@ -203,7 +204,7 @@ class Snow(Law):
     @ti.func
     def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
         """h (mu sum (s_i - 1)^2 + lambda/2 (J_E - 1)^2)."""
-        return ti.exp(constants[HARDENING] * (1.0 - internal[0])) * corotated_energy(
+        return exp(constants[HARDENING] * (1.0 - internal[0])) * corotated_energy(
             deformation, constants[MU], constants[LAMBDA]
         )
 

@@ -3,6 +3,8 @@
 import numpy as np
 import taichi as ti
 
+from mpmcli.materials.elementary import log
+
 
 def determinant(F: np.ndarray) -> np.ndarray:
     """Return det F, (n,), of 2 x 2 or 3 x 3 matrices, (n, d, d), written out: ten times as fast as a factorisation."""
@@ -34,5 +36,5 @@ def log_ratio(x: float):
     rounded = ratio - 1.0
     result = x
     if rounded != 0.0:
-        result = ti.log(ratio) * (x / rounded)
+        result = log(ratio) * (x / rounded)
     return result

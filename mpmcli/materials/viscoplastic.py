@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 import taichi as ti
 from pydantic import Field
 
+from mpmcli.materials.elementary import exp, log
 from mpmcli.materials.fluid import WeaklyCompressibleParameters, soft_bulk_modulus, volume_energy
 from mpmcli.materials.law import CARRIED, Law, Mode, StateBound
 from mpmcli.materials.polar import rounding
@@ -153,7 +154,7 @@ class Viscoplastic(Law):
                 # Dilation by rounding must not accumulate.
                 opened = ti.static(1.0 + 8.0 * rounding())
                 if opened < J:
-                    share *= J ** (-1.0 / TEAR_STRAIN)
+                    share *= exp(ti.static(-1.0 / TEAR_STRAIN) * log(J))
                 J = 1.0
                 size = 1.0
         if share < 1.0:

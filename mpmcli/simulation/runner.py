@@ -28,7 +28,7 @@ class Runner:
     a kind that needs more room than an earlier one, and for each scene with many particles.
     """
 
-    def __init__(self, arch: Arch = "auto", threads: int | None = 1, optimisation: Optimisation = "most") -> None:
+    def __init__(self, arch: Arch = "auto", threads: int | None = 1, optimisation: Optimisation | None = None) -> None:
         """Choose the backend; nothing starts.
 
         Args:

@@ -18,8 +18,8 @@ from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.plain_text import counted
 
-# Taichi's optimisations: all, all but those across branches, or few. Those across branches take most of the time to
-# compile the kernel of a batch, and save 5 % of its steps. Few halve the rest, and steps are 7 to 18 % slower.
+# Taichi's optimisations: all, all but those across branches, or few. Those across branches take half to three quarters
+# of the time to compile for a CPU, and save nothing. Few halve the rest, and steps are 7 to 30 % slower.
 Optimisation = Literal["all", "most", "few"]
 OPTIMISATION: dict[str, dict[str, bool]] = {
     "all": {},
@@ -68,7 +68,7 @@ def choose_backend(
     precision: str = "f32",
     *,
     compile_cache: bool = True,
-    optimisation: Optimisation = "all",
+    optimisation: Optimisation | None = None,
 ) -> Backend:
     """Return the backend that a name stands for on this machine; it is not started.
 
@@ -77,6 +77,7 @@ def choose_backend(
 
     Args:
         threads: of the CPU; None for one on each core.
+        optimisation: None for most on the CPU, and all on a GPU.
 
     Raises:
         InputError: it cannot do this precision, or not with so many threads.
@@ -93,7 +94,8 @@ def choose_backend(
     most = max(FEW_THREADS, 2 * cores)
     if not 1 <= count <= most:
         raise InputError(f"--threads {count} is not possible; give 1 to {most}, best {cores} on this machine.")
-    return Backend(wanted, count, precision, compile_cache, optimisation)
+    usual: Optimisation = "most" if wanted == "cpu" else "all"
+    return Backend(wanted, count, precision, compile_cache, optimisation or usual)
 
 
 def start(backend: Backend) -> Backend:

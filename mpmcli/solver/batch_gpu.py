@@ -103,7 +103,7 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     def scatter(g: ti.template(), w: int, p: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
         _grid, _nodes, particles, _orders, seen = ti.static(views(device, w, h, inverse, scale, box, last, extent))
-        particles.scatter(g, seen[g], p, constants[w][KICK], constants[w][RELAXED], True)
+        particles.scatter(g, seen[g], p, constants[w][KICK], constants[w][RELAXED])
 
     @ti.func
     def relax(g: ti.template(), group: ti.template(), w: int, p: int, counts: ti.template()):

@@ -17,6 +17,7 @@ from mpmcli.solver.batch_steps import BatchSteps
 from mpmcli.solver.box import box_of
 from mpmcli.solver.cpu_loops import clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.grid import DRIFT
+from mpmcli.solver.lanes import advance_range
 from mpmcli.solver.ordering import CHUNK
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.sorting import sort_serially, tiles_in_use
@@ -112,10 +113,8 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
                 nodes.images.find_contact(grid, q, gravity_step)
         speed = ti.sqrt(update_rows(grid, nodes, 0, rows, gravity_step))
         for g, group in ti.static(members):
-            sharpest = NOTHING
             first = w * room[g]
-            for p in range(first, first + counts[w, count.particles[g]]):
-                sharpest = ti.max(sharpest, particles.advance(g, group, p, moved))
+            sharpest = advance_range(particles, g, group, first, first + counts[w, count.particles[g]], moved)
             numbers[w, real.rate[g]] = numbers[w, real.rate[g]] + ti.cast(sharpest, ti.f64)
             if lost[particles.first_lost + g] != NOT_LOST:
                 speed = -1.0

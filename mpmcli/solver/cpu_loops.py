@@ -2,6 +2,8 @@
 
 import taichi as ti
 
+from mpmcli.solver.lanes import scatter_range
+
 
 @ti.func
 def clear_rows(grid: ti.template(), first: int, last: int):
@@ -27,8 +29,7 @@ def scatter_pencils(
     """Scatter the particles of the g-th group in pencils first to last - 1 of a colour."""
     for r in range(first, last):
         tile = order.first_tile + order.pencil_start(colour, r)
-        for p in range(order.start[tile], order.start[tile + order.pencil]):
-            particles.scatter(g, group, p, kick, relaxed, False)
+        scatter_range(particles, g, group, order.start[tile], order.start[tile + order.pencil], kick, relaxed)
 
 
 @ti.func

@@ -10,7 +10,18 @@ import numpy as np
 import taichi as ti
 
 from mpmcli.solver.frame_arrays import FrameArrays, stress_entries
-from mpmcli.solver.observe import respond_later
+from mpmcli.solver.lane_state import (
+    LANES,
+    constants_of,
+    internal_entries,
+    load_lanes,
+    matrix_of,
+    no_lanes,
+    stored_entries,
+    stored_of,
+    vector_of,
+)
+from mpmcli.solver.observe import respond_after
 from mpmcli.solver.particle_arrays import MASS, VOLUME, ParticleArrays
 from mpmcli.solver.sums import Sums, axis_pairs
 
@@ -23,7 +34,7 @@ def build_frame_reader(group: ParticleArrays) -> Callable[[float, int, int, Fram
     """
     d, law, serial = group.dimension, group.law, group.serial
     keeps_F = law.deformation == "F"
-    inner_count = len(group.internal)
+    inner_count, inners = len(group.internal), internal_entries(group)
     entries = tuple(enumerate(stress_entries(d)))
     pairs = axis_pairs(d)
     turns = len(pairs)
@@ -41,43 +52,64 @@ def build_frame_reader(group: ParticleArrays) -> Callable[[float, int, int, Fram
         sums: ti.types.ndarray(),
     ):
         ti.loop_config(serialize=serial)
-        for q in range(count):
-            p = first + q
-            row = group.id[p]
-            velocity, C = group.motion(p)
-            for c in ti.static(range(d)):
-                reals[row, c] = group.x[p][c]
-                reals[row, d + c] = velocity[c]
-            if ti.static(affine_at >= 0):
-                for i, j in ti.static(ti.ndrange(d, d)):
-                    reals[row, affine_at + i * d + j] = C[i, j]
+        for chunk in range((count + LANES - 1) // LANES):
+            begin = first + chunk * LANES
+            own = ti.min(LANES, count - chunk * LANES)
+            affine, deformation = no_lanes(ti.static(d * d)), no_lanes(ti.static(stored_entries(group)))
+            internal, rows = no_lanes(inners), no_lanes(ti.static(group.table.n))
+            load_lanes(group, begin, own, affine, deformation, internal, rows)
+            # Energy, J, internal variables, and entries of the deformation and of the stress.
+            shown = no_lanes(ti.static(2 + inners + d * d + len(entries)))
             # Half a step back, where the velocities are, and now: a loop, so that the law is compiled once.
             for k in range(ti.static(2 if law.projects or tau_at >= 0 else 1)):
-                tau, tau_zz, deformation, inner = respond_later(group, p, 0.5 * (k - 1) * dt, dt)
-                if k == 0:
-                    reals[row, 2 * d] = law.energy(deformation, inner, group.constants(p))
-                if ti.static(not law.projects):
-                    deformation = group.stored(p)
-                    inner = group.inner(p)
-                if ti.static(keeps_F):
-                    reals[row, 2 * d + 1] = deformation.determinant()
-                else:
-                    reals[row, 2 * d + 1] = deformation
-                for i in ti.static(range(inner_count)):
-                    reals[row, 2 * d + 2 + i] = inner[i]
+                for lane in range(LANES):
+                    C, inner = matrix_of(affine, d, lane), vector_of(internal, 0, inners, lane)
+                    stored, constants = stored_of(group, deformation, lane), constants_of(rows, lane)
+                    tau, tau_zz, after, inner_after = respond_after(
+                        law, stored, inner, C, 0.5 * (k - 1) * dt, dt, constants
+                    )
+                    if k == 0:
+                        shown[0, lane] = law.energy(after, inner_after, constants)
+                    if ti.static(not law.projects):
+                        after = stored
+                        inner_after = inner
+                    for i in ti.static(range(inners)):
+                        shown[2 + i, lane] = inner_after[i]
+                    if ti.static(keeps_F):
+                        shown[1, lane] = after.determinant()
+                        for i, j in ti.static(ti.ndrange(d, d)):
+                            shown[2 + inners + i * d + j, lane] = after[i, j]
+                    else:
+                        shown[1, lane] = after
+                    for column, place in ti.static(entries):
+                        if ti.static(place[0] < d and place[1] < d):
+                            shown[2 + inners + d * d + column, lane] = tau[place[0], place[1]]
+                        else:
+                            shown[2 + inners + d * d + column, lane] = tau_zz
+            for lane in range(own):
+                p = begin + lane
+                row = group.id[p]
+                velocity, C = group.motion(p)
+                for c in ti.static(range(d)):
+                    reals[row, c] = group.x[p][c]
+                    reals[row, d + c] = velocity[c]
+                for i in ti.static(range(2 + inner_count)):
+                    reals[row, 2 * d + i] = shown[i, lane]
+                if ti.static(affine_at >= 0):
+                    for i, j in ti.static(ti.ndrange(d, d)):
+                        reals[row, affine_at + i * d + j] = C[i, j]
                 if ti.static(gradient_at >= 0):
                     for i, j in ti.static(ti.ndrange(d, d)):
                         if ti.static(keeps_F):
-                            reals[row, gradient_at + i * d + j] = deformation[i, j]
+                            reals[row, gradient_at + i * d + j] = shown[2 + inners + i * d + j, lane]
                         else:
                             # The isotropic F of this volume.
-                            reals[row, gradient_at + i * d + j] = deformation ** (1.0 / d) if ti.static(i == j) else 0.0
+                            reals[row, gradient_at + i * d + j] = (
+                                shown[1, lane] ** (1.0 / d) if ti.static(i == j) else 0.0
+                            )
                 if ti.static(tau_at >= 0):
-                    for column, place in ti.static(entries):
-                        if ti.static(place[0] < d and place[1] < d):
-                            reals[row, tau_at + column] = tau[place[0], place[1]]
-                        else:
-                            reals[row, tau_at + column] = tau_zz
+                    for column in ti.static(range(len(entries))):
+                        reals[row, tau_at + column] = shown[2 + inners + d * d + column, lane]
         # In one order on any number of threads.
         ti.loop_config(serialize=True)
         for _ in range(1):

@@ -31,12 +31,26 @@ class Observation:
 def respond_later(group: ti.template(), p: int, later: float, dt: float):
     """Return what the law of particle p gives in the next step, dt (s), if it deforms on for a time `later`, s."""
     _, C = group.motion(p)
-    stored = group.stored(p)
-    if ti.static(group.law.deformation == "F"):
-        stored += later * (C @ stored)
+    return respond_after(group.law, group.stored(p), group.inner(p), C, later, dt, group.constants(p))
+
+
+@ti.func
+def respond_after(
+    law: ti.template(),
+    stored: ti.template(),
+    inner: ti.template(),
+    C: ti.template(),
+    later: float,
+    dt: float,
+    constants: ti.template(),
+):
+    """Return what `respond_later` does, from what a particle stores."""
+    state = stored
+    if ti.static(law.deformation == "F"):
+        state += later * (C @ stored)
     else:
-        stored *= 1.0 + later * C.trace()
-    return group.law.respond(stored, group.inner(p), C, dt, group.constants(p))
+        state *= 1.0 + later * C.trace()
+    return law.respond(state, inner, C, dt, constants)
 
 
 def build_observation(group: ParticleArrays) -> Callable[..., Observation]:

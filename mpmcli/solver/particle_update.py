@@ -16,7 +16,7 @@ SMALLEST_J = 1e-6
 
 @ti.data_oriented
 class ParticleUpdate:
-    """Both halves of a step of a particle.
+    """Both halves of a step of a particle, as a GPU takes them; `lanes` takes them on the CPU.
 
     Attributes:
         extent: size of the domain, m; last: node of the upper walls, per axis.
@@ -41,17 +41,18 @@ class ParticleUpdate:
         return bool((self.lost.to_numpy() != NOT_LOST).any())
 
     @ti.func
-    def scatter(
-        self, g: ti.template(), group: ti.template(), p: int, kick: float, relaxed: float, atomic: ti.template()
-    ):
-        """Scatter one particle, unless it is crushed or inverted: its stress would spread NaN over the grid."""
+    def scatter(self, g: ti.template(), group: ti.template(), p: int, kick: float, relaxed: float):
+        """Scatter one particle, with atomics.
+
+        One that is crushed or inverted is lost: its stress would spread NaN over the grid.
+        """
         if volume_ratio(group, group.stored(p)) > SMALLEST_J:
-            scatter(group, self.grid, p, kick, atomic)
+            scatter(group, self.grid, p, kick)
         else:
             ti.atomic_min(self.lost[self.first_lost + g], p)
         if ti.static(self.grid.keeps_filling):
             if relaxed > 0.0:
-                scatter_volume(group.x[p], group.row(p)[VOLUME], self.grid, atomic)
+                scatter_volume(group.x[p], group.row(p)[VOLUME], self.grid, True)
 
     @ti.func
     def relax(self, group: ti.template(), p: int, relaxed: float):
@@ -76,15 +77,10 @@ class ParticleUpdate:
         x = group.x[p]
         v, gradient = gather(x, self.grid, self.grid.nodes)
         C = ti.Matrix.zero(float, d, d)
-        inside = x
-        beyond = 0.0
         for c in ti.static(range(d)):
             for a in ti.static(range(d)):
                 C[c, a] = gradient[a, c]
-            moved = x[c] + dt * v[c]
-            inside[c] = ti.select(moved > 0.0, moved, 0.0)
-            inside[c] = ti.select(inside[c] < self.extent[c], inside[c], self.extent[c])
-            beyond += ti.abs(moved - inside[c])
+        inside, beyond = self.moved(x, v, dt)
         if ti.static(self.grid.scheme.keeps_before):
             kept = self.unseen_velocity(group, p, x)
             for c in ti.static(range(d)):
@@ -100,16 +96,7 @@ class ParticleUpdate:
         # Deformation. The rate here, where C is at hand, takes half the time that it would take at the end.
         deforming = deformation_rate(group, C)
         if ti.static(group.law.deformation == "F"):
-            # F - I grows by dt C + dt C (F - I).
-            old = group.displacement_gradient[p]
-            new = old
-            for i in ti.static(range(d)):
-                for k in ti.static(range(d)):
-                    rate = dt * C[i, k]
-                    new[i, k] += rate
-                    for j in ti.static(range(old.m)):
-                        new[i, j] += rate * old[k, j]
-            group.displacement_gradient[p] = new
+            group.displacement_gradient[p] = deformed_gradient(group.displacement_gradient[p], C, dt)
         else:
             growth = volume_growth(C, dt)
             group.J_minus_1[p] += growth + growth * group.J_minus_1[p]
@@ -129,6 +116,18 @@ class ParticleUpdate:
         return deforming
 
     @ti.func
+    def moved(self, x: ti.template(), v: ti.template(), dt: float):
+        """Return where a particle at x moves in dt, clamped to the domain, and how far it would leave it, m."""
+        inside = ti.Vector.zero(float, self.dimension)
+        beyond = 0.0
+        for c in ti.static(range(self.dimension)):
+            moved = x[c] + dt * v[c]
+            inside[c] = ti.select(moved > 0.0, moved, 0.0)
+            inside[c] = ti.select(inside[c] < self.extent[c], inside[c], self.extent[c])
+            beyond += ti.abs(moved - inside[c])
+        return inside, beyond
+
+    @ti.func
     def unseen_velocity(self, group: ti.template(), p: int, x: ti.template()):
         """Return the share that particle p, at x, keeps of the velocity of its own that the nodes do not see.
 
@@ -141,3 +140,16 @@ class ParticleUpdate:
         for c in ti.static(range(self.dimension)):
             kept[c] = self.grid.scheme.flip * (group.v[p][c] - before[c])
         return kept
+
+
+@ti.func
+def deformed_gradient(H: ti.template(), C: ti.template(), dt: float):
+    """Return F - I after a step from H = F - I before it, d rows: it grows by dt C + dt C H."""
+    new = H
+    for i in ti.static(range(H.n)):
+        for k in ti.static(range(H.n)):
+            rate = dt * C[i, k]
+            new[i, k] += rate
+            for j in ti.static(range(H.m)):
+                new[i, j] += rate * H[k, j]
+    return new

@@ -29,11 +29,13 @@ class QuadraticSpline:
 
     @ti.func
     def weights(self, distance: ti.template()):
-        """Return the weights of the three nodes, each a vector over the axes (Steffen et al. 2008, eq. 24)."""
-        return (
-            0.5 * (1.5 - distance) ** 2,
-            0.75 - (distance - 1.0) ** 2,
-            0.5 * (distance - 0.5) ** 2,
+        """Return the weights of the three nodes, a row each, over the axes (Steffen et al. 2008, eq. 24)."""
+        return ti.Matrix.rows(
+            [
+                0.5 * (1.5 - distance) ** 2,
+                0.75 - (distance - 1.0) ** 2,
+                0.5 * (distance - 0.5) ** 2,
+            ]
         )
 
 
@@ -53,14 +55,16 @@ class CubicSpline:
 
     @ti.func
     def weights(self, distance: ti.template()):
-        """Return the weights of the four nodes, each a vector over the axes (Steffen et al. 2008, eq. 25)."""
+        """Return the weights of the four nodes, a row each, over the axes (Steffen et al. 2008, eq. 25)."""
         up = distance - 1.0
         down = 2.0 - distance
-        return (
-            down**3 / 6.0,
-            2.0 / 3.0 - up**2 + 0.5 * up**3,
-            2.0 / 3.0 - down**2 + 0.5 * down**3,
-            up**3 / 6.0,
+        return ti.Matrix.rows(
+            [
+                down**3 / 6.0,
+                2.0 / 3.0 - up**2 + 0.5 * up**3,
+                2.0 / 3.0 - down**2 + 0.5 * down**3,
+                up**3 / 6.0,
+            ]
         )
 
 

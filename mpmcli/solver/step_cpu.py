@@ -12,11 +12,20 @@ import taichi as ti
 from mpmcli.solver.cpu_loops import clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid
+from mpmcli.solver.lanes import advance_range
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.ordering import CHUNK, TileOrder, share_start
 from mpmcli.solver.particle_update import NOT_LOST, ParticleUpdate
 from mpmcli.solver.particles import ParticleGroup
-from mpmcli.solver.state_bounds import NOTHING, StateBounds, entries, state_bounds_of, widen_motion, widen_state
+from mpmcli.solver.state_bounds import (
+    NOTHING,
+    StateBounds,
+    deformation_rate,
+    entries,
+    state_bounds_of,
+    widen_motion,
+    widen_state,
+)
 
 
 @dataclass(frozen=True)
@@ -72,14 +81,13 @@ def build_cpu_step(
         Each thread keeps its own maxima and merges them once: with Taichi's own reduction, two threads took as long as
         one, as if they shared cache lines.
         """
-        sharpest = NOTHING
         own = ti.Vector([NOTHING] * ti.static(max(len(maxima[g]), 1)))
-        for p in range(share_start(group.count, t, threads), share_start(group.count, t + 1, threads)):
-            rate = particles.advance(g, group, p, dt)
-            sharpest = ti.max(sharpest, rate)
-            if ti.static(hardens[g]):
-                v, _ = group.motion(p)
-                widen_motion(own, v, rate)
+        first, last = share_start(group.count, t, threads), share_start(group.count, t + 1, threads)
+        sharpest = advance_range(particles, g, group, first, last, dt)
+        if ti.static(hardens[g]):
+            for p in range(first, last):
+                v, C = group.motion(p)
+                widen_motion(own, v, deformation_rate(group, C))
                 widen_state(group, own, p)
         ti.atomic_max(largest_rate[g][None], sharpest)
         for k in ti.static(range(len(maxima[g]))):

@@ -23,7 +23,7 @@ def build_gpu_step(
             grid.clear(grid.linear_index(grid.box_node(q)))
         for g, group in ti.static(numbered):
             for p in range(group.count):
-                particles.scatter(g, group, p, kick, relaxed, True)
+                particles.scatter(g, group, p, kick, relaxed)
         for g, group in ti.static(numbered):
             if ti.static(group.law.relaxes):
                 for p in range(group.count):

@@ -13,16 +13,14 @@ from mpmcli.solver.particle_arrays import MASS, VOLUME
 
 
 @ti.func
-def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float, atomic: ti.template()):
-    """Add the mass and the momentum of particle p, stress included, to the nodes around it.
+def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float):
+    """Add the mass and the momentum of particle p, stress included, to the nodes around it, with atomics.
 
     A law with plastic flow projects the particle's state first. Forces change what is scattered: v by kick a, and C by
     kick da/dx.
 
     Node i receives w_i (m v + A (x_i - x_p)) with A = m C - dt V0 tau / D (Hu et al. 2018, eq. 18; D = h^2/4
-    for quadratic splines), and w_i m. PIC leaves m C out. Without `atomic` no other thread may write those nodes.
-    """
-    d = ti.static(grid.dimension)
+    for quadratic splines), and w_i m. PIC leaves m C out."""
     affine = ti.static(grid.scheme.affine)
     row = group.row(p)
     mass = row[MASS]
@@ -36,25 +34,43 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float, atom
         C += kick * slope
     base, distance = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
+    middle, change = momentum(grid, distance, mass, row[VOLUME], v, C, stress, kick)
+    add_linear(grid.nodes, grid, grid.linear_index(base), w, middle, change, True)
+    if ti.static(grid.scheme.keeps_before):
+        # Last, and with a copy: before it, Taichi 1.7.4 loses what a force with branches adds to v and C.
+        own_v, own_C = group.motion(p)
+        scatter_before(group.x[p], mass, own_v, own_C, grid, True)
 
-    # Momentum and mass that the middle node would take, and their change per cell along each axis.
+
+@ti.func
+def momentum(
+    grid: ti.template(),
+    distance: ti.template(),
+    mass: float,
+    volume: float,
+    v: ti.template(),
+    C: ti.template(),
+    stress: ti.template(),
+    kick: float,
+):
+    """Return the momentum and mass that the middle node of a stencil would take, and their change per cell.
+
+    Both are as wide as a node; the change has a row for each axis. `distance` is that to the first node, in cells.
+    """
+    d = ti.static(grid.dimension)
     middle = ti.Vector.zero(float, grid.width)
     change = ti.Matrix.zero(float, d, grid.width)
-    stress_scale = kick * row[VOLUME] * grid.gradient_scale
+    stress_scale = kick * volume * grid.gradient_scale
     for c in ti.static(range(d)):
         middle[c] = mass * v[c]
         for a in ti.static(range(d)):
-            if ti.static(affine):
+            if ti.static(grid.scheme.affine):
                 change[a, c] = (mass * grid.spacing) * C[c, a] - stress_scale * stress[c, a]
             else:
                 change[a, c] = -stress_scale * stress[c, a]
             middle[c] -= change[a, c] * (distance[a] - 1.0)
     middle[d] = mass
-    add_linear(grid.nodes, grid, grid.linear_index(base), w, middle, change, atomic)
-    if ti.static(grid.scheme.keeps_before):
-        # Last, and with a copy: before it, Taichi 1.7.4 loses what a force with branches adds to v and C.
-        own_v, own_C = group.motion(p)
-        scatter_before(group.x[p], mass, own_v, own_C, grid, atomic)
+    return middle, change
 
 
 @ti.func
@@ -103,6 +119,8 @@ def add_linear(
 ):
     """Add to the nodes of a stencil a quantity that varies linearly over it, weighted by the spline.
 
+    Without `atomic` no other thread may write those nodes.
+
     Args:
         field: of the nodes; first: linear index of the first node.
         middle: the quantity at the middle node; change: its change per cell, a row for each axis.
@@ -113,7 +131,7 @@ def add_linear(
         line = middle
         step = ti.Vector.zero(float, grid.width)
         for a in ti.static(range(d - 1)):
-            line_weight *= w[o[a]][a]
+            line_weight *= w[o[a], a]
         for c in ti.static(range(grid.width)):
             for a in ti.static(range(d - 1)):
                 if ti.static(o[a] == 0):
@@ -125,11 +143,11 @@ def add_linear(
             line[c] *= line_weight
             step[c] = line_weight * change[d - 1, c]
         node = first + line_node
-        add(field, node, (line - step) * w[0][d - 1], atomic)
-        add(field, node + 1, line * w[1][d - 1], atomic)
-        add(field, node + 2, (line + step) * w[2][d - 1], atomic)
+        add(field, node, (line - step) * w[0, d - 1], atomic)
+        add(field, node + 1, line * w[1, d - 1], atomic)
+        add(field, node + 2, (line + step) * w[2, d - 1], atomic)
         if ti.static(grid.scheme.spline.nodes == 4):
-            add(field, node + 3, (line + 2.0 * step) * w[3][d - 1], atomic)
+            add(field, node + 3, (line + 2.0 * step) * w[3, d - 1], atomic)
 
 
 @ti.func
@@ -148,23 +166,43 @@ def gather(x: ti.template(), grid: ti.template(), field: ti.template()):
     The gradient has a row for each axis: row a holds dv/dx_a, so it is the transpose of C. Both are as wide
     as a node; entries beyond the d components of the velocity have no meaning.
     """
-    d = ti.static(grid.dimension)
     base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
-    first = grid.linear_index(base)
+    velocity, moment = gather_linear(field, grid, grid.linear_index(base), w)
+    return velocity, centred(grid, distance, velocity, moment)
+
+
+@ti.func
+def centred(grid: ti.template(), distance: ti.template(), velocity: ti.template(), moment: ti.template()):
+    """Return the gradient of the velocity at a point from sums over its stencil, see `gather` and `gather_linear`."""
+    gradient = moment
+    for a in ti.static(range(moment.n)):
+        for c in ti.static(range(moment.m)):
+            gradient[a, c] = (moment[a, c] - velocity[c] * (distance[a] - 1.0)) * grid.gradient_scale
+    return gradient
+
+
+@ti.func
+def gather_linear(field: ti.template(), grid: ti.template(), first: int, w: ti.template()):
+    """Return the weighted sums over a stencil of what nodes hold, and of that times the cells from the middle node.
+
+    Args:
+        field: of the nodes; first: linear index of the first node.
+    """
+    d = ti.static(grid.dimension)
     velocity = ti.Vector.zero(float, grid.width)
     moment = ti.Matrix.zero(float, d, grid.width)
     for o, line_node in ti.static(grid.lines):
         line_weight = 1.0
         for a in ti.static(range(d - 1)):
-            line_weight *= w[o[a]][a]
+            line_weight *= w[o[a], a]
         node = first + line_node
-        low = field[node] * (w[0][d - 1] * line_weight)
-        mid = field[node + 1] * (w[1][d - 1] * line_weight)
-        high = field[node + 2] * (w[2][d - 1] * line_weight)
+        low = field[node] * (w[0, d - 1] * line_weight)
+        mid = field[node + 1] * (w[1, d - 1] * line_weight)
+        high = field[node + 2] * (w[2, d - 1] * line_weight)
         total = (low + high) + mid
         if ti.static(grid.scheme.spline.nodes == 4):
-            far = field[node + 3] * (w[3][d - 1] * line_weight)
+            far = field[node + 3] * (w[3, d - 1] * line_weight)
             total += far
             for c in ti.static(range(grid.width)):
                 moment[d - 1, c] += 2.0 * far[c]
@@ -178,7 +216,4 @@ def gather(x: ti.template(), grid: ti.template(), field: ti.template()):
                 if ti.static(o[a] == 3):
                     moment[a, c] += 2.0 * total[c]
             moment[d - 1, c] += high[c] - low[c]
-    for a in ti.static(range(d)):
-        for c in ti.static(range(grid.width)):
-            moment[a, c] = (moment[a, c] - velocity[c] * (distance[a] - 1.0)) * grid.gradient_scale
     return velocity, moment

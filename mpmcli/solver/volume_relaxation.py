@@ -74,11 +74,11 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
     if near_wall:
         for o, _line_node in ti.static(grid.lines):
             for k in ti.static(range(grid.scheme.spline.nodes)):
-                weight = w[k][d - 1]
+                weight = w[k, d - 1]
                 node = base
                 node[d - 1] += k
                 for a in ti.static(range(d - 1)):
-                    weight *= w[o[a]][a]
+                    weight *= w[o[a], a]
                     node[a] += o[a]
                 held = mirrored_sum(node, grid, last, reach)
                 mean += held * weight
@@ -90,10 +90,10 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
         for o, line_node in ti.static(grid.lines):
             line_weight = 1.0
             for a in ti.static(range(d - 1)):
-                line_weight *= w[o[a]][a]
+                line_weight *= w[o[a], a]
             for k in ti.static(range(grid.scheme.spline.nodes)):
                 held = grid.holding[first + line_node + k]
-                total += held * (line_weight * w[k][d - 1])
+                total += held * (line_weight * w[k, d - 1])
                 smallest = ti.min(smallest, held)
         mean = total[d]
         least = smallest[d]

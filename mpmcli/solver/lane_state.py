@@ -1,0 +1,103 @@
+"""What particles store, for LANES of them at once on the CPU, so that a compiler makes vector instructions.
+
+A loop over lanes becomes vector instructions, branches included, where it reads and writes local arrays alone and calls
+nothing. One that stores to fields does not, as Taichi reads the address of a field anew after every store. Therefore
+particles are copied to local arrays with a row for each quantity and a column for each lane. Every lane computes what
+it would compute alone.
+"""
+
+import taichi as ti
+
+from mpmcli.solver.particle_arrays import CONSTANTS
+
+LANES = 16
+
+
+@ti.func
+def no_lanes(rows: ti.template()):
+    """Return an array of zeros with so many rows."""
+    return ti.Matrix.zero(float, rows, LANES)
+
+
+def stored_entries(group: object) -> int:
+    """Return the numbers of what a particle stores of its deformation."""
+    return group.dimension**2 if group.law.deformation == "F" else 1
+
+
+def internal_entries(group: object) -> int:
+    """Return the numbers that `ParticleArrays.inner` returns."""
+    return max(len(group.internal), 1)
+
+
+@ti.func
+def load_lanes(
+    group: ti.template(),
+    begin: int,
+    count: int,
+    affine: ti.template(),
+    deformation: ti.template(),
+    internal: ti.template(),
+    rows: ti.template(),
+):
+    """Copy `count` particles from `begin` on; lanes beyond the last one repeat it.
+
+    Args:
+        affine: takes C, d^2; deformation: F - I, d^2, or J - 1; internal: the internal variables.
+        rows: takes the row of the table.
+    """
+    d = ti.static(group.dimension)
+    for lane in range(LANES):
+        p = begin + ti.min(lane, count - 1)
+        for c, a in ti.static(ti.ndrange(d, d)):
+            affine[c * d + a, lane] = group.gradient[p][a, c]
+        load_deformation(group, p, lane, deformation)
+        for i in ti.static(range(len(group.internal))):
+            internal[i, lane] = group.internal[i][p]
+        row = group.row(p)
+        for k in ti.static(range(row.n)):
+            rows[k, lane] = row[k]
+
+
+@ti.func
+def load_deformation(group: ti.template(), p: int, lane: int, deformation: ti.template()):
+    """Copy F - I or J - 1 of particle p to a lane."""
+    d = ti.static(group.dimension)
+    if ti.static(group.law.deformation == "F"):
+        for i, j in ti.static(ti.ndrange(d, d)):
+            deformation[i * d + j, lane] = group.displacement_gradient[p][i, j]
+    else:
+        deformation[0, lane] = group.J_minus_1[p]
+
+
+@ti.func
+def matrix_of(lanes: ti.template(), d: ti.template(), lane: int):
+    """Return the d x d matrix in a lane."""
+    result = ti.Matrix.zero(float, d, d)
+    for i, j in ti.static(ti.ndrange(d, d)):
+        result[i, j] = lanes[i * d + j, lane]
+    return result
+
+
+@ti.func
+def vector_of(lanes: ti.template(), first: ti.template(), size: ti.template(), lane: int):
+    """Return some entries of a lane, from row `first` on."""
+    result = ti.Vector.zero(float, size)
+    for i in ti.static(range(size)):
+        result[i] = lanes[first + i, lane]
+    return result
+
+
+@ti.func
+def stored_of(group: ti.template(), deformation: ti.template(), lane: int):
+    """Return J, or F as a d x d matrix, of a lane."""
+    if ti.static(group.law.deformation == "F"):
+        d = ti.static(group.dimension)
+        return ti.Matrix.identity(float, d) + matrix_of(deformation, d, lane)
+    else:
+        return 1.0 + deformation[0, lane]
+
+
+@ti.func
+def constants_of(rows: ti.template(), lane: int):
+    """Return the constants of the law in a lane."""
+    return vector_of(rows, CONSTANTS, ti.static(rows.n - CONSTANTS), lane)
