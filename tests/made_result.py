@@ -92,7 +92,8 @@ def write_made(
     changes: dict[int, dict[str, object]] | None = None,
 ) -> Path:
     """Store the run as "packed", "segments" or "series", with other values in some rows, and return the directory."""
-    store = (VtkSeriesStore if form == "series" else SegmentStore)(directory, made_header(dimension, driven=driven))
+    header, hold = made_header(dimension, driven=driven), np.inf if form == "packed" else 0.0
+    store = (VtkSeriesStore if form == "series" else SegmentStore)(directory, header, hold=hold)
     # Nothing of it needs to outlive a power cut.
     with mock.patch("os.fsync"):
         for k in range(frames):

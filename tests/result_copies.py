@@ -83,7 +83,9 @@ class StoredRun:
         return directory
 
     def _store(self, directory: Path, form: str, frames: Sequence[Frame], rows: Sequence[LedgerRow]) -> None:
-        store = (VtkSeriesStore if form == "series" else SegmentStore)(directory, self.header)
+        # Frames that are packed in the end are sealed at once: a segment of each takes most of the time.
+        hold = np.inf if form == "packed" else 0.0
+        store = (VtkSeriesStore if form == "series" else SegmentStore)(directory, self.header, hold=hold)
         for frame, row in zip(frames, rows, strict=True):
             store.write(frame, row)
         if form != "segments":
