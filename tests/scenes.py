@@ -62,18 +62,19 @@ def stresses(fields: dict[str, np.ndarray]) -> np.ndarray:
     return fields["stress"].reshape(-1, 3, 3)
 
 
-def restart(solver: Solver, sample: BodyParticles, end: float) -> None:
-    """Begin a run of a scene of one body again, with other particles, as many: its kernels stay compiled."""
-    group = solver.groups[0]
-    group.x.from_numpy(sample.position.astype(group.real))
-    group.set_motion(sample.velocity, sample.affine)
-    d = group.dimension
-    group.set_deformation(
-        np.ones(group.count) if group.law.deformation == "J" else np.tile(np.eye(d), (group.count, 1, 1))
-    )
-    for variable, values in zip(group.law.internal, group.internal, strict=True):
-        values.fill(variable.at_rest)
-    group.id.from_numpy(np.arange(group.count, dtype=np.int32))
+def restart(solver: Solver, samples: Sequence[BodyParticles], end: float) -> None:
+    """Begin a run of a scene with one body of each law again, with other particles, as many: kernels stay compiled."""
+    for group in solver.groups:
+        (body,) = group.bodies
+        sample, d = samples[body], group.dimension
+        group.x.from_numpy((sample.position - solver.scene.domain.origin).astype(group.real))
+        group.set_motion(sample.velocity, sample.affine)
+        group.set_deformation(
+            np.ones(group.count) if group.law.deformation == "J" else np.tile(np.eye(d), (group.count, 1, 1))
+        )
+        for variable, values in zip(group.law.internal, group.internal, strict=True):
+            values.fill(variable.at_rest)
+        group.id.from_numpy(np.arange(group.count, dtype=np.int32) + sum(s.count for s in samples[:body]))
     solver.scene = solver.scene.model_copy(update={"time": solver.scene.time.model_copy(update={"end": end})})
     solver.restart()
 

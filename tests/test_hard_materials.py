@@ -60,7 +60,7 @@ class Bench:
         velocity = rate * (position - position.mean(0))
         velocity[:, -1] -= fall
         affine = np.tile(rate * np.eye(self.dimension), (len(position), 1, 1))
-        restart(self.solver, replace(self.cube, position=position, velocity=velocity, affine=affine), end)
+        restart(self.solver, [replace(self.cube, position=position, velocity=velocity, affine=affine)], end)
 
     def run(self) -> UnstableRunError | None:
         """Run to the end, and return the error that stopped it; nothing may be NaN unnoticed."""

@@ -1,15 +1,16 @@
 """A run whose state is lost stops at once, and says which particle, where and why."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from solver_state import scene_of
 
 from mpmcli.scene import Scene, sample_bodies
+from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.solver import Solver
+from mpmcli.solver.state import SavedState
 
 H = 0.1
 STEP = 1e-3
@@ -75,12 +76,34 @@ def run_until_lost(solver: Solver, steps: int = 40) -> UnstableRunError:
     return stopped.value
 
 
-@pytest.fixture
-def running(backend_of: Callable) -> Solver:
-    """Return a solver on two threads that has taken some steps and sorts."""
-    solver = Solver(scene(), backend_of("f32", 2))
+@pytest.fixture(scope="module")
+def backend(backend_of: Callable) -> Backend:
+    return backend_of("f32", 2)
+
+
+@pytest.fixture(scope="module")
+def started(backend: Backend) -> tuple[Solver, SavedState, SavedState]:
+    """Return a solver on two threads, its state at the start, and that after some steps and sorts."""
+    solver = Solver(scene(), backend)
+    start = solver.state.save()
     for _ in range(30):
         solver.step(STEP)
+    return solver, start, solver.state.save()
+
+
+@pytest.fixture
+def fresh(started: tuple[Solver, SavedState, SavedState]) -> Solver:
+    """Return the solver as it was at the start."""
+    solver, start, _ = started
+    solver.state.load(start)
+    return solver
+
+
+@pytest.fixture
+def running(started: tuple[Solver, SavedState, SavedState]) -> Solver:
+    """Return the solver as it was after some steps and sorts."""
+    solver, _, later = started
+    solver.state.load(later)
     return solver
 
 
@@ -132,7 +155,7 @@ def test_a_lost_velocity_names_its_body(running: Solver, value: float) -> None:
     assert all(np.isfinite(diagnosis.position))
 
 
-def test_a_particle_that_leaves_is_named_with_its_speed(backend_of: Callable) -> None:
+def test_a_particle_that_leaves_is_named_with_its_speed(backend: Backend) -> None:
     """One lone particle, faster than the step allows, leaves: it is it, there, and that fast."""
     lone = scene_of(
         domain={"size": [2.4, 1.5], "origin": [-1.0, 0.0], "spacing": H},
@@ -147,41 +170,41 @@ def test_a_particle_that_leaves_is_named_with_its_speed(backend_of: Callable) ->
             }
         ],
     )
-    diagnosis = run_until_lost(Solver(lone, backend_of("f32", 2))).diagnosis
+    diagnosis = run_until_lost(Solver(lone, backend)).diagnosis
     assert (diagnosis.particle, diagnosis.body, diagnosis.step) == (0, "bullet", 1)
     assert diagnosis.cause == "left the domain at 900 m/s"
     assert diagnosis.position == pytest.approx((1.05, 0.75), abs=1e-5)
     assert diagnosis.limit == "speed"
 
 
-def test_frames_before_the_end_stay(running: Solver, backend_of: Callable) -> None:
+def test_frames_before_the_end_stay(fresh: Solver) -> None:
     """A run that is lost between two frames has yielded the earlier ones, all of them finite and complete."""
-    solver = Solver(scene(), backend_of("f32", 2))
-    frames = solver.frames()
+    frames = fresh.frames()
     kept = [next(frames) for _ in range(4)]
-    poison_deformation(solver, "fluid", 3, np.nan)
+    poison_deformation(fresh, "fluid", 3, np.nan)
     with pytest.raises(UnstableRunError):
         next(frames)
     with pytest.raises(StopIteration):
         next(frames)
     assert [frame.time for frame, _ in kept] == pytest.approx([0.0, 0.02, 0.04, 0.06], abs=1e-15)
     for frame, row in kept:
-        assert len(frame.position) == solver.particle_count
+        assert len(frame.position) == fresh.particle_count
         assert np.isfinite(frame.position).all()
         assert row.volume_ratio_min > 0
         assert np.isfinite(row.energy)
 
 
-def test_no_frame_holds_a_crushed_particle(backend_of: Callable) -> None:
+def test_no_frame_holds_a_crushed_particle(fresh: Solver) -> None:
     """A particle that is pressed to nothing is seen before that state becomes a frame."""
-    lone = scene()
-    samples = sample_bodies(lone)
+    group, place = by_id(fresh, "fluid")
+    v, C = group.motion_to_numpy()
     # A fifth shorter along each axis in the first step, and so on until nothing is left.
-    crushed = [replace(s, affine=np.tile(-2e5 * np.eye(2), (s.count, 1, 1))) for s in samples[:1]]
-    solver = Solver(lone, backend_of("f32", 2), [*crushed, *samples[1:]])
-    limits = [limit for limit in solver.limits() if limit.name == "deformation"]
+    C[place[: sample_bodies(fresh.scene)[0].count]] = -2e5 * np.eye(2)
+    group.set_motion(v, C)
+    fresh.restart()
+    limits = [limit for limit in fresh.limits() if limit.name == "deformation"]
     assert min(limits).value == pytest.approx(0.5 / 4e5)
-    frames = solver.frames()
+    frames = fresh.frames()
     with pytest.raises(UnstableRunError, match="crushed to nothing"):
         for frame, row in frames:
             assert row.volume_ratio_min > 0, frame.index
