@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -226,14 +227,15 @@ def test_the_split_has_its_fractions_of_every_first_trajectories(seed):
 
 def test_a_split_of_one_part_has_no_other():
     head = 'base = "base.toml"\ncount = 100\n[split]\n'
-    assert {sweep_of(f"{head}valid = 1").split_of(n) for n in range(100)} == {"valid"}
+    whole = sweep_of(f"{head}valid = 1")
+    assert {whole.split_of(n) for n in range(100)} == {"valid"}
     halves = sweep_of(f"{head}train = 0.5\ntest = 0.5")
     assert {halves.split_of(n) for n in range(100)} == {"train", "test"}
 
 
 def test_seeds_split_differently():
-    names = [[sweep_of(SWEEP.replace("seed = 7", f"seed = {seed}")).split_of(n) for n in range(50)] for seed in (1, 2)]
-    assert names[0] != names[1]
+    sweeps = [sweep_of(SWEEP.replace("seed = 7", f"seed = {seed}")) for seed in (1, 2)]
+    assert [sweeps[0].split_of(n) for n in range(50)] != [sweeps[1].split_of(n) for n in range(50)]
 
 
 def test_every_trajectory_has_its_own_jitter_and_each_body_its_own():
@@ -288,20 +290,22 @@ def test_there_are_as_many_trajectories_as_the_sweep_says():
             draw(sweep, number)
 
 
-@pytest.mark.parametrize("method", ["random", "sobol", "latin"])
-def test_every_process_draws_the_same(method, run_python):
-    text = SWEEP.replace("seed = 7", f'seed = 7\nmethod = "{method}"')
-    sweep = sweep_of(text)
+def test_every_process_draws_the_same(run_python):
+    expected, methods = [], ["random", "sobol", "latin"]
+    for method in methods:
+        sweep = sweep_of(SWEEP.replace("seed = 7", f'seed = 7\nmethod = "{method}"'))
+        Path("sweep.toml").rename(f"{method}.toml")
+        expected.append([sweep.key, *(draw(sweep, n).data for n in (5, 3))])
     code = (
         "import json\n"
         "from mpmcli.dataset.draw import draw\n"
         "from mpmcli.dataset.sweep_file import load_sweep\n"
         "from mpmcli.materials.registry import parameter_models\n"
-        "sweep = load_sweep('sweep.toml', laws=parameter_models())\n"
-        "print(json.dumps([sweep.key, *(draw(sweep, n).data for n in (5, 3))]))\n"
+        f"sweeps = [load_sweep(f'{{method}}.toml', laws=parameter_models()) for method in {methods}]\n"
+        "print(json.dumps([[sweep.key, *(draw(sweep, n).data for n in (5, 3))] for sweep in sweeps]))\n"
     )
     said = run_python(code, environment={"PYTHONHASHSEED": "12345"}).stdout.splitlines()[-1]
-    assert json.loads(said) == [sweep.key, *(draw(sweep, n).data for n in (5, 3))]
+    assert json.loads(said) == expected
 
 
 def test_scipy_is_loaded_only_where_a_sequence_is_drawn(run_python):
