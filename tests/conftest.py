@@ -20,6 +20,8 @@ ROOT = Path(__file__).resolve().parent.parent
 settings.register_profile("mpmcli", deadline=None, max_examples=50, print_blob=True)
 settings.load_profile("mpmcli")
 
+# Taichi's variable, and its value for few optimisations.
+FEW = ("TI_ADVANCED_OPTIMIZATION", "0")
 
 # Files that take longest, which begin first: at the end of a run one core would wait for the other.
 LONG = ("test_docs", "test_sweep_run", "test_solver_paths", "test_batch", "test_knobs", "test_validate_cli")
@@ -94,6 +96,17 @@ def run_module() -> Callable[..., PythonRun]:
     return run
 
 
+@pytest.fixture(scope="module")
+def few_optimisations() -> Iterator[None]:
+    """Let the commands and processes of a module compile with few of Taichi's optimisations.
+
+    All of them take half of the time to compile or more, and leave the bytes as they are (test_optimisation.py).
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(*FEW)
+        yield
+
+
 @pytest.fixture
 def record_property(record_property: Callable[[str, object], None]) -> Callable[[str, object], None]:
     """Return pytest's own, for numbers of numpy too, which a worker could not send to the process that reports."""
@@ -107,8 +120,7 @@ def backend_of() -> "Iterator[Callable[..., Backend]]":
     Taichi is global: whatever was built on the backend before dies with it, so a module starts one and
     builds its solvers on it, or keeps no solver from one test to the next.
 
-    Taichi's own optimisations take half of the time to compile and leave the bytes as they are (test_optimisation.py),
-    so that they are left out here. Commands that a test runs, and `fully_optimised` backends, have them.
+    It compiles with few of Taichi's optimisations, as `few_optimisations` says; a `fully_optimised` one has all.
     """
     from mpmcli.solver.backend import start_backend, stop_backend
 
@@ -117,7 +129,7 @@ def backend_of() -> "Iterator[Callable[..., Backend]]":
         if fully_optimised:
             return start_backend(arch, threads, precision)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("TI_ADVANCED_OPTIMIZATION", "0")
+            patch.setenv(*FEW)
             return start_backend(arch, threads, precision)
 
     yield start

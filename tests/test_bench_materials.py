@@ -150,6 +150,7 @@ class TestWorker:
             assert block["watch_seconds"] == pytest.approx(0.02 * 0.15 * times)
         assert flowing == {"share": 0.5}
 
+    @pytest.mark.usefixtures("few_optimisations")
     def test_a_column_runs_in_its_own_process(self) -> None:
         """Of two laws, and late enough that some fluid is torn: the same steps from the kept state tear the same."""
         with start_worker("fluid,neo_hookean", SMALL, Setting(threads=1)) as process:

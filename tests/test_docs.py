@@ -31,6 +31,13 @@ STUDIES = {"docs/hard-cases.md", "docs/shading.md", "docs/stable-step.md"}
 # Commands that are run in a shorter form. The README gives the one of the demo itself.
 SHORTER = {
     "scripts/demo": "scripts/demo --overwrite --set time.end=0.1 --set time.frames=5",
+    # A worker more compiles the same kernel once more; test_sweep_run.py has two.
+    "mpmcli sweep configs/sweeps/sand_boxes_2d.toml --count 8 -o results/sand_boxes": (
+        "mpmcli sweep configs/sweeps/sand_boxes_2d.toml --count 3 --workers 1 -o results/sand_boxes"
+    ),
+    "mpmcli sweep drops.toml --count 4 -o results/drops": (
+        "mpmcli sweep drops.toml --count 4 --workers 1 -o results/drops"
+    ),
     "mpmcli bench --json > results/bench.json": (
         "mpmcli bench --case 2d-64 --seconds 0.1 --blocks 1 --json > results/bench.json"
     ),
@@ -146,7 +153,7 @@ def failed(done: dict[str, subprocess.CompletedProcess]) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def commands(checkout) -> dict[str, subprocess.CompletedProcess]:
+def commands(checkout, few_optimisations) -> dict[str, subprocess.CompletedProcess]:
     """What came of every command but the slow ones."""
     return run_commands(checkout, slow=False)
 

@@ -1,7 +1,6 @@
 """The saved state of a run is complete: what is loaded goes on to the same bytes, for every law."""
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -30,6 +29,7 @@ USUAL = ("forces",)
     ],
     ids=["3 threads", "all, 1 thread", "all, 3 threads"],
 )
+@pytest.mark.usefixtures("few_optimisations")
 def test_a_loaded_run_has_the_bytes_of_one_that_went_on(threads: int, names: tuple[str, ...]) -> None:
     """Save, 50 steps, load, 50 steps; and the same in another solver of the scene, by a route through JSON."""
     done = subprocess.run(
@@ -38,8 +38,6 @@ def test_a_loaded_run_has_the_bytes_of_one_that_went_on(threads: int, names: tup
         text=True,
         timeout=600,
         check=True,
-        # Less time to compile, and the same bytes (test_optimisation.py).
-        env={**os.environ, "TI_ADVANCED_OPTIMIZATION": "0"},
     )
     found = json.loads(done.stdout)
     assert found.keys() == set(names)

@@ -17,6 +17,7 @@ import numpy as np
 import psutil
 import pytest
 from command import ROOT, run_here, started
+from conftest import FEW
 from test_plugin import LAW
 from tiny_sweep import BASE, contents, small_shards, tiny_sweep, told, write_sweep
 
@@ -34,13 +35,15 @@ from mpmcli.simulation.recording import Recording, record
 
 # A law that is stable by its own word, and in truth is not: its pressure pulls.
 WRONG_LAW = LAW.replace("spherical = constants[0]", "spherical = -constants[0]")
+pytestmark = pytest.mark.usefixtures("few_optimisations")
 
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The dataset of the tiny sweep, in three shards, by two workers."""
+    """The dataset of the tiny sweep, in three shards, by two workers that have the optimisations of every sweep."""
     directory = tmp_path_factory.mktemp("truth")
     with pytest.MonkeyPatch.context() as patch:
+        patch.delenv(FEW[0], raising=False)
         small_shards(patch)
         state = run_sweep(tiny_sweep(directory), SweepSettings(directory / "dataset", workers=2))
     assert (state.status, state.done, state.accepted) == ("finished", 12, 12)
