@@ -14,8 +14,8 @@ from mpmcli.scene.presets import PRESETS
 
 SCENES = sorted(CONFIGS.glob("*.toml"))
 # In 3D each has a twin in 2D of the same materials, and other scenes run in 3D. The dam break is the demo that
-# test_docs.py runs, and the drop a validation case.
-SLOW = {"jelly_stack_3d", "sand_column_3d", "snowball_wall_3d", "dam_break_2d", "elliptical_drop_2d"}
+# test_docs.py runs, and the drop a validation case. The laws of mixed_2d run alone, and test_check_result.py runs two.
+SLOW = {"jelly_stack_3d", "sand_column_3d", "snowball_wall_3d", "dam_break_2d", "elliptical_drop_2d", "mixed_2d"}
 
 
 def test_these_are_the_scenes():
@@ -77,13 +77,12 @@ def test_a_config_says_how_many_particles_it_has(path):
 @pytest.mark.parametrize(
     "path", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in SLOW)) for path in SCENES]
 )
-def test_a_config_runs(path, tmp_path, monkeypatch):
+@pytest.mark.usefixtures("few_optimisations")
+def test_a_config_runs(path, tmp_path):
     """A few steps to the first frames, which land on their times; nothing is lost, and energy is not made."""
     scene = load_scene(path, laws=parameter_models()).scene
     # A twentieth of an impact that lasts 0.1 ms, and of the others no more than they take to move.
     end = min(5e-3, scene.time.end / 20)
-    # Half the time to compile, and the same bytes (test_optimisation.py).
-    monkeypatch.setenv("TI_ADVANCED_OPTIMIZATION", "0")
     outcome = run_here(
         "simulate", path, "-o", tmp_path / "result", "--set", f"time.end={end}", "--set", "time.frames=2", "--quiet"
     )
