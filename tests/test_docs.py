@@ -38,6 +38,9 @@ SHORTER = {
     "mpmcli sweep drops.toml --count 4 -o results/drops": (
         "mpmcli sweep drops.toml --count 4 --workers 1 -o results/drops"
     ),
+    "mpmcli render results/drop --mode surface --size 640x480 --movie results/drop.mp4": (
+        "mpmcli render results/drop --mode surface --size 320x240 --movie results/drop.mp4"
+    ),
     "mpmcli bench --json > results/bench.json": (
         "mpmcli bench --case 2d-64 --seconds 0.1 --blocks 1 --json > results/bench.json"
     ),

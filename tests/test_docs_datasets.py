@@ -36,11 +36,13 @@ material = { law = "fluid", density = 1000.0 }
 shape = { box = { min = [0.25, 0.0], max = [0.75, 0.5] } }
 """
 SWEEP = 'base = "scene.toml"\ncount = 8\n[vary]\n"domain.gravity.1" = { uniform = [-9.81, -3.7] }\n'
-# The command, with shards small enough that two parts have some.
+# The command, with one worker, as a second compiles the same, and with shards small enough that two parts have some.
 PROGRAM = """\
 #!{python}
 import sys
 sys.path.insert(0, {root!r})
+from mpmcli import cores
+cores.available_cores = lambda: 1
 from mpmcli.cli import main
 from mpmcli.dataset import sweep_folder
 sweep_folder._per_shard = lambda size: 2
