@@ -15,7 +15,9 @@ from mpmcli.scene.presets import PRESETS
 SCENES = sorted(CONFIGS.glob("*.toml"))
 # In 3D each has a twin in 2D of the same materials, and other scenes run in 3D. The dam break is the demo that
 # test_docs.py runs, and the drop a validation case. The laws of mixed_2d run alone, and test_check_result.py runs two.
-SLOW = {"jelly_stack_3d", "sand_column_3d", "snowball_wall_3d", "dam_break_2d", "elliptical_drop_2d", "mixed_2d"}
+SLOW = {f"{name}_3d" for name in ("jelly_drop", "jelly_stack", "sand_column", "snowball_wall")} | {
+    f"{name}_2d" for name in ("dam_break", "elliptical_drop", "mixed")
+}
 
 
 def test_these_are_the_scenes():

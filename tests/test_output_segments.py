@@ -120,7 +120,7 @@ def datasets(path: Path) -> dict[str, tuple]:
         return {name: (str(item.dtype), item.shape, item[()].tobytes()) for name, item in found.items()}
 
 
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=10)
 @given(
     frames=st.lists(st.tuples(st.integers(0, 40), st.booleans()), min_size=1, max_size=6),
     d=st.sampled_from([2, 3]),
