@@ -169,4 +169,6 @@ _SETTINGS = {
     # A step of a large scene holds the interpreter for longer than Dask expects.
     "distributed.admin.tick.limit": "1h",
     "distributed.comm.timeouts.connect": "30s",
+    # Samples of every thread, a hundred a second, which nobody sees.
+    "distributed.worker.profile.enabled": False,
 }
