@@ -25,28 +25,30 @@ def volume_error(x: np.ndarray, volume: np.ndarray, flows: np.ndarray, spacing: 
     """
     if not flows.any():
         return 0.0
-    some = not flows.all()
-    counts = np.array(cells, np.int32)
-    place = np.minimum((x * (1 / spacing)).astype(np.int32), counts - 1)
-    low, high = np.zeros_like(counts), counts - 1
+    place = [np.minimum((x[:, a] * (1 / spacing)).astype(np.intp), n - 1) for a, n in enumerate(cells)]
+    low, high = [0] * len(cells), [n - 1 for n in cells]
     if math.prod(cells) > WHOLE:
-        low, high = place.min(0), place.max(0)
+        low, high = [int(own.min()) for own in place], [int(own.max()) for own in place]
     # One cell more on each side: a wall asks for nothing, the void is empty.
-    shape = (high - low + 3).tolist()
-    strides = [math.prod(shape[a + 1 :]) for a in range(len(shape))]
-    index = (place - low + 1) @ np.array(strides)
-    held = np.bincount(index[flows] if some else index, volume[flows] if some else volume, math.prod(shape)).reshape(
-        shape
-    )
-    inside = held > 0
-    if some:
-        inside &= np.bincount(index[~flows], minlength=held.size).reshape(shape) == 0
-    before = ((), (slice(None),), (slice(None), slice(None)))
+    shape = [last - first + 3 for first, last in zip(low, high, strict=True)]
+    index = place[0] + (1 - low[0])
+    for own, first, count in zip(place[1:], low[1:], shape[1:], strict=True):
+        index *= count
+        index += own + (1 - first)
+    size = math.prod(shape)
+    if flows.all():
+        held = np.bincount(index, volume, size).reshape(shape)
+        inside = held > 0
+    else:
+        held = np.bincount(index[flows], volume[flows], size).reshape(shape)
+        inside = (held > 0) & (np.bincount(index[~flows], minlength=size).reshape(shape) == 0)
     for axis, count in enumerate(cells):
-        inside[(*before[axis], 0)], inside[(*before[axis], -1)] = low[axis] == 0, high[axis] == count - 1
-    for own in before[: len(cells)]:
-        inside = inside[(*own, slice(-2))] & inside[(*own, slice(1, -1))] & inside[(*own, slice(2, None))]
-    count = int(inside.sum())
+        planes = inside.swapaxes(0, axis)
+        planes[0], planes[-1] = low[axis] == 0, high[axis] == count - 1
+    for axis in range(len(cells)):
+        planes = inside.swapaxes(0, axis)
+        inside = (planes[:-2] & planes[1:-1] & planes[2:]).swapaxes(0, axis)
+    count = int(np.count_nonzero(inside))
     if count < FEWEST:
         return 0.0
     within = held[(slice(1, -1),) * len(cells)]
