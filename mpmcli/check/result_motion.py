@@ -124,9 +124,12 @@ class MotionCheck:
         if h is None:
             return
         own = (frame.position - before.position) - 0.5 * time * (before.velocity + frame.velocity)
-        change = frame.velocity - before.velocity
         threshold = OUTLIER_CELLS * h + OUTLIER_PART * allowed
-        excess = np.sqrt(np.einsum("ij,ij->i", own, own))
+        squares = np.einsum("ij,ij->i", own, own)
+        if squares.max() <= threshold**2:
+            return
+        change = frame.velocity - before.velocity
+        excess = np.sqrt(squares)
         excess -= 0.5 * time * np.sqrt(np.einsum("ij,ij->i", change, change))
         candidates = np.flatnonzero(excess > threshold)
         for p in candidates[np.argsort(excess[candidates])[::-1][:CANDIDATES]].tolist():

@@ -196,7 +196,8 @@ class StateCheck:
 
 def extent(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and the upper corner of the particles, (d,) each, m; column by column, which is faster."""
-    return np.array([x.min() for x in position.T]), np.array([x.max() for x in position.T])
+    columns = np.ascontiguousarray(position.T)
+    return columns.min(1), columns.max(1)
 
 
 def _within(labels: np.ndarray, count: int) -> bool:

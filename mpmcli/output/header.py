@@ -184,12 +184,12 @@ class RunHeader:
         """Whether the Courant numbers of the ledger are estimates."""
         return self.backend.get("arch", "cpu") != "cpu"
 
-    @property
+    @cached_property
     def farthest(self) -> float:
         """Largest coordinate of the domain, m: what the rounding of stored positions is relative to; 0 if not known."""
         return 0.0 if self.origin is None else float(np.abs([self.origin, self.upper]).max())
 
-    @property
+    @cached_property
     def step_error(self) -> float:
         """Rounding of a position in one step, m: the solver counts from the corner of the domain."""
         return 0.0 if self.origin is None else self.epsilon * float((self.upper - self.origin).max())

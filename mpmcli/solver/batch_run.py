@@ -62,6 +62,7 @@ class BatchRun(Run):
         self._numbers, self._counts = batch.numbers[slot], batch.counts[slot]
         self._real, self._count = batch.layout.real, batch.layout.count
         self._row = Row(batch.layout, self._numbers, self._counts)
+        self._followed = [getattr(self._real, name) for name in FOLLOWED]
         first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in self._particles])])
         self.groups = []
         for g, shared in enumerate(batch.kind.members):
@@ -248,15 +249,14 @@ class BatchRun(Run):
 
     def _pull(self) -> None:
         """Read what the kernel has changed."""
-        for name in FOLLOWED:
-            setattr(self.state, name, self._row.number(name))
+        for name, value in zip(FOLLOWED, self._numbers[self._followed].tolist(), strict=True):
+            setattr(self.state, name, value)
         self.state.unrelaxed_steps = self._row.count("unrelaxed_steps")
         self.state.step_count += self._row.count("steps")
 
     def _push(self) -> None:
         """Write what the host has changed."""
-        for name in FOLLOWED:
-            self._row.set(**{name: getattr(self.state, name)})
+        self._numbers[self._followed] = [getattr(self.state, name) for name in FOLLOWED]
         self._row.set_counts(unrelaxed_steps=self.state.unrelaxed_steps)
         forces = self.state.external_forces
         self._row.set(pull=forces.steady_pull)
