@@ -10,7 +10,7 @@ import taichi as ti
 
 from mpmcli.solver.particle_arrays import CONSTANTS
 
-LANES = 16
+LANES = 8
 
 
 @ti.func
