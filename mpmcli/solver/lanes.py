@@ -28,208 +28,186 @@ def scatter_range(
     particles: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int, kick: float, relaxed: float
 ):
     """Scatter particles first to last - 1 of the g-th group; no other thread may write their nodes."""
-    begin = first
-    while begin < last:
-        scatter_lanes(particles, g, group, begin, ti.min(LANES, last - begin), kick, relaxed)
-        begin += LANES
-
-
-@ti.func
-def scatter_lanes(
-    particles: ti.template(),
-    g: ti.template(),
-    group: ti.template(),
-    begin: int,
-    count: int,
-    kick: float,
-    relaxed: float,
-):
-    """Scatter `count` particles from `begin` on, as `ParticleUpdate.scatter` does one."""
     grid = particles.grid
     d = ti.static(group.dimension)
     width = ti.static(group.v.n)
     nodes = ti.static(grid.scheme.spline.nodes)
     keeps_F = ti.static(group.law.deformation == "F")
     inners = ti.static(internal_entries(group))
-
     x, v, affine = no_lanes(d), no_lanes(d), no_lanes(ti.static(d * d))
     deformation, internal = no_lanes(ti.static(stored_entries(group))), no_lanes(inners)
     rows = no_lanes(ti.static(group.table.n))
     pushes = no_lanes(ti.static(d + d * d if group.pushed else 1))
-    load_lanes(group, begin, count, affine, deformation, internal, rows)
-    for lane in range(LANES):
-        p = begin + ti.min(lane, count - 1)
-        for c in ti.static(range(d)):
-            x[c, lane] = group.x[p][c]
-            v[c, lane] = group.v[p][c]
-        if ti.static(group.pushed):
-            push, slope = group.force.acceleration(group, p, ti.static(group.force.spreads and grid.scheme.affine))
-            for c in ti.static(range(d)):
-                pushes[c, lane] = push[c]
-                for a in ti.static(range(d)):
-                    pushes[d + c * d + a, lane] = slope[c, a]
-
-    # The law, and what the nodes get; see `transfer.scatter`.
     change, after = no_lanes(ti.static(stored_entries(group))), no_lanes(inners)
     first_node, weights = ti.Vector.zero(int, LANES), no_lanes(ti.static(nodes * d))
     middles, slopes = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
-    for lane in range(LANES):
-        C = matrix_of(affine, d, lane)
-        place, own = vector_of(x, 0, d, lane), vector_of(v, 0, d, lane)
-        state = stored_of(group, deformation, lane)
-        stress, _, state_after, inner_after = group.law.respond(
-            state, vector_of(internal, 0, inners, lane), C, kick, constants_of(rows, lane)
-        )
-        difference = state_after - state
-        if ti.static(keeps_F):
-            for i, j in ti.static(ti.ndrange(d, d)):
-                change[i * d + j, lane] = difference[i, j]
-        else:
-            change[0, lane] = difference
-        for i in ti.static(range(inners)):
-            after[i, lane] = inner_after[i]
-        if ti.static(group.pushed):
-            own += kick * vector_of(pushes, 0, d, lane)
-            for c, a in ti.static(ti.ndrange(d, d)):
-                C[c, a] += kick * pushes[d + c * d + a, lane]
-        base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
-        first_node[lane] = grid.linear_index(base)
-        w = grid.scheme.spline.weights(distance)
-        for k in ti.static(range(nodes)):
-            for a in ti.static(range(d)):
-                weights[k * d + a, lane] = w[k, a]
-        middle, slope = momentum(grid, distance, rows[MASS, lane], rows[VOLUME, lane], own, C, stress, kick)
-        for c in ti.static(range(width)):
-            middles[lane, c] = middle[c]
-            for a in ti.static(range(d)):
-                slopes[lane, a * width + c] = slope[a, c]
+    begin = first
+    while begin < last:
+        count = ti.min(LANES, last - begin)
+        load_lanes(group, begin, count, affine, deformation, internal, rows)
+        for lane in range(LANES):
+            p = begin + ti.min(lane, count - 1)
+            for c in ti.static(range(d)):
+                x[c, lane] = group.x[p][c]
+                v[c, lane] = group.v[p][c]
+            if ti.static(group.pushed):
+                push, slope = group.force.acceleration(group, p, ti.static(group.force.spreads and grid.scheme.affine))
+                for c in ti.static(range(d)):
+                    pushes[c, lane] = push[c]
+                    for a in ti.static(range(d)):
+                        pushes[d + c * d + a, lane] = slope[c, a]
 
-    for lane in range(count):
-        p = begin + lane
-        # The stress of a particle that is crushed or inverted would spread NaN over the grid.
-        if volume_ratio(group, group.stored(p)) > SMALLEST_J:
-            if ti.static(group.law.projects):
-                if ti.static(keeps_F):
-                    for i, j in ti.static(ti.ndrange(d, d)):
-                        group.displacement_gradient[p][i, j] += change[i * d + j, lane]
-                else:
-                    group.J_minus_1[p] += change[0, lane]
-                for i in ti.static(range(len(group.internal))):
-                    group.internal[i][p] = after[i, lane]
-            w = weights_of(weights, nodes, d, lane)
-            middle = ti.Vector.zero(float, width)
-            slope = ti.Matrix.zero(float, d, width)
-            for c in ti.static(range(width)):
-                middle[c] = middles[lane, c]
+        # The law, and what the nodes get; see `transfer.scatter`.
+        for lane in range(LANES):
+            C = matrix_of(affine, d, lane)
+            place, own = vector_of(x, 0, d, lane), vector_of(v, 0, d, lane)
+            state = stored_of(group, deformation, lane)
+            stress, _, state_after, inner_after = group.law.respond(
+                state, vector_of(internal, 0, inners, lane), C, kick, constants_of(rows, lane)
+            )
+            difference = state_after - state
+            if ti.static(keeps_F):
+                for i, j in ti.static(ti.ndrange(d, d)):
+                    change[i * d + j, lane] = difference[i, j]
+            else:
+                change[0, lane] = difference
+            for i in ti.static(range(inners)):
+                after[i, lane] = inner_after[i]
+            if ti.static(group.pushed):
+                own += kick * vector_of(pushes, 0, d, lane)
+                for c, a in ti.static(ti.ndrange(d, d)):
+                    C[c, a] += kick * pushes[d + c * d + a, lane]
+            base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
+            first_node[lane] = grid.linear_index(base)
+            w = grid.scheme.spline.weights(distance)
+            for k in ti.static(range(nodes)):
                 for a in ti.static(range(d)):
-                    slope[a, c] = slopes[lane, a * width + c]
-            add_linear(grid.nodes, grid, first_node[lane], w, middle, slope, False)
-            if ti.static(grid.scheme.keeps_before):
-                own_v, own_C = group.motion(p)
-                scatter_before(group.x[p], group.row(p)[MASS], own_v, own_C, grid, False)
-        else:
-            ti.atomic_min(particles.lost[particles.first_lost + g], p)
-        if ti.static(grid.keeps_filling):
-            if relaxed > 0.0:
-                scatter_volume(group.x[p], group.row(p)[VOLUME], grid, False)
+                    weights[k * d + a, lane] = w[k, a]
+            middle, slope = momentum(grid, distance, rows[MASS, lane], rows[VOLUME, lane], own, C, stress, kick)
+            for c in ti.static(range(width)):
+                middles[lane, c] = middle[c]
+                for a in ti.static(range(d)):
+                    slopes[lane, a * width + c] = slope[a, c]
+
+        for lane in range(count):
+            p = begin + lane
+            # The stress of a particle that is crushed or inverted would spread NaN over the grid.
+            if volume_ratio(group, group.stored(p)) > SMALLEST_J:
+                if ti.static(group.law.projects):
+                    if ti.static(keeps_F):
+                        for i, j in ti.static(ti.ndrange(d, d)):
+                            group.displacement_gradient[p][i, j] += change[i * d + j, lane]
+                    else:
+                        group.J_minus_1[p] += change[0, lane]
+                    for i in ti.static(range(len(group.internal))):
+                        group.internal[i][p] = after[i, lane]
+                w = weights_of(weights, nodes, d, lane)
+                middle = ti.Vector.zero(float, width)
+                slope = ti.Matrix.zero(float, d, width)
+                for c in ti.static(range(width)):
+                    middle[c] = middles[lane, c]
+                    for a in ti.static(range(d)):
+                        slope[a, c] = slopes[lane, a * width + c]
+                add_linear(grid.nodes, grid, first_node[lane], w, middle, slope, False)
+                if ti.static(grid.scheme.keeps_before):
+                    own_v, own_C = group.motion(p)
+                    scatter_before(group.x[p], group.row(p)[MASS], own_v, own_C, grid, False)
+            else:
+                ti.atomic_min(particles.lost[particles.first_lost + g], p)
+            if ti.static(grid.keeps_filling):
+                if relaxed > 0.0:
+                    scatter_volume(group.x[p], group.row(p)[VOLUME], grid, False)
+        begin += LANES
 
 
 @ti.func
 def advance_range(particles: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int, dt: float):
     """Gather and move particles first to last - 1 of the g-th group; return their largest rate of deformation, 1/s."""
-    sharpest = NOTHING
-    begin = first
-    while begin < last:
-        sharpest = ti.max(sharpest, advance_lanes(particles, g, group, begin, ti.min(LANES, last - begin), dt))
-        begin += LANES
-    return sharpest
-
-
-@ti.func
-def advance_lanes(particles: ti.template(), g: ti.template(), group: ti.template(), begin: int, count: int, dt: float):
-    """Gather and move `count` particles from `begin` on, as `ParticleUpdate.advance` does one."""
     grid = particles.grid
     d = ti.static(group.dimension)
     width = ti.static(group.v.n)
     nodes = ti.static(grid.scheme.spline.nodes)
     keeps_F = ti.static(group.law.deformation == "F")
-
     x, distances, deformation = no_lanes(d), no_lanes(d), no_lanes(ti.static(stored_entries(group)))
-    for lane in range(LANES):
-        p = begin + ti.min(lane, count - 1)
-        for c in ti.static(range(d)):
-            x[c, lane] = group.x[p][c]
-        load_deformation(group, p, lane, deformation)
-
     first_node, weights = ti.Vector.zero(int, LANES), no_lanes(ti.static(nodes * d))
-    for lane in range(LANES):
-        base, distance = grid.scheme.spline.stencil(vector_of(x, 0, d, lane), grid.inverse_spacing)
-        first_node[lane] = grid.linear_index(base)
-        w = grid.scheme.spline.weights(distance)
-        for a in ti.static(range(d)):
-            distances[a, lane] = distance[a]
-            for k in ti.static(range(nodes)):
-                weights[k * d + a, lane] = w[k, a]
-
     velocities = ti.Matrix.zero(float, LANES, width)
     moments = ti.Matrix.zero(float, LANES, ti.static(d * width))
-    for lane in range(count):
-        w = weights_of(weights, nodes, d, lane)
-        velocity, moment = gather_linear(grid.nodes, grid, first_node[lane], w)
-        for c in ti.static(range(width)):
-            velocities[lane, c] = velocity[c]
-            for a in ti.static(range(d)):
-                moments[lane, a * width + c] = moment[a, c]
-
     gradients, rates = ti.Matrix.zero(float, LANES, ti.static(d * width)), ti.Vector.zero(float, LANES)
     moved, beyond, after = no_lanes(d), ti.Vector.zero(float, LANES), no_lanes(ti.static(stored_entries(group)))
-    for lane in range(LANES):
-        velocity = ti.Vector.zero(float, d)
-        moment = ti.Matrix.zero(float, d, d)
-        for c in ti.static(range(d)):
-            velocity[c] = velocities[lane, c]
-            for a in ti.static(range(d)):
-                moment[a, c] = moments[lane, a * width + c]
-        gradient = centred(grid, vector_of(distances, 0, d, lane), velocity, moment)
-        C = gradient.transpose()
-        for c, a in ti.static(ti.ndrange(d, d)):
-            gradients[lane, a * width + c] = gradient[a, c]
-        inside, outside = particles.moved(vector_of(x, 0, d, lane), velocity, dt)
-        for c in ti.static(range(d)):
-            moved[c, lane] = inside[c]
-        beyond[lane] = outside
-        rates[lane] = deformation_rate(group, C)
-        if ti.static(keeps_F):
-            deformed = deformed_gradient(matrix_of(deformation, d, lane), C, dt)
-            for i, j in ti.static(ti.ndrange(d, d)):
-                after[i * d + j, lane] = deformed[i, j]
-        else:
-            growth = volume_growth(C, dt)
-            after[0, lane] = deformation[0, lane] + growth + growth * deformation[0, lane]
-
     sharpest = NOTHING
-    for lane in range(count):
-        p = begin + lane
-        kept = ti.Vector.zero(float, d)
-        if ti.static(grid.scheme.keeps_before):
-            kept = particles.unseen_velocity(group, p, group.x[p])
-        for c in ti.static(range(d)):
-            group.v[p][c] = velocities[lane, c] + kept[c]
-        for a in ti.static(range(d)):
-            for c in ti.static(range(width)):
-                group.gradient[p][a, c] = gradients[lane, a * width + c]
-        if ti.static(keeps_F):
-            for i, j in ti.static(ti.ndrange(d, d)):
-                group.displacement_gradient[p][i, j] = after[i * d + j, lane]
-        else:
-            group.J_minus_1[p] = after[0, lane]
-        # Written so that a NaN is not sound; then it stays, and no later step writes outside the grid.
-        if beyond[lane] <= 0.5 * grid.spacing:
+    begin = first
+    while begin < last:
+        count = ti.min(LANES, last - begin)
+        for lane in range(LANES):
+            p = begin + ti.min(lane, count - 1)
             for c in ti.static(range(d)):
-                group.x[p][c] = moved[c, lane]
-        else:
-            ti.atomic_min(particles.lost[particles.first_lost + g], p)
-        sharpest = ti.max(sharpest, rates[lane])
+                x[c, lane] = group.x[p][c]
+            load_deformation(group, p, lane, deformation)
+
+        for lane in range(LANES):
+            base, distance = grid.scheme.spline.stencil(vector_of(x, 0, d, lane), grid.inverse_spacing)
+            first_node[lane] = grid.linear_index(base)
+            w = grid.scheme.spline.weights(distance)
+            for a in ti.static(range(d)):
+                distances[a, lane] = distance[a]
+                for k in ti.static(range(nodes)):
+                    weights[k * d + a, lane] = w[k, a]
+
+        for lane in range(count):
+            w = weights_of(weights, nodes, d, lane)
+            velocity, moment = gather_linear(grid.nodes, grid, first_node[lane], w)
+            for c in ti.static(range(width)):
+                velocities[lane, c] = velocity[c]
+                for a in ti.static(range(d)):
+                    moments[lane, a * width + c] = moment[a, c]
+
+        for lane in range(LANES):
+            velocity = ti.Vector.zero(float, d)
+            moment = ti.Matrix.zero(float, d, d)
+            for c in ti.static(range(d)):
+                velocity[c] = velocities[lane, c]
+                for a in ti.static(range(d)):
+                    moment[a, c] = moments[lane, a * width + c]
+            gradient = centred(grid, vector_of(distances, 0, d, lane), velocity, moment)
+            C = gradient.transpose()
+            for c, a in ti.static(ti.ndrange(d, d)):
+                gradients[lane, a * width + c] = gradient[a, c]
+            inside, outside = particles.moved(vector_of(x, 0, d, lane), velocity, dt)
+            for c in ti.static(range(d)):
+                moved[c, lane] = inside[c]
+            beyond[lane] = outside
+            rates[lane] = deformation_rate(group, C)
+            if ti.static(keeps_F):
+                deformed = deformed_gradient(matrix_of(deformation, d, lane), C, dt)
+                for i, j in ti.static(ti.ndrange(d, d)):
+                    after[i * d + j, lane] = deformed[i, j]
+            else:
+                growth = volume_growth(C, dt)
+                after[0, lane] = deformation[0, lane] + growth + growth * deformation[0, lane]
+
+        for lane in range(count):
+            p = begin + lane
+            kept = ti.Vector.zero(float, d)
+            if ti.static(grid.scheme.keeps_before):
+                kept = particles.unseen_velocity(group, p, group.x[p])
+            for c in ti.static(range(d)):
+                group.v[p][c] = velocities[lane, c] + kept[c]
+            for a in ti.static(range(d)):
+                for c in ti.static(range(width)):
+                    group.gradient[p][a, c] = gradients[lane, a * width + c]
+            if ti.static(keeps_F):
+                for i, j in ti.static(ti.ndrange(d, d)):
+                    group.displacement_gradient[p][i, j] = after[i * d + j, lane]
+            else:
+                group.J_minus_1[p] = after[0, lane]
+            # Written so that a NaN is not sound; then it stays, and no later step writes outside the grid.
+            if beyond[lane] <= 0.5 * grid.spacing:
+                for c in ti.static(range(d)):
+                    group.x[p][c] = moved[c, lane]
+            else:
+                ti.atomic_min(particles.lost[particles.first_lost + g], p)
+            sharpest = ti.max(sharpest, rates[lane])
+        begin += LANES
     return sharpest
 
 
