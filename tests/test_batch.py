@@ -39,13 +39,13 @@ def driven(k: int) -> dict[str, tuple]:
     return {
         "gravity of time": (("fluid",), gravity, []),
         "a force of the place": (("neo_hookean",), [0.0, -9.81], [(None, everywhere)]),
-        "forces on one body of two": (("sand", "fluid", "sand"), gravity, [("body 2", swirl), (None, everywhere)]),
+        "forces on one body of two": (("snow", "snow"), gravity, [("body 1", swirl), (None, everywhere)]),
     }
 
 
 # In the default suite, with the runs that a solver repeats: the second is smaller than what the batch has room for.
 # All others, and the first runs of these, carry the marker slow.
-USUAL = {"sand": (0, 1), "two laws, two bodies of one": (1,), "3D, AFLIP": (1,), "forces on one body of two": (1,)}
+USUAL = {"sand": (1,), "two laws, two bodies of one": (1,), "3D, AFLIP": (1,), "forces on one body of two": (1,)}
 Output = list[tuple[Frame, LedgerRow]]
 
 
@@ -146,7 +146,9 @@ def test_runs_of_a_batch_have_the_bytes_of_a_solver(backend_of: Callable, name: 
         assert list(same(found[k], expected)) == []
 
 
-@pytest.mark.parametrize("name", ["two laws, two bodies of one", pytest.param("3D, AFLIP", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["sand", *(pytest.param(n, marks=pytest.mark.slow) for n in ("two laws, two bodies of one", "3D, AFLIP"))]
+)
 def test_threads_share_no_memory(backend_of: Callable, name: str) -> None:
     """Many runs at once on three threads, again and again, have the bytes that they have on one."""
     scenes = [scene_named(name, other=k % 2 == 1) for k in range(7)]

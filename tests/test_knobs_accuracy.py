@@ -49,6 +49,7 @@ def test_aflip_loses_less_than_a_tenth_of_what_apic_does(measured: Callable) -> 
     assert aflip["period error"] == pytest.approx(apic["period error"], rel=0.05)
 
 
+@pytest.mark.slow
 def test_zeroed_walls_are_first_order(measured: Callable) -> None:
     """Two fixed ends: an error of 0.36 h/L at least (docs/theory.md, 3.3), halved with h; folded ones fall by four."""
     coarse, fine = (measured(n, walls="zeroed")[0]["period error"] for n in (13, 26))

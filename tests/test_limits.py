@@ -111,7 +111,7 @@ def test_a_lone_particle_is_stable_just_below_its_limit(
         assert START / 2 < value < 1.05 * START / np.sqrt(1 - 0.98**2)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_lone_particle_grows_just_above_its_limit(
     backend_of: Callable, dimension: int, record_property: Callable
 ) -> None:

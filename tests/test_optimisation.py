@@ -7,8 +7,8 @@ import state_run
 
 from mpmcli.solver.solver import Solver
 
-# Two laws in one scene, forces and expressions.
-USUAL = ("forces",)
+# Two bodies, and FLIP; forces are slow to compile.
+USUAL = ("several bodies, FLIP",)
 STEPS = 40
 
 

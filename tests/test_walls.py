@@ -279,6 +279,7 @@ def test_balls_leave_the_walls_that_they_hit(backend_of: Callable, record_proper
         assert np.abs(x - after.x[:n]).max() < 1e-10
 
 
+@pytest.mark.slow
 def test_resting_fluid_stays_on_a_separating_floor(backend_of: Callable, record_property: Callable) -> None:
     """A column that starts with its pressure, p = rho g (H - Y), stays as it is (6.1 b).
 

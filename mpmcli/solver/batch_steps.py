@@ -43,11 +43,12 @@ class BatchSteps:
         due_kick = numbers[w, self.real.owed] + 0.5 * (numbers[w, self.real.last_step] + dt)
         kick = ti.min(due_kick, dt / numbers[w, self.real.safety])
         since = self.velocity_time(w, numbers)
-        if largest < numbers[w, self.real.collapse]:
-            counts[w, self.count.status] = COLLAPSED
-            dt = 0.0 * dt
-        elif since + kick > numbers[w, self.real.horizon]:
+        # First: as long as the tables hold another time, the step means nothing.
+        if since + kick > numbers[w, self.real.horizon]:
             counts[w, self.count.status] = BEYOND
+            dt = 0.0 * dt
+        elif largest < numbers[w, self.real.collapse]:
+            counts[w, self.count.status] = COLLAPSED
             dt = 0.0 * dt
         else:
             numbers[w, self.real.owed] = due_kick - kick
