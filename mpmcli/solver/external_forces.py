@@ -20,7 +20,7 @@ from mpmcli.solver.run_values import DeviceValues, Entries, RunValues
 INSTANTS = 5
 MARGIN = 1.5
 
-
+# Measurement of the force on particles of a run, see `build_push`.
 Push = Callable[[int, int, int], tuple[float, float]]
 
 
@@ -60,7 +60,7 @@ class ExternalForces:
         """Keep the numbers of the run, and the measurement of the force on each group that one acts on."""
         self._domain = scene.domain
         self._constant = scene.domain.gravity_at(0.0)
-        self._steady_pull = float(np.linalg.norm(self._constant))
+        self._gravity_pull = float(np.linalg.norm(self._constant))
         self._values, self._measures = values, measures
         self._push = 0.0
         self.slope = 0.0
@@ -73,7 +73,7 @@ class ExternalForces:
     @property
     def steady_pull(self) -> float:
         """A bound on the acceleration, m/s^2, by gravity, if it is steady, and by forces as measured."""
-        return (self._steady_pull if self._domain.steady else 0.0) + self._push
+        return (self._gravity_pull if self._domain.steady else 0.0) + self._push
 
     def save(self) -> dict[str, float]:
         """Return what was last measured, as plain numbers."""

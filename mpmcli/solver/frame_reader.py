@@ -16,10 +16,10 @@ from mpmcli.solver.lane_state import (
     internal_entries,
     load_lanes,
     matrix_of,
-    no_lanes,
     stored_entries,
     stored_of,
     vector_of,
+    zero_lanes,
 )
 from mpmcli.solver.observe import respond_after
 from mpmcli.solver.particle_arrays import MASS, VOLUME, ParticleArrays
@@ -55,11 +55,11 @@ def build_frame_reader(group: ParticleArrays) -> Callable[[float, int, int, Fram
         for chunk in range((count + LANES - 1) // LANES):
             begin = first + chunk * LANES
             own = ti.min(LANES, count - chunk * LANES)
-            affine, deformation = no_lanes(ti.static(d * d)), no_lanes(ti.static(stored_entries(group)))
-            internal, rows = no_lanes(inners), no_lanes(ti.static(group.table.n))
+            affine, deformation = zero_lanes(ti.static(d * d)), zero_lanes(ti.static(stored_entries(group)))
+            internal, rows = zero_lanes(inners), zero_lanes(ti.static(group.table.n))
             load_lanes(group, begin, own, affine, deformation, internal, rows)
             # Energy, J, internal variables, and entries of the deformation and of the stress.
-            shown = no_lanes(ti.static(2 + inners + d * d + len(entries)))
+            shown = zero_lanes(ti.static(2 + inners + d * d + len(entries)))
             # Half a step back, where the velocities are, and now: a loop, so that the law is compiled once.
             for k in range(ti.static(2 if law.projects or tau_at >= 0 else 1)):
                 for lane in range(LANES):

@@ -14,7 +14,7 @@ LANES = 8
 
 
 @ti.func
-def no_lanes(rows: ti.template()):
+def zero_lanes(rows: ti.template()):
     """Return an array of zeros with so many rows."""
     return ti.Matrix.zero(float, rows, LANES)
 

@@ -12,14 +12,14 @@ from mpmcli.solver.lane_state import (
     load_deformation,
     load_lanes,
     matrix_of,
-    no_lanes,
     stored_entries,
     stored_of,
     vector_of,
+    zero_lanes,
 )
 from mpmcli.solver.particle_arrays import MASS, VOLUME
-from mpmcli.solver.particle_update import SMALLEST_J, deformed_gradient
-from mpmcli.solver.state_bounds import NOTHING, deformation_rate, volume_growth, volume_ratio
+from mpmcli.solver.particle_update import SMALLEST_J, deformed_gradient, deformed_volume
+from mpmcli.solver.state_bounds import NOTHING, deformation_rate, volume_ratio
 from mpmcli.solver.transfer import add_linear, centred, gather_linear, momentum, scatter_before, scatter_volume
 
 
@@ -34,12 +34,12 @@ def scatter_range(
     nodes = ti.static(grid.scheme.spline.nodes)
     keeps_F = ti.static(group.law.deformation == "F")
     inners = ti.static(internal_entries(group))
-    x, v, affine = no_lanes(d), no_lanes(d), no_lanes(ti.static(d * d))
-    deformation, internal = no_lanes(ti.static(stored_entries(group))), no_lanes(inners)
-    rows = no_lanes(ti.static(group.table.n))
-    pushes = no_lanes(ti.static(d + d * d if group.pushed else 1))
-    change, after = no_lanes(ti.static(stored_entries(group))), no_lanes(inners)
-    first_node, weights = ti.Vector.zero(int, LANES), no_lanes(ti.static(nodes * d))
+    x, v, affine = zero_lanes(d), zero_lanes(d), zero_lanes(ti.static(d * d))
+    deformation, internal = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
+    rows = zero_lanes(ti.static(group.table.n))
+    pushes = zero_lanes(ti.static(d + d * d if group.pushed else 1))
+    change, after = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
+    first_node, weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(nodes * d))
     middles, slopes = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
     begin = first
     while begin < last:
@@ -103,11 +103,9 @@ def scatter_range(
                         group.internal[i][p] = after[i, lane]
                 w = weights_of(weights, nodes, d, lane)
                 middle = ti.Vector.zero(float, width)
-                slope = ti.Matrix.zero(float, d, width)
                 for c in ti.static(range(width)):
                     middle[c] = middles[lane, c]
-                    for a in ti.static(range(d)):
-                        slope[a, c] = slopes[lane, a * width + c]
+                slope = node_rows_of(slopes, d, width, width, lane)
                 add_linear(grid.nodes, grid, first_node[lane], w, middle, slope, False)
                 if ti.static(grid.scheme.keeps_before):
                     own_v, own_C = group.motion(p)
@@ -128,12 +126,12 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
     width = ti.static(group.v.n)
     nodes = ti.static(grid.scheme.spline.nodes)
     keeps_F = ti.static(group.law.deformation == "F")
-    x, distances, deformation = no_lanes(d), no_lanes(d), no_lanes(ti.static(stored_entries(group)))
-    first_node, weights = ti.Vector.zero(int, LANES), no_lanes(ti.static(nodes * d))
+    x, distances, deformation = zero_lanes(d), zero_lanes(d), zero_lanes(ti.static(stored_entries(group)))
+    first_node, weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(nodes * d))
     velocities = ti.Matrix.zero(float, LANES, width)
     moments = ti.Matrix.zero(float, LANES, ti.static(d * width))
     gradients, rates = ti.Matrix.zero(float, LANES, ti.static(d * width)), ti.Vector.zero(float, LANES)
-    moved, beyond, after = no_lanes(d), ti.Vector.zero(float, LANES), no_lanes(ti.static(stored_entries(group)))
+    moved, beyond, after = zero_lanes(d), ti.Vector.zero(float, LANES), zero_lanes(ti.static(stored_entries(group)))
     sharpest = NOTHING
     begin = first
     while begin < last:
@@ -163,11 +161,9 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
 
         for lane in range(LANES):
             velocity = ti.Vector.zero(float, d)
-            moment = ti.Matrix.zero(float, d, d)
             for c in ti.static(range(d)):
                 velocity[c] = velocities[lane, c]
-                for a in ti.static(range(d)):
-                    moment[a, c] = moments[lane, a * width + c]
+            moment = node_rows_of(moments, d, width, d, lane)
             gradient = centred(grid, vector_of(distances, 0, d, lane), velocity, moment)
             C = gradient.transpose()
             for c, a in ti.static(ti.ndrange(d, d)):
@@ -182,8 +178,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 for i, j in ti.static(ti.ndrange(d, d)):
                     after[i * d + j, lane] = deformed[i, j]
             else:
-                growth = volume_growth(C, dt)
-                after[0, lane] = deformation[0, lane] + growth + growth * deformation[0, lane]
+                after[0, lane] = deformed_volume(deformation[0, lane], C, dt)
 
         for lane in range(count):
             p = begin + lane
@@ -209,6 +204,16 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
             sharpest = ti.max(sharpest, rates[lane])
         begin += LANES
     return sharpest
+
+
+@ti.func
+def node_rows_of(lanes: ti.template(), d: ti.template(), width: ti.template(), columns: ti.template(), lane: int):
+    """Return the d rows, each as wide as a node, that a lane has one after another; of each the first `columns`."""
+    result = ti.Matrix.zero(float, d, columns)
+    for c in ti.static(range(columns)):
+        for a in ti.static(range(d)):
+            result[a, c] = lanes[lane, a * width + c]
+    return result
 
 
 @ti.func
