@@ -7,7 +7,7 @@ import numpy as np
 from solver_state import scene_of
 
 from mpmcli.scene import BodyParticles, Scene
-from mpmcli.solver.frame_arrays import FrameArrays
+from mpmcli.solver.frame_arrays import FrameArrays, ParticleConstants
 from mpmcli.solver.solver import Solver
 from mpmcli.solver.sums import ledger_sums
 
@@ -81,12 +81,14 @@ def restart(solver: Solver, samples: Sequence[BodyParticles], end: float) -> Non
 
 def sums(solver: Solver) -> dict:
     """Return what the ledger sums at this moment, in float64."""
-    internal = max(len(group.law.internal) for group in solver.groups)
-    arrays = FrameArrays(solver.particle_count, solver.scene.dimension, internal, solver.groups[0].real)
+    columns = solver._builder.columns
+    arrays = FrameArrays(columns, np.empty((1, solver.particle_count, columns.count), solver.groups[0].real))
     # As on a GPU: in numpy.
-    found, ratios = solver._observe(arrays), solver._constants.volume_ratios(arrays)
-    gravity = np.array(solver.scene.domain.gravity)
-    return ledger_sums(found, ratios, gravity, solver.spacing, solver.last_step)
+    found = solver._observe(arrays)
+    constants = ParticleConstants.of(solver.groups, [len(b.position) for b in solver._particles])
+    gravity, dt = np.array([solver.scene.domain.gravity]), np.array([solver.last_step])
+    result = ledger_sums(found, constants.volume_ratios(arrays), gravity, solver.spacing, dt)
+    return {name: values[0] for name, values in result.items()}
 
 
 def total_energy(solver: Solver) -> float:

@@ -11,6 +11,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene, sample_bodies
+from mpmcli.solver import batch_run
 from mpmcli.solver.batch import Batch, Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.diagnosis import UnstableRunError
@@ -160,6 +161,19 @@ def test_threads_share_no_memory(backend_of: Callable, name: str) -> None:
             assert list(same(outcome, truth[k % 2])) == []
 
 
+@pytest.mark.parametrize(
+    "name", ["sand", *(pytest.param(n, marks=pytest.mark.slow) for n in SCENES if n != "sand" and n not in DRIVEN)]
+)
+def test_threads_that_share_a_run_change_no_byte(backend_of: Callable, name: str) -> None:
+    """One run on more threads than there are cores, again and again: any thread may do any part, at any time."""
+    scene = scene_named(name, other=True)
+    (truth,) = outputs_of(batch_of([scene], backend_of(scene.solver.precision, 1)), [scene])
+    batch = batch_of([scene], backend_of(scene.solver.precision, 5))
+    for _ in range(5):
+        (found,) = outputs_of(batch, [scene])
+        assert list(same(found, truth)) == []
+
+
 def test_a_place_is_used_again(backend_of: Callable) -> None:
     """A run leaves nothing behind in its place, one that became unstable included."""
     backend = backend_of("f32", 1)
@@ -225,11 +239,28 @@ def test_kinds_are_equal_where_flags_are() -> None:
     assert kind_with(dry).joined(Kind.of(fluid, sample_bodies(fluid))) is None
 
 
-def test_frames_stop_on_request(backend_of: Callable) -> None:
+def test_frames_stop_on_request(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between two launches, after the frames that were recorded until then."""
+    monkeypatch.setattr(batch_run, "BUDGET", 1)
     scene = scene_named("sand")
     run = BatchRun(batch_of([scene, scene_named("sand", other=True)], backend_of("f32", 1)), 0, scene)
     frames = run.frames(stop=lambda: run.step_count > 0)
     next(frames)
     with pytest.raises(KeyboardInterrupt):
         list(frames)
-    assert np.isfinite(run.frame(1, [])[0].position).all()
+    assert np.isfinite(run.frame(1)[0].position).all()
+
+
+def test_no_frame_shows_a_particle_without_volume(backend_of: Callable) -> None:
+    """The step that crushed it cannot tell, and the next one comes after the frame."""
+    scene = scene_named("sand")
+    backend = backend_of("f32", 1)
+    run = BatchRun(batch_of([scene], backend), 0, scene)
+    run.begin()
+    assert run.frame()[1].volume_ratio_min > 0.9
+    run.groups[0].arrays.displacement_gradient[5][0, 0] = -1.0
+    solver = Solver(scene, backend)
+    solver.groups[0].displacement_gradient[5][0, 0] = -1.0
+    for crushed in (run, solver):
+        with pytest.raises(UnstableRunError, match="inside out"):
+            crushed.frame()

@@ -96,7 +96,7 @@ from mpmcli.bench.cases import BenchCase
 from mpmcli.bench.{module} import {name}
 side = {name}({case!r}, threads=2, precision="f64", arch="cpu")
 if "{module}" == "ours":
-    # Few particles: the batch, on one thread.
+    # Few particles: one thread.
     assert side.threads == 1
     side.engine.begin()
     side.engine.state.last_step = {case.step}

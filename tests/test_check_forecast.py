@@ -17,6 +17,7 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.output import SegmentStore, VtkSeriesStore
 from mpmcli.output.layout import FrameLayout
 from mpmcli.scene import scene_to_toml
+from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError
 from mpmcli.solver.ordering import entry_count
 from mpmcli.solver.plan import make_plan
@@ -111,7 +112,7 @@ def test_the_layout_is_that_of_a_frame(backend_of: Callable) -> None:
         for corner in body["shape"]["box"].values():
             corner[0] += 1e5
     scene = loaded(bodies, domain={"origin": [1e5, 0.0]}, output={"fields": EVERYTHING}).scene
-    frame, _ = Solver(scene, backend_of("f32")).frame(0, [])
+    frame, _ = Solver(scene, backend_of("f32")).frame()
     assert layout_of(scene) == FrameLayout.of(frame)
     assert layout_of(scene).arrays["Points"].dtype == "float64"
 
@@ -173,10 +174,10 @@ def test_the_command_probes_and_writes_nothing(tmp_path: Path, monkeypatch: pyte
     assert forecast["seconds"] > forecast["steps"] * forecast["step_seconds"] + forecast["compile_seconds"] > 0
     assert list(tmp_path.iterdir()) == [path]
 
-    def broken(self: Solver, dt: float) -> None:
-        raise UnstableRunError(Diagnosis(1, dt, 7, "drop", (0.5, 0.5), "went to pieces", "wave", dt, "look at it"))
+    def broken(self: BatchRun, count: int) -> tuple[int, float]:
+        raise UnstableRunError(Diagnosis(1, 0.1, 7, "drop", (0.5, 0.5), "went to pieces", "wave", 0.1, "look at it"))
 
-    monkeypatch.setattr(Solver, "step", broken)
+    monkeypatch.setattr(BatchRun, "advance", broken)
     outcome = run_here("check", path, "--threads", "2")
     assert outcome.status == 1
     assert "error: The run became unstable within 0 steps of the probe: the run became unstable" in outcome.stdout

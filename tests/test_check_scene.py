@@ -161,7 +161,7 @@ def test_mpm88_is_called_right(backend_of: Callable, tmp_path, cells: int, stabl
     outcome = run_here("check", path, "--no-probe", "--json")
     assert (outcome.status, json.loads(outcome.stdout)["ok"]) == (0 if stable else 1, stable)
     solver = Solver(scene.scene, backend_of("f32"), force=True)
-    start = solver.frame(0, [])[1].energy
+    start = solver.frame()[1].energy
 
     def run() -> None:
         for _ in range(1500):
@@ -169,7 +169,7 @@ def test_mpm88_is_called_right(backend_of: Callable, tmp_path, cells: int, stabl
 
     if stable:
         run()
-        assert solver.frame(0, [])[1].energy <= start
+        assert solver.frame()[1].energy <= start
     else:
         with pytest.raises(UnstableRunError):
             run()

@@ -326,4 +326,4 @@ def test_the_bench_table_is_written_from_its_json(commands, checkout):
     section = page[page.index("<!-- bench:") : page.index("<!-- end of bench -->")]
     report = json.loads((checkout / "results" / "bench.json").read_text(encoding="utf-8"))
     assert f"**{report['cases'][0]['ratio']:.1f}**" in section
-    assert "| 2d-64 | 5,000 | 1 / " in section
+    assert f"| 2d-64 | 5,000 | {report['cases'][0]['ours']['threads']} / " in section

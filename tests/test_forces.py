@@ -144,7 +144,7 @@ def test_initial_deformation_is_a_stress(backend, precision, rounding):
     """Neo-Hookean, F = diag(a, 1): tau_xx = mu (a^2 - 1) + lambda ln a, tau_yy = lambda ln a; sigma = tau / a."""
     body = block("bar", JELLY, (0.25, 0.25), (0.75, 0.5), deformation=[["1 + X / 10", 0], [0, 1]])
     scene = driven([body], precision=precision, output={"fields": ["velocity", "stress", "initial_position"]})
-    frame, _ = Solver(scene, backend).frame(0, [])
+    frame, _ = Solver(scene, backend).frame()
     a = 1 + frame.fields["initial_position"][:, 0] / 10
     mu, lam = 1e4 / 2.6, 1e4 * 0.3 / (1.3 * 0.4)
     sigma = stresses(frame.fields)
@@ -161,7 +161,7 @@ def test_a_hydrostatic_column_stays_at_rest(backend, precision, exponent):
     body = block("pool", water, (0.0, 0.0), (1.0, H), initial_pressure="hydrostatic")
     scene = driven([body], precision=precision, gravity=(0.0, -g), output={"fields": ["velocity", "pressure"]})
     solver = Solver(scene, backend)
-    frame, _ = solver.frame(0, [])
+    frame, _ = solver.frame()
     # J p = density g depth.
     J = bodies_of(solver)["pool"].deformation
     np.testing.assert_allclose(J * frame.fields["pressure"], 1000.0 * g * (H - frame.position[:, 1]), atol=1e-6 * 2e5)

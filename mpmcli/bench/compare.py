@@ -133,7 +133,7 @@ def run_bench(
 
     Args:
         cases: sizes to measure, of mpmcli.bench.cases.
-        threads: of the processor, for both; ours leaves few particles to one, as `mpmcli simulate` does.
+        threads: of the processor, for both; ours takes one for each 2,500 particles, as `mpmcli simulate` does.
         seconds: length of one block.
         progress: called with a line of text for each case and each pair of blocks.
         blocks: measured blocks of each contestant.

@@ -64,7 +64,7 @@ class Ours:
         threads: int,
         precision: str,
         arch: str,
-        serial: bool = False,
+        batched: bool = False,
         force: bool = False,
     ) -> None:
         """Put the scene on the device.
@@ -72,26 +72,26 @@ class Ours:
         Args:
             data: the scene; step: its time.step, s.
             particles: one entry per body, in place of the scene's own sampling.
-            serial: leave a scene with few particles to one thread, as `mpmcli simulate` does.
+            batched: compute it as `mpmcli simulate` does; otherwise by a `Solver`, which tells what its parts take.
             force: take time.step above the stable step too.
         """
         # Imported here, so that a scene can be described without importing Taichi.
         from mpmcli.solver.backend import choose_backend, start
-        from mpmcli.solver.engine import build_engine, suits_batch
+        from mpmcli.solver.engine import build_engine, suits_batch, useful_threads
         from mpmcli.solver.plan import make_plan
 
         scene = parse_scene(data, laws=parameter_models(), source=data["title"]).scene
         backend = choose_backend(arch, threads, precision, compile_cache=False)
-        batched = serial and suits_batch(scene, sum(body.count for body in particles or ()), backend)
-        if batched:
-            backend = replace(backend, threads=1)
+        count = sum(body.count for body in particles or ())
+        batched = batched and suits_batch(count, backend)
+        if batched and backend.on_cpu:
+            backend = replace(backend, threads=useful_threads(count, threads))
         start(backend)
         self.engine = build_engine(scene, backend, particles, batched=batched, force=force)
         self.threads = backend.threads
         self.smallest_step = step
         self.particles: int = self.engine.particle_count
-        # The plan is that of a solver.
-        self.bytes_per_particle: int | None = None if batched else make_plan(scene, backend).bytes_per_particle
+        self.bytes_per_particle: int = make_plan(scene, backend).bytes_per_particle
 
     @property
     def watch_seconds(self) -> float:
@@ -110,7 +110,7 @@ class Ours:
 
     def positions(self) -> np.ndarray:
         """Return the positions of the particles, (particles, dimension), m, in their initial order."""
-        return self.engine.frame(0, [])[0].position
+        return self.engine.frame()[0].position
 
     def is_sound(self) -> bool:
         """Whether every particle is in the domain."""
@@ -121,4 +121,4 @@ class Ours:
 def falling_block(case: BenchCase, *, threads: int, precision: str, arch: str) -> Ours:
     """Return what `mpmcli simulate` computes with, on the block of the peer."""
     data, particles = scene_of(case, precision), [particles_of(case)]
-    return Ours(data, case.step, particles, threads=threads, precision=precision, arch=arch, serial=True, force=True)
+    return Ours(data, case.step, particles, threads=threads, precision=precision, arch=arch, batched=True, force=True)

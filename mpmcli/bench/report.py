@@ -171,7 +171,7 @@ class BenchReport:
         title = heading(self.machine, self.arch, self.threads, self.precision)
         notes = [
             "M steps/s: million particle-steps per second, median of the blocks.",
-            "threads: ours / the peer's; with few particles one thread is faster, and mpmcli simulate takes one.",
+            "threads: ours / the peer's; mpmcli takes one for each 2,500 particles.",
             "ratio: ours over the peer's; range: of neighbouring blocks.",
             "start+compile, memory: ours / the peer's, with no kernel cached on disk.",
         ]

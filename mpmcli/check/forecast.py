@@ -11,8 +11,8 @@ from mpmcli.output.layout import POSITION, ArrayLayout, FrameLayout
 from mpmcli.output.store import HOLD
 from mpmcli.scene import Scene, scene_to_toml
 from mpmcli.scene.schema import SolverSettings
+from mpmcli.solver.frame_builder import POSITION_ERROR
 from mpmcli.solver.plan import Plan
-from mpmcli.solver.run import POSITION_ERROR
 from mpmcli.stability.transfer_factors import loss_per_step
 
 # Bytes of a packed file without particles, measured on files of 51 to 151 frames in 2D and 3D: headers of the data

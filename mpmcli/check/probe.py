@@ -60,7 +60,7 @@ def probe_scene(
     engine = build_engine(scene, backend, batched=batched)
     started = time.perf_counter() - began
     engine.begin()
-    engine.frame(0, [])
+    engine.frame()
     first_frame = time.perf_counter() - began - started
     # The smallest of three: the second frame allocates memory, later ones reuse it.
     frame = min(_seconds_of_a_frame(engine) for _ in range(3))
@@ -87,5 +87,5 @@ def probe_scene(
 
 def _seconds_of_a_frame(engine: Engine) -> float:
     since = time.perf_counter()
-    engine.frame(0, [])
+    engine.frame()
     return time.perf_counter() - since

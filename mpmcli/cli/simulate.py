@@ -28,9 +28,7 @@ from mpmcli.cli.streams import print_json, print_text
     show_default=True,
     help="Where to compute; auto takes CUDA or Metal where they are, and else the CPU.",
 )
-@click.option(
-    "--threads", type=click.IntRange(min=1), help="CPU threads; by default all of them, or one for few particles."
-)
+@click.option("--threads", type=click.IntRange(min=1), help="CPU threads; by default one for each 2,500 particles.")
 @click.option("--precision", type=click.Choice(["f32", "f64"]), help="Replaces solver.precision of the scene.")
 @click.option(
     "--format",

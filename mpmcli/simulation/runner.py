@@ -11,12 +11,11 @@ from mpmcli.solver.backend import Arch, Backend, Optimisation, choose_backend, s
 from mpmcli.solver.batch import Batch, Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.engine import suits_batch
+from mpmcli.solver.engine import build_engine, suits_batch
 from mpmcli.solver.plan import make_plan, require_room
-from mpmcli.solver.solver import Solver
 
-# Kinds whose kernels are kept at once.
-MOST_KINDS = 8
+# Kinds whose kernels are kept at once, and particles below which a scene is computed by kernels that are kept.
+MOST_KINDS, FEW_PARTICLES = 8, 20_000
 # Runs that advance at once on a GPU.
 MOST_RUNS = 256
 
@@ -45,7 +44,7 @@ class Runner:
         for scene in scenes:
             particles = sample_bodies(scene)
             backend = self._choose(scene)
-            if not backend.on_cpu or not suits_batch(scene, sum(len(b.position) for b in particles), backend):
+            if not backend.on_cpu or not _keeps(particles, backend):
                 continue
             kind = Kind.of(scene, particles)
             place = next((i for i, known in enumerate(kinds) if known.joined(kind) is not None), None)
@@ -65,13 +64,13 @@ class Runner:
         """
         particles = sample_bodies(scene)
         backend = self._choose(scene)
-        if suits_batch(scene, sum(len(b.position) for b in particles), backend):
+        if _keeps(particles, backend):
             backend = replace(backend, threads=1) if backend.on_cpu else backend
             engine = BatchRun(self._batch_for(Kind.of(scene, particles), backend), 0, scene, particles)
         else:
             require_room(make_plan(scene, backend))
             self._restart(backend)
-            engine = Solver(scene, backend, particles)
+            engine = build_engine(scene, backend, particles, batched=backend.on_cpu)
         return record(engine, scene, backend, stop)
 
     def run_all(self, scenes: Sequence[Scene]) -> Iterator[tuple[int, Recording | Exception]]:
@@ -89,7 +88,7 @@ class Runner:
             except MpmcliError as error:
                 yield place, error
                 continue
-            if backend.on_cpu or not suits_batch(scene, sum(len(b.position) for b in particles), backend):
+            if backend.on_cpu or not _keeps(particles, backend):
                 alone.append(place)
                 continue
             sampled[place] = particles
@@ -166,6 +165,12 @@ class Runner:
             self._restart(backend)
         self._batches.append(Batch(_roomy(wanted), backend, _power(runs)))
         return self._batches[-1]
+
+
+def _keeps(particles: Sequence[BodyParticles], backend: Backend) -> bool:
+    """Return whether a scene with these particles is computed by kernels that are kept for others."""
+    count = sum(len(body.position) for body in particles)
+    return suits_batch(count, backend) and (count < FEW_PARTICLES or not backend.on_cpu)
 
 
 def _roomy(kind: Kind) -> Kind:

@@ -19,12 +19,12 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.batch_device import Device
 from mpmcli.solver.batch_gpu import build_gpu_launch
 from mpmcli.solver.batch_kernel import build_batch_kernel
-from mpmcli.solver.batch_layout import Layout
+from mpmcli.solver.batch_layout import MOST_FRAMES, NOTES, Layout
 from mpmcli.solver.batch_values import BatchValues, Drives
 from mpmcli.solver.external_forces import push_on
 from mpmcli.solver.forces import Gravity
-from mpmcli.solver.frame_reader import build_frame_reader
-from mpmcli.solver.grid import DRIFT, Grid, node_width
+from mpmcli.solver.frame_reader import sum_entries
+from mpmcli.solver.grid import Grid, drift_allowed, node_width, tile_edge
 from mpmcli.solver.held_bound import HOLD, RISE
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.observe import build_observation
@@ -108,8 +108,10 @@ class Batch:
         device: all of it.
         layout: columns of `numbers`, (runs, k) float64, and `counts`, (runs, l) int32, which the kernel reads and
             changes.
+        shown: what particles show at the frames that the last launch recorded, on the CPU: (rows, k), as many rows for
+            each run; notes: on each of these frames, (runs, MOST_FRAMES, NOTES and sums of each law), float64.
         values: numbers that expressions read.
-        readers: of frames, per law, on the CPU; observations: per law, on a GPU.
+        observations: per law, on a GPU.
         pushes: measurements of the forces on each law, None where there are none.
         seconds: wall time of all launches; first_seconds: of the first, which compiles the kernel.
     """
@@ -119,7 +121,10 @@ class Batch:
         self.kind, self.runs, self.backend = kind, runs, backend
         on_cpu = backend.on_cpu
         width = node_width(d, on_cpu=on_cpu)
-        grid = Grid(d, 1.0, kind.cells, width, scheme_of(kind.settings), runs, keeps_filling=kind.keeps_filling)
+        scheme = scheme_of(kind.settings)
+        stencil = scheme.spline.nodes
+        tile = tile_edge(stencil, d, on_cpu=on_cpu)
+        grid = Grid(d, 1.0, kind.cells, width, scheme, runs, tile=tile, keeps_filling=kind.keeps_filling)
         groups = [
             ParticleArrays(
                 law,
@@ -128,8 +133,9 @@ class Batch:
                 (runs * bodies, CONSTANTS + len(law.constants(law.members[0]))),
                 width if on_cpu else d,
                 ti.Layout.AOS if on_cpu else ti.Layout.SOA,
-                several=True,
-                serial=on_cpu,
+                # Forces of a batch select the particles of their body.
+                several=runs > 1 or bodies > 1 or bool(forces.terms),
+                serial=on_cpu and backend.threads == 1,
                 keeps_initial=forces.initial,
             )
             for law, room, bodies, forces in zip(
@@ -150,7 +156,8 @@ class Batch:
         orders = []
         if on_cpu:
             buffers = SortBuffers(groups, runs)
-            orders = [TileOrder(group, grid, buffers, 1, True, runs) for group in groups]
+            sharing = backend.threads if runs == 1 else 1
+            orders = [TileOrder(group, grid, buffers, sharing, True, runs) for group in groups]
         self.device = Device(
             runs,
             kind.particles,
@@ -167,18 +174,37 @@ class Batch:
         self.layout = Layout(d, [len(law.internal) for law in kind.members])
         self.numbers = np.zeros((runs, self.layout.reals))
         self.counts = np.zeros((runs, self.layout.counts), np.int32)
-        constants = {"drift_allowed": DRIFT, "hold": HOLD, "rise": RISE, "slack": 1e-6, "infinity": math.inf}
+        constants = {"drift_allowed": drift_allowed(tile, stencil)}
+        constants |= {"hold": HOLD, "rise": RISE, "slack": 1e-6, "infinity": math.inf}
         for name, value in constants.items():
             self.numbers[:, getattr(self.layout.real, name)] = value
-        self.readers = [build_frame_reader(group) for group in groups] if on_cpu else []
         self.observations = [] if on_cpu else [build_observation(group) for group in groups]
         self.seconds = self.first_seconds = 0.0
+        self.shown = self._room = np.zeros((runs, 1), groups[0].real)
+        if on_cpu:
+            self.notes = np.zeros((runs, MOST_FRAMES, len(NOTES) + len(groups) * sum_entries(d)))
         build = build_batch_kernel if on_cpu else build_gpu_launch
         self._launch = build(self.device, self.layout)
+
+    def make_room(self, rows: int, columns: int) -> None:
+        """Let each run have so many rows of `shown` from the next launch on."""
+        shape = max(rows * self.runs, len(self._room)), max(columns, self._room.shape[1])
+        if shape != self._room.shape:
+            self._room = np.empty(shape, self._room.dtype)
+
+    def first_row(self, slot: int) -> int:
+        """Return the first row of a run in `shown`."""
+        return slot * (len(self.shown) // self.runs)
 
     def launch(self) -> None:
         """Advance every run until its host has to attend to it, or its budget of steps is spent."""
         began = time.perf_counter()
-        self._launch(self.numbers, self.counts)
+        if self.backend.on_cpu:
+            self.shown = self._room
+            self.counts[:, self.layout.count.recorded] = 0
+            self.counts[:, self.layout.count.row] = [self.first_row(slot) for slot in range(self.runs)]
+            self._launch(self.numbers, self.counts, self.shown, self.notes)
+        else:
+            self._launch(self.numbers, self.counts)
         self.seconds += time.perf_counter() - began
         self.first_seconds = self.first_seconds or self.seconds

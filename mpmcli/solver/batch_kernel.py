@@ -5,36 +5,39 @@ batch, alone, and in a `Solver` on any number of threads. The functions of a ste
 objects; `views` returns copies of them for one run, whose numbers are variables of the kernel.
 """
 
-import math
 from collections.abc import Callable
 
 import numpy as np
 import taichi as ti
 
 from mpmcli.solver.batch_device import Device, views
-from mpmcli.solver.batch_layout import ATTEND, GOING, MEASURE, Layout
+from mpmcli.solver.batch_layout import ATTEND, GOING, LOST, MEASURE, NOTES, Layout
+from mpmcli.solver.batch_phases import BatchPhases
 from mpmcli.solver.batch_steps import BatchSteps
+from mpmcli.solver.batch_threads import PATIENCE, BatchThreads
 from mpmcli.solver.box import box_of
-from mpmcli.solver.cpu_loops import clear_rows, scatter_pencils, update_rows
-from mpmcli.solver.grid import DRIFT
-from mpmcli.solver.lanes import advance_range
+from mpmcli.solver.frame_reader import SOUND, sum_entries, sum_range
 from mpmcli.solver.ordering import CHUNK
-from mpmcli.solver.particle_update import NOT_LOST
-from mpmcli.solver.sorting import sort_serially, tiles_in_use
+from mpmcli.solver.sorting import find_places
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
 
 
-def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, np.ndarray], None]:
-    """Compile-ready kernel: (numbers, counts) of all runs, see `batch_layout`; it advances and changes both."""
+def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, ...], None]:
+    """Compile-ready kernel: (numbers, counts, shown, notes) of all runs, see `Batch`; it advances and changes all."""
     d = device.grid.dimension
     groups, room, threads = tuple(device.groups), tuple(device.room), device.threads
     members = tuple(enumerate(groups))
     real, count = layout.real, layout.count
     steps = BatchSteps(layout, [group.law for group in groups], device.values)
-    lost = device.particles.lost
+    phases = BatchPhases(device, layout)
+    team = BatchThreads(phases, device.runs)
+    noted = tuple((k, getattr(real, name)) for k, name in enumerate(NOTES) if hasattr(real, name))
+    counted = tuple((k, getattr(count, name)) for k, name in enumerate(NOTES) if hasattr(count, name))
     alone = threads == 1
     next_run = ti.field(int, shape=())
+    # Of each run and axis the first and the last node at which a stencil began when particles were sorted.
+    stencils = ti.field(int, shape=(2 * device.runs, d))
 
     @ti.func
     def measure(w: int, numbers: ti.template(), counts: ti.template()):
@@ -50,124 +53,152 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
                 numbers[w, real.maxima[g] + k] = ti.cast(own[k], ti.f64)
 
     @ti.func
-    def sort(
-        w: int,
-        box: ti.template(),
-        last: ti.template(),
-        orders: ti.template(),
-        numbers: ti.template(),
-        counts: ti.template(),
-    ):
-        """Sort the particles of a run, and find the nodes in use."""
+    def end_sort(w: int, numbers: ti.template(), counts: ti.template()):
+        """Find the range of the stencils of particles that were sorted."""
         low = ti.Vector([2**30] * d)
         high = ti.Vector([-1] * d)
+        h, inverse, scale, box, last, extent = phases.place(w, numbers, counts)
+        _grid, _nodes, _particles, orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
         for g in ti.static(range(len(groups))):
-            first = w * room[g]
-            sort_serially(orders[g], first, counts[w, count.particles[g]], w)
-            tiles_in_use(orders[g], low, high)
+            first, own = w * room[g], counts[w, count.particles[g]]
+            for p in range(first, first + own):
+                base = orders[g].first_node_of(p)
+                low, high = ti.min(low, base), ti.max(high, base)
+            if ti.static(phases.shared):
+                phases.places.divide(g, own)
         for a in ti.static(range(d)):
-            first_node, last_node = box_of(device.grid, low[a], high[a], ti.static(math.ceil(DRIFT)), last[a])
-            box[0, a] = first_node
-            box[1, a] = last_node - first_node + 1
+            stencils[w * 2, a], stencils[w * 2 + 1, a] = low[a], high[a]
         numbers[w, real.drift] = 0.0
 
     @ti.func
-    def move(
-        w: int,
-        grid: ti.template(),
-        nodes: ti.template(),
-        particles: ti.template(),
-        orders: ti.template(),
-        seen: ti.template(),
-        dt: ti.f64,
-        moved: float,
-        kick: float,
-        relaxed: float,
-        numbers: ti.template(),
-        counts: ti.template(),
-    ):
-        """Take a step; return the largest speed of a node, -1 where a particle was lost. Rates are stored."""
-        gravity_step = ti.Vector.zero(float, d)
-        if ti.static(device.values.gravity_varies):
-            gravity_step = device.gravity.in_step(kick, w)
+    def sort_on(w: int, phase: int, numbers: ti.template(), counts: ti.template()):
+        """Do what follows on a phase of a sort before the next one."""
+        h, inverse, scale, box, last, extent = phases.place(w, numbers, counts)
+        _grid, _nodes, _particles, orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        for g in ti.static(range(len(groups))):
+            if phase == ti.static(phases.sorts_of[g]):
+                find_places(orders[g], w, w * room[g])
+
+    @ti.func
+    def find_box(w: int, numbers: ti.template(), counts: ti.template()):
+        """Find the nodes that the next step uses."""
+        drift = ti.cast(ti.ceil(numbers[w, real.drift]), int)
+        for a in ti.static(range(d)):
+            last_wall = PAD + counts[w, count.cells[a]]
+            first, last = box_of(device.grid, stencils[w * 2, a], stencils[w * 2 + 1, a], drift, last_wall)
+            device.grid.box[w * 2, a] = first
+            device.grid.box[w * 2 + 1, a] = last - first + 1
+        if ti.static(phases.shared):
+            phases.places.divide_rows()
+
+    @ti.func
+    def record(w: int, numbers: ti.template(), counts: ti.template(), shown: ti.template(), notes: ti.template()):
+        """Note what belongs to a frame that is shown, and aim at the next one if there is one."""
+        frame, row = counts[w, count.recorded], counts[w, count.row]
+        sound = True
+        for g, group in ti.static(members):
+            sums = sum_range(group, w * room[g], counts[w, count.particles[g]], row, shown)
+            for k in ti.static(range(sum_entries(d))):
+                notes[w, frame, ti.static(len(NOTES) + g * sum_entries(d)) + k] = sums[k]
+            if sums[ti.static(SOUND)] == 0:
+                sound = False
+        for k, column in ti.static(noted):
+            notes[w, frame, k] = numbers[w, column]
+        for k, column in ti.static(counted):
+            notes[w, frame, k] = ti.cast(counts[w, column], ti.f64)
+        if sound:
+            counts[w, count.recorded] = frame + 1
+            for g in ti.static(range(len(groups))):
+                counts[w, count.row] += counts[w, count.particles[g]]
+            if counts[w, count.frame] < counts[w, count.frames]:
+                counts[w, count.frame] += 1
+                steps.aim(w, numbers, counts)
+                if frame + 1 == counts[w, count.room] and counts[w, count.status] == GOING:
+                    counts[w, count.status] = ATTEND
+            else:
+                counts[w, count.status] = ATTEND
         else:
-            for a in ti.static(range(d)):
-                gravity_step[a] = kick * ti.cast(numbers[w, real.gravity[a]], float)
-        rows = grid.row_count()
-        clear_rows(grid, 0, rows)
-        for g, group in ti.static(enumerate(seen)):
-            for colour in range(ti.static(device.orders[g].colours)):
-                pencils = orders[g].pencil_count(colour)
-                scatter_pencils(particles, g, group, orders[g], colour, 0, pencils, kick, relaxed)
-        for g, group in ti.static(members):
-            relaxation = 0.0
-            if ti.static(group.law.relaxes):
-                if relaxed > 0.0:
-                    first = w * room[g]
-                    for p in range(first, first + counts[w, count.particles[g]]):
-                        relaxation = ti.max(relaxation, particles.relax(group, p, relaxed))
-            # What the relaxation adds to the rate of deformation.
-            numbers[w, real.rate[g]] = ti.cast(relaxation, ti.f64) / dt
-        if ti.static(nodes.needs_contact):
-            for q in range(nodes.images.plane_nodes(grid)):
-                nodes.images.find_contact(grid, q, gravity_step)
-        speed = ti.sqrt(update_rows(grid, nodes, 0, rows, gravity_step))
-        for g, group in ti.static(members):
-            first = w * room[g]
-            sharpest = advance_range(particles, g, group, first, first + counts[w, count.particles[g]], moved)
-            numbers[w, real.rate[g]] = numbers[w, real.rate[g]] + ti.cast(sharpest, ti.f64)
-            if lost[particles.first_lost + g] != NOT_LOST:
-                speed = -1.0
-        return speed
+            counts[w, count.status] = LOST
 
     @ti.func
-    def advance(w: int, numbers: ti.template(), counts: ti.template()):
-        """Take the steps of one run."""
-        h = ti.cast(numbers[w, real.spacing], float)
-        inverse = ti.cast(numbers[w, real.inverse_spacing], float)
-        scale = ti.cast(numbers[w, real.gradient_scale], float)
-        last = ti.Vector.zero(int, d)
-        extent = ti.Vector.zero(float, d)
-        box = ti.Matrix.zero(int, 2, d)
-        for a in ti.static(range(d)):
-            last[a] = PAD + counts[w, count.cells[a]]
-            extent[a] = ti.cast(numbers[w, real.extent[a]], float)
-            for i in ti.static(range(2)):
-                box[i, a] = device.grid.box[w * 2 + i, a]
-        grid, nodes, particles, orders, seen = ti.static(views(device, w, h, inverse, scale, box, last, extent))
-        while counts[w, count.status] == GOING and counts[w, count.budget] > 0:
-            if numbers[w, real.drift] >= numbers[w, real.drift_allowed]:
-                sort(w, box, last, orders, numbers, counts)
-            dt, kick, splits, limit, deformation = steps.begin(w, numbers, counts)
-            if dt > 0:
-                relaxed = ti.cast(steps.relaxed_in(w, dt, numbers, counts), float)
-                moved, kicked = ti.cast(dt, float), ti.cast(kick, float)
-                speed = move(w, grid, nodes, particles, orders, seen, dt, moved, kicked, relaxed, numbers, counts)
-                steps.end(w, dt, splits, limit, deformation, ti.cast(speed, ti.f64), numbers, counts)
-        for a in ti.static(range(d)):
-            for i in ti.static(range(2)):
-                device.grid.box[w * 2 + i, a] = box[i, a]
-
-    @ti.func
-    def attend(w: int, numbers: ti.template(), counts: ti.template()):
-        """Advance a run, and measure it where the host needs that."""
+    def attend(
+        w: int, t: int, numbers: ti.template(), counts: ti.template(), shown: ti.template(), notes: ti.template()
+    ):
+        """Advance a run, record frames, and measure it where the host needs that; threads but t = 0 only help."""
         status = counts[w, count.status]
-        if status == GOING:
-            advance(w, numbers, counts)
-        if status == MEASURE or (status == GOING and counts[w, count.status] == ATTEND):
-            counts[w, count.status] = ATTEND
-            measure(w, numbers, counts)
+        team.enter(w)
+        goes_on, recorded = True, False
+        phase, limit, idle = -1, 0, 0
+        dt, splits, deformation = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        while goes_on:
+            if t == 0 and team.finished(w):
+                if phase == phases.last_of_step:
+                    speed = phases.end_step(w, dt, numbers)
+                    steps.end(w, dt, splits, limit, deformation, speed, numbers, counts)
+                    recorded = False
+                elif phase == phases.last_of_sort:
+                    end_sort(w, numbers, counts)
+                elif phase == phases.showing:
+                    record(w, numbers, counts, shown, notes)
+                    recorded = True
+                elif phase >= phases.sorts:
+                    sort_on(w, phase, numbers, counts)
+                inside = phase >= 0 and phase != phases.showing
+                if inside and phase != phases.last_of_step and phase != phases.last_of_sort:
+                    phase += 1
+                else:
+                    phase = -1
+                    arrived, going = counts[w, count.arrived] == 1, counts[w, count.status] == GOING
+                    if arrived and counts[w, count.records] == 1 and counts[w, count.status] != LOST and not recorded:
+                        phase = phases.showing
+                    elif going and not arrived and counts[w, count.budget] > 0:
+                        if numbers[w, real.drift] >= numbers[w, real.drift_allowed]:
+                            phase = phases.sorts
+                        else:
+                            dt, kick, splits, limit, deformation = steps.begin(w, numbers, counts)
+                            if dt > 0:
+                                find_box(w, numbers, counts)
+                                relaxed = steps.relaxed_in(w, dt, numbers, counts)
+                                phases.begin_step(w, dt, kick, relaxed, numbers)
+                                phase = 0
+                if phase >= 0:
+                    team.publish(w, phase)
+                else:
+                    goes_on = False
+            if goes_on:
+                found = team.help(w, t, idle, numbers, counts, shown)
+                idle = 0 if found == 1 else idle + 1
+                if found < 0 or (idle > PATIENCE and t > 0):
+                    goes_on = False
+        team.leave(w)
+        if t == 0:
+            team.close(w)
+            if status == MEASURE or (status == GOING and counts[w, count.status] == ATTEND):
+                counts[w, count.status] = ATTEND
+                measure(w, numbers, counts)
 
     @ti.kernel
-    def launch(numbers: ti.types.ndarray(ti.f64, 2), counts: ti.types.ndarray(ti.i32, 2)):
+    def launch(
+        numbers: ti.types.ndarray(ti.f64, 2),
+        counts: ti.types.ndarray(ti.i32, 2),
+        shown: ti.types.ndarray(ndim=2),
+        notes: ti.types.ndarray(ti.f64, 3),
+    ):
+        ti.loop_config(serialize=True)
+        for w in range(device.runs):
+            team.open(w)
         next_run[None] = 0
         ti.loop_config(serialize=alone)
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
-                # Threads take runs as they become free: no number depends on which one.
                 w = ti.atomic_add(next_run[None], 1)
-                while w < device.runs:
-                    attend(w, numbers, counts)
-                    w = ti.atomic_add(next_run[None], 1)
+                if ti.static(phases.shared):
+                    # The first thread to come leads: a system may let threads run one after another.
+                    attend(0, w, numbers, counts, shown, notes)
+                else:
+                    # Threads take runs as they become free: no number depends on which one.
+                    while w < device.runs:
+                        attend(w, 0, numbers, counts, shown, notes)
+                        w = ti.atomic_add(next_run[None], 1)
 
     return launch

@@ -7,8 +7,9 @@ import numpy as np
 
 from mpmcli.solver.state_bounds import ENTRIES
 
-# Status of a run: free, or waiting for the host; to be measured; advancing; measured, as a bound on its step requires;
-# with lost particles; with a stable step that collapsed; before a kick that ends beyond its time tables.
+# Status of a run: free, or waiting for the host; to be measured; advancing; measured, as a bound on its step requires,
+# at its target, or with no room for frames left; with lost particles; with a stable step that collapsed; before a kick
+# that ends beyond its time tables.
 IDLE, MEASURE, GOING, ATTEND, LOST, COLLAPSED, BEYOND = range(7)
 # Bounds on the step by their code; of equal ones the lower code counts, as in a comparison of `Limit`s.
 LIMITS = ("", "deformation", "force", "forced", "maximum", "speed", "viscosity", "wave")
@@ -24,8 +25,16 @@ REALS = (
     *("spacing", "inverse_spacing", "gradient_scale"),
     *("drift_allowed", "hold", "rise", "slack", "infinity"),
 )
-# Columns of the counts, int32.
-COUNTS = ("status", "arrived", "steps", "unrelaxed_steps", "budget", "limit", "stiffness_limit", "forced", "longest")
+# Columns of the counts, int32. `frame` of `frames` is the next that the kernel records, `recorded` the number of those
+# of this launch, which go to rows of `shown` from `row` on; `affine`, `gradient` and `tau` are columns there.
+COUNTS = (
+    *("status", "arrived", "steps", "unrelaxed_steps", "budget", "limit", "stiffness_limit", "forced", "longest"),
+    *("records", "frame", "frames", "recorded", "room", "row", "affine", "gradient", "tau"),
+)
+# Columns of the notes on a recorded frame, float64, before the sums of each group.
+NOTES = ("time", "last_step", "smallest", "smallest_courant", "largest", "largest_courant", "limit", "steps")
+# Most frames that a launch records of a run.
+MOST_FRAMES = 128
 
 
 def _columns(first: int, names: Iterable[str]) -> dict[str, int]:

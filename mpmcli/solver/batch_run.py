@@ -1,6 +1,7 @@
 """One run of a batch: fills its place on the device, and attends to it between launches."""
 
 import math
+import time
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -10,12 +11,14 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.batch import Batch
+from mpmcli.solver.batch_exchange import Exchange
 from mpmcli.solver.batch_group import BatchGroup
-from mpmcli.solver.batch_layout import ATTEND, BEYOND, COLLAPSED, GOING, HELD, IDLE, LIMITS, LOST, MEASURE, Row
+from mpmcli.solver.batch_layout import ATTEND, BEYOND, COLLAPSED, GOING, IDLE, LOST, MEASURE, Row
+from mpmcli.solver.batch_recorder import Recorder, steps_of
 from mpmcli.solver.batch_values import Drives
 from mpmcli.solver.external_forces import ExternalForces
+from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.groups import require_inside
-from mpmcli.solver.held_bound import HeldBound
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.particles import initial_state, table_of
 from mpmcli.solver.plan import members_of
@@ -23,13 +26,11 @@ from mpmcli.solver.run import COLLAPSE, Run
 from mpmcli.solver.run_values import RunValues
 from mpmcli.solver.state import Progress
 from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
-from mpmcli.solver.step_control import StepControl, StepCounters
-from mpmcli.stability.limits import force_limit
+from mpmcli.solver.step_control import StepControl
+from mpmcli.solver.sums import Sums
 
-# Numbers of `Progress` that the kernel changes.
-FOLLOWED = ("time", "last_step", "unrelaxed", "speed", "courant", "drift", "owed")
 # Particle-steps of a run in one launch: some tenths of a second, after which the host may stop the run.
-BUDGET = 2_000_000
+BUDGET = 5_000_000
 
 
 class BatchRun(Run):
@@ -57,12 +58,14 @@ class BatchRun(Run):
         super().__init__(scene, batch.backend, particles, force=force)
         require_inside(scene, self._particles)
         self.batch, self.slot = batch, slot
-        self._readers, self._observations = batch.readers, batch.observations
+        self._observations = batch.observations
         self._begun = False
         self._numbers, self._counts = batch.numbers[slot], batch.counts[slot]
         self._real, self._count = batch.layout.real, batch.layout.count
         self._row = Row(batch.layout, self._numbers, self._counts)
-        self._followed = [getattr(self._real, name) for name in FOLLOWED]
+        self._row.set(time=0.0, last_step=0.0)
+        self._row.set_counts(records=0, arrived=0, steps=0)
+        self._exchange = Exchange(batch.layout, self._numbers, self._counts)
         first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in self._particles])])
         self.groups = []
         for g, shared in enumerate(batch.kind.members):
@@ -77,6 +80,7 @@ class BatchRun(Run):
             lost = batch.device.particles.lost
             if lost[slot * len(batch.kind.members) + g] != NOT_LOST:
                 lost[slot * len(batch.kind.members) + g] = NOT_LOST
+        self._recorder = Recorder(batch, slot, self.particle_count, scene.time.frames)
         entries = Drives.of(scene, [group.bodies for group in self.groups])[1]
         self._values = RunValues(batch.values.device, slot, entries, scene.time.end)
         self._tables, self._means = batch.values.tables, list(self._values.means.values())
@@ -128,17 +132,26 @@ class BatchRun(Run):
         Raises:
             UnstableRunError: a particle left the domain, was inverted or became non-finite.
         """
+        if self.backend.on_cpu:
+            self._recorder.begin(self._builder.columns)
         yield None
         self._start()
-        yield self.frame(0, [])
+        if self.backend.on_cpu:
+            yield from self._recorded(0)
+            if self._row.count("recorded") == 0:
+                self._stop(0.0, self._lost())
+            yield from self._advance()
+            return
+        yield self.frame()
         count = self.scene.time.frames
         for index in range(1, count + 1):
-            target = self.scene.time.end * index / count
-            if target <= self.time:
-                continue
             before = self.step_count
-            yield from self._reach(target)
-            yield self.frame(index, self._taken(before))
+            for _ in self._reach(self.scene.time.end * index / count):
+                yield None
+            # A particle that the last step has inverted would be found in the next one only.
+            if not self.state.step_control.sound():
+                self._stop(self.last_step, self._lost())
+            yield self.frame(index, steps_of(self._row, self.step_count - before))
 
     def begin(self) -> None:
         """Take the bounds of time 0, where this is the only run of its batch; a second call does nothing."""
@@ -149,7 +162,7 @@ class BatchRun(Run):
     def advance(self, count: int) -> tuple[int, float]:
         """Take `count` steps as large as the next one, fewer or more where it changes; see `Engine.advance`."""
         self.begin()
-        self._push()
+        self._exchange.push(self.state)
         before = self.step_count
         step = min(self.stable_step()[0], self.scene.time.end / self.scene.time.frames)
         for _ in self._reach(self.time + count * step):
@@ -181,36 +194,55 @@ class BatchRun(Run):
         for g, group in enumerate(self.groups):
             self._numbers[self._real.sensitivity[g]] = group.law.sensitivity
             self._numbers[self._real.hardening[g]] = group.law.hardening
-        self._push()
+        self._exchange.push(self.state)
 
     def _reach(self, target: float) -> Iterator[None]:
         """Let the batch launch until the run has reached a time, s."""
         self._row.set(target=target, smallest=math.inf, largest=0.0, largest_courant=0.0)
-        self._row.set_counts(arrived=0, limit=0)
-        arrived = False
-        while not arrived:
-            self._row.set_counts(status=GOING, budget=max(1, BUDGET // self.particle_count), steps=0)
+        self._row.set_counts(arrived=0, limit=0, records=0)
+        for _ in self._advance():
             yield None
-            self._pull()
-            arrived = self._row.count("arrived") == 1
+
+    def _advance(self) -> Iterator[tuple[Frame, LedgerRow] | None]:
+        """Let the batch launch until the run has reached its target, or its last frame where the kernel records.
+
+        Yields:
+            None where the batch must launch; and the frames that it has recorded.
+        """
+        while self._row.count("arrived") == 0:
+            self._row.set_counts(status=GOING, budget=max(1, BUDGET // self.particle_count), steps=0)
+            if self._row.count("records"):
+                self._recorder.make_room()
+            yield None
+            before = self.step_count
+            self._exchange.pull(self.state)
             status = self._row.count("status")
-            if status == LOST:
-                self._row.set_counts(status=IDLE)
-                self._stop(self.last_step, self._lost())
-            if status == COLLAPSED:
-                self._row.set_counts(status=IDLE)
-                self._stop_collapsed(self.stable_step()[0])
-            if status == BEYOND:
-                self._fill_tables()
-            if status == ATTEND:
-                due = self.state.step_control.take_counters(self._counters())
-                # At a frame all are measured.
-                if due and not arrived:
-                    self._measure(due)
-                self._push()
-        self.state.time = target
-        self._measure(range(len(self.groups)))
-        self._push()
+            if self._row.count("records"):
+                yield from self._recorded(before)
+            self._attend(status)
+
+    def _attend(self, status: int) -> None:
+        """Do what a status asks for after a launch."""
+        if status in (LOST, COLLAPSED):
+            self._row.set_counts(status=IDLE)
+        if status == LOST:
+            self._stop(self.last_step, self._lost())
+        if status == COLLAPSED:
+            self._stop_collapsed(self.stable_step()[0])
+        if status == BEYOND:
+            self._fill_tables()
+        if status == ATTEND:
+            due = self.state.step_control.take_counters(self._exchange.counters(self.state.step_control))
+            if due:
+                self._measure(due)
+            self._exchange.push(self.state)
+
+    def _recorded(self, before: int) -> Iterator[tuple[Frame, LedgerRow]]:
+        """Yield the frames that the last launch has recorded; `before` are the steps taken before it."""
+        began = time.perf_counter()
+        built = self._recorder.read(self._builder, before)
+        self.frame_seconds += time.perf_counter() - began
+        yield from built
 
     def _measure(self, due: range | list[int]) -> None:
         """Take the measurement of some groups that the kernel has made after the last step."""
@@ -234,61 +266,24 @@ class BatchRun(Run):
         found = self.batch.device.particles.lost.to_numpy()[self.slot * count :][:count]
         return [None if p == NOT_LOST else int(p) - group.first for p, group in zip(found, self.groups, strict=True)]
 
-    def _counters(self) -> StepCounters:
-        def numbers(columns: tuple[int, ...]) -> tuple[float, ...]:
-            return tuple(self._numbers[list(columns)].tolist())
-
-        return StepCounters(
-            self.state.step_control.counters().stiffness_limit,
-            HeldBound(*(self._row.number(name) for name in HELD)),
-            numbers(self._real.rate),
-            tuple(self._counts[list(self._count.unwatched)].tolist()),
-            numbers(self._real.change),
-            numbers(self._real.hardened),
-        )
-
-    def _pull(self) -> None:
-        """Read what the kernel has changed."""
-        for name, value in zip(FOLLOWED, self._numbers[self._followed].tolist(), strict=True):
-            setattr(self.state, name, value)
-        self.state.unrelaxed_steps = self._row.count("unrelaxed_steps")
-        self.state.step_count += self._row.count("steps")
-
-    def _push(self) -> None:
-        """Write what the host has changed."""
-        self._numbers[self._followed] = [getattr(self.state, name) for name in FOLLOWED]
-        self._row.set_counts(unrelaxed_steps=self.state.unrelaxed_steps)
-        forces = self.state.external_forces
-        self._row.set(pull=forces.steady_pull)
-        if forces.pushes:
-            self._row.set(force=force_limit(forces.slope))
-        counters = self.state.step_control.counters()
-        self._row.set(stiffness=counters.stiffness_limit.value, **dict(zip(HELD, counters.held, strict=True)))
-        self._row.set_counts(stiffness_limit=LIMITS.index(counters.stiffness_limit.name))
-        for g in range(len(self.groups)):
-            self._numbers[self._real.rate[g]] = counters.rates[g]
-            self._numbers[self._real.change[g]] = counters.change[g]
-            self._numbers[self._real.hardened[g]] = counters.hardened[g]
-            self._counts[self._count.unwatched[g]] = counters.unwatched[g]
-
-    def _taken(self, before: int) -> list[tuple[float, float, str]]:
-        """Return the steps since the step `before` as `ledger_row` counts them: the smallest one, and the largest."""
-        smallest = self._row.number("smallest"), self._row.number("smallest_courant"), LIMITS[self._row.count("limit")]
-        steps = self.step_count - before
-        return [smallest] + [(self._row.number("largest"), self._row.number("largest_courant"), "")] * (steps - 1)
+    def _read(self, arrays: FrameArrays) -> list[Sums]:
+        sums = self._recorder.read_now(arrays)
+        if sums is None:
+            self._stop(self.last_step, self._lost())
+        return sums
 
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield as `Solver.frames`, where this is the only run of its batch.
 
         Raises:
             UnstableRunError: see `events`.
-            KeyboardInterrupt: `stop`, called after each launch, returned True.
+            KeyboardInterrupt: `stop`, called before each launch but the first, returned True.
         """
         for event in self.events():
             if event is not None:
                 yield event
                 continue
-            self.batch.launch()
-            # Frame 0 is always there.
+            # Frame 0 is always there, and what a launch has recorded is yielded before.
             if self.step_count and stop():
                 raise KeyboardInterrupt
+            self.batch.launch()

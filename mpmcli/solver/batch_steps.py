@@ -75,6 +75,8 @@ class BatchSteps:
     ):
         """Count a step with this largest speed of a node, m/s, -1 where a particle was lost. Its rates are stored."""
         numbers[w, self.real.time] = numbers[w, self.real.time] + dt
+        if splits == 1:
+            numbers[w, self.real.time] = numbers[w, self.real.target]
         numbers[w, self.real.last_step] = dt
         counts[w, self.count.steps] += 1
         counts[w, self.count.budget] -= 1
@@ -88,7 +90,7 @@ class BatchSteps:
             self.book(w, dt, courant, limit, numbers, counts)
             if splits == 1:
                 counts[w, self.count.arrived] = 1
-            if due or splits == 1:
+            if due or (splits == 1 and counts[w, self.count.records] == 0):
                 counts[w, self.count.status] = ATTEND
         else:
             counts[w, self.count.status] = LOST
@@ -134,6 +136,17 @@ class BatchSteps:
             value = maximum
             limit = FORCED
         return value, limit, deformation
+
+    @ti.func
+    def aim(self, w: int, numbers: ti.template(), counts: ti.template()):
+        """Go on to the next frame after one that was recorded."""
+        index = ti.cast(counts[w, self.count.frame], ti.f64)
+        numbers[w, self.real.target] = numbers[w, self.real.end] * index / ti.cast(counts[w, self.count.frames], ti.f64)
+        numbers[w, self.real.smallest] = numbers[w, self.real.infinity]
+        numbers[w, self.real.largest] = ti.cast(0.0, ti.f64)
+        numbers[w, self.real.largest_courant] = ti.cast(0.0, ti.f64)
+        counts[w, self.count.limit] = 0
+        counts[w, self.count.arrived] = 0
 
     @ti.func
     def relaxed_in(self, w: int, dt: ti.f64, numbers: ti.template(), counts: ti.template()):

@@ -11,18 +11,17 @@ from mpmcli.solver.splines import PAD
 
 
 @ti.func
-def box_of(grid: ti.template(), low: int, high: int, drift: ti.template(), last_wall: int):
+def box_of(grid: ti.template(), low: int, high: int, drift: int, last_wall: int):
     """Return the first and the last node in use along an axis.
 
     Args:
-        low, high: first and last tile that holds particles.
-        drift: cells that a particle may move away from the tile that it was sorted into.
+        low, high: first and last node at which a stencil began when particles were sorted.
+        drift: cells that a particle may have moved since.
         last_wall: node of the upper wall.
     """
-    # A stencil starts up to `drift` cells outside its tile and ends `reach` nodes further up.
     reach = ti.static(grid.scheme.spline.nodes - 1)
-    first = grid.tile * low - drift
-    last = grid.tile * high + grid.tile - 1 + drift + reach
+    first = low - drift
+    last = high + drift + reach
     # A box that comes near a wall holds the images beyond it too: they are read and written.
     if first <= PAD + REACH:
         first = PAD - REACH
@@ -57,7 +56,8 @@ def build_box_search(grid: Grid, orders: Sequence[TileOrder], drift: int) -> Cal
                         ti.atomic_max(tile_high[a], rest % ti.static(grid.tiles[a]))
                         rest = rest // ti.static(grid.tiles[a])
         for a in ti.static(range(d)):
-            first, last = box_of(grid, tile_low[a], tile_high[a], drift, ti.static(PAD + grid.cells[a]))
+            low, high = grid.tile * tile_low[a], grid.tile * tile_high[a] + grid.tile - 1
+            first, last = box_of(grid, low, high, drift, ti.static(PAD + grid.cells[a]))
             grid.box[0, a] = first
             grid.box[1, a] = last - first + 1
 

@@ -1,9 +1,7 @@
-"""What computes a scene: a batch of one run, which many small scenes need, or a solver on all threads.
-
-Both compute the same bytes.
-"""
+"""What computes a scene: a batch of one run on the CPU, a solver on a GPU. On the CPU both compute the same bytes."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Protocol
 
 from mpmcli.frames.frame import Frame
@@ -14,13 +12,12 @@ from mpmcli.solver.batch import Batch, Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.solver import Solver
 
-# Particles, by dimension, below which one thread is faster than two: the hand-over to a pool of threads takes
-# about 0.4 ms of each step.
-FEW_PARTICLES = {2: 20_000, 3: 10_000}
+# Particles that are worth a thread.
+WORTH_A_THREAD = 2_500
 # On a GPU, where runs advance at once; its kernels count time in double precision, which Metal lacks.
 FEW_ON_GPU, BATCHING_GPUS = 100_000, ("cuda", "vulkan")
 # Particle-steps below which the time to optimise kernels exceeds what faster steps save.
-LITTLE_WORK = 1e8
+LITTLE_WORK = 2e8
 
 
 class Engine(Protocol):
@@ -63,7 +60,7 @@ class Engine(Protocol):
             UnstableRunError: see `advance`.
         """
 
-    def frame(self, index: int, taken: list[tuple[float, float, str]]) -> tuple[Frame, LedgerRow]:
+    def frame(self) -> tuple[Frame, LedgerRow]:
         """Return the state as a frame, see `Run.frame`; after `begin`."""
 
     def frames(self, stop: Callable[[], bool]) -> Iterator[tuple[Frame, LedgerRow]]:
@@ -81,29 +78,29 @@ def choose_engine(
     """Return the backend for a scene, not started, and whether a batch runs it.
 
     Args:
-        expected_steps: their number; called only where a batch runs the scene.
-        threads: CPU threads; None for one where a batch runs the scene, and otherwise for all.
+        expected_steps: their number; called on the CPU only.
+        threads: CPU threads; None for as many as the scene has use for.
 
     Raises:
         InputError: the backend cannot be used.
     """
     backend = choose_backend(arch, threads, scene.solver.precision, compile_cache=compile_cache)
-    particles = estimate_particles(scene)
-    if not _is_small(scene, particles, backend) or threads not in (None, 1):
+    if not backend.on_cpu:
         return backend, False
+    particles = estimate_particles(scene)
     optimisation = "few" if particles * expected_steps() < LITTLE_WORK else "most"
-    return choose_backend(
-        "cpu", 1, scene.solver.precision, compile_cache=compile_cache, optimisation=optimisation
-    ), True
+    count = threads or useful_threads(particles, backend.threads)
+    return replace(backend, threads=count, optimisation=optimisation), True
 
 
-def suits_batch(scene: Scene, particles: int, backend: Backend) -> bool:
+def useful_threads(particles: int, threads: int) -> int:
+    """Return how many of these threads a batch of one run has use for."""
+    return min(threads, max(1, particles // WORTH_A_THREAD))
+
+
+def suits_batch(particles: int, backend: Backend) -> bool:
     """Return whether a batch can run a scene of so many particles, and, of many runs, faster than a `Solver`."""
-    return _is_small(scene, particles, backend) or (backend.arch in BATCHING_GPUS and particles < FEW_ON_GPU)
-
-
-def _is_small(scene: Scene, particles: int, backend: Backend) -> bool:
-    return backend.on_cpu and particles < FEW_PARTICLES[scene.dimension]
+    return backend.on_cpu or (backend.arch in BATCHING_GPUS and particles < FEW_ON_GPU)
 
 
 def build_engine(

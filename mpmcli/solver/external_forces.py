@@ -59,8 +59,7 @@ class ExternalForces:
     def __init__(self, scene: Scene, values: RunValues, measures: Sequence[Callable[[], tuple[float, float]]]) -> None:
         """Keep the numbers of the run, and the measurement of the force on each group that one acts on."""
         self._domain = scene.domain
-        self._constant = scene.domain.gravity_at(0.0)
-        self._gravity_pull = float(np.linalg.norm(self._constant))
+        self._gravity_pull = float(np.linalg.norm(scene.domain.gravity_at(0.0)))
         self._values, self._measures = values, measures
         self._push = 0.0
         self.slope = 0.0
@@ -87,10 +86,6 @@ class ExternalForces:
         """Set what depends on time alone to its mean over the kick from `start` to `end`, s."""
         if self._values.timed:
             self._values.write(start, end)
-
-    def gravity_at(self, time: float) -> np.ndarray:
-        """Return gravity, (d,), m/s^2."""
-        return self._constant if self._domain.steady else self._domain.gravity_at(time)
 
     def pull(self, start: float, end: float) -> float:
         """Return a bound on the acceleration between two times (s): gravity by its bounds, forces as measured."""

@@ -1,4 +1,4 @@
-"""What the particles show at an output time, row i being particle i, and the fields of a frame made of it."""
+"""What the particles show at output times, row i being particle i, and the fields of frames made of it."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -19,24 +19,26 @@ def stress_entries(dimension: int) -> tuple[tuple[int, int], ...]:
     return ENTRIES if dimension == 3 else ENTRIES[:4]
 
 
-class FrameArrays:
-    """What n particles show at one time.
+class FrameColumns:
+    """Columns of what particles show.
+
+    In this order: x relative to the origin of the domain, m, and v, m/s, d each; the stored energy per volume at rest,
+    J/m^3, half a step earlier, where the velocities are; J or det F and the internal variables of the law after plastic
+    flow; and, where a field needs it, C, F after plastic flow, d^2 each, and tau, Pa, see `stress_entries`.
 
     Attributes:
-        reals: (n, k), in columns: x relative to the origin of the domain, m, and v, m/s, d each; the stored energy per
-            volume at rest, J/m^3, half a step earlier, where the velocities are; J or det F and the internal variables
-            of the law after plastic flow; and, where a field needs it, C, F after plastic flow, d^2 each, and tau, Pa,
-            see `stress_entries`.
         first: the first column of each, by name: "x", "v", "energy", "J", "internal", "affine", "gradient", "tau"; -1
             where it is left out.
+        widths: number of columns of each that is there.
+        count: of all columns.
     """
 
-    def __init__(self, count: int, dimension: int, internal: int, real: type, fields: Collection[str] = ()) -> None:
-        """Allocate; the content is arbitrary.
+    def __init__(self, dimension: int, internal: int, fields: Collection[str] = ()) -> None:
+        """Assign columns.
 
         Args:
             internal: most internal variables of a law of the run.
-            fields: of the frame.
+            fields: of the frames.
         """
         d = dimension
         widths = {"x": d, "v": d, "energy": 1, "J": 1, "internal": internal}
@@ -46,17 +48,30 @@ class FrameArrays:
             widths["gradient"] = d * d
         if not set(STRESSES).isdisjoint(fields):
             widths["tau"] = len(stress_entries(d))
-        self.dimension, self._widths, end = d, widths, 0
+        self.dimension, self.widths, self.count = d, widths, 0
         self.first = dict.fromkeys(("affine", "gradient", "tau"), -1)
         for name, width in widths.items():
-            self.first[name] = end
-            end += width
-        self.reals = np.empty((count, end), real)
+            self.first[name] = self.count
+            self.count += width
+
+
+@dataclass(frozen=True)
+class FrameArrays:
+    """What n particles show at T times.
+
+    Attributes:
+        columns: of `reals`, (T, n, k), which may have more of them.
+    """
+
+    columns: FrameColumns
+    reals: np.ndarray
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return the columns of a name, a view of `reals`: (n,) of the energy and of J, else (n, columns)."""
-        first = self.first[name]
-        return self.reals[:, first] if name in ("energy", "J") else self.reals[:, first : first + self._widths[name]]
+        """Return the columns of a name, a view of `reals`: (T, n) of the energy and of J, else (T, n, columns)."""
+        first = self.columns.first[name]
+        if name in ("energy", "J"):
+            return self.reals[..., first]
+        return self.reals[..., first : first + self.columns.widths[name]]
 
 
 @dataclass(frozen=True)
@@ -102,19 +117,19 @@ class ParticleConstants:
         return ParticleConstants(body, material, mass, volume, flows, members)
 
     def volume_ratios(self, arrays: FrameArrays) -> np.ndarray:
-        """Return volume over volume at rest, (n,)."""
+        """Return volume over volume at rest, (T, n)."""
         J, internal = arrays["J"], arrays["internal"]
         if not any(law.internal for law, _ in self.members):
             return J
         ratios = np.empty_like(J)
         for law, rows in self.members:
-            own = internal[rows]
-            named = {variable.name: own[:, i] for i, variable in enumerate(law.internal)}
-            ratios[rows] = law.total_volume_ratio(J[rows], named)
+            own = internal[:, rows]
+            named = {variable.name: own[..., i] for i, variable in enumerate(law.internal)}
+            ratios[:, rows] = law.total_volume_ratio(J[:, rows], named)
         return ratios
 
     def fields(self, arrays: FrameArrays, ratios: np.ndarray, names: Collection[str]) -> dict[str, np.ndarray]:
-        """Return fields of a frame by name.
+        """Return fields of frames by name, (T, n) or (T, n, k).
 
         Args:
             ratios: see `volume_ratios`.
@@ -130,31 +145,31 @@ class ParticleConstants:
             case "density":
                 return self.mass / self.volume / ratios
             case "mass":
-                return self.mass
+                return np.broadcast_to(self.mass, ratios.shape)
             case "affine":
                 return arrays["affine"]
             case "deformation_gradient":
                 return arrays["gradient"]
             case "stress":
-                return self._stress(arrays) / ratios[:, None]
+                return self._stress(arrays) / ratios[..., None]
             case "pressure":
-                return arrays["tau"][:, :3].sum(axis=1) / (-3 * ratios)
+                return arrays["tau"][..., :3].sum(axis=-1) / (-3 * ratios)
         return self._internal(name, arrays)
 
     def _stress(self, arrays: FrameArrays) -> np.ndarray:
-        tau = np.zeros((len(arrays.reals), 9), arrays.reals.dtype)
+        tau = np.zeros((*arrays.reals.shape[:2], 9), arrays.reals.dtype)
         # The sign of a zero depends on how far a kernel was optimised.
         entries = arrays["tau"] + 0.0
-        for column, (i, j) in enumerate(stress_entries(arrays.dimension)):
-            tau[:, 3 * i + j] = tau[:, 3 * j + i] = entries[:, column]
+        for column, (i, j) in enumerate(stress_entries(arrays.columns.dimension)):
+            tau[..., 3 * i + j] = tau[..., 3 * j + i] = entries[..., column]
         return tau
 
     def _internal(self, name: str, arrays: FrameArrays) -> np.ndarray:
         """Return an internal variable; particles of other laws show it at rest."""
         variables = [variable for law, _ in self.members for variable in law.internal if variable.name == name]
-        values = np.full(len(arrays.reals), variables[-1].at_rest, arrays.reals.dtype)
+        values = np.full(arrays.reals.shape[:2], variables[-1].at_rest, arrays.reals.dtype)
         for law, rows in self.members:
             for i, variable in enumerate(law.internal):
                 if variable.name == name:
-                    values[rows] = arrays["internal"][rows, i]
+                    values[:, rows] = arrays["internal"][:, rows, i]
         return values

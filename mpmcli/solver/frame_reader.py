@@ -1,7 +1,7 @@
-"""Reads a frame on the CPU by one launch per law: what the particles show, and the ledger's sums.
+"""Reads a frame on the CPU: what the particles show, and the ledger's sums.
 
-`snapshot.fill` does the same with numpy, for a GPU, which has no double precision everywhere; of
-few particles they take several times as long.
+`snapshot.fill` does the same with numpy, for a GPU, which has no double precision everywhere; of few particles they
+take several times as long.
 """
 
 from collections.abc import Callable
@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import taichi as ti
 
-from mpmcli.solver.frame_arrays import FrameArrays, stress_entries
+from mpmcli.solver.frame_arrays import FrameArrays, FrameColumns, stress_entries
 from mpmcli.solver.lane_state import (
     LANES,
     constants_of,
@@ -23,128 +23,195 @@ from mpmcli.solver.lane_state import (
 )
 from mpmcli.solver.observe import respond_after
 from mpmcli.solver.particle_arrays import MASS, VOLUME, ParticleArrays
+from mpmcli.solver.particle_update import SMALLEST_J
+from mpmcli.solver.state_bounds import volume_ratio
 from mpmcli.solver.sums import Sums, axis_pairs
 
+# Entry of the sums that is 0 where a particle is crushed, inverted or not finite, else 1.
+SOUND = 5
+# Columns of a frame that may be left out.
+CHOSEN = ("affine", "gradient", "tau")
 
-def build_frame_reader(group: ParticleArrays) -> Callable[[float, int, int, FrameArrays], Sums]:
+
+@ti.func
+def show_range(
+    group: ti.template(),
+    first: int,
+    count: int,
+    dt: float,
+    row: int,
+    affine_at: int,
+    gradient_at: int,
+    tau_at: int,
+    shown: ti.template(),
+):
+    """Write what some particles show, as `FrameColumns` has it, each to the row of its number after `row`.
+
+    Their state does not change: the next step applies the plastic flow that the frame shows.
+
+    Args:
+        dt: the last step, s.
+        affine_at, gradient_at, tau_at: columns, -1 where they are left out.
+    """
+    d = ti.static(group.dimension)
+    keeps_F = ti.static(group.law.deformation == "F")
+    inner_count = ti.static(len(group.internal))
+    inners = ti.static(internal_entries(group))
+    entries = ti.static(tuple(enumerate(stress_entries(group.dimension))))
+    affine, deformation = zero_lanes(ti.static(d * d)), zero_lanes(ti.static(stored_entries(group)))
+    internal, rows = zero_lanes(inners), zero_lanes(ti.static(group.table.n))
+    # Energy, J, internal variables, and entries of the deformation and of the stress.
+    found = zero_lanes(ti.static(2 + inners + d * d + len(entries)))
+    turns = 1
+    if ti.static(group.law.projects) or tau_at >= 0:
+        turns = 2
+    begin = first
+    while begin < first + count:
+        own = ti.min(LANES, first + count - begin)
+        load_lanes(group, begin, own, affine, deformation, internal, rows)
+        # Half a step back, where the velocities are, and now: a loop, so that the law is compiled once.
+        for k in range(turns):
+            for lane in range(LANES):
+                C, inner = matrix_of(affine, d, lane), vector_of(internal, 0, inners, lane)
+                stored, constants = stored_of(group, deformation, lane), constants_of(rows, lane)
+                tau, tau_zz, after, inner_after = respond_after(
+                    group.law, stored, inner, C, 0.5 * (k - 1) * dt, dt, constants
+                )
+                if k == 0:
+                    found[0, lane] = group.law.energy(after, inner_after, constants)
+                if ti.static(not group.law.projects):
+                    after = stored
+                    inner_after = inner
+                for i in ti.static(range(inners)):
+                    found[2 + i, lane] = inner_after[i]
+                if ti.static(keeps_F):
+                    found[1, lane] = after.determinant()
+                    for i, j in ti.static(ti.ndrange(d, d)):
+                        found[2 + inners + i * d + j, lane] = after[i, j]
+                else:
+                    found[1, lane] = after
+                for column, place in ti.static(entries):
+                    if ti.static(place[0] < d and place[1] < d):
+                        found[2 + inners + d * d + column, lane] = tau[place[0], place[1]]
+                    else:
+                        found[2 + inners + d * d + column, lane] = tau_zz
+        for lane in range(own):
+            p = begin + lane
+            r = row + group.id[p]
+            velocity, C = group.motion(p)
+            for c in ti.static(range(d)):
+                shown[r, c] = group.x[p][c]
+                shown[r, d + c] = velocity[c]
+            for i in ti.static(range(2 + inner_count)):
+                shown[r, 2 * d + i] = found[i, lane]
+            if affine_at >= 0:
+                for i, j in ti.static(ti.ndrange(d, d)):
+                    shown[r, affine_at + i * d + j] = C[i, j]
+            if gradient_at >= 0:
+                if ti.static(keeps_F):
+                    for i, j in ti.static(ti.ndrange(d, d)):
+                        shown[r, gradient_at + i * d + j] = found[2 + inners + i * d + j, lane]
+                else:
+                    # The isotropic F of this volume.
+                    stretch = found[1, lane] ** ti.static(1.0 / group.dimension)
+                    for i, j in ti.static(ti.ndrange(d, d)):
+                        shown[r, gradient_at + i * d + j] = stretch if ti.static(i == j) else 0.0
+            if tau_at >= 0:
+                for column in ti.static(range(len(entries))):
+                    shown[r, tau_at + column] = found[2 + inners + d * d + column, lane]
+        begin += LANES
+
+
+def sum_entries(dimension: int) -> int:
+    """Return the numbers that `sum_range` returns."""
+    return 6 + 2 * dimension + 2 * len(axis_pairs(dimension))
+
+
+@ti.func
+def sum_range(group: ti.template(), first: int, count: int, row: int, shown: ti.template()):
+    """Return sums over some particles in one order, float64, see `sums_of`; `shown` has what they show after `row`."""
+    d = ti.static(group.dimension)
+    pairs = ti.static(axis_pairs(group.dimension))
+    turns = ti.static(len(axis_pairs(group.dimension)))
+    total = ti.Vector.zero(ti.f64, ti.static(sum_entries(group.dimension)))
+    fastest = 0.0
+    sound = 1
+    for p in range(first, first + count):
+        table = group.row(p)
+        m = ti.cast(table[MASS], ti.f64)
+        velocity, C = group.motion(p)
+        place = ti.cast(group.x[p], ti.f64)
+        speed = ti.cast(velocity, ti.f64)
+        affine = ti.cast(C, ti.f64)
+        total[0] += m
+        total[1] += m * speed.norm_sqr()
+        total[2] += m * affine.norm_sqr()
+        total[3] += ti.cast(table[VOLUME], ti.f64) * ti.cast(shown[row + group.id[p], 2 * d], ti.f64)
+        for c in ti.static(range(d)):
+            total[6 + c] += m * place[c]
+            total[6 + d + c] += m * speed[c]
+        for k in ti.static(range(turns)):
+            a, b = ti.static(pairs[k])
+            total[6 + 2 * d + k] += m * (place[a] * speed[b] - place[b] * speed[a])
+            total[6 + 2 * d + turns + k] += m * (affine[b, a] - affine[a, b])
+        fastest = ti.max(fastest, velocity.norm_sqr())
+        J = volume_ratio(group, group.stored(p))
+        # Written so that a NaN is not sound.
+        if not J > SMALLEST_J:
+            sound = 0
+    total[4] = ti.cast(fastest, ti.f64)
+    total[SOUND] = ti.cast(sound, ti.f64)
+    return total
+
+
+def sums_of(found: np.ndarray, dimension: int) -> tuple[Sums, np.ndarray]:
+    """Return the sums that `sum_range` has found at T times, (T, k), and whether all particles were sound, (T,)."""
+    d = dimension
+    turns = len(axis_pairs(d))
+    mass, motion, affine, elastic, speed, sound = found.T[:6]
+    place, momentum, turning, spin = np.split(found[:, 6:], [d, 2 * d, 2 * d + turns], axis=1)
+    return Sums(mass, place, momentum, motion, affine, turning, spin, elastic, speed), sound > 0
+
+
+def build_frame_reader(group: ParticleArrays) -> Callable[[float, int, int, FrameArrays], tuple[Sums, bool]]:
     """Return the reader of a range of particles: a function (dt, first, count, arrays).
 
-    Its `dt` is the last step, s. It fills the rows of those particles in `arrays`, and returns the sums. The device's
-    state does not change: the next step applies the plastic flow that the frame shows.
+    Its `dt` is the last step, s. It fills the rows of those particles in `arrays`, which have one time, and returns the
+    sums, and whether every particle is sound.
     """
-    d, law, serial = group.dimension, group.law, group.serial
-    keeps_F = law.deformation == "F"
-    inner_count, inners = len(group.internal), internal_entries(group)
-    entries = tuple(enumerate(stress_entries(d)))
-    pairs = axis_pairs(d)
-    turns = len(pairs)
-    width = 5 + 2 * d + 2 * turns
+    d, serial = group.dimension, group.serial
+    width = sum_entries(d)
 
     @ti.kernel
     def read(
         dt: float,
         first: int,
         count: int,
-        affine_at: ti.template(),
-        gradient_at: ti.template(),
-        tau_at: ti.template(),
-        reals: ti.types.ndarray(),
+        affine_at: int,
+        gradient_at: int,
+        tau_at: int,
+        shown: ti.types.ndarray(),
         sums: ti.types.ndarray(),
     ):
         ti.loop_config(serialize=serial)
         for chunk in range((count + LANES - 1) // LANES):
-            begin = first + chunk * LANES
             own = ti.min(LANES, count - chunk * LANES)
-            affine, deformation = zero_lanes(ti.static(d * d)), zero_lanes(ti.static(stored_entries(group)))
-            internal, rows = zero_lanes(inners), zero_lanes(ti.static(group.table.n))
-            load_lanes(group, begin, own, affine, deformation, internal, rows)
-            # Energy, J, internal variables, and entries of the deformation and of the stress.
-            shown = zero_lanes(ti.static(2 + inners + d * d + len(entries)))
-            # Half a step back, where the velocities are, and now: a loop, so that the law is compiled once.
-            for k in range(ti.static(2 if law.projects or tau_at >= 0 else 1)):
-                for lane in range(LANES):
-                    C, inner = matrix_of(affine, d, lane), vector_of(internal, 0, inners, lane)
-                    stored, constants = stored_of(group, deformation, lane), constants_of(rows, lane)
-                    tau, tau_zz, after, inner_after = respond_after(
-                        law, stored, inner, C, 0.5 * (k - 1) * dt, dt, constants
-                    )
-                    if k == 0:
-                        shown[0, lane] = law.energy(after, inner_after, constants)
-                    if ti.static(not law.projects):
-                        after = stored
-                        inner_after = inner
-                    for i in ti.static(range(inners)):
-                        shown[2 + i, lane] = inner_after[i]
-                    if ti.static(keeps_F):
-                        shown[1, lane] = after.determinant()
-                        for i, j in ti.static(ti.ndrange(d, d)):
-                            shown[2 + inners + i * d + j, lane] = after[i, j]
-                    else:
-                        shown[1, lane] = after
-                    for column, place in ti.static(entries):
-                        if ti.static(place[0] < d and place[1] < d):
-                            shown[2 + inners + d * d + column, lane] = tau[place[0], place[1]]
-                        else:
-                            shown[2 + inners + d * d + column, lane] = tau_zz
-            for lane in range(own):
-                p = begin + lane
-                row = group.id[p]
-                velocity, C = group.motion(p)
-                for c in ti.static(range(d)):
-                    reals[row, c] = group.x[p][c]
-                    reals[row, d + c] = velocity[c]
-                for i in ti.static(range(2 + inner_count)):
-                    reals[row, 2 * d + i] = shown[i, lane]
-                if ti.static(affine_at >= 0):
-                    for i, j in ti.static(ti.ndrange(d, d)):
-                        reals[row, affine_at + i * d + j] = C[i, j]
-                if ti.static(gradient_at >= 0):
-                    for i, j in ti.static(ti.ndrange(d, d)):
-                        if ti.static(keeps_F):
-                            reals[row, gradient_at + i * d + j] = shown[2 + inners + i * d + j, lane]
-                        else:
-                            # The isotropic F of this volume.
-                            reals[row, gradient_at + i * d + j] = (
-                                shown[1, lane] ** (1.0 / d) if ti.static(i == j) else 0.0
-                            )
-                if ti.static(tau_at >= 0):
-                    for column in ti.static(range(len(entries))):
-                        reals[row, tau_at + column] = shown[2 + inners + d * d + column, lane]
-        # In one order on any number of threads.
+            show_range(group, first + chunk * LANES, own, dt, 0, affine_at, gradient_at, tau_at, shown)
         ti.loop_config(serialize=True)
         for _ in range(1):
-            total = ti.Vector.zero(ti.f64, width)
-            fastest = 0.0
-            for q in range(count):
-                p = first + q
-                row = group.row(p)
-                m = ti.cast(row[MASS], ti.f64)
-                velocity, C = group.motion(p)
-                place = ti.cast(group.x[p], ti.f64)
-                speed = ti.cast(velocity, ti.f64)
-                affine = ti.cast(C, ti.f64)
-                total[0] += m
-                total[1] += m * speed.norm_sqr()
-                total[2] += m * affine.norm_sqr()
-                total[3] += ti.cast(row[VOLUME], ti.f64) * ti.cast(reals[group.id[p], 2 * d], ti.f64)
-                for c in ti.static(range(d)):
-                    total[5 + c] += m * place[c]
-                    total[5 + d + c] += m * speed[c]
-                for k in ti.static(range(turns)):
-                    a, b = ti.static(pairs[k])
-                    total[5 + 2 * d + k] += m * (place[a] * speed[b] - place[b] * speed[a])
-                    total[5 + 2 * d + turns + k] += m * (affine[b, a] - affine[a, b])
-                fastest = ti.max(fastest, velocity.norm_sqr())
-            total[4] = ti.cast(fastest, ti.f64)
+            total = sum_range(group, first, count, 0, shown)
             for k in ti.static(range(width)):
                 sums[k] = total[k]
 
-    def reader(dt: float, first: int, count: int, arrays: FrameArrays) -> Sums:
+    def reader(dt: float, first: int, count: int, arrays: FrameArrays) -> tuple[Sums, bool]:
         found = np.empty(width)
-        at = arrays.first
-        read(dt, first, count, at["affine"], at["gradient"], at["tau"], arrays.reals, found)
-        mass, motion, affine, elastic, speed = found[:5].tolist()
-        place, momentum, turning, spin = np.split(found[5:], [d, 2 * d, 2 * d + turns])
-        return Sums(mass, place, momentum, motion, affine, turning, spin, elastic, speed)
+        read(dt, first, count, *chosen_columns(arrays.columns), arrays.reals[0], found)
+        sums, sound = sums_of(found[None], d)
+        return sums, bool(sound[0])
 
     return reader
+
+
+def chosen_columns(columns: FrameColumns) -> tuple[int, ...]:
+    """Return the first column of each of CHOSEN, -1 where it is left out."""
+    return tuple(columns.first[name] for name in CHOSEN)

@@ -10,18 +10,26 @@ import taichi as ti
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.transfer_scheme import TransferScheme
 
-# Cells that a particle may drift out of the tile that it was sorted into. A little less than one leaves room for the
-# rounding of positions.
-DRIFT = 0.98
+# What is left of the cells that a particle may drift, for the rounding of positions.
+ROUNDING = 0.02
 
 
-def tile_edge(stencil: int) -> int:
+def tile_edge(stencil: int, dimension: int, *, on_cpu: bool) -> int:
     """Return the edge of a tile, cells, for a spline whose stencil has this many nodes per axis.
 
-    Same-coloured tiles write disjoint nodes as long as no particle has drifted more than one cell: two edges of t cells
-    apart, they write t + 1 + 1 nodes and the rest of the last stencil, which leaves t > stencil.
+    The larger a tile, the longer particles stay in its reach, and the rarer they are sorted. In 3D its nodes must fit
+    into the fastest cache.
     """
-    return stencil + 1
+    return stencil + (3 if on_cpu and dimension == 2 else 1)
+
+
+def drift_allowed(tile: int, stencil: int) -> float:
+    """Return the cells that a particle may drift out of its tile as long as same-coloured tiles write disjoint nodes.
+
+    Tiles of one colour lie two edges of t cells apart. With a drift of up to c cells one writes t + 2 c nodes and the
+    rest of the last stencil, which must be fewer: 2 c < t - stencil + 2.
+    """
+    return (tile - stencil + 1) // 2 - ROUNDING
 
 
 def node_width(dimension: int, *, on_cpu: bool) -> int:
@@ -64,6 +72,7 @@ class Grid:
         scheme: TransferScheme,
         runs: int = 1,
         *,
+        tile: int,
         keeps_filling: bool = False,
     ) -> None:
         """Allocate nodes for a number of runs, the nodes of one after those of another."""
@@ -74,14 +83,13 @@ class Grid:
         self.gradient_scale = scheme.spline.inverse_moment / spacing
         self.cells = tuple(cells)
         self.scheme = scheme
-        stencil = scheme.spline.nodes
-        self.tile = tile_edge(stencil)
-        self.tiles = self.tile_counts(cells, stencil)
+        self.tile = tile
+        self.tiles = self.tile_counts(cells, tile)
         self.shape = tuple(self.tile * n for n in self.tiles)
         self.strides = tuple(int(np.prod(self.shape[a + 1 :])) for a in range(dimension))
         self.lines = tuple(
             (o, sum(n * stride for n, stride in zip(o, self.strides, strict=False)))
-            for o in product(range(stencil), repeat=dimension - 1)
+            for o in product(range(scheme.spline.nodes), repeat=dimension - 1)
         )
         self.first_node = 0
         self.node_count = int(np.prod(self.shape))
@@ -93,14 +101,14 @@ class Grid:
         self.box = ti.field(int, shape=(2 * runs, dimension))
 
     @staticmethod
-    def tile_counts(cells: Sequence[int], stencil: int) -> tuple[int, ...]:
-        """Return the tiles per axis of a grid over these cells, for a stencil of this many nodes per axis."""
-        return tuple(-(-(n + 1 + 2 * PAD) // tile_edge(stencil)) for n in cells)
+    def tile_counts(cells: Sequence[int], tile: int) -> tuple[int, ...]:
+        """Return the tiles per axis of a grid over these cells, for tiles with this edge."""
+        return tuple(-(-(n + 1 + 2 * PAD) // tile) for n in cells)
 
     @staticmethod
-    def nodes_needed(cells: Sequence[int], stencil: int) -> int:
+    def nodes_needed(cells: Sequence[int], tile: int) -> int:
         """Return the number of nodes of that grid."""
-        return math.prod(tile_edge(stencil) * n for n in Grid.tile_counts(cells, stencil))
+        return math.prod(tile * n for n in Grid.tile_counts(cells, tile))
 
     @ti.func
     def clear(self, node: int):

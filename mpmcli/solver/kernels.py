@@ -10,7 +10,7 @@ from mpmcli.scene import Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.box import build_box_search
 from mpmcli.solver.forces import Gravity
-from mpmcli.solver.grid import DRIFT, Grid, node_width
+from mpmcli.solver.grid import Grid, drift_allowed, node_width, tile_edge
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.ordering import SortBuffers, TileOrder
 from mpmcli.solver.particle_update import ParticleUpdate
@@ -39,12 +39,15 @@ class Kernels:
 
     def __init__(self, scene: Scene, backend: Backend, groups: Sequence[ParticleGroup], gravity: Gravity) -> None:
         width = node_width(scene.dimension, on_cpu=backend.on_cpu)
+        scheme = scheme_of(scene.solver)
+        stencil = scheme.spline.nodes
         self.grid = Grid(
             scene.dimension,
             scene.domain.spacing,
             scene.domain.cells,
             width,
-            scheme_of(scene.solver),
+            scheme,
+            tile=tile_edge(stencil, scene.dimension, on_cpu=backend.on_cpu),
             keeps_filling=needs_filling(scene, [group.law for group in groups]),
         )
         faces = scene.domain.walls.faces(scene.dimension)
@@ -58,7 +61,7 @@ class Kernels:
         buffers = SortBuffers(groups)
         self.orders = [TileOrder(g, self.grid, buffers, backend.threads, backend.on_cpu) for g in groups]
         self._sorts = [build_sort(order) for order in self.orders]
-        self.drift_allowed = DRIFT if backend.on_cpu else float(self.grid.tile)
+        self.drift_allowed = drift_allowed(self.grid.tile, stencil) if backend.on_cpu else float(self.grid.tile)
         self._find_box = build_box_search(self.grid, self.orders, math.ceil(self.drift_allowed))
         if backend.on_cpu:
             self.step = build_cpu_step(self.grid, nodes, self.particles, groups, self.orders, gravity)

@@ -44,6 +44,15 @@ class NodeUpdate:
         Gravity, gravity_step (m/s), acts on the momentum of every image near a wall and on the velocity elsewhere,
         which is the same up to round-off.
         """
+        speed_squared = 0.0
+        # Where an image beyond a wall has mass, so has the node inside: a stencil that reaches the one holds the other.
+        if self.grid.nodes[index][ti.static(self.dimension)] > 0:
+            speed_squared = self.update_massive(node, index, gravity_step)
+        return speed_squared
+
+    @ti.func
+    def update_massive(self, node: ti.template(), index: int, gravity_step: ti.template()):
+        """Do what `update` does, for a node with mass."""
         d = ti.static(self.dimension)
         value = self.grid.nodes[index]
         pull = gravity_step

@@ -81,17 +81,23 @@ class TileOrder:
         self.work = ti.field(int, shape=(self.colours, threads + 1))
 
     @staticmethod
-    def bytes_needed(cells: Sequence[int], stencil: int, threads: int) -> int:
+    def bytes_needed(cells: Sequence[int], tile: int, threads: int) -> int:
         """Return the bytes that the tables of one group take."""
         tiles = 1
-        for n in Grid.tile_counts(cells, stencil):
+        for n in Grid.tile_counts(cells, tile):
             tiles *= n
         return 4 * tiles * (threads + 1)
 
     @ti.func
+    def first_node_of(self, p: int):
+        """Return the integer coordinates of the first node of the stencil of particle p."""
+        base, _ = self.grid.scheme.spline.stencil(self.group.x[p], self.grid.inverse_spacing)
+        return base
+
+    @ti.func
     def tile_of(self, p: int):
         """Return the linear index of the tile that holds the stencil's first node of particle p."""
-        base, _ = self.grid.scheme.spline.stencil(self.group.x[p], self.grid.inverse_spacing)
+        base = self.first_node_of(p)
         tile = 0
         for a in ti.static(range(self.grid.dimension)):
             tile = tile * ti.static(self.grid.tiles[a]) + ti.raw_div(base[a], ti.static(self.grid.tile))

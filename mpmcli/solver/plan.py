@@ -154,13 +154,13 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     # The widest field is a matrix; sources and keys are integers.
     widest = max(size for group in groups for size in group.fields.values())
     scheme = scheme_of(scene.solver)
-    stencil = scheme.spline.nodes
-    nodes = Grid.nodes_needed(cells, stencil)
+    tile = tile_edge(scheme.spline.nodes, dimension, on_cpu=backend.on_cpu)
+    nodes = Grid.nodes_needed(cells, tile)
     members = [
         laws()[name]([scene.bodies[i].material for i in members_of(scene, name)], dimension) for name in sorted(bodies)
     ]
     node_bytes = real * width * (1 + scheme.keeps_before + needs_filling(scene, members))
-    tables = len(groups) * TileOrder.bytes_needed(cells, stencil, backend.threads) + _contact_bytes(scene, nodes)
+    tables = len(groups) * TileOrder.bytes_needed(cells, tile, backend.threads) + _contact_bytes(scene, nodes, tile)
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
     host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)
     passes = passes_of(sorted(bodies), scene)
@@ -175,11 +175,10 @@ def _separating_axes(scene: Scene) -> list[int]:
     return [axis for axis, pair in enumerate(faces) for wall in pair if wall == "separate"]
 
 
-def _contact_bytes(scene: Scene, nodes: int) -> int:
+def _contact_bytes(scene: Scene, nodes: int, tile: int) -> int:
     """Return the bytes of the contact of separating walls: an integer per face and node of the largest such plane."""
-    stencil = scheme_of(scene.solver).spline.nodes
-    tiles = Grid.tile_counts(scene.domain.cells, stencil)
-    planes = [nodes // (tile_edge(stencil) * tiles[axis]) for axis in _separating_axes(scene)]
+    tiles = Grid.tile_counts(scene.domain.cells, tile)
+    planes = [nodes // (tile * tiles[axis]) for axis in _separating_axes(scene)]
     return 4 * len(planes) * max(planes, default=0)
 
 

@@ -11,17 +11,14 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError, cause_of, diagnose, first_unsound, rate_of_change
-from mpmcli.solver.frame_arrays import FrameArrays, ParticleConstants
+from mpmcli.solver.frame_arrays import FrameArrays
+from mpmcli.solver.frame_builder import FrameBuilder, Moment
 from mpmcli.solver.observe import Observation
 from mpmcli.solver.snapshot import Snapshot, fill, read_group
 from mpmcli.solver.state import Progress
-from mpmcli.solver.sums import Sums, ledger_row, ledger_sums
-from mpmcli.solver.volume_error import volume_error
+from mpmcli.solver.sums import StepsTaken, Sums
 from mpmcli.stability.limits import Limit, force_limit, speed_limit
-from mpmcli.stability.transfer_factors import affine_moment
 
-# Largest rounding of a stored position, in cells.
-POSITION_ERROR = 1e-3
 # Ratio of the stable step to the first one at which a run stops: steps that small do not recover.
 COLLAPSE = 1e-4
 
@@ -40,8 +37,7 @@ class Run:
 
     groups: Sequence
     state: Progress
-    # What reads frames of each group: on the CPU, and on a GPU.
-    _readers: Sequence[Callable[..., Sums]]
+    # What reads frames of each group on a GPU.
     _observations: Sequence[Callable[..., Observation]]
 
     def __init__(
@@ -60,17 +56,8 @@ class Run:
         self.frame_seconds = 0.0
         self.spacing = scene.domain.spacing
         self._origin = np.array(scene.domain.origin)
-        # Far from zero single precision cannot tell neighbours apart, though the solver, which counts from the
-        # origin of the domain, can.
-        farthest = float(np.abs([self._origin, scene.domain.upper]).max())
-        coarse = farthest * np.finfo(np.float32).eps > POSITION_ERROR * self.spacing
-        self._position_type = np.float64 if coarse or backend.precision == "f64" else np.float32
         self._particles = particles or sample_bodies(scene)
         self.particle_count = sum(len(b.position) for b in self._particles)
-        self._initial = None
-        if "initial_position" in scene.output.fields:
-            initial = [b.position if b.initial is None else b.initial for b in self._particles]
-            self._initial = np.concatenate(initial)
 
     @property
     def laws(self) -> tuple[str, ...]:
@@ -170,56 +157,39 @@ class Run:
             snapshot, p, cause, self.scene, self.step_count, self.time, dt, self.nearest_limit, forced=forced
         )
 
-    def frame(self, index: int, taken: list[tuple[float, float, str]]) -> tuple[Frame, LedgerRow]:
-        """Return the state as a frame, and the ledger row for the steps (size, Courant number, limit) taken."""
+    def frame(self, index: int = 0, taken: StepsTaken = StepsTaken()) -> tuple[Frame, LedgerRow]:  # noqa: B008
+        """Return the state as a frame, and the ledger row for the steps taken.
+
+        Raises:
+            UnstableRunError: a particle is inverted or not finite.
+        """
         began = time.perf_counter()
-        names = [name for name in self.scene.output.fields if name not in ("velocity", "initial_position")]
-        internal = max(len(group.law.internal) for group in self.groups)
-        arrays = FrameArrays(self.particle_count, self.scene.dimension, internal, self.groups[0].real, names)
-        if self.backend.on_cpu:
-            sums = [self._read(g, arrays) for g in range(len(self.groups))]
-        else:
-            sums = self._observe(arrays)
-        particles = self._constants
-        ratios = particles.volume_ratios(arrays)
-        gravity, moment = self.state.external_forces.gravity_at(self.time), affine_moment(self.scene.solver)
-        fields = particles.fields(arrays, ratios, names)
-        if self._initial is not None:
-            fields["initial_position"] = self._initial.astype(self._position_type)
-        frame = Frame(
-            index=index,
-            time=self.time,
-            step=self.step_count,
-            position=(arrays["x"] + self._origin).astype(self._position_type),
-            velocity=np.ascontiguousarray(arrays["v"]),
-            body=particles.body,
-            material=particles.material,
-            fields={name: fields[name] for name in self.scene.output.fields if name != "velocity"},
-        )
-        conserved = ledger_sums(sums, ratios, gravity, self.spacing, self.last_step, moment)
-        cells = self.scene.domain.cells
-        conserved["volume_error"] = volume_error(
-            arrays["x"], ratios * particles.volume, particles.flows, self.spacing, cells
-        )
-        row = ledger_row(conserved, self.time, taken)
+        columns = self._builder.columns
+        arrays = FrameArrays(columns, np.empty((1, self.particle_count, columns.count), self.groups[0].real))
+        sums = self._read(arrays) if self.backend.on_cpu else self._observe(arrays)
+        moment = Moment(index, self.time, self.step_count, self.last_step, taken)
+        (built,) = self._builder.build([moment], arrays, sums)
         self.frame_seconds += time.perf_counter() - began
-        return frame, row
+        return built
 
     @cached_property
-    def _constants(self) -> ParticleConstants:
-        return ParticleConstants.of(self.groups, [len(b.position) for b in self._particles])
+    def _builder(self) -> FrameBuilder:
+        return FrameBuilder(self.scene, self._particles, self.groups)
+
+    def _read(self, arrays: FrameArrays) -> list[Sums]:
+        """Fill all rows of a frame on the CPU; return the sums of each group.
+
+        Raises:
+            UnstableRunError: see `frame`.
+        """
+        raise NotImplementedError
 
     def _observe(self, arrays: FrameArrays) -> list[Sums]:
         """Fill all rows of a frame with numpy, as on a GPU; return the sums of each group."""
         snapshots = [read_group(group) for group in self.groups]
-        stress = arrays.first["tau"] >= 0
+        stress = arrays.columns.first["tau"] >= 0
         seen = [
             observation(self.last_step, group.first, group.count, stress=stress, stored=(s.deformation, s.internal))
             for observation, group, s in zip(self._observations, self.groups, snapshots, strict=True)
         ]
         return fill(arrays, snapshots, seen)
-
-    def _read(self, g: int, arrays: FrameArrays) -> Sums:
-        """Fill the rows of the g-th group on the CPU; see `build_frame_reader`."""
-        group = self.groups[g]
-        return self._readers[g](self.last_step, group.first, group.count, arrays)

@@ -52,26 +52,26 @@ def read_group(group: ParticleGroup) -> Snapshot:
 
 
 def fill(arrays: FrameArrays, snapshots: Sequence[Snapshot], seen: Sequence[Observation]) -> list[Sums]:
-    """Fill all rows, and return the sums over the particles of each law, as `build_frame_reader` does."""
+    """Fill all rows of one time, and return the sums over the particles of each law, as `build_frame_reader` does."""
     for snapshot, observed in zip(snapshots, seen, strict=True):
         _fill(arrays, snapshot, observed)
     return [_sums(s, o) for s, o in zip(snapshots, seen, strict=True)]
 
 
 def _fill(arrays: FrameArrays, snapshot: Snapshot, seen: Observation) -> None:
-    rows, d = snapshot.id, arrays.dimension
+    rows, d, first = snapshot.id, arrays.columns.dimension, arrays.columns.first
     keeps_F = seen.deformation.ndim == 3
-    arrays["x"][rows], arrays["v"][rows], arrays["energy"][rows] = snapshot.x, snapshot.v, seen.energy
-    arrays["J"][rows] = determinant(seen.deformation) if keeps_F else seen.deformation
+    arrays["x"][0, rows], arrays["v"][0, rows], arrays["energy"][0, rows] = snapshot.x, snapshot.v, seen.energy
+    arrays["J"][0, rows] = determinant(seen.deformation) if keeps_F else seen.deformation
     for i, values in enumerate(seen.internal.values()):
-        arrays["internal"][rows, i] = values
-    if arrays.first["affine"] >= 0:
-        arrays["affine"][rows] = snapshot.C.reshape(-1, d * d)
-    if arrays.first["gradient"] >= 0:
+        arrays["internal"][0, rows, i] = values
+    if first["affine"] >= 0:
+        arrays["affine"][0, rows] = snapshot.C.reshape(-1, d * d)
+    if first["gradient"] >= 0:
         F = seen.deformation if keeps_F else seen.deformation[:, None, None] ** (1 / d) * np.eye(d)
-        arrays["gradient"][rows] = F.reshape(-1, d * d)
-    if arrays.first["tau"] >= 0:
-        arrays["tau"][rows] = seen.tau
+        arrays["gradient"][0, rows] = F.reshape(-1, d * d)
+    if first["tau"] >= 0:
+        arrays["tau"][0, rows] = seen.tau
 
 
 def _sums(snapshot: Snapshot, seen: Observation) -> Sums:
@@ -88,13 +88,13 @@ def _sums(snapshot: Snapshot, seen: Observation) -> Sums:
     turning, affine = products[x, v], products[0, C].reshape(d, d)
     pairs = axis_pairs(d)
     return Sums(
-        mass=products[0, 0],
-        place=products[0, x],
-        momentum=products[0, v],
-        motion=products[v, v].trace(),
-        affine=products[C, C].trace(),
-        turning=np.array([turning[a, b] - turning[b, a] for a, b in pairs]),
-        spin=np.array([affine[b, a] - affine[a, b] for a, b in pairs]),
-        elastic=float(snapshot.per_body(VOLUME) @ seen.energy.astype(np.float64)),
-        speed_squared=float(np.einsum("pc,pc->p", snapshot.v, snapshot.v).max()),
+        mass=products[None, 0, 0],
+        place=products[None, 0, x],
+        momentum=products[None, 0, v],
+        motion=np.array([products[v, v].trace()]),
+        affine=np.array([products[C, C].trace()]),
+        turning=np.array([[turning[a, b] - turning[b, a] for a, b in pairs]]),
+        spin=np.array([[affine[b, a] - affine[a, b] for a, b in pairs]]),
+        elastic=np.array([snapshot.per_body(VOLUME) @ seen.energy.astype(np.float64)]),
+        speed_squared=np.array([np.einsum("pc,pc->p", snapshot.v, snapshot.v).max()], np.float64),
     )

@@ -9,6 +9,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.external_forces import drive
+from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.frame_reader import build_frame_reader
 from mpmcli.solver.groups import build_groups
 from mpmcli.solver.kernels import Kernels
@@ -18,6 +19,7 @@ from mpmcli.solver.run import COLLAPSE, Run
 from mpmcli.solver.state import State
 from mpmcli.solver.state_bounds import build_measurement
 from mpmcli.solver.step_control import StepControl
+from mpmcli.solver.sums import StepsTaken, Sums
 
 # Cells that a particle of a GPU run may move in a step beyond the estimate.
 UNSEEN = 0.05
@@ -65,8 +67,11 @@ class Solver(Run):
         self.state.begin()
         self._begin()
 
-    def step(self, dt: float) -> None:
+    def step(self, dt: float, until: float | None = None) -> None:
         """Advance by dt (s).
+
+        Args:
+            until: the time after the step where that is known, s; a sum has rounding errors.
 
         Raises:
             UnstableRunError: a particle left the domain, was inverted or became non-finite.
@@ -83,7 +88,7 @@ class Solver(Run):
         state.owed = due_kick - kick
         state.external_forces.begin_step(since, since + kick)
         result = self._kernels.step(dt, kick, state.relaxed_in(dt))
-        state.time += dt
+        state.time = state.time + dt if until is None else until
         state.last_step = dt
         state.step_count += 1
         if state.step_count == 1:
@@ -147,6 +152,15 @@ class Solver(Run):
         self.state.drift = math.inf
         self.measure_state(self.last_step)
 
+    def _read(self, arrays: FrameArrays) -> list[Sums]:
+        found = [
+            reader(self.last_step, group.first, group.count, arrays)
+            for reader, group in zip(self._readers, self.groups, strict=True)
+        ]
+        if not all(sound for _, sound in found):
+            self._stop(self.last_step, self._lost())
+        return [sums for sums, _ in found]
+
     def _lost(self) -> list[int | None]:
         """Return a lost particle of each group, in solver order, None where none is known."""
         return [None if p == NOT_LOST else int(p) for p in self._kernels.particles.lost.to_numpy()]
@@ -164,12 +178,12 @@ class Solver(Run):
             KeyboardInterrupt: `stop` returned True.
         """
         count = self.scene.time.frames
-        yield self.frame(0, [])
+        yield self.frame()
         for index in range(1, count + 1):
             target = self.scene.time.end * index / count
             if target <= self.time:
                 continue
-            taken: list[tuple[float, float, str]] = []
+            taken = StepsTaken()
             while True:
                 largest, limit = self.stable_step()
                 if largest < COLLAPSE * self.state.first_stable_step:
@@ -177,12 +191,13 @@ class Solver(Run):
                 left = target - self.time
                 splits = max(1, math.ceil(left / largest - 1e-6))
                 dt = left / splits
-                self.step(dt)
-                taken.append((dt, self.courant, limit.name))
+                self.step(dt, target if splits == 1 else None)
+                taken = taken.and_one(dt, self.courant, limit.name)
                 if splits == 1:
                     break
                 if stop():
                     raise KeyboardInterrupt
-            self.state.time = target
-            self.measure_state(dt)
+            if not self.backend.on_cpu:
+                # Nothing else detects lost particles there.
+                self.measure_state(dt)
             yield self.frame(index, taken)

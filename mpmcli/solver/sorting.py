@@ -9,81 +9,72 @@ from mpmcli.solver.ordering import CHUNK, SPAN, TileOrder, entry_count, share_st
 
 
 @ti.func
-def sort_serially(order: ti.template(), first: int, count: int, run: int):
-    """Sort particles first to first + count - 1, those of one run, by one thread: the same order as by `build_sort`."""
-    group = order.group
-    buffers = order.buffers
-    tiles = ti.static(order.tiles)
-    cursor = run * tiles
-    # Other runs may be at other groups, which begin elsewhere: the scratch memory of a run is that of no other.
-    own = run * ti.static(buffers.room)
-    for tile in range(tiles):
-        order.cursor[cursor + tile, 0] = 0
-    for q in range(count):
+def count_tiles(order: ti.template(), run: int, t: int, first: int, begin: int, end: int):
+    """Count the particles of each tile in share t of those of a run, which begin at `first`: from `begin` to `end`."""
+    cursor, own = run * ti.static(order.tiles), run * ti.static(order.buffers.room)
+    for tile in range(order.tiles):
+        order.cursor[cursor + tile, t] = 0
+    for q in range(begin, end):
         tile = order.tile_of(first + q)
-        buffers.key[own + q] = tile
-        order.cursor[cursor + tile, 0] = order.cursor[cursor + tile, 0] + 1
-    place = 0
-    for tile in range(tiles):
+        order.buffers.key[own + q] = tile
+        order.cursor[cursor + tile, t] = order.cursor[cursor + tile, t] + 1
+
+
+@ti.func
+def find_places(order: ti.template(), run: int, first: int):
+    """Set the first particle of each tile of a run, and where each share places its particles of the tile."""
+    cursor, place = run * ti.static(order.tiles), 0
+    for tile in range(order.tiles):
         order.start[order.first_tile + tile] = first + place
-        size = order.cursor[cursor + tile, 0]
-        order.cursor[cursor + tile, 0] = place
-        place += size
-    order.start[order.first_tile + tiles] = first + place
-    for q in range(count):
-        tile = cursor + buffers.key[own + q]
-        buffers.order[own + order.cursor[tile, 0]] = first + q
-        order.cursor[tile, 0] = order.cursor[tile, 0] + 1
-    for field in ti.static(group.state):
-        scratch = own * ti.static(buffers.widest)
-        for q in range(count):
-            keep(buffers, field, scratch, q, buffers.order[own + q])
-        for q in range(count):
-            take(buffers, field, scratch, q, first + q)
-    for label in ti.static(group.labels):
-        for q in range(count):
-            buffers.key[own + q] = label[buffers.order[own + q]]
-        for q in range(count):
-            label[first + q] = buffers.key[own + q]
+        for t in range(ti.static(order.threads)):
+            size = order.cursor[cursor + tile, t]
+            order.cursor[cursor + tile, t] = place
+            place += size
+    order.start[order.first_tile + order.tiles] = first + place
+
+
+@ti.func
+def place_particles(order: ti.template(), run: int, t: int, first: int, begin: int, end: int):
+    """Note, at the place of each particle of a share, where it comes from; see `count_tiles`."""
+    cursor, own = run * ti.static(order.tiles), run * ti.static(order.buffers.room)
+    for q in range(begin, end):
+        tile = cursor + order.buffers.key[own + q]
+        order.buffers.order[own + order.cursor[tile, t]] = first + q
+        order.cursor[tile, t] = order.cursor[tile, t] + 1
+
+
+def is_label(field: ti.Field) -> bool:
+    """Return whether a field holds integers."""
+    return field.dtype == ti.i32
 
 
 @ti.func
 def keep(buffers: ti.template(), field: ti.template(), first: int, q: int, source: int):
-    """Copy the entries of one particle to place q of the buffer behind `first`."""
+    """Copy the entries of one particle to place q of a buffer; `first` is that of the first particle of its run."""
     entries = ti.static(entry_count(field))
     value = field[source]
-    if ti.static(entries == 1):
-        buffers.real[first + q] = value
+    if ti.static(is_label(field)):
+        buffers.key[first + q] = value
+    elif ti.static(entries == 1):
+        buffers.real[first * ti.static(buffers.widest) + q] = value
     else:
         for e in ti.static(range(entries)):
             place = ti.static(e if field.m == 1 else (e // field.m, e % field.m))
-            buffers.real[first + q * entries + e] = value[place]
+            buffers.real[first * ti.static(buffers.widest) + q * entries + e] = value[place]
 
 
 @ti.func
 def take(buffers: ti.template(), field: ti.template(), first: int, q: int, p: int):
-    """Set particle p to what is in place q of the buffer behind `first`."""
+    """Set particle p to what `keep` has copied to place q."""
     entries = ti.static(entry_count(field))
-    if ti.static(entries == 1):
-        field[p] = buffers.real[first + q]
+    if ti.static(is_label(field)):
+        field[p] = buffers.key[first + q]
+    elif ti.static(entries == 1):
+        field[p] = buffers.real[first * ti.static(buffers.widest) + q]
     else:
         for e in ti.static(range(entries)):
             place = ti.static(e if field.m == 1 else (e // field.m, e % field.m))
-            field[p][place] = buffers.real[first + q * entries + e]
-
-
-@ti.func
-def tiles_in_use(order: ti.template(), low: ti.template(), high: ti.template()):
-    """Lower and raise the range of tiles, per axis, to that of the tiles with particles."""
-    d = ti.static(order.grid.dimension)
-    for tile in range(order.tiles):
-        if order.start[order.first_tile + tile + 1] > order.start[order.first_tile + tile]:
-            rest = tile
-            for b in ti.static(range(d)):
-                a = ti.static(d - 1 - b)
-                low[a] = ti.min(low[a], rest % ti.static(order.grid.tiles[a]))
-                high[a] = ti.max(high[a], rest % ti.static(order.grid.tiles[a]))
-                rest = rest // ti.static(order.grid.tiles[a])
+            field[p][place] = buffers.real[first * ti.static(buffers.widest) + q * entries + e]
 
 
 @dataclass(frozen=True)
@@ -104,6 +95,7 @@ def build_sort(order: TileOrder) -> Sort:
     group, buffers = order.group, order.buffers
     key, source = buffers.key, buffers.order
     n, threads, tiles = group.count, order.threads, order.tiles
+    moved = (*group.state, *group.labels)
 
     @ti.kernel
     def count_stable():
@@ -169,16 +161,11 @@ def build_sort(order: TileOrder) -> Sort:
 
     @ti.kernel
     def move():
-        for field in ti.static(group.state):
+        for field in ti.static(moved):
             for p in range(n):
                 keep(buffers, field, 0, p, source[p])
             for p in range(n):
                 take(buffers, field, 0, p, p)
-        for label in ti.static(group.labels):
-            for p in range(n):
-                key[p] = label[source[p]]
-            for p in range(n):
-                label[p] = key[p]
 
     @ti.kernel
     def share_work():

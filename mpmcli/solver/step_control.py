@@ -16,10 +16,10 @@ from mpmcli.solver.step_cpu import StepResult
 from mpmcli.stability.limits import Limit, deformation_limit, mode_limit
 from mpmcli.stability.transfer_factors import step_inertia
 
-# Most steps between two measurements of the state. A measurement is due earlier where a stiffness may have grown since
-# by more than this share of the margin that time.safety leaves. The share is near 1 as every step reads the rate of
-# deformation back.
-MOST_UNWATCHED_STEPS, UNWATCHED_SHARE = 64, 0.95
+# Most steps between two measurements of the state, and with it of forces. A measurement is due earlier where a
+# stiffness may have grown since by more than this share of the margin that time.safety leaves; that one has fallen
+# shows late. The share is near 1 as every step reads the rate of deformation back.
+MOST_UNWATCHED_STEPS, MOST_PUSHED_STEPS, UNWATCHED_SHARE = 256, 64, 0.95
 # The same on a GPU, where the rate is an estimate, and where only a measurement detects lost particles.
 MOST_BLIND_STEPS, BLIND_SHARE = 16, 0.75
 # Cells per step below which a sudden stop, which turns speed into a velocity gradient of up to two speeds a cell,
@@ -76,7 +76,8 @@ class StepControl:
         self._unwatched = [0] * len(groups)
         self._change = [0.0] * len(groups)
         self._hardened = [0.0] * len(groups)
-        self.longest = MOST_UNWATCHED_STEPS if on_cpu else MOST_BLIND_STEPS
+        most = MOST_PUSHED_STEPS if scene.forces else MOST_UNWATCHED_STEPS
+        self.longest = most if on_cpu else MOST_BLIND_STEPS
         share = UNWATCHED_SHARE if on_cpu else BLIND_SHARE
         # A step of safety times the limit is stable until the stiffness has grown to safety^-2 of what it was.
         self.growth_allowed = -2 * share * math.log(scene.time.safety)
@@ -222,6 +223,10 @@ class StepControl:
         due = self._groups_due(known, [0.0] * len(known))
         self.seconds += time.perf_counter() - began
         return due
+
+    def sound(self) -> bool:
+        """Return whether no particle is crushed, inverted or NaN, by a measurement that is not stored."""
+        return all(_sound(measure.state()) for measure in self._measure)
 
     def measure(self, due: Iterable[int] | None = None) -> bool:
         """Measure some groups, all where None, and return whether they are sound: none crushed, inverted or NaN."""

@@ -12,6 +12,7 @@ from mpmcli.scene import Scene, parse_scene
 from mpmcli.solver.backend import Backend, start_backend
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.solver import Solver
+from mpmcli.solver.sums import StepsTaken
 from mpmcli.validation.case import Case
 from mpmcli.validation.run_result import RunResult, failure, not_finite
 from mpmcli.validation.setting import Setting
@@ -83,15 +84,15 @@ class TimedSolver(Solver):
                 return
             yield found
 
-    def step(self, dt: float) -> None:
+    def step(self, dt: float, until: float | None = None) -> None:
         """Advance by dt, s. The first step compiles the kernels and is not counted."""
         if self.step_count:
-            super().step(dt)
+            super().step(dt, until)
         else:
             with self._excluded():
-                super().step(dt)
+                super().step(dt, until)
 
-    def frame(self, index: int, taken: list[tuple[float, float, str]]) -> tuple[Frame, LedgerRow]:
+    def frame(self, index: int = 0, taken: StepsTaken = StepsTaken()) -> tuple[Frame, LedgerRow]:  # noqa: B008
         """Return a frame. The time for building it is not counted."""
         with self._excluded():
             return super().frame(index, taken)

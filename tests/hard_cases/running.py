@@ -63,7 +63,7 @@ def start(asked: Scene, particles: list[BodyParticles] | None = None) -> Solver:
 
 def look(solver: Solver) -> tuple[Frame, LedgerRow]:
     """Return the state of a solver at this moment."""
-    return solver.frame(0, [])
+    return solver.frame()
 
 
 def sound(frame: Frame, row: LedgerRow) -> bool:
