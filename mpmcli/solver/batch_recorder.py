@@ -9,7 +9,7 @@ from mpmcli.solver.batch_layout import IDLE, LIMITS, MOST_FRAMES, NOTES, Row
 from mpmcli.solver.frame_arrays import FrameArrays, FrameColumns
 from mpmcli.solver.frame_builder import FrameBuilder, Moment
 from mpmcli.solver.frame_reader import CHOSEN, chosen_columns, sum_entries, sums_of
-from mpmcli.solver.sums import StepsTaken, Sums
+from mpmcli.solver.sums import NO_STEPS, StepsTaken, Sums
 
 # Bytes that the frames of a run may take in one launch.
 ROOM = 16_000_000
@@ -21,7 +21,7 @@ def steps_of(row: Row, count: int) -> StepsTaken:
     return StepsTaken(count, smallest, row.number("largest"), row.number("largest_courant"))
 
 
-class Recorder:
+class BatchRecorder:
     """The place of a run in `Batch.shown` and `Batch.notes`."""
 
     def __init__(self, batch: Batch, slot: int, particles: int, frames: int) -> None:
@@ -57,7 +57,7 @@ class Recorder:
         for note in self._batch.notes[self._slot, :count, : len(NOTES)].tolist():
             now, last_step, smallest, courant, largest, largest_courant, limit, steps = note
             step = before + int(steps)
-            taken = StepsTaken()
+            taken = NO_STEPS
             if step > self._steps:
                 taken = StepsTaken(
                     step - self._steps, (smallest, courant, LIMITS[int(limit)]), largest, largest_courant

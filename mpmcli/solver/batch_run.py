@@ -14,7 +14,7 @@ from mpmcli.solver.batch import Batch
 from mpmcli.solver.batch_exchange import Exchange
 from mpmcli.solver.batch_group import BatchGroup
 from mpmcli.solver.batch_layout import ATTEND, BEYOND, COLLAPSED, GOING, IDLE, LOST, MEASURE, Row
-from mpmcli.solver.batch_recorder import Recorder, steps_of
+from mpmcli.solver.batch_recorder import BatchRecorder, steps_of
 from mpmcli.solver.batch_values import Drives
 from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.frame_arrays import FrameArrays
@@ -80,7 +80,7 @@ class BatchRun(Run):
             lost = batch.device.particles.lost
             if lost[slot * len(batch.kind.members) + g] != NOT_LOST:
                 lost[slot * len(batch.kind.members) + g] = NOT_LOST
-        self._recorder = Recorder(batch, slot, self.particle_count, scene.time.frames)
+        self._recorder = BatchRecorder(batch, slot, self.particle_count, scene.time.frames)
         entries = Drives.of(scene, [group.bodies for group in self.groups])[1]
         self._values = RunValues(batch.values.device, slot, entries, scene.time.end)
         self._tables, self._means = batch.values.tables, list(self._values.means.values())

@@ -16,7 +16,7 @@ from mpmcli.solver.frame_builder import FrameBuilder, Moment
 from mpmcli.solver.observe import Observation
 from mpmcli.solver.snapshot import Snapshot, fill, read_group
 from mpmcli.solver.state import Progress
-from mpmcli.solver.sums import StepsTaken, Sums
+from mpmcli.solver.sums import NO_STEPS, StepsTaken, Sums
 from mpmcli.stability.limits import Limit, force_limit, speed_limit
 
 # Ratio of the stable step to the first one at which a run stops: steps that small do not recover.
@@ -157,7 +157,7 @@ class Run:
             snapshot, p, cause, self.scene, self.step_count, self.time, dt, self.nearest_limit, forced=forced
         )
 
-    def frame(self, index: int = 0, taken: StepsTaken = StepsTaken()) -> tuple[Frame, LedgerRow]:  # noqa: B008
+    def frame(self, index: int = 0, taken: StepsTaken = NO_STEPS) -> tuple[Frame, LedgerRow]:
         """Return the state as a frame, and the ledger row for the steps taken.
 
         Raises:

@@ -19,7 +19,7 @@ from mpmcli.solver.run import COLLAPSE, Run
 from mpmcli.solver.state import State
 from mpmcli.solver.state_bounds import build_measurement
 from mpmcli.solver.step_control import StepControl
-from mpmcli.solver.sums import StepsTaken, Sums
+from mpmcli.solver.sums import NO_STEPS, Sums
 
 # Cells that a particle of a GPU run may move in a step beyond the estimate.
 UNSEEN = 0.05
@@ -183,7 +183,7 @@ class Solver(Run):
             target = self.scene.time.end * index / count
             if target <= self.time:
                 continue
-            taken = StepsTaken()
+            taken = NO_STEPS
             while True:
                 largest, limit = self.stable_step()
                 if largest < COLLAPSE * self.state.first_stable_step:

@@ -53,6 +53,9 @@ class StepsTaken:
         return StepsTaken(self.count + 1, smallest, max(self.largest, dt), max(self.courant, courant))
 
 
+NO_STEPS = StepsTaken()
+
+
 def axis_pairs(dimension: int) -> tuple[tuple[int, int], ...]:
     """Return the axes (a, b) of each component x_a v_b - x_b v_a of a cross product."""
     return ((0, 1),) if dimension == 2 else ((1, 2), (2, 0), (0, 1))

@@ -12,7 +12,7 @@ from mpmcli.scene import Scene, parse_scene
 from mpmcli.solver.backend import Backend, start_backend
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.solver import Solver
-from mpmcli.solver.sums import StepsTaken
+from mpmcli.solver.sums import NO_STEPS, StepsTaken
 from mpmcli.validation.case import Case
 from mpmcli.validation.run_result import RunResult, failure, not_finite
 from mpmcli.validation.setting import Setting
@@ -92,7 +92,7 @@ class TimedSolver(Solver):
             with self._excluded():
                 super().step(dt, until)
 
-    def frame(self, index: int = 0, taken: StepsTaken = StepsTaken()) -> tuple[Frame, LedgerRow]:  # noqa: B008
+    def frame(self, index: int = 0, taken: StepsTaken = NO_STEPS) -> tuple[Frame, LedgerRow]:
         """Return a frame. The time for building it is not counted."""
         with self._excluded():
             return super().frame(index, taken)
