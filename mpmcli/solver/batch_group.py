@@ -1,5 +1,7 @@
 """The particles of one law of one run of a batch."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from mpmcli.materials.law import Law
@@ -21,8 +23,9 @@ class BatchGroup:
         """Return x, v, C, deformation, internal, (n, k), id and body, (n), in the solver's order."""
         return self.arrays.read(self.first, self.count, self.bodies, self.row)
 
-    def write(self, found: dict[str, np.ndarray], place: np.ndarray) -> None:
-        """Fill the device with particles, see `initial_state`."""
-        self.arrays.write(self.first, found, self.row + place)
+    def write(self, states: Iterable[tuple[int, dict[str, np.ndarray], np.ndarray]]) -> None:
+        """Fill the device with particles, see `initial_states`."""
+        for first, found, row in states:
+            self.arrays.write(self.first + first, found, self.row + row)
         for i, row in enumerate(self.rows):
             self.arrays.table[self.row + i] = row.tolist()

@@ -20,7 +20,7 @@ from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.groups import require_inside
 from mpmcli.solver.particle_update import NOT_LOST
-from mpmcli.solver.particles import initial_state, table_of
+from mpmcli.solver.particles import initial_states, table_of
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.run import COLLAPSE, Run
 from mpmcli.solver.run_values import RunValues
@@ -74,7 +74,7 @@ class BatchRun(Run):
             law = type(shared)([scene.bodies[i].material for i in bodies], scene.dimension)
             count = sum(len(b.position) for b in own)
             group = BatchGroup(batch, g, slot, law, bodies, table_of(law, own), count)
-            group.write(*initial_state(law, own, [int(first_ids[i]) for i in bodies], self._origin))
+            group.write(initial_states(law, own, [int(first_ids[i]) for i in bodies], self._origin))
             self.groups.append(group)
             self._counts[self._count.particles[g]] = count
             lost = batch.device.particles.lost

@@ -1,6 +1,6 @@
 """Particles of one law in one run: their fields on the device, and what each body contributes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import taichi as ti
@@ -9,38 +9,47 @@ from mpmcli.materials.law import Law
 from mpmcli.scene import BodyParticles
 from mpmcli.solver.particle_arrays import ParticleArrays
 
+# Particles that the device takes at once.
+PART = 2**18
+
 
 def table_of(law: Law, particles: Sequence[BodyParticles]) -> np.ndarray:
     """Return the rows of `ParticleArrays.table` for the members of a law, (bodies, columns)."""
     return np.array([(b.mass, b.volume, *law.constants(p)) for b, p in zip(particles, law.members, strict=True)])
 
 
-def initial_state(
+def initial_states(
     law: Law, particles: Sequence[BodyParticles], first_ids: Sequence[int], origin: np.ndarray
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Return the particles of some bodies as `ParticleArrays.write` takes them, and the place of the body of each.
+) -> Iterator[tuple[int, dict[str, np.ndarray], np.ndarray]]:
+    """Yield the particles of some bodies, PART at a time, which bounds the memory.
 
     Args:
         first_ids: id of the first particle of each body.
         origin: of the domain, (d,), m.
+
+    Yields:
+        The number of those before, and what `ParticleArrays.write` takes; its rows count from the first body.
     """
-    d = len(origin)
-    counts = [len(b.position) for b in particles]
-    rest = np.ones(1) if law.deformation == "J" else np.eye(d)[None]
-    deformation = [
-        np.repeat(rest, n, 0) if b.deformation is None else b.deformation
-        for b, n in zip(particles, counts, strict=True)
-    ]
-    found = {
-        "x": np.concatenate([b.position - origin for b in particles]),
-        "initial": np.concatenate([(b.position if b.initial is None else b.initial) - origin for b in particles]),
-        "v": np.concatenate([b.velocity for b in particles]),
-        "C": np.concatenate([b.affine for b in particles]),
-        "deformation": np.concatenate(deformation),
-        "internal": np.tile([float(variable.at_rest) for variable in law.internal], (sum(counts), 1)),
-        "id": np.concatenate([first + np.arange(n) for first, n in zip(first_ids, counts, strict=True)]),
-    }
-    return found, np.repeat(np.arange(len(counts)), counts)
+    rest = np.ones(1) if law.deformation == "J" else np.eye(len(origin))[None]
+    at_rest = [float(variable.at_rest) for variable in law.internal]
+    before = 0
+    for place, (body, first_id) in enumerate(zip(particles, first_ids, strict=True)):
+        count = len(body.position)
+        for first in range(0, count, PART):
+            own = slice(first, min(first + PART, count))
+            n = own.stop - first
+            position = body.position[own] - origin
+            found = {
+                "x": position,
+                "initial": position if body.initial is None else body.initial[own] - origin,
+                "v": body.velocity[own],
+                "C": body.affine[own],
+                "deformation": np.repeat(rest, n, 0) if body.deformation is None else body.deformation[own],
+                "internal": np.tile(at_rest, (n, 1)),
+                "id": first_id + np.arange(first, own.stop),
+            }
+            yield before + first, found, np.full(n, place)
+        before += count
 
 
 @ti.data_oriented
@@ -82,7 +91,8 @@ class ParticleGroup(ParticleArrays):
         )
         self.rows = rows.astype(self.real)
         self.table.from_numpy(self.rows)
-        self.write(0, *initial_state(law, particles, first_ids, origin))
+        for first, found, row in initial_states(law, particles, first_ids, origin):
+            self.write(first, found, row)
 
     def fields(self) -> dict[str, ti.Field]:
         """Return every field of the particles that changes during a run or is sorted, by name."""
