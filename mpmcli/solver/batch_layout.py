@@ -25,8 +25,9 @@ REALS = (
     *("spacing", "inverse_spacing", "gradient_scale"),
     *("drift_allowed", "hold", "rise", "slack", "infinity"),
 )
-# Columns of the counts, int32. `frame` of `frames` is the next that the kernel records, `recorded` the number of those
-# of this launch, which go to rows of `shown` from `row` on; `affine`, `gradient` and `tau` are columns there.
+# Columns of the counts, int32. `records` is 1 where the kernel records frames, the next being `frame` of `frames`;
+# `recorded` is the number of those of this launch, for at most `room` of which `shown` has rows, from `row` on;
+# `affine`, `gradient` and `tau` are columns there.
 COUNTS = (
     *("status", "arrived", "steps", "unrelaxed_steps", "budget", "limit", "stiffness_limit", "forced", "longest"),
     *("records", "frame", "frames", "recorded", "room", "row", "affine", "gradient", "tau"),

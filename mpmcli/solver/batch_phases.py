@@ -30,7 +30,7 @@ class BatchPhases:
 
     Attributes:
         shared: whether several threads work on one run; regions: of each run, one for each of them.
-        places: of what a step divides among regions.
+        places: of the regions in the particles and the nodes.
         last_of_step, sorts, last_of_sort, showing: places of phases. A step begins with phase 0, a sort with `sorts`.
     """
 

@@ -30,7 +30,7 @@ class FrameColumns:
         first: the first column of each, by name: "x", "v", "energy", "J", "internal", "affine", "gradient", "tau"; -1
             where it is left out.
         widths: number of columns of each that is there.
-        count: of all columns.
+        count: of all columns; dimension: d.
     """
 
     def __init__(self, dimension: int, internal: int, fields: Collection[str] = ()) -> None:

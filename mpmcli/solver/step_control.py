@@ -17,8 +17,8 @@ from mpmcli.stability.limits import Limit, deformation_limit, mode_limit
 from mpmcli.stability.transfer_factors import step_inertia
 
 # Most steps between two measurements of the state, and with it of forces. A measurement is due earlier where a
-# stiffness may have grown since by more than this share of the margin that time.safety leaves; that one has fallen
-# shows late. The share is near 1 as every step reads the rate of deformation back.
+# stiffness may have grown since by more than this share of the margin that time.safety leaves; one that has fallen is
+# noticed late. The share is near 1 as every step reads the rate of deformation back.
 MOST_UNWATCHED_STEPS, MOST_PUSHED_STEPS, UNWATCHED_SHARE = 256, 64, 0.95
 # The same on a GPU, where the rate is an estimate, and where only a measurement detects lost particles.
 MOST_BLIND_STEPS, BLIND_SHARE = 16, 0.75
