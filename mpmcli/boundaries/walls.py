@@ -9,8 +9,18 @@ from collections.abc import Sequence
 
 import taichi as ti
 
+from mpmcli.scene.schema import SolverSettings
+
 # Nodes on each side of a wall that can hold mass from particles of the other side.
 REACH = 2
+# The word of a face that is no wall.
+OPEN = "open"
+
+
+def faces_on_grid(faces: Sequence[tuple[str, str]], settings: SolverSettings) -> tuple[tuple[str, str], ...]:
+    """Return the words of the walls that act on nodes: on the grid of the state at rest those that never let go."""
+    total = settings.solids == "total"
+    return tuple(tuple(OPEN if total and word == "separate" else word for word in pair) for pair in faces)
 
 
 @ti.data_oriented
@@ -18,7 +28,7 @@ class Walls:
     """All faces of the domain, as a boundary that acts on nodes.
 
     Attributes:
-        faces: per axis the words of the lower and the upper face: "slip", "stick" or "separate".
+        faces: per axis the words of the lower and the upper face: "slip", "stick", "separate", or OPEN for none.
         first: index of the wall's node plane at the lower faces; `last`, per axis, at the upper ones.
         separating: (axis, side) of every face whose word is "separate".
         lateral: per axis, the other axes.
@@ -96,12 +106,14 @@ class Walls:
         for a in ti.static(range(self.dimension)):
             depth[a] = REACH + 1
             if node[a] <= self.first + REACH:
-                depth[a] = node[a] - self.first
-                mirror[a] = 2 * self.first - node[a]
+                if ti.static(self.faces[a][0] != OPEN):
+                    depth[a] = node[a] - self.first
+                    mirror[a] = 2 * self.first - node[a]
             elif node[a] >= self.last[a] - REACH:
-                upper[a] = 1
-                depth[a] = self.last[a] - node[a]
-                mirror[a] = 2 * self.last[a] - node[a]
+                if ti.static(self.faces[a][1] != OPEN):
+                    upper[a] = 1
+                    depth[a] = self.last[a] - node[a]
+                    mirror[a] = 2 * self.last[a] - node[a]
         return depth, mirror, upper
 
     @ti.func

@@ -88,7 +88,8 @@ def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene:
     inertia = step_inertia(scene.solver)
     scheme = _scheme_text(scene.solver, inertia)
     smallest: dict[str, tuple[float, float, float]] = {}
-    for mode in law.modes(material, law.swung(bound)):
+    modes = law.reference_modes if scene.solver.solids == "total" else law.modes
+    for mode in modes(material, law.swung(bound)):
         value, name = mode_limit(spacing, material.density, mode.stiffness, mode.viscosity, inertia)
         entry = (value, mode.stiffness, mode.viscosity)
         smallest[name] = min(smallest.get(name, entry), entry)

@@ -33,12 +33,24 @@ class FixedCorotated(Law):
     parameters = FixedCorotatedParameters
     deformation = "F"
     coherent = True
+    elastic = True
 
     def constants(self, parameters: FixedCorotatedParameters) -> tuple[float, ...]:
         return (parameters.shear_modulus, parameters.lame_lambda)
 
     def modes(self, parameters: FixedCorotatedParameters, bound: StateBound) -> list[Mode]:
         return [Mode(corotated_stiffness(parameters.shear_modulus, parameters.lame_lambda, self.dimension, bound))]
+
+    def reference_modes(self, parameters: FixedCorotatedParameters, bound: StateBound) -> list[Mode]:
+        """Return 2 mu + lambda (d s^(2d-2) + |J - 1| s^(d-2)), where s is the largest stretch, at least 1.
+
+        P = 2 mu (F - R) + lambda (J - 1) cof F. The derivative of R is positive, cof F has entries of up to s^(d-1) in
+        the principal frame, and its derivative eigenvalues of up to s^(d-2).
+        """
+        d, s = self.dimension, math.sqrt(max(bound.stretch_squared_max, 1.0))
+        volume = max(abs(bound.volume_ratio_max - 1), abs(bound.volume_ratio_min - 1))
+        volumetric = max(parameters.lame_lambda, 0.0) * (d * s ** (2 * d - 2) + volume * s ** (d - 2))
+        return [Mode(2 * parameters.shear_modulus + volumetric)]
 
     def opened(self, J: float) -> float:
         """Return 2 - J, as the energy of volume is that of J - 1."""
@@ -65,6 +77,10 @@ class FixedCorotated(Law):
     @ti.func
     def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
         return corotated_energy(deformation, constants[MU], constants[LAMBDA])
+
+    @ti.func
+    def wave_modulus(self, constants: ti.template()):
+        return constants[LAMBDA] + 2.0 * constants[MU]
 
 
 @ti.func

@@ -94,6 +94,8 @@ class Law(ABC):
             messages name the first that is a positive number. A law that calls them otherwise lists its own.
         coherent: whether the material resists being pulled apart, so that `check` reports a J far above 1.
         flows: whether it is a liquid or grains, whose volume the ledger compares with what they fill on the grid.
+        elastic: whether the stress is a function of F alone, so that the body can be computed on the grid of its state
+            at rest (docs/theory.md, 2.5).
         sensitivity: growth of the logarithm of the largest stiffness per stored strain, dimensionless. It sets how
             often the state is measured during a run; 0 if no state is stiffer than rest (docs/theory.md, 6.7).
         hardening: the same growth caused by the internal variables, which are measured separately; 0 without any.
@@ -109,17 +111,19 @@ class Law(ABC):
     relaxes: bool = False
     coherent: ClassVar[bool] = False
     flows: ClassVar[bool] = False
+    elastic: ClassVar[bool] = False
     stiffness_parameters: ClassVar[tuple[str, ...]] = ("bulk_modulus", "youngs_modulus", "shear_modulus")
     viscosity_parameters: ClassVar[tuple[str, ...]] = ("viscosity", "consistency", "bulk_viscosity")
     sensitivity: float = 1.0
     hardening: float = 0.0
 
     def __init_subclass__(cls, **options: object) -> None:
-        """Copy `deformation` to the parameter class, which is validated before an instance of the law exists."""
+        """Copy what scenes are checked for to the parameter class: there is no instance of the law yet."""
         super().__init_subclass__(**options)
         parameters = getattr(cls, "parameters", None)
         if isinstance(parameters, type) and issubclass(parameters, MaterialParameters):
             parameters.stores = getattr(cls, "deformation", parameters.stores)
+            parameters.elastic = cls.elastic
 
     def __init__(self, members: Sequence[MaterialParameters], dimension: int) -> None:
         self.members = tuple(members)
@@ -147,6 +151,13 @@ class Law(ABC):
 
         The step is stable if dt^2 stiffness + 2 dt viscosity <= density h^2 for each mode (docs/theory.md, 6.1).
         """
+
+    def reference_modes(self, parameters: MaterialParameters, bound: StateBound) -> list[Mode]:
+        """Return the modes of an isolated particle on the grid of the state at rest: of dP/dF (docs/theory.md, 6.9).
+
+        Only elastic laws have them.
+        """
+        raise NotImplementedError
 
     def swung(self, bound: StateBound) -> StateBound:
         """Return the bound that contains what springs back as well.
@@ -248,4 +259,9 @@ class Law(ABC):
     @ti.func
     def energy(self, deformation: ti.template(), internal: ti.template(), constants: ti.template()):
         """Return the stored energy per volume at rest, J/m^3, for a state that `respond` returned."""
+        raise NotImplementedError
+
+    @ti.func
+    def wave_modulus(self, constants: ti.template()):
+        """Return the modulus of pressure waves at rest, lambda + 2 mu, Pa. Only elastic laws have it."""
         raise NotImplementedError

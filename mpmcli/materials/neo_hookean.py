@@ -32,6 +32,7 @@ class NeoHookean(Law):
     parameters = NeoHookeanParameters
     deformation = "F"
     coherent = True
+    elastic = True
 
     def constants(self, parameters: NeoHookeanParameters) -> tuple[float, ...]:
         return (parameters.shear_modulus, parameters.lame_lambda)
@@ -50,6 +51,17 @@ class NeoHookean(Law):
         low, J = least_stretch(bound, self.dimension), min(max(bound.volume_ratio_min, SMALLEST), 1.0)
         pressure = mu * (1 - min(low, 1.0) ** 2) - lam * math.log(J)
         return [Mode(max(self.dimension * lam + shear, carried_stiffness(lam + shear, pressure)))]
+
+    def reference_modes(self, parameters: NeoHookeanParameters, bound: StateBound) -> list[Mode]:
+        """Return mu + (|mu - lambda ln J| + d lambda) / s^2, where s is the smallest stretch, at most 1.
+
+        P = mu F + (lambda ln J - mu) F^-T, whose last factor changes by up to |dF| / s^2.
+        """
+        lam, mu = max(parameters.lame_lambda, 0.0), parameters.shear_modulus
+        smallest = min(least_stretch(bound, self.dimension), 1.0)
+        ends = (max(bound.volume_ratio_min, SMALLEST), max(bound.volume_ratio_max, SMALLEST), 1.0)
+        pressure = max(abs(mu - lam * math.log(J)) for J in ends)
+        return [Mode(mu + (pressure + self.dimension * lam) / smallest**2)]
 
     def stored_energy(self, parameters: NeoHookeanParameters, deformation: np.ndarray) -> np.ndarray:
         s = principal(deformation, self.dimension)
@@ -75,6 +87,10 @@ class NeoHookean(Law):
         log_volume = log_ratio(volume_strain(H))
         stretch = H.trace() + 0.5 * (H * H).sum()
         return constants[MU] * (stretch - log_volume) + 0.5 * constants[LAMBDA] * log_volume**2
+
+    @ti.func
+    def wave_modulus(self, constants: ti.template()):
+        return constants[LAMBDA] + 2.0 * constants[MU]
 
 
 LAW = NeoHookean

@@ -16,7 +16,7 @@ from mpmcli.scene.schema import SolverSettings, usual_particles_per_cell
 from mpmcli.scene.shapes import Shape
 
 # Of a scene that does not say.
-_TRANSFER = SolverSettings.model_fields["transfer"].default
+_TRANSFER, _SOLIDS = (SolverSettings.model_fields[name].default for name in ("transfer", "solids"))
 
 
 class LawFacts(Protocol):
@@ -77,7 +77,7 @@ class RunHeader:
         gravity: (d,), m/s^2; None where it depends on time.
         steady_gravity: (d,), m/s^2, with 0 for each entry that depends on time; None where not known.
         driven: whether forces act, or gravity depends on time: energy and momentum have a source then.
-        keeps_spin: whether the transfers conserve angular momentum, as those of APIC do.
+        keeps_spin: whether the transfers conserve angular momentum, as those of APIC do on the grid of places.
         sticking: per axis, whether a face normal to it sticks.
         bodies: in the order of their labels in the frames.
         laws: in the order of the labels in the frames.
@@ -134,7 +134,7 @@ class RunHeader:
     def read(cls, stored: Mapping[str, Any]) -> "RunHeader":
         """Read the header that a file holds; what it does not say itself is taken from the scene's text in it."""
         scene = _parsed(stored.get("scene", ""))
-        domain, time = scene.get("domain", {}), scene.get("time", {})
+        domain, time, solver = (scene.get(name, {}) for name in ("domain", "time", "solver"))
         d = int(stored.get("dimension", 0)) or len(domain.get("size", (0, 0)))
         origin = _vector(stored.get("origin", domain.get("origin")), d)
         size = _vector(stored.get("size", domain.get("size")), d)
@@ -153,7 +153,7 @@ class RunHeader:
             gravity=None if timed else steady,
             steady_gravity=steady,
             driven=timed or bool(scene.get("forces")),
-            keeps_spin=scene.get("solver", {}).get("transfer", _TRANSFER) == "apic",
+            keeps_spin=solver.get("transfer", _TRANSFER) == "apic" and solver.get("solids", _SOLIDS) == "updated",
             sticking=_sticking(domain.get("walls"), d),
             bodies=_bodies([str(name) for name in stored.get("bodies", ())], scene.get("bodies", []), d),
             laws=_laws(stored),

@@ -18,6 +18,10 @@ from mpmcli.scene.shapes import Box
 
 # Lengths below this fraction of the grid spacing are round-off.
 _TOLERANCE = 1e-6
+# Cells from a wall beyond which no kernel of a body reaches it.
+_CLEAR = 2
+# Cells between bodies beyond which they share no node.
+_APART = 3
 # Points per axis that are tried where two bodies may overlap, 2D and 3D.
 _MOST_TRIED = {2: 512, 3: 64}
 # Lattices above this size are not searched for a first particle; sampling does it later.
@@ -31,7 +35,7 @@ def problems_in(scene: Scene) -> list[Problem]:
     empty = [] if outside else list(_empty(scene))
     unstarted = [] if outside or empty else list(_initial(scene))
     where = [*_repeated_names(scene), *outside, *_overlaps(scene), *empty]
-    return [*where, *unstarted, *_pushed(scene), *_unstored(scene)]
+    return [*where, *unstarted, *_pushed(scene), *_unstored(scene), *_total(scene)]
 
 
 def _repeated_names(scene: Scene) -> Iterator[Problem]:
@@ -153,6 +157,67 @@ def _pushed(scene: Scene) -> Iterator[Problem]:
             guess = nearest(force.body, names)
             hint = f'did you mean "{guess}"?' if guess else f"the bodies are {listed(names, 'and')}"
             yield Problem(("forces", k, "body"), f'no body has the name "{force.body}"; {hint}')
+
+
+def _total(scene: Scene) -> Iterator[Problem]:
+    """Find what the grid of the state at rest cannot hold."""
+    if scene.solver.solids != "total":
+        return
+    where = ("solver", "solids")
+    names = sorted({body.material.law for body in scene.bodies})
+    if len(names) > 1:
+        said = f'"total" is for bodies of one law; found {listed(names, "and")}: give solids = "updated"'
+        yield Problem(where, said)
+    yield from _too_close(scene)
+    for i, body in enumerate(scene.bodies):
+        if not body.material.elastic:
+            said = (
+                f'"total" is for elastic laws; body "{body.name}" follows {body.material.law}: give solids = "updated"'
+            )
+            yield Problem(where, said)
+        if body.deformation is not None:
+            said = 'must be left out with solver.solids = "total", whose state at rest is the one at the start'
+            yield Problem(("bodies", i, "deformation"), said)
+        yield from _nearly_held(body, i, scene)
+    if scene.solver.walls == "zeroed":
+        yield Problem(where, '"total" needs walls = "folded"')
+
+
+def _too_close(scene: Scene) -> Iterator[Problem]:
+    """Find bodies that share nodes at rest, which would hold them together."""
+    h = scene.domain.spacing
+    bounds = [body.shape.form.bounds() for body in scene.bodies]
+    for j, (lower, upper) in enumerate(bounds):
+        for i, (other_lower, other_upper) in enumerate(bounds[:j]):
+            gap = float(np.maximum(lower - other_upper, other_lower - upper).max())
+            if gap < (_APART - _TOLERANCE) * h:
+                said = (
+                    f'"{scene.bodies[j].name}" begins {max(gap, 0.0):.4g} m from "{scene.bodies[i].name}", along the '
+                    f'axis on which they are farther apart; with solver.solids = "total" it must be {_APART * h:.4g} m'
+                )
+                yield Problem(("bodies", j, "shape"), said)
+
+
+def _nearly_held(body: Body, index: int, scene: Scene) -> Iterator[Problem]:
+    """Find walls that stick and are met later, and those that do not let go, which only the kernels of a body reach."""
+    h, domain = scene.domain.spacing, scene.domain
+    lower, upper = body.shape.form.bounds()
+    for k, pair in enumerate(domain.walls.faces(scene.dimension)):
+        gaps = (lower[k] - domain.origin[k], domain.upper[k] - upper[k])
+        for side, word, gap in zip(("min", "max"), pair, gaps, strict=True):
+            if word != "separate" and _TOLERANCE * h < gap < _CLEAR * h:
+                said = (
+                    f'body "{body.name}" begins {gap:.4g} m from the wall {AXES[k]}_{side}, which never lets go; with '
+                    f'solver.solids = "total" it must touch it, or begin {_CLEAR * h:.4g} m away, or the wall be '
+                    '"separate"'
+                )
+                yield Problem(("bodies", index, "shape"), said)
+            elif word == "stick" and gap >= _CLEAR * h:
+                said = (
+                    f'"stick" is, with solver.solids = "total", for a wall that the body touches at the start; '
+                    f'"{body.name}" begins {gap:.4g} m away, and would meet it without friction: give "separate"'
+                )
+                yield Problem(("domain", "walls", f"{AXES[k]}_{side}"), said)
 
 
 def _unstored(scene: Scene) -> Iterator[Problem]:

@@ -55,6 +55,7 @@ class MaterialParameters(BaseModel):
     Attributes:
         internal: what a particle stores beside its deformation.
         stores: what it stores of its deformation, "J" or "F", as the law says that these parameters belong to.
+        elastic: whether its stress is a function of F alone.
         hydrostatic: whether it is a fluid whose J follows from the pressure, by `volume_ratio_under`.
     """
 
@@ -65,6 +66,7 @@ class MaterialParameters(BaseModel):
 
     internal: ClassVar[tuple[Internal, ...]] = ()
     stores: ClassVar[Literal["J", "F"]] = "F"
+    elastic: ClassVar[bool] = False
     hydrostatic: ClassVar[bool] = False
 
     @classmethod

@@ -225,6 +225,13 @@ class SolverSettings(Table):
         AfterValidator(_only_with_aflip),
         Field(validate_default=True),
     ] = None
+    solids: Annotated[
+        Literal["updated", "total"],
+        Field(
+            description='Grid of elastic solids. "updated": that of all materials. "total": of their state at rest '
+            "(total Lagrangian): more accurate, without tears; for scenes of one elastic law, whose bodies begin apart."
+        ),
+    ] = "updated"
     walls: Annotated[
         Literal["folded", "zeroed"],
         Field(

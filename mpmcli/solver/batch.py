@@ -9,7 +9,7 @@ import numpy as np
 import taichi as ti
 
 from mpmcli.boundaries.mirror_images import MirrorImages
-from mpmcli.boundaries.walls import Walls
+from mpmcli.boundaries.walls import Walls, faces_on_grid
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.materials.law import Law
 from mpmcli.materials.registry import laws
@@ -30,6 +30,7 @@ from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.observe import build_observation
 from mpmcli.solver.ordering import SortBuffers, TileOrder
 from mpmcli.solver.particle_arrays import CONSTANTS, ParticleArrays
+from mpmcli.solver.particle_contact import DRIFT, contact_between
 from mpmcli.solver.particle_update import ParticleUpdate
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.splines import PAD
@@ -137,6 +138,7 @@ class Batch:
                 several=runs > 1 or bodies > 1 or bool(forces.terms),
                 serial=on_cpu and backend.threads == 1,
                 keeps_initial=forces.initial,
+                total=kind.settings.solids == "total",
             )
             for law, room, bodies, forces in zip(
                 kind.members, kind.particles, kind.bodies, kind.drives.forces, strict=True
@@ -151,13 +153,15 @@ class Batch:
         if kind.settings.walls == "zeroed":
             walls = ZeroedWalls(kind.faces, PAD, grid.cells)
         else:
-            walls = Walls(kind.faces, PAD, grid.cells, grid.shape, runs)
+            faces = faces_on_grid(kind.faces, kind.settings)
+            walls = Walls(faces, PAD, grid.cells, grid.shape, runs)
             images = MirrorImages(walls)
         orders = []
         if on_cpu:
             buffers = SortBuffers(groups, runs)
             sharing = backend.threads if runs == 1 else 1
             orders = [TileOrder(group, grid, buffers, sharing, True, runs) for group in groups]
+        contact = contact_between(groups, kind.bodies, grid, backend, runs)
         self.device = Device(
             runs,
             kind.particles,
@@ -167,14 +171,14 @@ class Batch:
             orders,
             walls,
             NodeUpdate(grid, images, [walls]),
-            ParticleUpdate(grid, runs * len(groups), watches_box=False),
+            ParticleUpdate(grid, kind.faces, runs * len(groups), contact, watches_box=False),
             self.values,
             Gravity(kind.drives.gravity, [0.0] * d, self.values.device),
         )
         self.layout = Layout(d, [len(law.internal) for law in kind.members])
         self.numbers = np.zeros((runs, self.layout.reals))
         self.counts = np.zeros((runs, self.layout.counts), np.int32)
-        constants = {"drift_allowed": drift_allowed(tile, stencil)}
+        constants = {"drift_allowed": DRIFT if contact else drift_allowed(tile, stencil)}
         constants |= {"hold": HOLD, "rise": RISE, "slack": 1e-6, "infinity": math.inf}
         for name, value in constants.items():
             self.numbers[:, getattr(self.layout.real, name)] = value

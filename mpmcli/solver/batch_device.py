@@ -69,7 +69,9 @@ def views(
         walls.first_plane = w * len(walls.separating)
         images = _changed(images, walls=walls)
     nodes = _changed(device.nodes, grid=grid, images=images, boundaries=(walls,))
-    particles = _changed(device.particles, grid=grid, extent=extent, last=last, first_lost=w * len(device.groups))
+    particles = _changed(
+        device.particles, grid=grid, extent=extent, last=last, first_lost=w * len(device.groups), run=w
+    )
     orders = tuple(_changed(order, grid=grid, first_tile=w * (order.tiles + 1)) for order in device.orders)
     groups = tuple(group.seen_from(w) if group.pushed else group for group in device.groups)
     return grid, nodes, particles, orders, groups

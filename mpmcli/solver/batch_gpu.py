@@ -29,7 +29,8 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     groups, room = tuple(device.groups), tuple(device.room)
     members = tuple(enumerate(groups))
     real, count = layout.real, layout.count
-    steps = BatchSteps(layout, [group.law for group in groups], device.values)
+    drifts = device.particles.touches or not all(group.total for group in groups)
+    steps = BatchSteps(layout, [group.law for group in groups], device.values, drifts=drifts)
     lost, node_count, contact = device.particles.lost, device.grid.node_count, device.nodes.needs_contact
     under_way = ti.Vector.field(WIDTH, ti.f64, shape=runs)
     limits, stepping = ti.field(int, shape=runs), ti.field(int, shape=runs)

@@ -14,6 +14,7 @@ class BatchGroup:
     def __init__(self, batch: Batch, g: int, slot: int, law: Law, bodies: list[int], rows: np.ndarray, count: int):
         self.law, self.bodies, self.count = law, tuple(bodies), count
         self.arrays = batch.device.groups[g]
+        self.total = self.arrays.total
         self.dimension, self.real, self.internal = self.arrays.dimension, self.arrays.real, self.arrays.internal
         self.rows = rows.astype(self.real)
         self.first = slot * batch.kind.particles[g]

@@ -29,7 +29,8 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
     groups, room, threads = tuple(device.groups), tuple(device.room), device.threads
     members = tuple(enumerate(groups))
     real, count = layout.real, layout.count
-    steps = BatchSteps(layout, [group.law for group in groups], device.values)
+    drifts = device.particles.touches or not all(group.total for group in groups)
+    steps = BatchSteps(layout, [group.law for group in groups], device.values, drifts=drifts)
     phases = BatchPhases(device, layout)
     team = BatchThreads(phases, device.runs)
     noted = tuple((k, getattr(real, name)) for k, name in enumerate(NOTES) if hasattr(real, name))
@@ -59,6 +60,8 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
         high = ti.Vector([-1] * d)
         h, inverse, scale, box, last, extent = phases.place(w, numbers, counts)
         _grid, _nodes, _particles, orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        if ti.static(device.particles.touches):
+            device.particles.contact.fill(w, w * room[0], counts[w, count.particles[0]], h)
         for g in ti.static(range(len(groups))):
             first, own = w * room[g], counts[w, count.particles[g]]
             for p in range(first, first + own):

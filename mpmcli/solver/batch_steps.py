@@ -22,7 +22,9 @@ DEFORMING, FORCE, FORCED, MAXIMUM, CROSSING = (
 class BatchSteps:
     """The steps of the runs of a batch, w being the number of a run; numbers and counts as of `batch_layout`."""
 
-    def __init__(self, layout: Layout, laws: Sequence[Law], values: BatchValues) -> None:
+    def __init__(self, layout: Layout, laws: Sequence[Law], values: BatchValues, *, drifts: bool) -> None:
+        """Prepare; `drifts` says whether particles move on the grid."""
+        self.drifts = drifts
         self.real, self.count = layout.real, layout.count
         self.values = values
         self.laws = tuple(laws)
@@ -84,7 +86,8 @@ class BatchSteps:
             courant = dt * speed / numbers[w, self.real.spacing]
             numbers[w, self.real.speed] = speed
             numbers[w, self.real.courant] = courant
-            numbers[w, self.real.drift] = numbers[w, self.real.drift] + courant
+            if ti.static(self.drifts):
+                numbers[w, self.real.drift] = numbers[w, self.real.drift] + courant
             self.hold(w, ti.min(numbers[w, self.real.stiffness], deformation), numbers)
             due = self.control(w, dt, numbers, counts)
             self.book(w, dt, courant, limit, numbers, counts)

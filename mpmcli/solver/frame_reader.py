@@ -145,7 +145,13 @@ def sum_range(group: ti.template(), first: int, count: int, row: int, shown: ti.
         affine = ti.cast(C, ti.f64)
         total[0] += m
         total[1] += m * speed.norm_sqr()
-        total[2] += m * affine.norm_sqr()
+        if ti.static(group.total):
+            # Nodes lie at F (X_i - X_p) from the particle, and move by C F (X_i - X_p).
+            F = ti.cast(group.stored(p), ti.f64)
+            total[2] += m * (affine @ F).norm_sqr()
+            affine = affine @ F @ F.transpose()
+        else:
+            total[2] += m * affine.norm_sqr()
         total[3] += ti.cast(table[VOLUME], ti.f64) * ti.cast(shown[row + group.id[p], 2 * d], ti.f64)
         for c in ti.static(range(d)):
             total[6 + c] += m * place[c]

@@ -40,6 +40,7 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
                 layout,
                 serial=backend.on_cpu and backend.threads == 1,
                 keeps_initial=needs_initial(scene, members),
+                total=scene.solver.solids == "total",
             )
         )
     return groups

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 from mpmcli.boundaries.mirror_images import MirrorImages
-from mpmcli.boundaries.walls import Walls
+from mpmcli.boundaries.walls import Walls, faces_on_grid
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.scene import Scene
 from mpmcli.solver.backend import Backend
@@ -13,6 +13,7 @@ from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid, drift_allowed, node_width, tile_edge
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.ordering import SortBuffers, TileOrder
+from mpmcli.solver.particle_contact import DRIFT, contact_between
 from mpmcli.solver.particle_update import ParticleUpdate
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.sorting import build_sort
@@ -54,14 +55,17 @@ class Kernels:
         if scene.solver.walls == "zeroed":
             images, walls = None, ZeroedWalls(faces, PAD, self.grid.cells)
         else:
-            walls = Walls(faces, PAD, self.grid.cells, self.grid.shape)
+            walls = Walls(faces_on_grid(faces, scene.solver), PAD, self.grid.cells, self.grid.shape)
             images = MirrorImages(walls)
         nodes = NodeUpdate(self.grid, images, [walls])
-        self.particles = ParticleUpdate(self.grid, len(groups), watches_box=not backend.on_cpu)
+        self._contact = contact_between(groups, [len(group.bodies) for group in groups], self.grid, backend)
+        self.particles = ParticleUpdate(self.grid, faces, len(groups), self._contact, watches_box=not backend.on_cpu)
         buffers = SortBuffers(groups)
         self.orders = [TileOrder(g, self.grid, buffers, backend.threads, backend.on_cpu) for g in groups]
         self._sorts = [build_sort(order) for order in self.orders]
         self.drift_allowed = drift_allowed(self.grid.tile, stencil) if backend.on_cpu else float(self.grid.tile)
+        if self._contact is not None:
+            self.drift_allowed = DRIFT
         self._find_box = build_box_search(self.grid, self.orders, math.ceil(self.drift_allowed))
         if backend.on_cpu:
             self.step = build_cpu_step(self.grid, nodes, self.particles, groups, self.orders, gravity)
@@ -72,6 +76,8 @@ class Kernels:
         """Sort the particles of every group by tile, and find the nodes in use."""
         for sort in self._sorts:
             sort.run()
+        if self._contact is not None:
+            self._contact.fill_all(self.particles.grid.spacing)
         self._find_box()
 
     def share_work(self) -> None:

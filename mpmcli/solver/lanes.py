@@ -19,6 +19,7 @@ from mpmcli.solver.lane_state import (
 )
 from mpmcli.solver.particle_arrays import MASS, VOLUME
 from mpmcli.solver.particle_update import SMALLEST_J, deformed_gradient, deformed_volume
+from mpmcli.solver.reference_grid import pulled_back, push_of_walls
 from mpmcli.solver.state_bounds import NOTHING, deformation_rate, volume_ratio
 from mpmcli.solver.transfer import add_linear, centred, gather_linear, momentum, scatter_before, scatter_volume
 
@@ -35,6 +36,9 @@ def scatter_range(
     keeps_F = ti.static(group.law.deformation == "F")
     inners = ti.static(internal_entries(group))
     x, v, affine = zero_lanes(d), zero_lanes(d), zero_lanes(ti.static(d * d))
+    touches = zero_lanes(ti.static(d if particles.touches else 1))
+    # Where particles are, if that is not where they are on the grid.
+    here = zero_lanes(ti.static(d if group.total else 1))
     deformation, internal = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
     rows = zero_lanes(ti.static(group.table.n))
     pushes = zero_lanes(ti.static(d + d * d if group.pushed else 1))
@@ -47,9 +51,16 @@ def scatter_range(
         load_lanes(group, begin, count, affine, deformation, internal, rows)
         for lane in range(LANES):
             p = begin + ti.min(lane, count - 1)
+            at = group.on_grid(p)
             for c in ti.static(range(d)):
-                x[c, lane] = group.x[p][c]
+                x[c, lane] = at[c]
                 v[c, lane] = group.v[p][c]
+                if ti.static(group.total):
+                    here[c, lane] = group.x[p][c]
+            if ti.static(particles.touches):
+                push = particles.contact.push(group, p, grid.spacing, particles.run)
+                for c in ti.static(range(d)):
+                    touches[c, lane] = push[c]
             if ti.static(group.pushed):
                 push, slope = group.force.acceleration(group, p, ti.static(group.force.spreads and grid.scheme.affine))
                 for c in ti.static(range(d)):
@@ -77,6 +88,14 @@ def scatter_range(
                 own += kick * vector_of(pushes, 0, d, lane)
                 for c, a in ti.static(ti.ndrange(d, d)):
                     C[c, a] += kick * pushes[d + c * d + a, lane]
+            if ti.static(group.total):
+                row = vector_of(rows, 0, ti.static(group.table.n), lane)
+                if ti.static(particles.touches):
+                    own += kick * vector_of(touches, 0, d, lane)
+                at = vector_of(here, 0, d, lane)
+                own += kick * push_of_walls(particles, group, at, place, state, row, constants_of(rows, lane))
+                C = C @ state
+                stress = pulled_back(stress, state)
             base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
             first_node[lane] = grid.linear_index(base)
             w = grid.scheme.spline.weights(distance)
@@ -108,8 +127,8 @@ def scatter_range(
                 slope = node_rows_of(slopes, d, width, width, lane)
                 add_linear(grid.nodes, grid, first_node[lane], w, middle, slope, False)
                 if ti.static(grid.scheme.keeps_before):
-                    own_v, own_C = group.motion(p)
-                    scatter_before(group.x[p], group.row(p)[MASS], own_v, own_C, grid, False)
+                    own_v, own_C = group.motion_on_grid(p)
+                    scatter_before(group.on_grid(p), group.row(p)[MASS], own_v, own_C, grid, False)
             else:
                 ti.atomic_min(particles.lost[particles.first_lost + g], p)
             if ti.static(grid.keeps_filling):
@@ -132,14 +151,18 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
     moments = ti.Matrix.zero(float, LANES, ti.static(d * width))
     gradients, rates = ti.Matrix.zero(float, LANES, ti.static(d * width)), ti.Vector.zero(float, LANES)
     moved, beyond, after = zero_lanes(d), ti.Vector.zero(float, LANES), zero_lanes(ti.static(stored_entries(group)))
+    here = zero_lanes(ti.static(d if group.total else 1))
     sharpest = NOTHING
     begin = first
     while begin < last:
         count = ti.min(LANES, last - begin)
         for lane in range(LANES):
             p = begin + ti.min(lane, count - 1)
+            at = group.on_grid(p)
             for c in ti.static(range(d)):
-                x[c, lane] = group.x[p][c]
+                x[c, lane] = at[c]
+                if ti.static(group.total):
+                    here[c, lane] = group.x[p][c]
             load_deformation(group, p, lane, deformation)
 
         for lane in range(LANES):
@@ -166,14 +189,23 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
             moment = node_rows_of(moments, d, width, d, lane)
             gradient = centred(grid, vector_of(distances, 0, d, lane), velocity, moment)
             C = gradient.transpose()
+            place = vector_of(x, 0, d, lane)
+            if ti.static(group.total):
+                place = vector_of(here, 0, d, lane)
+                grown = matrix_of(deformation, d, lane) + dt * C
+                for i, j in ti.static(ti.ndrange(d, d)):
+                    after[i * d + j, lane] = grown[i, j]
+                C = C @ (grown + ti.Matrix.identity(float, d)).inverse()
             for c, a in ti.static(ti.ndrange(d, d)):
-                gradients[lane, a * width + c] = gradient[a, c]
-            inside, outside = particles.moved(vector_of(x, 0, d, lane), velocity, dt)
+                gradients[lane, a * width + c] = C[c, a]
+            inside, outside = particles.moved(place, velocity, dt)
             for c in ti.static(range(d)):
                 moved[c, lane] = inside[c]
             beyond[lane] = outside
             rates[lane] = deformation_rate(group, C)
-            if ti.static(keeps_F):
+            if ti.static(group.total):
+                pass
+            elif ti.static(keeps_F):
                 deformed = deformed_gradient(matrix_of(deformation, d, lane), C, dt)
                 for i, j in ti.static(ti.ndrange(d, d)):
                     after[i * d + j, lane] = deformed[i, j]
@@ -184,7 +216,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
             p = begin + lane
             kept = ti.Vector.zero(float, d)
             if ti.static(grid.scheme.keeps_before):
-                kept = particles.unseen_velocity(group, p, group.x[p])
+                kept = particles.unseen_velocity(group, p)
             for c in ti.static(range(d)):
                 group.v[p][c] = velocities[lane, c] + kept[c]
             for a in ti.static(range(d)):

@@ -91,7 +91,7 @@ class TileOrder:
     @ti.func
     def first_node_of(self, p: int):
         """Return the integer coordinates of the first node of the stencil of particle p."""
-        base, _ = self.grid.scheme.spline.stencil(self.group.x[p], self.grid.inverse_spacing)
+        base, _ = self.grid.scheme.spline.stencil(self.group.on_grid(p), self.grid.inverse_spacing)
         return base
 
     @ti.func

@@ -30,7 +30,9 @@ class ParticleArrays:
         body: (n) int, row of its body in the table; None where `several` is false.
         several: whether particles may belong to more than one body.
         serial: whether loops that copy particles from and to the host run on one thread, which few particles need.
-        initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force.
+        total: whether the body is on the grid of its state at rest, see `reference_grid`.
+        initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force, or
+            since they are `total`.
         force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
         table: per body a row of particle mass, particle volume and the constants of the law.
         real: numpy's type of the real fields.
@@ -48,6 +50,7 @@ class ParticleArrays:
         several: bool,
         serial: bool,
         keeps_initial: bool = False,
+        total: bool = False,
     ) -> None:
         """Allocate.
 
@@ -68,8 +71,9 @@ class ParticleArrays:
         self.several = several
         self.serial = serial
         self.body = ti.field(int, shape=count) if several else None
-        self.keeps_initial = keeps_initial
-        self.initial = ti.Vector.field(d, float, shape=count, layout=layout) if keeps_initial else None
+        self.total = total
+        self.keeps_initial = keeps_initial or total
+        self.initial = ti.Vector.field(d, float, shape=count, layout=layout) if self.keeps_initial else None
         self.pushed = False
         self.force = None
         self.run = 0
@@ -249,6 +253,25 @@ class ParticleArrays:
             v[c] = self.v[p][c]
             for a in ti.static(range(d)):
                 C[c, a] = self.gradient[p][a, c]
+        return v, C
+
+    @ti.func
+    def on_grid(self, p: int):
+        """Return where particle p is on the grid, m."""
+        if ti.static(self.total):
+            return self.initial[p]
+        else:
+            return self.x[p]
+
+    @ti.func
+    def motion_on_grid(self, p: int):
+        """Return the velocity of particle p, and its gradient with respect to places on the grid."""
+        v, C = self.motion(p)
+        if ti.static(self.total):
+            # Entry by entry: Taichi loses matrices that are assigned as a whole here.
+            at_rest = C @ self.stored(p)
+            for i, j in ti.static(ti.ndrange(self.dimension, self.dimension)):
+                C[i, j] = at_rest[i, j]
         return v, C
 
     @ti.func

@@ -1,9 +1,12 @@
 """What a step does with one particle: scatter it to the nodes, and move it with them."""
 
+from collections.abc import Sequence
+
 import taichi as ti
 
 from mpmcli.solver.grid import Grid
 from mpmcli.solver.particle_arrays import VOLUME
+from mpmcli.solver.particle_contact import ParticleContact
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import deformation_rate, volume_growth, volume_ratio
 from mpmcli.solver.transfer import gather, scatter, scatter_volume
@@ -19,15 +22,28 @@ class ParticleUpdate:
     """Both halves of a step of a particle, as a GPU takes them; `lanes` takes them on the CPU.
 
     Attributes:
-        extent: size of the domain, m; last: node of the upper walls, per axis.
+        extent: size of the domain, m; last: node of the upper walls, per axis; faces: words of the walls, per axis.
+        contact: between elastic bodies that are `total`; touches: whether there is any.
+        run: number of the run that a view is for.
         watches_box: whether a particle whose stencil has left the nodes in use is lost: on a GPU, where speeds are not
             read back at every step.
         lost: per group, the first particle (in solver order) that left the domain, was inverted or is not finite, or
             NOT_LOST.
     """
 
-    def __init__(self, grid: Grid, group_count: int, *, watches_box: bool) -> None:
+    def __init__(
+        self,
+        grid: Grid,
+        faces: Sequence[tuple[str, str]],
+        group_count: int,
+        contact: ParticleContact | None = None,
+        *,
+        watches_box: bool,
+    ) -> None:
+        self.contact, self.touches = contact, contact is not None
+        self.run = 0
         self.grid = grid
+        self.faces = tuple(tuple(pair) for pair in faces)
         self.dimension = grid.dimension
         self.extent = tuple(n * grid.spacing for n in grid.cells)
         self.last = tuple(PAD + n for n in grid.cells)
@@ -47,7 +63,7 @@ class ParticleUpdate:
         One that is crushed or inverted is lost: its stress would spread NaN over the grid.
         """
         if volume_ratio(group, group.stored(p)) > SMALLEST_J:
-            scatter(group, self.grid, p, kick)
+            scatter(group, self, p, kick)
         else:
             ti.atomic_min(self.lost[self.first_lost + g], p)
         if ti.static(self.grid.keeps_filling):
@@ -68,6 +84,8 @@ class ParticleUpdate:
     def advance(self, g: ti.template(), group: ti.template(), p: int, dt: float):
         """Gather and move one particle, x += dt v and F <- (I + dt C) F or J *= det(I + dt C).
 
+        On the grid of the state at rest it is F += dt dv/dX.
+
         Returns:
             Its rate of deformation, 1/s (see `deformation_rate`).
         """
@@ -75,34 +93,44 @@ class ParticleUpdate:
 
         # Gather.
         x = group.x[p]
-        v, gradient = gather(x, self.grid, self.grid.nodes)
+        v, gradient = gather(group.on_grid(p), self.grid, self.grid.nodes)
         C = ti.Matrix.zero(float, d, d)
         for c in ti.static(range(d)):
             for a in ti.static(range(d)):
                 C[c, a] = gradient[a, c]
         inside, beyond = self.moved(x, v, dt)
         if ti.static(self.grid.scheme.keeps_before):
-            kept = self.unseen_velocity(group, p, x)
+            kept = self.unseen_velocity(group, p)
             for c in ti.static(range(d)):
                 v[c] += kept[c]
 
         # Motion.
         for c in ti.static(range(group.v.n)):
             group.v[p][c] = v[c]
+        if ti.static(group.total):
+            for c, a in ti.static(ti.ndrange(d, d)):
+                group.displacement_gradient[p][c, a] += dt * C[c, a]
+            # Entry by entry: Taichi loses matrices that are assigned as a whole here.
+            in_space = C @ group.stored(p).inverse()
+            for c, a in ti.static(ti.ndrange(d, d)):
+                C[c, a] = in_space[c, a]
+                gradient[a, c] = in_space[c, a]
         for a in ti.static(range(d)):
             for c in ti.static(range(group.v.n)):
                 group.gradient[p][a, c] = gradient[a, c]
 
         # Deformation. The rate here, where C is at hand, takes half the time that it would take at the end.
         deforming = deformation_rate(group, C)
-        if ti.static(group.law.deformation == "F"):
+        if ti.static(group.total):
+            pass
+        elif ti.static(group.law.deformation == "F"):
             group.displacement_gradient[p] = deformed_gradient(group.displacement_gradient[p], C, dt)
         else:
             group.J_minus_1[p] = deformed_volume(group.J_minus_1[p], C, dt)
 
         # Position. Written so that a NaN is not sound; then it stays, and no later step writes outside the grid.
         sound = beyond <= 0.5 * self.grid.spacing
-        if ti.static(self.watches_box):
+        if ti.static(self.watches_box and not group.total):
             base, _ = self.grid.scheme.spline.stencil(inside, self.grid.inverse_spacing)
             for a in ti.static(range(d)):
                 low = self.grid.box[0, a]
@@ -127,14 +155,14 @@ class ParticleUpdate:
         return inside, beyond
 
     @ti.func
-    def unseen_velocity(self, group: ti.template(), p: int, x: ti.template()):
-        """Return the share that particle p, at x, keeps of the velocity of its own that the nodes do not see.
+    def unseen_velocity(self, group: ti.template(), p: int):
+        """Return the share that particle p keeps of the velocity of its own that the nodes do not see.
 
         AFLIP adds it to APIC's velocity: v <- sum w v_i + flip (v - sum w v_i^before) (Fei et al. 2021;
         docs/theory.md, 2.3). C, positions and deformations follow the nodes. As positions do, and not the particle's
         own velocity, angular momentum is kept to first order in the step only.
         """
-        before, _ = gather(x, self.grid, self.grid.before)
+        before, _ = gather(group.on_grid(p), self.grid, self.grid.before)
         kept = ti.Vector.zero(float, self.dimension)
         for c in ti.static(range(self.dimension)):
             kept[c] = self.grid.scheme.flip * (group.v[p][c] - before[c])

@@ -74,6 +74,7 @@ class ParticleGroup(ParticleArrays):
         *,
         serial: bool,
         keeps_initial: bool = False,
+        total: bool = False,
     ) -> None:
         self.bodies = tuple(bodies)
         self.first, self.count = 0, sum(len(b.position) for b in particles)
@@ -88,6 +89,7 @@ class ParticleGroup(ParticleArrays):
             several=len(self.bodies) > 1,
             serial=serial,
             keeps_initial=keeps_initial,
+            total=total,
         )
         self.rows = rows.astype(self.real)
         self.table.from_numpy(self.rows)

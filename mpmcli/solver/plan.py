@@ -146,7 +146,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 dimension,
                 backend,
                 several_bodies=bodies[name] > 1,
-                keeps_initial=needs_initial(scene, members_of(scene, name)),
+                keeps_initial=scene.solver.solids == "total" or needs_initial(scene, members_of(scene, name)),
             ),
         )
         for name in sorted(bodies)

@@ -78,14 +78,22 @@ def _sums(snapshot: Snapshot, seen: Observation) -> Sums:
     """Sum over the particles of a law, by the products sum m a a^T with a = (1, x, v, C)."""
     count, d = snapshot.x.shape
     products = np.zeros((1 + 2 * d + d * d,) * 2)
+    spins = np.zeros((d, d))
     mass = snapshot.per_body(MASS)
     for first in range(0, count, ROWS):
         rows = slice(first, first + ROWS)
-        parts = (snapshot.x[rows], snapshot.v[rows], snapshot.C[rows].reshape(-1, d * d))
+        C = snapshot.C[rows].astype(np.float64)
+        spin = C
+        if snapshot.group.total:
+            # Nodes lie at F (X_i - X_p) from the particle, and move by C F (X_i - X_p).
+            F = snapshot.deformation[rows].astype(np.float64)
+            C, spin = C @ F, C @ F @ F.transpose(0, 2, 1)
+        spins += np.tensordot(mass[rows], spin, 1)
+        parts = (snapshot.x[rows], snapshot.v[rows], C.reshape(-1, d * d))
         a = np.concatenate([np.ones((len(parts[0]), 1)), *parts], axis=1)
         products += (a * mass[rows, None]).T @ a
     x, v, C = slice(1, 1 + d), slice(1 + d, 1 + 2 * d), slice(1 + 2 * d, None)
-    turning, affine = products[x, v], products[0, C].reshape(d, d)
+    turning = products[x, v]
     pairs = axis_pairs(d)
     return Sums(
         mass=products[None, 0, 0],
@@ -94,7 +102,7 @@ def _sums(snapshot: Snapshot, seen: Observation) -> Sums:
         motion=np.array([products[v, v].trace()]),
         affine=np.array([products[C, C].trace()]),
         turning=np.array([[turning[a, b] - turning[b, a] for a, b in pairs]]),
-        spin=np.array([[affine[b, a] - affine[a, b] for a, b in pairs]]),
+        spin=np.array([[spins[b, a] - spins[a, b] for a, b in pairs]]),
         elastic=np.array([snapshot.per_body(VOLUME) @ seen.energy.astype(np.float64)]),
         speed_squared=np.array([np.einsum("pc,pc->p", snapshot.v, snapshot.v).max()], np.float64),
     )

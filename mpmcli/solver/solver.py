@@ -50,6 +50,7 @@ class Solver(Run):
         self.groups = build_groups(scene, backend, self._particles)
         gravity, forces = drive(scene, self.groups, backend)
         self._kernels = Kernels(scene, backend, self.groups, gravity)
+        self._drifts = self._kernels.particles.touches or not all(group.total for group in self.groups)
         self.grid = self._kernels.grid
         self._observations = [build_observation(group) for group in self.groups]
         self._readers = [build_frame_reader(group) for group in self.groups]
@@ -103,9 +104,10 @@ class Solver(Run):
         state.courant = dt * state.speed / self.spacing
         # On a GPU stress may double the speed; `ParticleUpdate.advance` flags particles that went further.
         unseen = 2 * state.courant + UNSEEN if result is None else 0.0
-        state.drift += max(state.courant, unseen)
+        if self._drifts:
+            state.drift += max(state.courant, unseen)
         due = state.step_control.after_step(dt, state.courant, result)
-        if unseen > 0 and state.drift + unseen >= self._kernels.drift_allowed:
+        if self._drifts and unseen > 0 and state.drift + unseen >= self._kernels.drift_allowed:
             self.measure_state(dt)
         elif due:
             self.measure_state(dt, due)

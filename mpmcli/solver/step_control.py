@@ -266,7 +266,8 @@ class StepControl:
             bound = group.law.swung(bound)
         limits = []
         for place, parameters in zip(group.bodies, group.law.members, strict=True):
-            for mode in group.law.modes(parameters, bound):
+            modes = group.law.reference_modes if group.total else group.law.modes
+            for mode in modes(parameters, bound):
                 value, cause = mode_limit(
                     self._spacing, parameters.density, mode.stiffness, mode.viscosity, self._inertia
                 )

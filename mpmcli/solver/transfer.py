@@ -10,10 +10,11 @@ instructions; that halves the time of the gather in 3D.
 import taichi as ti
 
 from mpmcli.solver.particle_arrays import MASS, VOLUME
+from mpmcli.solver.reference_grid import pulled_back, push_of_walls
 
 
 @ti.func
-def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float):
+def scatter(group: ti.template(), particles: ti.template(), p: int, kick: float):
     """Add the mass and the momentum of particle p, stress included, to the nodes around it, with atomics.
 
     A law with plastic flow projects the particle's state first. Forces change what is scattered: v by kick a, and C by
@@ -21,6 +22,7 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float):
 
     Node i receives w_i (m v + A (x_i - x_p)) with A = m C - dt V0 tau / D (Hu et al. 2018, eq. 18; D = h^2/4
     for quadratic splines), and w_i m. PIC leaves m C out."""
+    grid = particles.grid
     affine = ti.static(grid.scheme.affine)
     row = group.row(p)
     mass = row[MASS]
@@ -32,14 +34,22 @@ def scatter(group: ti.template(), grid: ti.template(), p: int, kick: float):
         push, slope = group.force.acceleration(group, p, ti.static(group.force.spreads and affine))
         v += kick * push
         C += kick * slope
-    base, distance = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
+    if ti.static(group.total):
+        F = group.stored(p)
+        v += kick * push_of_walls(particles, group, group.x[p], group.initial[p], F, row, group.constants(p))
+        # Entry by entry: Taichi loses matrices that are assigned as a whole here.
+        C_rest, P = C @ F, pulled_back(stress, F)
+        for i, j in ti.static(ti.ndrange(group.dimension, group.dimension)):
+            C[i, j] = C_rest[i, j]
+            stress[i, j] = P[i, j]
+    base, distance = grid.scheme.spline.stencil(group.on_grid(p), grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
     middle, change = momentum(grid, distance, mass, row[VOLUME], v, C, stress, kick)
     add_linear(grid.nodes, grid, grid.linear_index(base), w, middle, change, True)
     if ti.static(grid.scheme.keeps_before):
         # Last, and with a copy: before it, Taichi 1.7.4 loses what a force with branches adds to v and C.
-        own_v, own_C = group.motion(p)
-        scatter_before(group.x[p], mass, own_v, own_C, grid, True)
+        own_v, own_C = group.motion_on_grid(p)
+        scatter_before(group.on_grid(p), mass, own_v, own_C, grid, True)
 
 
 @ti.func

@@ -68,6 +68,7 @@ class Case(ABC):
         measures: the measures; the first one is the error of the case.
         varies: the fields of `Setting` that are varied.
         finer: factor on the particles per cell and axis of the setting.
+        solids: grid of elastic bodies, as in a scene.
         note: remarks on the result, such as the origin of a bound; may be "".
     """
 
@@ -80,6 +81,7 @@ class Case(ABC):
     measures: ClassVar[tuple[Measure, ...]]
     varies: ClassVar[tuple[str, ...]] = ("precision", "kernel", "transfer", "walls", "per_axis", "safety")
     finer: ClassVar[int] = 1
+    solids: str = "updated"
     note: ClassVar[str] = ""
 
     @abstractmethod
@@ -94,7 +96,7 @@ class Case(ABC):
             "title": self.title,
             **tables,
             "time": {**tables["time"], "safety": setting.safety},
-            "solver": setting.solver_table(),
+            "solver": setting.solver_table() | ({"solids": "total"} if self.solids == "total" else {}),
             "bodies": [{**body, "particles_per_cell": per_cell} for body in tables["bodies"]],
         }
 

@@ -1,0 +1,62 @@
+"""Elastic bodies on the grid of their state at rest (total Lagrangian; de Vaucorbeil, Nguyen, Hutchinson 2020).
+
+Particles scatter and gather at the places X that they have at rest, with the first Piola-Kirchhoff stress
+P = tau F^-T and dv/dX (docs/theory.md, 2.5). No stencil ever changes. What the body meets after the start is not
+on that grid: walls push at particles.
+"""
+
+import taichi as ti
+
+from mpmcli.solver.particle_arrays import MASS, VOLUME
+
+# A body that begins within this distance of a wall that slips or sticks, cells, is held by that wall for good.
+HELD = 1.0
+
+
+@ti.func
+def pulled_back(tau: ti.template(), F: ti.template()):
+    """Return the first Piola-Kirchhoff stress of a Kirchhoff stress, tau F^-T."""
+    return tau @ F.inverse().transpose()
+
+
+@ti.func
+def push_of_walls(
+    particles: ti.template(),
+    group: ti.template(),
+    x: ti.template(),
+    X: ti.template(),
+    F: ti.template(),
+    row: ti.template(),
+    constants: ti.template(),
+):
+    """Return the acceleration of a particle by the walls that it presses on, m/s^2.
+
+    A particle is the ellipse that F makes of a ball of its spacing s. Where it reaches beyond a wall by g, the wall
+    pushes it with (lambda + 2 mu) V / (m s h) g, about as stiff as the material, and without friction.
+
+    Args:
+        x, X: where it is, and where it is at rest, m; row: of the table.
+    """
+    d = ti.static(group.dimension)
+    push = ti.Vector.zero(float, d)
+    spacing = row[VOLUME] ** ti.static(1.0 / group.dimension)
+    h = particles.grid.spacing
+    stiffness = group.law.wave_modulus(constants) * row[VOLUME] / (row[MASS] * spacing * h)
+    for a in ti.static(range(d)):
+        stretched = 0.0
+        for b in ti.static(range(d)):
+            stretched += F[a, b] * F[a, b]
+        stretched = ti.sqrt(stretched)
+        for side in ti.static(range(2)):
+            distance, at_rest = x[a], X[a]
+            if ti.static(side == 1):
+                distance, at_rest = particles.extent[a] - x[a], particles.extent[a] - X[a]
+            # A body that fills its place up to the wall begins without a push, whatever its spacing along this axis.
+            overlap = ti.min(0.5 * spacing, at_rest) * stretched - distance
+            meets = overlap > 0.0
+            if ti.static(particles.faces[a][side] != "separate"):
+                meets = meets and at_rest >= HELD * h
+            if meets:
+                inward = ti.static(1.0 - 2.0 * side)
+                push[a] += inward * stiffness * overlap
+    return push

@@ -1,0 +1,442 @@
+"""Elastic bodies on the grid of their state at rest (docs/theory.md, 2.5)."""
+
+import math
+from collections.abc import Callable
+
+import mpm_reference as reference
+import numpy as np
+import pytest
+from law_probe import LawProbe
+from law_tangent import unit_gradients
+from solver_state import scene_of
+
+from mpmcli.errors import InputError
+from mpmcli.materials.law import StateBound
+from mpmcli.materials.registry import laws
+from mpmcli.scene import Scene
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.engine import build_engine
+from mpmcli.solver.solver import Solver
+
+H = 0.1
+E, NU, DENSITY = 1e5, 0.3, 1000.0
+MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
+WAVES = math.sqrt((LAMBDA + 2 * MU) / DENSITY)
+
+
+def jelly(**more: object) -> dict:
+    """Return a material."""
+    return {"law": "neo_hookean", "density": DENSITY, "youngs_modulus": E, "poissons_ratio": NU, **more}
+
+
+def body_scene(
+    low: list[float],
+    high: list[float],
+    cells: list[int],
+    *,
+    walls: object = "separate",
+    gravity: list[float] | None = None,
+    material: dict | None = None,
+    end: float = 1.0,
+    frames: int = 1,
+    precision: str = "f64",
+    safety: float = 0.8,
+    spacing: float = H,
+    **more: object,
+) -> Scene:
+    """Return a scene of one box."""
+    domain = {"size": [n * spacing for n in cells], "cells": cells, "walls": walls}
+    return scene_of(
+        domain=domain | ({"gravity": gravity} if gravity else {}),
+        time={"end": end, "frames": frames, "safety": safety},
+        solver={"solids": "total", "precision": precision},
+        output={"fields": ["velocity", "initial_position"]},
+        bodies=[
+            {
+                "name": "body",
+                "material": material or jelly(),
+                "shape": {"box": {"min": low, "max": high}},
+                **more,
+            }
+        ],
+    )
+
+
+def stirred(solver: Solver, dimension: int) -> None:
+    """Give the particles velocities at random, and deformations of up to a fifth, where they are."""
+    group, rng = solver.groups[0], np.random.default_rng(0)
+    n, d = group.count, dimension
+    group.set_motion(rng.uniform(-1, 1, (n, d)), rng.uniform(-3, 3, (n, d, d)))
+    group.set_deformation(np.eye(d) + rng.uniform(-0.2, 0.2, (n, d, d)))
+    x = group.x.to_numpy()
+    group.x.from_numpy((x + rng.uniform(-0.02, 0.02, x.shape)).astype(group.real))
+    solver.state_was_replaced()
+
+
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> None:
+    """P2G with tau F^-T and dv/dX at X, G2P at X, F += dt dv/dX, x += dt v; the floor pushes at x."""
+    d = dimension
+    faces = {"x_min": "slip", "y_min": "separate"}
+    gravity = [1.0, -9.81, 0.5][:d]
+    scene = body_scene([0.0] * d, [0.3, 0.2, 0.2][:d], [8, 6, 5][:d], walls=faces, gravity=gravity)
+    solver = Solver(scene, backend_of("f64", 1))
+    stirred(solver, d)
+    group = solver.groups[0]
+    before, X = group.to_numpy(), group.initial.to_numpy()
+    sample = solver._particles[0]
+    n, kick, dt = group.count, 0.5e-3, 1e-3
+    F = before["deformation"]
+    # The floor: a particle reaches from its place by half of its spacing, stretched by F, at most to the wall.
+    reach = np.minimum(0.5 * sample.volume ** (1 / d), X[:, 1]) * np.linalg.norm(F[:, 1], axis=1)
+    overlap = np.maximum(reach - before["x"][:, 1], 0.0)
+    assert 0 < (overlap > 0).sum() < n
+    stiffness = (LAMBDA + 2 * MU) * sample.volume / (sample.mass * sample.volume ** (1 / d) * H)
+    v = before["v"].copy()
+    v[:, 1] += kick * stiffness * overlap
+    # No wall that lets go is on the grid: here the body is away from all but the one that slips.
+    cells = tuple(n + (20 if a else 0) for a, n in enumerate(scene.domain.cells))
+    box = reference.Box(cells, H, np.array(gravity), [("slip", "stick")] * d)
+    lifted = X + np.array([0.0, *[10 * H] * (d - 1)])
+    tau = reference.neo_hookean_stress(np.full(n, MU), np.full(n, LAMBDA))
+    particles = reference.Particles(
+        lifted,
+        v,
+        before["C"] @ F,
+        F,
+        np.full(n, sample.mass),
+        np.full(n, sample.volume),
+        lambda F, p: tau(F, p) @ np.linalg.inv(F).T,
+    )
+    velocity = reference.update(*reference.scatter([particles], box, kick), box, kick)
+    (after,) = reference.gather([particles], velocity, box, dt)
+    F = F + dt * after.C
+    solver.step(dt)
+    found = group.to_numpy()
+    assert np.abs(found["v"] - after.v).max() < 1e-12 * np.abs(after.v).max()
+    assert np.abs(found["x"] - (before["x"] + dt * after.v)).max() < 1e-14
+    assert np.abs(found["deformation"] - F).max() < 1e-13
+    assert np.abs(found["C"] - after.C @ np.linalg.inv(F)).max() < 1e-11 * np.abs(after.C).max()
+
+
+def test_momenta_stay(backend_of: Callable) -> None:
+    """A body that spins and swings keeps its momentum, and its angular momentum to second order in the spacing.
+
+    Nodes have no place of their own: each particle sees them where its own F puts them.
+    """
+
+    def turned(cells: int) -> float:
+        spacing = 0.4 / cells
+        scene = body_scene(
+            [0.6, 0.6],
+            [1.2, 1.0],
+            [5 * cells, 5 * cells],
+            material=jelly(youngs_modulus=1e4),
+            end=0.5,
+            frames=4,
+            spacing=spacing,
+            velocity=[0.3, -0.4],
+            velocity_gradient=[[1.0, 4.0], [-6.0, -2.0]],
+        )
+        rows = [row for _, row in Solver(scene, backend_of("f64", 1)).frames()]
+        assert max(row.volume_ratio_max for row in rows) > 1.2
+        linear = np.array([row.linear_momentum for row in rows])
+        assert np.abs(linear - linear[0]).max() < 1e-12 * np.abs(linear[0]).max()
+        own = [row.angular_momentum[0] for row in rows]
+        return max(abs(value - own[0]) for value in own) / abs(own[0])
+
+    coarse, fine = turned(4), turned(8)
+    assert fine < 2e-3
+    assert coarse / fine > 2**1.9
+
+
+def test_no_stencil_changes_as_a_body_flies(backend_of: Callable) -> None:
+    """Flight over many cells does not change how a body swings: Galilean invariance to round-off."""
+
+    def swing(speed: float) -> np.ndarray:
+        scene = body_scene(
+            [0.2, 0.7],
+            [0.6, 1.1],
+            [40, 20],
+            end=0.4,
+            velocity=[speed, 0.0],
+            velocity_gradient=[[1.0, 2.0], [0.5, -1.0]],
+        )
+        solver = Solver(scene, backend_of("f64", 1))
+        for _ in range(100):
+            solver.step(0.004)
+        return solver.groups[0].to_numpy()["deformation"]
+
+    resting, flying = swing(0.0), swing(5.0)
+    assert np.abs(resting - np.eye(2)).max() > 0.02
+    assert np.abs(flying - resting).max() < 1e-12
+
+
+def test_a_stretched_bar_does_not_tear(backend_of: Callable) -> None:
+    """Pulled to three times its length, when its particles stand 1.5 cells apart, its stress is still that of F."""
+    pull = 150.0
+    scene = scene_of(
+        domain={"size": [4.0, 1.0], "spacing": H, "walls": {"x_min": "slip", "x_max": "separate"}},
+        time={"end": 0.25, "frames": 1},
+        solver={"solids": "total", "precision": "f64"},
+        output={"fields": ["velocity", "initial_position", "deformation_gradient"]},
+        bodies=[
+            {
+                "name": "bar",
+                "material": jelly(poissons_ratio=0.0),
+                "shape": {"box": {"min": [0.0, 0.3], "max": [1.0, 0.7]}},
+                "velocity": ["4 * X", 0.0],
+            }
+        ],
+        forces=[{"acceleration": [f"{pull} * X", 0.0]}],
+    )
+    frame = list(Solver(scene, backend_of("f64", 1)).frames())[-1][0]
+    X, x = frame.fields["initial_position"], frame.position
+    row = np.isclose(X[:, 1], X[:, 1].min())
+    order = np.argsort(X[row, 0])
+    gaps = np.diff(x[row, 0][order])
+    spacing = np.diff(X[row, 0][order])
+    assert gaps.max() > 1.3 * H
+    # Each gap is that of the stored deformation.
+    F = frame.fields["deformation_gradient"].reshape(-1, 2, 2)[row][order, 0, 0]
+    assert np.abs(gaps / spacing / (0.5 * (F[1:] + F[:-1])) - 1).max() < 0.01
+
+
+@pytest.mark.parametrize("safety", [0.8, 0.98])
+def test_a_bar_bounces_off_a_wall_after_a_wave_has_gone_there_and_back(backend_of: Callable, safety: float) -> None:
+    """It meets the wall where its surface does, stays for 2 L / c, and gains no energy."""
+    n, speed, gap = 16, 0.1, 4
+    h = 1 / n
+    c = math.sqrt(E / DENSITY)
+    start = gap * h / speed
+    scene = body_scene(
+        [gap * h, 0.0],
+        [1 + gap * h, 5 * h],
+        [n + 2 * gap, 5],
+        walls={"x_min": "separate", "x_max": "separate", "y_min": "slip", "y_max": "slip"},
+        material=jelly(poissons_ratio=0.0),
+        end=start + 4 / c,
+        frames=400,
+        safety=safety,
+        spacing=h,
+        velocity=[-speed, 0.0],
+    )
+    rows = [row for _, row in Solver(scene, backend_of("f64", 1)).frames()]
+    times = np.array([row.time for row in rows])
+    moving = np.array([row.linear_momentum[0] / row.mass / speed for row in rows])
+    energy = np.array([row.kinetic + row.elastic for row in rows])
+    assert abs(times[np.argmax(moving > -0.999)] - start) * speed < 0.3 * h
+    contact = times[np.argmax(moving > moving[-1] - 0.02)] - times[np.argmax(moving > -0.98)]
+    assert contact == pytest.approx(2 / c, rel=0.1)
+    assert 0.95 < moving[-1] <= 1
+    assert energy.max() <= energy[0] * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("word", ["separate", "slip"])
+def test_a_block_rests_on_a_floor(backend_of: Callable, word: str) -> None:
+    """It comes to rest where its weight balances the push: within a hundredth of a cell of the floor."""
+    scene = body_scene(
+        [0.5, 0.21],
+        [1.1, 0.61],
+        [16, 10],
+        walls={"y_min": word, "y_max": "separate", "x_min": "separate", "x_max": "separate"},
+        gravity=[0.0, -9.81],
+        material=jelly(youngs_modulus=1e6),
+        end=4.0,
+        frames=4,
+        precision="f32",
+    )
+    frame, row = list(Solver(scene, backend_of("f32", 1)).frames())[-1]
+    lowest = frame.position[:, 1].min()
+    assert row.kinetic < 1e-3 * row.mass * 9.81 * 0.4
+    assert abs(lowest - H / 4) < 0.02 * H
+
+
+@pytest.mark.parametrize("law", ["neo_hookean", "fixed_corotated"])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_no_state_is_stiffer_than_its_bound(backend_of: Callable, law: str, dimension: int) -> None:
+    """The eigenvalues of dP/dF, P = tau F^-T, by central differences, against `reference_modes`; exact at rest."""
+    member = laws()[law]
+    parameters = member.parameters(law=law, density=DENSITY, youngs_modulus=E, poissons_ratio=NU)
+    backend_of("f64", 1)
+    probe = LawProbe(member, parameters, dimension)
+    rng = np.random.default_rng(1)
+    d, n, strain = dimension, 200, 1e-6
+    F = np.eye(d) + rng.uniform(-0.5, 0.5, (n, d, d)) * rng.uniform(0, 1, (n, 1, 1))
+    F = np.concatenate([np.eye(d)[None], F[np.linalg.det(F) > 0.1]])
+    internal = probe.at_rest(len(F))
+
+    def first_piola(F: np.ndarray) -> np.ndarray:
+        return probe(F, internal).tau[:, :d, :d] @ np.linalg.inv(F).transpose(0, 2, 1)
+
+    columns = [
+        (first_piola(F + strain * unit) - first_piola(F - strain * unit)).reshape(len(F), d * d) / (2 * strain)
+        for unit in unit_gradients(d)
+    ]
+    stiffest = np.linalg.eigvals(np.stack(columns, axis=2)).real.max(axis=1)
+    J, stretch = np.linalg.det(F), np.linalg.svd(F, compute_uv=False)[:, 0]
+    bounds = np.array(
+        [
+            max(
+                mode.stiffness
+                for mode in member([parameters], d).reference_modes(
+                    parameters, StateBound(min(J, 1.0), max(J, 1.0), max(s, 1.0) ** 2)
+                )
+            )
+            for J, s in zip(J, stretch, strict=True)
+        ]
+    )
+    assert bounds[0] == pytest.approx(d * LAMBDA + 2 * MU)
+    assert stiffest[0] == pytest.approx(bounds[0], rel=1e-6)
+    assert (stiffest <= bounds * (1 + 1e-6)).all()
+
+
+def bars(n: int, shift: float, *, precision: str = "f64", solids: str = "total", frames: int = 400) -> Scene:
+    """Return two equal bars of length 1, n cells long, four cells apart, that fly at each other, at 0.05 m/s each."""
+    h, width, gap = 1 / n, 0.25, 4
+    time = gap * h / 0.1 + 5 / math.sqrt(E / DENSITY)
+    return scene_of(
+        domain={"size": [2 + 12 * h, width + 16 * h], "spacing": h},
+        time={"end": time, "frames": frames},
+        solver={"solids": solids, "precision": precision},
+        output={"fields": ["velocity"]},
+        bodies=[
+            {
+                "name": f"bar {k}",
+                "material": jelly(poissons_ratio=0.0),
+                "shape": {
+                    "box": {
+                        "min": [4 * h + k * (1 + gap * h), (8 + k * shift) * h],
+                        "max": [4 * h + k * (1 + gap * h) + 1, (8 + k * shift) * h + width],
+                    }
+                },
+                "velocity": [0.05 * (1 - 2 * k), 0.0],
+            }
+            for k in (0, 1)
+        ],
+    )
+
+
+@pytest.mark.parametrize("shift", [0.0, pytest.param(0.25, marks=pytest.mark.slow)])
+def test_bars_collide_for_as_long_as_a_wave_takes(backend_of: Callable, shift: float) -> None:
+    """They meet within 0.3 cells of touching, stay for 2 L / c, and part at nearly the speed of approach."""
+    n, speed = 32, 0.05
+    scene = bars(n, shift)
+    found = list(Solver(scene, backend_of("f64", 1)).frames())
+    times = np.array([row.time for _, row in found])
+    moving = np.array([frame.velocity[frame.body == 0, 0].mean() / speed for frame, _ in found])
+    energy = np.array([row.kinetic + row.elastic for _, row in found])
+    touch = 4 / n / (2 * speed)
+    assert 0 < (touch - times[np.argmax(moving < 0.999)]) * 2 * speed * n < 0.3
+    contact = times[np.argmax(moving < moving[-1] + 0.02)] - times[np.argmax(moving < 0.98)]
+    assert contact == pytest.approx(2 / math.sqrt(E / DENSITY), rel=0.1)
+    assert -1 <= moving[-1] < -0.95
+    assert energy.max() <= energy[0] * (1 + 1e-9)
+    momentum = np.array([row.linear_momentum for _, row in found])
+    assert np.abs(momentum).max() < 1e-12 * found[0][1].mass * speed
+    # The forces are central; the bars' own part is of second order.
+    turning = np.array([row.angular_momentum[0] for _, row in found])
+    assert np.abs(turning - turning[0]).max() < 1e-6 * found[0][1].mass * speed
+
+
+def test_particles_of_two_bodies_push_as_the_formula_says(backend_of: Callable) -> None:
+    """A step of stirred bodies that overlap, against all pairs in plain numpy; the grid's part is taken from a copy."""
+    scene = bars(8, 0.3)
+    spacing = scene.domain.spacing
+
+    def speeds(gap: float) -> tuple[Solver, dict[str, np.ndarray], np.ndarray]:
+        solver = Solver(scene, backend_of("f64", 1))
+        stirred(solver, 2)
+        group = solver.groups[0]
+        x = group.x.to_numpy()
+        x[group.body.to_numpy() == 1, 0] += gap
+        group.x.from_numpy(x)
+        solver.state_was_replaced()
+        before = group.to_numpy()
+        solver.step(1e-4)
+        after = group.to_numpy()
+        return solver, before, (after["v"] - before["v"])[np.argsort(after["id"])] * 1.0
+
+    solver, before, near = speeds(-4.3 * spacing)
+    *_, far = speeds(0.0)
+    sample = solver._particles[0]
+    s, k = sample.volume**0.5, (E * sample.volume) / (2 * sample.volume**0.5 * spacing)
+    force = np.zeros_like(before["x"])
+    for p in range(len(force)):
+        for q in np.flatnonzero(before["body"] != before["body"][p]):
+            line = before["x"][p] - before["x"][q]
+            n = line / np.linalg.norm(line)
+            reach = sum(s * np.linalg.norm(before["deformation"][i].T @ n) for i in (p, q))
+            force[p] += k * max(0.75 * reach - np.linalg.norm(line), 0.0) * n
+    assert (np.abs(force).max(axis=1) > 0).sum() > 10
+    # What the grid does with an impulse is linear: the difference is that of the impulses, spread by the transfers.
+    impulse = force / sample.mass * 0.5e-4
+    order = np.argsort(before["id"])
+    total = (near - far).sum(axis=0)
+    assert np.abs(total).max() < 1e-9 * np.abs(impulse).sum()
+    own = before["body"][order] == 0
+    assert np.allclose((near - far)[own].sum(axis=0), impulse[order][own].sum(axis=0), rtol=1e-9)
+
+
+def small_run(backend: Backend, *, bodies: int, batched: bool) -> tuple[np.ndarray, list]:
+    """Return the last positions, and the ledger, of two bars that meet, or of a body that falls on a floor, turning."""
+    if bodies == 2:
+        scene = bars(16, 0.25, precision=backend.precision, frames=5)
+        found = list(build_engine(scene, backend, batched=batched).frames(lambda: False))
+        return found[-1][0].position, [row for _, row in found]
+    scene = body_scene(
+        [0.4, 0.2],
+        [0.9, 0.6],
+        [16, 10],
+        gravity=[0.5, -9.81],
+        end=0.3,
+        frames=3,
+        precision=backend.precision,
+        velocity_gradient=[[0.0, 2.0], [-2.0, 0.0]],
+    )
+    found = list(build_engine(scene, backend, batched=batched).frames(lambda: False))
+    return found[-1][0].position, [row for _, row in found]
+
+
+@pytest.mark.parametrize("bodies", [1, 2])
+def test_batches_have_the_bytes_of_a_solver(backend_of: Callable, bodies: int) -> None:
+    expected, rows = small_run(backend_of("f32", 1), bodies=bodies, batched=False)
+    for threads in (1, 3):
+        found, own = small_run(backend_of("f32", threads), bodies=bodies, batched=True)
+        assert found.tobytes() == expected.tobytes()
+        assert own == rows
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"bodies": [("body", jelly()), ("other", jelly())]}, "it must be 0.3 m"),
+        (
+            {"bodies": [("body", jelly()), ("other", jelly(law="fixed_corotated"))]},
+            "is for bodies of one law; found fixed_corotated and neo_hookean",
+        ),
+        ({"bodies": [("body", {"law": "fluid", "density": 1e3, "bulk_modulus": 1e4})]}, "follows fluid"),
+        ({"deformation": [[1.1, 0.0], [0.0, 1.0]]}, "must be left out with solver.solids"),
+        ({"low": 0.05}, "begins 0.05 m from the wall y_min, which never lets go"),
+        ({"low": 0.3, "word": "stick"}, '"body" begins 0.3 m away, and would meet it without friction'),
+        ({"walls": "zeroed"}, 'needs walls = "folded"'),
+    ],
+)
+def test_what_cannot_be_on_that_grid_is_refused(changes: dict, said: str) -> None:
+    low = changes.get("low", 0.0)
+    bodies = [
+        {
+            "name": name,
+            "material": material,
+            "shape": {"box": {"min": [0.3 + 0.6 * k, low], "max": [0.7 + 0.6 * k, low + 0.4]}},
+            **({"deformation": changes["deformation"]} if "deformation" in changes else {}),
+        }
+        for k, (name, material) in enumerate(changes.get("bodies", [("body", jelly())]))
+    ]
+    with pytest.raises(InputError, match=said):
+        scene_of(
+            domain={"size": [2.0, 1.0], "spacing": H, "walls": {"y_min": changes.get("word", "slip")}},
+            time={"end": 1.0, "frames": 1},
+            solver={"solids": "total", "walls": changes.get("walls", "folded")},
+            bodies=bodies,
+        )
