@@ -143,7 +143,7 @@ def percent(share: float) -> str:
 
 
 def flow_width(facts: SceneFacts, body: BodyFacts) -> float:
-    """Return half of the longest wave of a flow along walls that a shape allows, m: pi over its wave number.
+    """Return half of the longest wave of a flow along walls that a body allows, m: pi over its wave number.
 
     Across a box it is its width; twice that with "stick" on one side only, as of a film on a floor. Axes along which it
     spans the domain without "stick" are endless.
