@@ -16,6 +16,7 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import LoadedScene, parse_scene
+from mpmcli.scene.bounds import scene_bounds
 
 SCENES = [tomllib.loads(path.read_text(encoding="utf-8")) for path in sorted((ROOT / "configs").glob("*.toml"))]
 NUMBERS = st.one_of(
@@ -81,6 +82,17 @@ def scene_of(gravity: list, thickness: float = 0.5) -> dict[str, Any]:
 def test_an_infinite_gravity_is_refused_in_a_sentence() -> None:
     with pytest.raises(InputError, match=r"no run is possible: .* accelerations up to inf m/s\^2 .* step is 0 s"):
         check_scene(parsed(scene_of(["2**(t*1e9)", -9.8])))
+
+
+@pytest.mark.parametrize("strength", [1e-20, 1.0, 1e160, 1e308])
+def test_only_the_direction_of_gravity_makes_the_height(strength: float) -> None:
+    """The top of the box, 0.5 m, above the floor; along the diagonal its far corner, (0.5, 0.5), above (0, 0)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pull = f"-{strength} * exp(-t)"
+        down, aslant = (scene_bounds(parsed(scene_of(g)).scene) for g in ([0.0, pull], [pull, pull]))
+    assert down.height == pytest.approx(0.5, rel=1e-12)
+    assert aslant.height == pytest.approx(0.5 * 2**0.5, rel=1e-12)
 
 
 def test_a_box_of_no_thickness_is_checked() -> None:

@@ -19,10 +19,13 @@ class Arrival:
     Attributes:
         time: first contact, s; 0 if it is in contact at the start, infinite if there is no contact.
         speed: largest closing speed, m/s, over the walls and bodies that it meets.
+        impact: velocity in the first contact after the start, (d,), m/s: relative to a wall, or half of that to a body;
+            empty if there is none in the run.
     """
 
     time: float
     speed: float
+    impact: tuple[float, ...] = ()
 
 
 def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> list[Arrival]:
@@ -58,7 +61,16 @@ def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> li
         met = np.isfinite(times)
         speeds = [speed for time, speed in falls if math.isfinite(time)]
         speeds += np.linalg.norm(relative[met], axis=1).tolist()
-        found.append(Arrival(min([time for time, _ in falls] + times.tolist()), max(speeds, default=0.0)))
+        ends = np.array([time for time, _ in falls] + times.tolist())
+        # What touches it from the start, such as a wall along which it flies, is no impact.
+        later = np.where(ends > 0, ends, np.inf)
+        first = int(np.argmin(later))
+        impact = np.zeros(0)
+        if later[first] <= scene.time.end:
+            # The axes of the lower walls, then those of the upper ones; then the bodies.
+            axis, body = first % len(lower), first - len(falls)
+            impact = relative[body] / 2 if body >= 0 else falls[first][1] * np.eye(len(lower))[axis]
+        found.append(Arrival(float(ends.min()), max(speeds, default=0.0), tuple(impact.tolist())))
     return found
 
 

@@ -13,6 +13,7 @@ from mpmcli.check.result_ledger import check_ledger
 from mpmcli.check.result_motion import MomentumCheck, MotionCheck
 from mpmcli.check.result_order import check_order, frames_expected
 from mpmcli.check.result_state import StateCheck
+from mpmcli.check.result_stretch import StretchCheck
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -33,6 +34,7 @@ TOLD = {
     "volume_ratio_min": "smallest J",
     "volume_ratio_max": "largest J",
     "volume_error": "lasting volume error",
+    "neighbour_distance": "farthest neighbours, cells",
     "step_min": "smallest step, s",
     "step_max": "largest step, s",
 }
@@ -171,7 +173,7 @@ def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindin
     # Only a file can have been changed since the run.
     stored = opened.kind != "memory"
     state, motion = StateCheck(header, findings, stored=stored), MotionCheck(header, findings)
-    agreement = AgreementCheck(header, findings)
+    agreement, stretch = AgreementCheck(header, findings), StretchCheck(header, findings)
     momentum = MomentumCheck(header, findings, opened.entries[0].row)
     size = 0
     before: tuple[int, int] | None = None
@@ -198,12 +200,14 @@ def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindin
                 if stored:
                     agreement.check(number, frame, row, J, steps)
                 momentum.check(number, frame, row)
+                stretch.check(number, frame)
             else:
                 momentum.lost()
         before = (number, frame.step)
     return {
         "displacement_ratio": motion.largest_ratio,
         "deformation_max": motion.deformation,
+        "neighbour_distance": stretch.largest,
         "momentum_drift": momentum.drift,
         "momentum_frames": momentum.frames,
         "ledger_difference": agreement.largest if stored else None,

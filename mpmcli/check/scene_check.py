@@ -7,6 +7,7 @@ from pathlib import Path
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import SEVERITIES, Finding, gravest_first, passes
 from mpmcli.check.forecast import Forecast, forecast_of
+from mpmcli.check.loss_rules import loss_findings
 from mpmcli.check.material_rules import material_findings
 from mpmcli.check.output_rules import output_findings
 from mpmcli.check.probe import Probe
@@ -111,6 +112,7 @@ def check_scene(
         *step_findings(facts),
         *shape_findings(facts),
         *material_findings(facts),
+        *loss_findings(facts),
         *rounding_findings(facts),
         *output_findings(facts, plan, forecast, directory),
     ]

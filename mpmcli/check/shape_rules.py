@@ -1,12 +1,16 @@
-"""Rules on resolution: thin bodies, gaps between bodies, distance from walls, and particles per cell."""
+"""Rules on resolution: thin bodies, gaps between bodies, distance from walls, particles per cell, and stretch."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
 
 from mpmcli.check.distance import close_pairs
-from mpmcli.check.facts import SceneFacts
+from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
+from mpmcli.check.result_stretch import STRETCHED, TORN
+from mpmcli.scene.bounds import body_points
+from mpmcli.scene.initial import initial_deformation, initial_motion, moves_unevenly
 from mpmcli.scene.quantity import AXES
 
 # Cells across a body below which internal motion is not resolved. The stencil is three nodes wide, so that with three
@@ -29,6 +33,7 @@ def shape_findings(facts: SceneFacts) -> Iterator[Finding]:
     yield from _gaps(facts)
     yield from _walls(facts)
     yield from _particles(facts)
+    yield from _stretched(facts)
 
 
 def _thin(facts: SceneFacts) -> Iterator[Finding]:
@@ -124,3 +129,51 @@ def _particles(facts: SceneFacts) -> Iterator[Finding]:
                 count,
                 body.name,
             )
+
+
+def _stretched(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield the distance to which the start of an elastic body will pull its particles."""
+    d = facts.scene.dimension
+    for body in facts.bodies:
+        if not body.law.coherent or body.law.projects or body.law.deformation == "J":
+            continue
+        count = body.body.particles_per_cell
+        stretch = _stretch_to_come(facts, body)
+        cells = stretch * count ** (-1 / d)
+        # Of one particle per cell there is a finding anyway.
+        if not STRETCHED < cells < math.inf or stretch * STRETCHED <= 1:
+            continue
+        more = f"Set particles_per_cell = {math.ceil(stretch / STRETCHED) ** d}, or start" if stretch < 10 else "Start"
+        yield Finding(
+            "warning" if cells > TORN else "note",
+            "stretch",
+            f'The start of body "{body.name}" stretches it by about {stretch:.3g}, so that its particles come to stand '
+            f"{cells:.3g} cells apart: above {STRETCHED:g} the grid hardly sees what moves between them, noise grows, "
+            f"and above {TORN:g} it tears.",
+            f"{more} it slower or less deformed.",
+            cells,
+            body.name,
+        )
+
+
+def _stretch_to_come(facts: SceneFacts, body: BodyFacts) -> float:
+    """Return the stretch of distances, as they are at the start, that the start of an elastic body makes.
+
+    Relaxing undoes the initial deformation, which is 1 over its smallest stretch. Matter that moves at v relative to
+    the body, its rotation left out, strains it by v / c, c = sqrt(E / density), where waves of v meet its ends.
+    """
+    stretch, material = 1.0, body.body.material
+    points = body_points(body.body)
+    if body.body.deformation is not None:
+        F = initial_deformation(body.body, points, facts.scene.domain)
+        F = F[np.isfinite(F).reshape(len(F), -1).all(1)]
+        least = np.linalg.svd(F, compute_uv=False).min(initial=math.inf) if F.ndim == 3 else math.inf
+        stretch = max(1.0, 1 / float(least)) if least > 0 else math.inf
+    modulus = getattr(material, "youngs_modulus", body.stiffness)
+    moving = body.body.velocity_gradient is not None or moves_unevenly(body.body)
+    if not moving or not modulus > 0:
+        return stretch
+    C = initial_motion(body.body, points)[1].mean(0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        speed = np.linalg.norm((points - points.mean(0)) @ (C + C.T) / 2, axis=1).max()
+    return stretch * (1 + float(speed) / math.sqrt(modulus / material.density))

@@ -5,14 +5,11 @@ from collections.abc import Iterator
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import Finding
-from mpmcli.check.forecast import wave_loss
 from mpmcli.stability.transfer_factors import step_inertia
 
 # Ratio to the stable step below which a step is reported: four times the cost and loss of energy (docs/hard-cases.md,
 # H19).
 SMALL_STEP = 0.25
-# Share of energy, lost in the run by the longest wave across the thinnest body, above which it is reported.
-NOTED_LOSS = 0.1
 # Consequence of a step above each limit.
 LONE = "above it a lone particle, and with it the run, is unstable"
 CONSEQUENCE = {
@@ -24,11 +21,10 @@ CONSEQUENCE = {
 
 
 def step_findings(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield the findings on time.step, and on the energy lost by the steps."""
+    """Yield the findings on time.step."""
     step = facts.scene.time.step
     if step != "auto":
         yield from _asked(facts, step)
-    yield from _dissipation(facts)
 
 
 def _asked(facts: SceneFacts, step: float) -> Iterator[Finding]:
@@ -87,26 +83,3 @@ def _courant(facts: SceneFacts, step: float) -> str:
         return ""
     limit = math.sqrt(step_inertia(facts.scene.solver) / facts.scene.dimension)
     return f" (Courant number c dt / h = {limit * step / rest.value:.3f}, the limit is {limit:.3f})"
-
-
-def _dissipation(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield the loss of energy by the transfers, unless plastic flow or viscosity of the body dissipates more."""
-    step = facts.taken(facts.step_at_start)
-    h, end = facts.scene.domain.spacing, facts.scene.time.end
-    # The loss per step is of order (k h)^4, with PIC (k h)^2, in twice as many steps.
-    part = "a half" if facts.scene.solver.transfer == "pic" else "an eighth"
-    for body in facts.bodies:
-        rate = wave_loss(body.thickness, h, step, facts.scene.solver)
-        lost = -math.expm1(-rate * end)
-        if lost < NOTED_LOSS or body.own_loss > rate:
-            continue
-        yield Finding(
-            "note",
-            "dissipation",
-            f"At a step of {step:.3g} s the transfers take {100 * -math.expm1(-rate):.2g} % of the energy of a wave "
-            f'across body "{body.name}", {body.thickness / h:.3g} cells thick, in a second, and '
-            f"{100 * lost:.2g} % in the run.",
-            f"The largest stable step, {facts.step_at_start:.3g} s, loses least; half the spacing loses {part}.",
-            rate,
-            body.name,
-        )

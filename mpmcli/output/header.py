@@ -26,11 +26,13 @@ class LawFacts(Protocol):
         name: the word for it in a scene.
         deformation: what a particle stores, "J" or "F".
         coherent: whether the material resists being pulled apart.
+        projects: whether it may yield or flow.
     """
 
     name: str
     deformation: str
     coherent: bool
+    projects: bool
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class LawHeader:
     name: str
     deformation: str
     coherent: bool
+    # Of laws in older files it is not known.
+    projects: bool = True
 
 
 @dataclass(frozen=True)
@@ -123,7 +127,9 @@ class RunHeader:
                 "size": list(scene.domain.size),
                 "bodies": [body.name for body in scene.bodies],
                 "materials": [law.name for law in laws],
-                "laws": [{"deformation": law.deformation, "coherent": law.coherent} for law in laws],
+                "laws": [
+                    {"deformation": law.deformation, "coherent": law.coherent, "projects": law.projects} for law in laws
+                ],
                 "precision": backend["precision"],
                 "backend": dict(backend),
                 "scene": text,

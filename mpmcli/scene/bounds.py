@@ -15,6 +15,9 @@ POINTS = {2: 65, 3: 17}
 # Particles up to which a body is looked at where its particles are; a larger one on a lattice.
 MOST_LOOKED_AT = 500_000
 
+# Numbers whose squares, and sums of a few, are numbers.
+SQUARED = (1e-150, 1e150)
+
 
 def scene_bounds(scene: Scene) -> SceneBounds:
     """Return bounds on the speed, the depth and the density of a scene.
@@ -87,6 +90,10 @@ def body_places(body: Body, index: int, h: float) -> np.ndarray:
 
 
 def _height(scene: Scene, corners: np.ndarray, gravity: np.ndarray) -> float:
+    largest = float(np.max(np.abs(gravity)))
+    if not SQUARED[0] < largest < SQUARED[1]:
+        # Only its direction counts, and its squares would leave the range of numbers.
+        gravity = gravity / largest
     down = gravity / float(np.linalg.norm(gravity))
     floor = np.max(_corners(np.array(scene.domain.origin), np.array(scene.domain.upper)) @ down)
     return max(0.0, float(floor - np.min(corners @ down)))

@@ -1,5 +1,7 @@
 """Factors of the transfer schemes: moments of the splines, inertia for the stable step, and loss of energy per step."""
 
+import math
+
 from mpmcli.scene.schema import SolverSettings
 
 # h^2 over the second moment of the spline, D = sum w (x_i - x)^2, by which APIC divides (Jiang et al. 2015;
@@ -9,6 +11,13 @@ INVERSE_MOMENT = {"quadratic": 4, "cubic": 3}
 # A step of APIC removes this times (k h)^4 of the energy of a wave of wave number k: the leading term of the spectrum
 # of a step with two and three particles per cell and axis (docs/theory.md, 2.4).
 APIC_LOSS = {"quadratic": 0.024, "cubic": 0.047}
+
+# Of an impact, measured on bars of 8 to 64 cells at 0.0005 to 0.1 of their wave speed, in pairs and on walls
+# (docs/theory.md, 2.5): -ln(1 - loss) = IMPACT_LOSS sqrt(min(1 / M, n / SLOW)) / (n C) in n cells, at the Mach number M
+# of a bar and the Courant number C of a step.
+IMPACT_LOSS, SLOW = 0.165, 1 / 14
+# The same with PIC over that with APIC, and the least that AFLIP leaves of it.
+IMPACT_OF_PIC, IMPACT_OF_AFLIP = 1.5, 0.12
 
 
 def affine_moment(settings: SolverSettings) -> float:
@@ -37,3 +46,25 @@ def loss_per_step(settings: SolverSettings, kh: float) -> float:
     if settings.transfer == "pic":
         return square / INVERSE_MOMENT[settings.kernel]
     return (1 - (settings.flip or 0.0)) * APIC_LOSS[settings.kernel] * square * square
+
+
+def impact_loss(settings: SolverSettings, cells: float, mach: float, courant: float) -> float:
+    """Return the share of its energy that a head-on impact of elastic bodies loses; right within a factor of 2.
+
+    Bodies meet about two cells early, where their kernels couple them softly. The nodes between them see the jump of
+    velocity in each step until the gap is closed: the loss counts the steps of that time, and the layers that lose are
+    about a cell thick whatever the length of the bodies (docs/theory.md, 2.5).
+
+    Args:
+        settings: transfer and kernel.
+        cells: length of each body in the direction of the impact, in cells; of one before a wall.
+        mach: speed of each relative to their mean, or to the wall, over their wave speed.
+        courant: wave speed times step over spacing.
+    """
+    factor = APIC_LOSS[settings.kernel] / APIC_LOSS["quadratic"]
+    if settings.transfer == "pic":
+        factor *= IMPACT_OF_PIC
+    elif settings.transfer == "aflip":
+        factor *= max(1 - (settings.flip or 0.0), IMPACT_OF_AFLIP)
+    slowness = min(1 / mach, cells / SLOW) if mach > 0 else cells / SLOW
+    return -math.expm1(-factor * IMPACT_LOSS * math.sqrt(slowness) / (cells * courant))
