@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from command import SCENE, run_here
 
+from mpmcli.materials.volume_relaxation import FULL
 from mpmcli.output import open_result
 
 FALL = """\
@@ -35,7 +36,8 @@ def scene(tmp_path: Path) -> Path:
 def test_a_flat_fall_ends_well_with_all_defaults(scene: Path) -> None:
     """Water falls flat on a separating floor, and its jets climb walls and run along the ceiling.
 
-    Energy is lost only (9.9: 1e-3), and J stays near 1: droplets along the walls must not pump either up.
+    Energy is lost only (9.9: 1e-3), and J stays near 1 where there is pressure: droplets along the walls must not pump
+    either up. Water that opened remembers at most what the grid sees of stencils that are filled.
     """
     scene.write_text(FALL, encoding="utf-8")
     outcome = run_here("simulate", scene, "-o", scene.parent / "result", "--quiet")
@@ -44,7 +46,7 @@ def test_a_flat_fall_ends_well_with_all_defaults(scene: Path) -> None:
     energy = np.array([row.energy for row in ledger])
     assert (energy - np.minimum.accumulate(energy)).max() <= 1e-3 * energy[0]
     assert min(row.volume_ratio_min for row in ledger) > 0.7
-    assert max(row.volume_ratio_max for row in ledger) < 1.3
+    assert max(row.volume_ratio_max for row in ledger) < 1 / FULL
 
 
 def test_positions_far_from_zero_stay_apart(scene: Path) -> None:

@@ -157,7 +157,7 @@ exponent = 1.0
 viscosity = 0.0
 bulk_viscosity = 0.0
 tension_cutoff = true
-volume_correction = false
+volume_correction = true
 
 [output]
 fields = ["velocity", "density", "pressure"]

@@ -161,7 +161,7 @@ def _volume_error(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) ->
             f"From frame {last[0][0]} to the end liquids and grains fill {100 * abs(lasting):.3g} % "
             f"{'more' if lasting > 0 else 'less'} than the volume of their particles"
         )
-        fix = "Set volume_correction = true in a fluid, or refine the domain."
+        fix = "Leave volume_correction = true in a fluid, or refine the domain."
         findings.add("note", "volume-error", last[0][0], what, fix, value=lasting)
     return lasting
 

@@ -132,8 +132,10 @@ def _particles(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _stretched(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield the distance to which the start of an elastic body will pull its particles."""
+    """Yield the distance to which the start of an elastic body will pull its particles, where they move on the grid."""
     d = facts.scene.dimension
+    if facts.scene.solver.solids == "total":
+        return
     for body in facts.bodies:
         if not body.law.coherent or body.law.projects or body.law.deformation == "J":
             continue

@@ -90,6 +90,7 @@ class Law(ABC):
         deformation: stored deformation, "J" (volume ratio) or "F" (deformation gradient).
         projects: whether `respond` may change the state.
         relaxes: whether `relax` moves the volume towards what the grid sees (docs/theory.md, 5.11).
+        grows_by_constants: whether `grown` reads the constants.
         stiffness_parameters, viscosity_parameters: names of the parameters that set the stiffness and the viscosity;
             messages name the first that is a positive number. A law that calls them otherwise lists its own.
         coherent: whether the material resists being pulled apart, so that `check` reports a J far above 1.
@@ -109,6 +110,7 @@ class Law(ABC):
     deformation: ClassVar[Literal["J", "F"]]
     projects: bool = False
     relaxes: bool = False
+    grows_by_constants: bool = False
     coherent: ClassVar[bool] = False
     flows: ClassVar[bool] = False
     elastic: ClassVar[bool] = False
@@ -234,6 +236,15 @@ class Law(ABC):
         raise NotImplementedError
 
     @ti.func
+    def grown(self, J_minus_1: float, growth: float, constants: ti.template()):
+        """Return J - 1 after J grew by the factor 1 + growth in a step, for laws that keep J.
+
+        Args:
+            constants: as of `respond` where `grows_by_constants`, else a single unused 0.
+        """
+        return J_minus_1 + (growth + growth * J_minus_1)
+
+    @ti.func
     def relax(
         self,
         deformation: ti.template(),
@@ -243,7 +254,9 @@ class Law(ABC):
         time: float,
         constants: ti.template(),
     ):
-        """Return (deformation, internal, |change of the logarithm of the volume|), moved towards what the grid sees.
+        """Return (deformation, internal, change), moved towards what the grid sees.
+
+        The change is that of the logarithm of the volume, without sign, as far as it changes the stiffness.
 
         Only laws with `relaxes` have it. It changes no momentum and no mass.
 

@@ -81,7 +81,8 @@ class RunHeader:
         gravity: (d,), m/s^2; None where it depends on time.
         steady_gravity: (d,), m/s^2, with 0 for each entry that depends on time; None where not known.
         driven: whether forces act, or gravity depends on time: energy and momentum have a source then.
-        keeps_spin: whether the transfers conserve angular momentum, as those of APIC do on the grid of places.
+        total: whether elastic bodies are on the grid of their state at rest.
+        keeps_spin: whether the transfers conserve angular momentum, as those of APIC do where bodies move on the grid.
         sticking: per axis, whether a face normal to it sticks.
         bodies: in the order of their labels in the frames.
         laws: in the order of the labels in the frames.
@@ -99,6 +100,7 @@ class RunHeader:
     gravity: np.ndarray | None
     steady_gravity: np.ndarray | None
     driven: bool
+    total: bool
     keeps_spin: bool
     sticking: tuple[bool, ...] | None
     bodies: tuple[BodyHeader, ...]
@@ -148,6 +150,7 @@ class RunHeader:
         gravity = domain.get("gravity", ())
         timed = any(isinstance(entry, str) for entry in gravity)
         steady = _vector([0.0 if isinstance(entry, str) else entry for entry in gravity], d)
+        total = solver.get("solids", _SOLIDS) == "total"
         return cls(
             stored=dict(stored),
             title=str(stored.get("title") or ""),
@@ -159,7 +162,8 @@ class RunHeader:
             gravity=None if timed else steady,
             steady_gravity=steady,
             driven=timed or bool(scene.get("forces")),
-            keeps_spin=solver.get("transfer", _TRANSFER) == "apic" and solver.get("solids", _SOLIDS) == "updated",
+            total=total,
+            keeps_spin=solver.get("transfer", _TRANSFER) == "apic" and not total,
             sticking=_sticking(domain.get("walls"), d),
             bodies=_bodies([str(name) for name in stored.get("bodies", ())], scene.get("bodies", []), d),
             laws=_laws(stored),

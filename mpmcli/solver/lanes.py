@@ -17,10 +17,10 @@ from mpmcli.solver.lane_state import (
     vector_of,
     zero_lanes,
 )
-from mpmcli.solver.particle_arrays import MASS, VOLUME
-from mpmcli.solver.particle_update import SMALLEST_J, deformed_gradient, deformed_volume
+from mpmcli.solver.particle_arrays import CONSTANTS, MASS, VOLUME
+from mpmcli.solver.particle_update import SMALLEST_J, deformed_gradient
 from mpmcli.solver.reference_grid import pulled_back, push_of_walls
-from mpmcli.solver.state_bounds import NOTHING, deformation_rate, volume_ratio
+from mpmcli.solver.state_bounds import NOTHING, deformation_rate, volume_growth, volume_ratio
 from mpmcli.solver.transfer import add_linear, centred, gather_linear, momentum, scatter_before, scatter_volume
 
 
@@ -152,6 +152,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
     gradients, rates = ti.Matrix.zero(float, LANES, ti.static(d * width)), ti.Vector.zero(float, LANES)
     moved, beyond, after = zero_lanes(d), ti.Vector.zero(float, LANES), zero_lanes(ti.static(stored_entries(group)))
     here = zero_lanes(ti.static(d if group.total else 1))
+    rows = zero_lanes(ti.static(group.table.n if group.law.grows_by_constants else CONSTANTS + 1))
     sharpest = NOTHING
     begin = first
     while begin < last:
@@ -164,6 +165,10 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 if ti.static(group.total):
                     here[c, lane] = group.x[p][c]
             load_deformation(group, p, lane, deformation)
+            if ti.static(group.law.grows_by_constants):
+                row = group.row(p)
+                for k in ti.static(range(row.n)):
+                    rows[k, lane] = row[k]
 
         for lane in range(LANES):
             base, distance = grid.scheme.spline.stencil(vector_of(x, 0, d, lane), grid.inverse_spacing)
@@ -210,7 +215,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 for i, j in ti.static(ti.ndrange(d, d)):
                     after[i * d + j, lane] = deformed[i, j]
             else:
-                after[0, lane] = deformed_volume(deformation[0, lane], C, dt)
+                after[0, lane] = group.law.grown(deformation[0, lane], volume_growth(C, dt), constants_of(rows, lane))
 
         for lane in range(count):
             p = begin + lane

@@ -126,7 +126,11 @@ class ParticleUpdate:
         elif ti.static(group.law.deformation == "F"):
             group.displacement_gradient[p] = deformed_gradient(group.displacement_gradient[p], C, dt)
         else:
-            group.J_minus_1[p] = deformed_volume(group.J_minus_1[p], C, dt)
+            growth = volume_growth(C, dt)
+            if ti.static(group.law.grows_by_constants):
+                group.J_minus_1[p] = group.law.grown(group.J_minus_1[p], growth, group.constants(p))
+            else:
+                group.J_minus_1[p] = group.law.grown(group.J_minus_1[p], growth, ti.Vector.zero(float, 1))
 
         # Position. Written so that a NaN is not sound; then it stays, and no later step writes outside the grid.
         sound = beyond <= 0.5 * self.grid.spacing
@@ -180,10 +184,3 @@ def deformed_gradient(H: ti.template(), C: ti.template(), dt: float):
             for j in ti.static(range(H.m)):
                 new[i, j] += rate * H[k, j]
     return new
-
-
-@ti.func
-def deformed_volume(J_minus_1: float, C: ti.template(), dt: float):
-    """Return J - 1 after a step: J grows by the factor det(I + dt C)."""
-    growth = volume_growth(C, dt)
-    return J_minus_1 + (growth + growth * J_minus_1)

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import taichi as ti
 
 from mpmcli.materials.law import Law
-from mpmcli.materials.volume_relaxation import FULL
+from mpmcli.materials.volume_relaxation import BESIDE, FULL
 from mpmcli.scene import Scene
 from mpmcli.solver.particle_arrays import MASS, VOLUME
 from mpmcli.solver.splines import PAD
+from mpmcli.solver.state_bounds import volume_ratio
 
 # Steps from one relaxation to the next.
 INTERVAL = 50
@@ -30,7 +31,7 @@ def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(),
         last: node of the upper walls per axis.
 
     Returns:
-        The change of the logarithm of its volume, without sign.
+        The change of the logarithm of its volume, without sign, as far as it changes its stiffness.
     """
     row = group.row(p)
     # Fraction of a cell that a node's mass fills, or its volume where nodes keep that.
@@ -42,13 +43,12 @@ def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(),
     held, least = held_around(x, grid, last)
     change = 0.0
     if least * scale > FULL:
+        seen = 1.0 / (held * scale)
+        opens = 0.0
+        if seen > volume_ratio(group, group.stored(p)):
+            opens = ti.select(held_beside(x, grid, last) > BESIDE * held, 1.0, 0.0)
         deformation, inner, change = group.law.relax(
-            group.stored(p),
-            group.inner(p),
-            1.0 / (held * scale),
-            ti.select(held_beside(x, grid, last) * scale > FULL, 1.0, 0.0),
-            time * grid.inverse_spacing,
-            group.constants(p),
+            group.stored(p), group.inner(p), seen, opens, time * grid.inverse_spacing, group.constants(p)
         )
         group.store(p, deformation, inner)
     return change

@@ -8,7 +8,7 @@ from mpmcli.scene import Scene
 from mpmcli.validation.case import Case, Frames, Level, Measure
 
 GRAVITY = 9.81
-WATER = {"law": "fluid", "density": 1000.0, "volume_correction": True}
+WATER = {"law": "fluid", "density": 1000.0}
 # What has come to rest fills the same volume to this fraction.
 TOLERANCE = 0.02
 
