@@ -41,7 +41,7 @@ MEASURES = (
         "Largest change of the linear momentum over the sum of m |v|.",
         bound=lambda n: 2e-14,
     ),
-    Measure("mass error", "", "Largest difference of the mass from density times volume.", bound=lambda n: 1e-13),
+    Measure("mass error", "", "Largest difference of the mass from density times volume.", bound=lambda n: 1e-12),
     Measure(
         "energy gain",
         "",

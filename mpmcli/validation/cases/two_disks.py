@@ -47,7 +47,7 @@ class TwoDisks(Case):
             "Largest angular momentum of all about their centre over the sum of m R |v|.",
             bound=lambda n: 1e-13,
         ),
-        Measure("centre of mass", "", "Largest way of the centre of mass over the radius.", bound=lambda n: 1e-13),
+        Measure("centre of mass", "", "Largest way of the centre of mass over the radius.", bound=lambda n: 5e-13),
         Measure(
             "energy gain",
             "",
