@@ -4,6 +4,7 @@ import mpm_reference as reference
 import numpy as np
 import pytest
 
+from mpmcli.validation.cases.channel import PULL, VISCOSITY, WIDTH, plugged, started
 from mpmcli.validation.cases.elliptical_drop import half_axis
 from mpmcli.validation.cases.sloshing import standing_wave_frequency
 from mpmcli.validation.transfer_loss import apic_factor
@@ -65,3 +66,26 @@ def test_apic_loses_as_the_reference_does() -> None:
     factor = apic_factor([k * h, k * h], np.array([-0.25, 0.25]))
     # The first step begins without the affine part; from then on the wave is multiplied.
     assert np.array(kept[1:]) / kept[:-1] == pytest.approx(factor, rel=1e-12)
+
+
+def test_a_started_flow_diffuses() -> None:
+    """u_t = g + nu u_yy with u = 0 at the walls and at the start, by explicit steps on 64 cells: second order."""
+    n = 64
+    y = np.linspace(0.0, WIDTH, n + 1)
+    dt, steps = 0.25 * (WIDTH / n) ** 2 / VISCOSITY, 2000
+    u = np.zeros(n + 1)
+    for _ in range(steps):
+        u[1:-1] += dt * (PULL + VISCOSITY * np.diff(u, 2) / (WIDTH / n) ** 2)
+    assert started(y, steps * dt) == pytest.approx(u, abs=2e-4 * u.max())
+
+
+@pytest.mark.parametrize("plug", [0.0, 0.4, 0.9])
+def test_a_plug_flows_as_much_as_the_formula_says(plug: float) -> None:
+    """Mean velocity g W^2/(12 nu) (1 - 3/2 b + b^3/2) between plates; stress above yield is viscous."""
+    y = (np.arange(20000) + 0.5) / 20000 * WIDTH
+    u = plugged(y, plug)
+    mean = PULL * WIDTH**2 / (12 * VISCOSITY) * (1 - 1.5 * plug + 0.5 * plug**3)
+    assert u.mean() == pytest.approx(mean, rel=1e-6)
+    slope = np.gradient(u, y)
+    beyond = np.maximum(PULL * np.abs(y - WIDTH / 2) - PULL * plug * WIDTH / 2, 0)
+    assert VISCOSITY * np.abs(slope) == pytest.approx(beyond, abs=1e-4 * PULL * WIDTH)

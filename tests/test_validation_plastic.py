@@ -1,5 +1,6 @@
 """What the validation cases of sand and snow compare with, against independent numbers."""
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -8,8 +9,17 @@ import pytest
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import parse_scene
 from mpmcli.solver.solver import Solver
+from mpmcli.validation import plastic_paths as paths
 from mpmcli.validation.cases import all_cases
-from mpmcli.validation.cases.snow_oedometer import DENSITY, DEPTH, PULL, confined_height, confined_stress
+from mpmcli.validation.cases.snow_oedometer import (
+    COMPRESSION,
+    DENSITY,
+    DEPTH,
+    HARDENING,
+    PULL,
+    confined_height,
+    confined_stress,
+)
 from mpmcli.validation.setting import Setting
 
 
@@ -35,6 +45,47 @@ def test_snow_under_its_own_weight_is_as_high_as_the_sum_of_its_stretches() -> N
     assert confined_height(DEPTH) == pytest.approx(height, rel=1e-6)
 
 
+@pytest.mark.parametrize("strain", [-0.03, 0.05])
+def test_hardened_metal_is_that_of_small_increments(strain: float) -> None:
+    """d tau = 2 mu (d e - d e_p) beyond yield, d e_p along the deviator with H d a = d q, in 20,000 Euler steps."""
+    total = math.log1p(strain)
+    e = np.array([0.0, 0.0, total]) / 20000
+    s, a, mu = np.zeros(3), 0.0, paths.MU
+    for _ in range(20000):
+        trial = s + 2 * mu * (e - e.mean())
+        q = math.sqrt(1.5) * float(np.linalg.norm(trial))
+        over = max(q - paths.YIELD - paths.HARDENING * a, 0.0) / (3 * mu + paths.HARDENING)
+        a += over
+        s = trial * (1 - 3 * mu * over / q)
+    tau = s + (paths.LAMBDA + 2 / 3 * mu) * total
+    assert np.diag(paths.hardened(np.diag([1, 1, 1 + strain]))) == pytest.approx(tau, rel=1e-9)
+    assert np.diag(paths.hardened(np.diag([1, 1 + strain]))) == pytest.approx(tau[1:], rel=1e-9)
+
+
+def test_damp_sand_is_at_the_limit_of_mohr_and_coulomb() -> None:
+    """In the plane (t1 - t2)/2 = c cos(phi) - (t1 + t2)/2 sin(phi), also where it is torn; nothing shears that."""
+    phi = math.radians(paths.FRICTION)
+    for tau in (paths.pressed(np.diag([1, 0.99])), paths.at_the_tip(np.diag([1.01, 1.01]))):
+        low, high = sorted(np.diag(tau))
+        strength = paths.COHESION * math.cos(phi) - (high + low) / 2 * math.sin(phi)
+        assert (high - low) / 2 == pytest.approx(strength, abs=1e-12 * paths.MU)
+
+
+@pytest.mark.parametrize("stretch", [0.99, 0.95])
+def test_packed_snow_is_that_of_the_shaft(stretch: float) -> None:
+    """J sigma along the axis over 2 mu + lambda: the shaft has the same law with other moduli."""
+    assert (paths.COMPRESSION, paths.SNOW_HARDENING) == (COMPRESSION, HARDENING)
+    known = confined_stress(np.array(stretch)) * stretch / confined_modulus()
+    found = paths.snow(np.diag([1, stretch]))[-1, -1] / (2 * paths.MU + paths.LAMBDA)
+    assert found == pytest.approx(float(known), rel=1e-6)
+
+
+def confined_modulus() -> float:
+    """Return 2 mu + lambda of the shaft, from its stress at a small strain, Pa."""
+    small = 1e-7
+    return float(-confined_stress(np.array(1 - small)) / small)
+
+
 @pytest.mark.slow
 def test_steep_sand_is_rejected_by_the_band_of_the_column(backend_of: Callable, record_property: Callable) -> None:
     """A friction angle of 63 degrees runs out to half of the lower end of the band (docs/theory.md, 10)."""
@@ -48,3 +99,17 @@ def test_steep_sand_is_rejected_by_the_band_of_the_column(backend_of: Callable, 
     error = case.measures[0]
     assert found["run-out"] < 1.5
     assert abs(found[error.name]) > error.bound(n)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("angle", [28.5, 31.5])
+def test_sand_of_another_friction_angle_runs_out_otherwise(backend_of: Callable, angle: float) -> None:
+    """5 % of the angle change the run-out by 7 %, which is beyond the bound about its first-order law."""
+    case, setting = all_cases()["sand_column_2"], Setting()
+    n = case.levels["coarse"][0]
+    tables = case.scene_tables(n, setting)
+    tables["bodies"][0]["material"]["friction_angle"] = angle
+    asked = parse_scene(tables, laws=parameter_models()).scene
+    found = case.measure(n, asked, Solver(asked, backend_of("f64")).frames())
+    refined = next(measure for measure in case.measures if measure.name == "run-out against refinement")
+    assert abs(found[refined.name]) > refined.bound(n)

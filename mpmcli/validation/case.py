@@ -26,6 +26,11 @@ def unbounded(n: int) -> float:
     return math.inf
 
 
+def rounded(n: int) -> float:
+    """Return what most values may come to by rounding in single precision."""
+    return 1e-4
+
+
 @dataclass(frozen=True)
 class Measure:
     """A scalar that a case computes from the frames of a run.
@@ -40,6 +45,8 @@ class Measure:
         expected: the theoretical order, shown in the report; None if there is none.
         order_to: the finest resolution used for the order; None for all. At finer ones another error dominates, as the
             note of the case explains.
+        single: (n) -> the |value| that rounding alone may make in single precision, where a larger one may be 1.2
+            times that of double precision.
     """
 
     name: str
@@ -49,6 +56,7 @@ class Measure:
     order: float | None = None
     expected: float | None = None
     order_to: int | None = None
+    single: Callable[[int], float] = rounded
 
     def has_order_at(self, n: int) -> bool:
         """Return whether resolution n is used for the order."""

@@ -9,9 +9,8 @@ from mpmcli.validation.matrix import Run, label_of
 from mpmcli.validation.run_result import RunResult
 from mpmcli.validation.setting import Setting
 
-# Largest ratio of f32 to f64 errors. It is checked for f64 errors above SINGLE_FLOOR, where rounding is negligible.
+# Largest ratio of values in f32 to those in f64, where those are above rounding (`Measure.single`).
 SINGLE_RATIO = 1.2
-SINGLE_FLOOR = 1e-4
 
 SINGLE = replace(Setting(), precision="f32")
 
@@ -117,17 +116,20 @@ def _order_check(measure: Measure, default: dict[int, RunResult]) -> Check | Non
 
 
 def _single_checks(case: Case, run: Run, double: RunResult | None, single: RunResult) -> list[Check]:
-    name = case.measures[0].name
-    if double is None or not double.finished or double.error(name) <= SINGLE_FLOOR:
+    if double is None or not double.finished:
         return []
-    bound, subject = f"{SINGLE_RATIO:g}", f"f32 / f64, {name}"
     if not single.finished:
         sentence = f"At n = {run.n} the run in {label_of(run.setting)} {_ending(single)}"
-        return [Check(subject, run.setting, run.n, None, bound, False, sentence)]
-    ratio = single.error(name) / double.error(name)
-    passed = ratio <= SINGLE_RATIO
-    sentence = f"At n = {run.n} the {name} in f32 is {ratio:.3g} times that in f64; up to {bound} is right."
-    return [Check(subject, run.setting, run.n, ratio, bound, passed, sentence)]
+        return [Check("run in f32", run.setting, run.n, None, "finishes", False, sentence)]
+    checks = []
+    for measure in case.measures:
+        figure, usual = abs(single.values[measure.name]), abs(double.values[measure.name])
+        bound = SINGLE_RATIO * max(usual, measure.single(run.n))
+        passed = figure <= bound
+        found = f"At n = {run.n} the {measure.name} is {figure:.3g} in f32 and {usual:.3g} in f64"
+        sentence = f"{found}, {'within' if passed else 'beyond'} {bound:.3g}."
+        checks.append(Check(f"f32, {measure.name}", run.setting, run.n, figure, f"{bound:.3g}", passed, sentence))
+    return checks
 
 
 def _ending(result: RunResult) -> str:

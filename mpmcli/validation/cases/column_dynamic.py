@@ -68,6 +68,7 @@ class ColumnDynamic(Case):
             "",
             "Deepest place of the top over density g height^2 / E, less 1.",
             bound=lambda n: 1.5 * (0.052 / n**2 + FLOOR),
+            single=lambda n: 3e-4,
         ),
         Measure(
             "period error",

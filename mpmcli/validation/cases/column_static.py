@@ -111,7 +111,13 @@ class ColumnStatic(WeightedColumn):
     levels = {"coarse": (16, 32), "default": (16, 32, 64), "fine": (16, 32, 64, 128)}  # noqa: RUF012
     measures = (
         Measure("stress error", "", STRESS, bound=lambda n: 1.1 * 3 / 32 / n, order=1.0, expected=1.0),
-        Measure("settlement error", "", SETTLEMENT, bound=lambda n: 1.3 * (0.132 / n**2 + 1.6e-4)),
+        Measure(
+            "settlement error",
+            "",
+            SETTLEMENT,
+            bound=lambda n: 1.3 * (0.132 / n**2 + 1.6e-4),
+            single=lambda n: 0.0046 * n / 64,
+        ),
     )
     note = (
         "The error of the stress is 3/32 h of its slope, up and down in turn: in a flow v = a x^2 a particle a quarter "

@@ -29,32 +29,33 @@ class DamBreak(Case):
     levels = {"coarse": (16,), "default": (16, 32, 64), "fine": (16, 32, 64, 96)}  # noqa: RUF012
     measures = (
         Measure(
-            "front error",
+            "shifted front error",
             "",
-            "Mean of |Z - measured| / measured over T from 1 to 4, mean of the three series, no shift of time.",
-            bound=lambda n: 0.15,
+            "Mean of |Z - measured| / measured over T from 1 to 4, mean of the three series, best shift of time.",
+            bound=lambda n: 0.02,
         ),
-        Measure("series i", "", "The same against series (i), a = 2.25 in, figure 3.", bound=lambda n: 0.15),
-        Measure("series ii", "", "The same against series (ii), a = 1.125 in, figure 3.", bound=lambda n: 0.15),
-        Measure("series iii", "", "The same against series (iii), a = 2.25 in, table 2.", bound=lambda n: 0.15),
         Measure(
             "time shift",
             "T",
             "How much later than at t = 0 the gate lets go, as the three fronts would have it.",
             bound=lambda n: 0.3,
         ),
-        Measure("shifted front error", "", "Front error that is left with that shift.", bound=lambda n: 0.03),
+        Measure("front error", "", "The same as the first without a shift of time.", bound=lambda n: 0.15),
+        Measure("series i", "", "That against series (i), a = 2.25 in, figure 3.", bound=lambda n: 0.15),
+        Measure("series ii", "", "That against series (ii), a = 1.125 in, figure 3.", bound=lambda n: 0.15),
+        Measure("series iii", "", "That against series (iii), a = 2.25 in, table 2.", bound=lambda n: 0.15),
         Measure(
             "height error",
             "",
             "Mean of |H - measured| / measured over T from 1 to 4 at the back, table 6, no shift of time.",
-            bound=lambda n: 0.03,
+            bound=lambda n: 0.021,
         ),
     )
     note = (
         "Validation, not verification: the experiment has a gate, a floor with friction and an uncertain origin of "
-        "time. The bound of 15 % is on the front without a shift of time, as frictionless codes lead by 5 to 15 %. One "
-        "shift of T by a quarter leaves 1 to 2 %, which no bend of the curve could; yet the height at the back agrees "
+        "time. So the front is judged with one shift of T for the three series, and the shift itself: a quarter leaves "
+        "1 to 2 %, which no bend of the curve could. Without it the front leads by 12 to 14 %, as those of "
+        "frictionless codes do by 5 to 15 %. Yet the height at the back agrees "
         "best without any, so that a late gate is not the whole of it. The front is that of 99.9 % of the water. The "
         "foremost particle is further ahead, and the more so the thinner a film the grid resolves: 13.7, 14.5 and "
         "14.8 % at 16, 32 and 64 cells; the front of 99 % is 5 % ahead. A floor that sticks is no friction at these "
@@ -100,10 +101,10 @@ class DamBreak(Case):
         shift, left = best_shift(curves, T, front)
         (height,) = measured("height")
         return {
+            "shifted front error": left,
+            "time shift": shift,
             "front error": float(np.mean(list(errors.values()))),
             **errors,
-            "time shift": shift,
-            "shifted front error": left,
             "height error": mean_error(height, T, np.array(heights)),
         }
 

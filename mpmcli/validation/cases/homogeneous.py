@@ -76,13 +76,30 @@ class Homogeneous(Case):
     resolution = "cells across a block"
     levels = {"coarse": (32,), "default": (32, 64), "fine": (32, 64, 128)}  # noqa: RUF012
     measures = (
-        Measure("deformation error", "", "Largest |F - (I + t L)| in the middle of the solids.", bound=lambda n: 3e-4),
-        Measure("neo-Hookean", "", "Stress in the middle less the closed form, over it.", bound=lambda n: 3e-4),
-        Measure("corotated", "", "The same of the fixed corotated solid.", bound=lambda n: 3e-4),
-        Measure("fluid", "", "The same of the fluid of exponent 7, with viscosity.", bound=lambda n: 0.004),
-        Measure("plastic", "", "Von Mises stress of the metal over its yield stress, less 1.", bound=lambda n: 3e-5),
         Measure(
-            "plastic pressure", "", "Its pressure over (lambda + 2 mu / 3) ln J / J, less 1.", bound=lambda n: 3e-4
+            "deformation error", "", "Largest |F - (I + t L)| in the middle of the solids.", bound=lambda n: 1.2e-4
+        ),
+        Measure(
+            "neo-Hookean",
+            "",
+            "Stress in the middle less the closed form, over it.",
+            bound=lambda n: 1.2e-4 * (32 / n) ** 1.2,
+        ),
+        Measure("corotated", "", "The same of the fixed corotated solid.", bound=lambda n: 1e-4 * (32 / n) ** 0.8),
+        Measure(
+            "fluid", "", "The same of the fluid of exponent 7, with viscosity.", bound=lambda n: 0.002 * (32 / n) ** 1.3
+        ),
+        Measure(
+            "plastic",
+            "",
+            "Von Mises stress of the metal over its yield stress, less 1.",
+            bound=lambda n: max(5e-6 * (32 / n) ** 2, 6e-7),
+        ),
+        Measure(
+            "plastic pressure",
+            "",
+            "Its pressure over (lambda + 2 mu / 3) ln J / J, less 1.",
+            bound=lambda n: max(9e-5 * (32 / n) ** 2, 1.2e-5),
         ),
     )
     note = (

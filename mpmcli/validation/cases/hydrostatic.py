@@ -63,13 +63,13 @@ class Hydrostatic(Case):
             "resting speed",
             "sqrt(g H)",
             "Largest speed of a particle in any frame.",
-            bound=lambda n: 1e-5 * 32 / n,
+            bound=lambda n: 6.5e-6 * (32 / n) ** 1.3,
         ),
         Measure(
             "row spread",
             "density g H",
             "Root mean square deviation of the pressure from the mean of its row of particles.",
-            bound=lambda n: 1e-9,
+            bound=lambda n: 1e-12,
         ),
     )
     note = (
@@ -133,7 +133,7 @@ class HydrostaticDrop(Case):
             "period error",
             "",
             "Period of the pressure at the base over 4 H/c (1 - density g H/2K), less 1.",
-            bound=lambda n: 5e-4 + 2e-3 * (16 / n) ** 2,
+            bound=lambda n: 1.5e-4 + 2.3e-3 * (16 / n) ** 2,
         ),
         Measure(
             "peak error",

@@ -32,10 +32,16 @@ class SandColumn(Case):
         resolutions: tuple[int, int, int],
         runout: tuple[float, float],
         height: tuple[float, float],
+        refined: tuple[float, float, float],
+        settled: tuple[float, float],
         note: str,
     ) -> None:
-        """`runout` and `height` are bands of (L - L0) / L0 and of H / L0; `resolutions`, those of the three levels."""
+        """`runout` and `height` are bands of (L - L0) / L0 and of H / L0; `resolutions`, those of the three levels.
+
+        `refined` has R, A and a bound: the run-out is R - A / n as the grid is refined. `settled`: height and bound.
+        """
         self.aspect, self.runout, self.height, self.note = aspect, runout, height, note
+        self.refined, self.settled = refined, settled
         self.name = f"sand_column_{aspect}"
         # What the knobs do shows in one of them.
         self.varies = ("precision", "kernel", "transfer", "walls") if aspect == 2 else ("precision",)
@@ -55,13 +61,28 @@ class SandColumn(Case):
                 f"Height of 99 % of the sand over L0, less {sum(height) / 2:.4g}, the middle of the band.",
                 bound=lambda n: (height[1] - height[0]) / 2,
             ),
+            Measure(
+                "run-out against refinement",
+                "L0",
+                f"Run-out less {refined[0]:g} - {refined[1]:g} / n: first order, as the toe is thinner than a cell.",
+                bound=lambda n: refined[2],
+                single=lambda n: 0.01,
+            ),
+            Measure(
+                "height against refinement",
+                "L0",
+                f"Height less {settled[0]:g}, where grids of other spacings have it.",
+                bound=lambda n: settled[1],
+                single=lambda n: 0.01,
+            ),
             Measure("run-out", "L0", "(L - L0) / L0 of 99 % of the sand."),
             Measure("height", "L0", "H / L0 of 99 % of the sand."),
             Measure(
                 "speed at the end",
                 "",
                 "Root of the mean square, over sqrt(g H0): it has come to rest.",
-                bound=lambda n: 0.05,
+                bound=lambda n: 0.02,
+                single=lambda n: 3e-4,
             ),
         )
 
@@ -97,6 +118,8 @@ class SandColumn(Case):
         return {
             "run-out from mid-band": runout - sum(self.runout) / 2,
             "height from mid-band": height - sum(self.height) / 2,
+            "run-out against refinement": runout - (self.refined[0] - self.refined[1] / n),
+            "height against refinement": height - self.settled[0],
             "run-out": runout,
             "height": height,
             "speed at the end": math.sqrt(2 * kinetic / mass / (GRAVITY * self.aspect * L0)),
@@ -110,6 +133,8 @@ CASES = (
         # 1.2 a (Lube) to 2.2 a (mu(I)); 0.65 a^0.35 (mu(I)) to a (Lube).
         (1.2, 2.2),
         (0.65, 1.0),
+        (1.7, 9.6, 0.05),
+        (0.79, 0.02),
         "The toe is thinner than the cells of a coarse grid, and is held back by the floor: run-out 0.84, 1.12, 1.30, "
         "1.41, 1.50 and 1.53 at 8, 16, 24, 32, 48 and 64 cells.",
     ),
@@ -119,6 +144,8 @@ CASES = (
         # 1.2 a (Lube) and half as much again, and room around a^0.4 = 1.32: the band that judges MUD, an SPH code.
         (2.4, 3.6),
         (0.8, 1.7),
+        (3.45, 8.0, 0.15),
+        (1.034, 0.03),
         "Converges from below: run-out 2.23, 2.95, 3.31 and 3.33 at 8, 16, 32 and 64 cells. Experiments have 2.4 "
         "(Lube, Lajeunesse): sand of constant friction, which the speed of flow does not change, runs further, as is "
         "known of it. At a friction angle of 63 degrees the run-out is 1.2, which the band rejects.",
@@ -129,6 +156,8 @@ CASES = (
         # 1.6 a^(2/3) (Lube) to 2.2 a (mu(I)); 0.65 a^0.35 (mu(I)) to a^0.4 (Lube).
         (4.68, 11.0),
         (1.14, 1.9),
+        (7.4, 6.5, 0.22),
+        (1.225, 0.03),
         "Run-out 6.2, 6.9, 7.15 and 7.2 at 8, 12, 16 and 32 cells, which is 7 % beyond the farthest coefficient of "
         "experiments, 2.3 a^(2/3) = 6.7, and converged: constant friction runs further from tall columns than sand "
         "does. The upper end of the band is therefore that of mu(I), 2.2 a, as for the column of height 1.",

@@ -38,13 +38,14 @@ class SandShear(Case):
             "strength error",
             "",
             "(s1 - s2) / (s1 + s2) of the stresses along y and x in the middle, over sin(phi), less 1.",
-            bound=lambda n: 1e-9,
+            bound=lambda n: 1e-13,
         ),
         Measure(
             "pressure error",
             "",
             "Pressure in the middle over that of its volume, K ln J with J = (1 - rate^2 t^2) J0, less 1.",
-            bound=lambda n: 1e-4,
+            bound=lambda n: 1.5e-6 * n / 32,
+            single=lambda n: 2.5e-4,
         ),
         Measure("friction angle", "degrees", "The one that acts."),
     )

@@ -64,7 +64,7 @@ class Sloshing(Case):
             "amplitude error",
             "",
             "Amplitude of the centre of mass at the start over the exact one, 2 a L/(pi^2 d), less 1.",
-            bound=lambda n: 0.025 * 32 / n,
+            bound=lambda n: 0.018 * 32 / n,
         ),
     )
     note = (

@@ -46,7 +46,7 @@ class SpinningDisc(Case):
             "angular momentum",
             "",
             "Change of the angular momentum in ten turns, over what it was.",
-            bound=lambda n: 1e-12,
+            bound=lambda n: 1e-13,
         ),
     )
     note = (

@@ -48,14 +48,14 @@ class TaylorGreen(Case):
             "decay unexplained",
             "",
             "The same rate over that of viscosity and of the transfers of APIC as predicted, less 1.",
-            bound=lambda n: 0.02,
+            bound=lambda n: 0.02 * (16 / n) ** 0.6,
         ),
         Measure(
             "velocity error",
             "",
             "Mean of |v - exact| at t = 1 s over the mean of |exact|.",
             # What the transfers take until then, and the noise of the particles.
-            bound=lambda n: 1.25 * (1 - math.exp(-0.5 * DECAY * END * excess(n))) + 0.4 / n,
+            bound=lambda n: 1.25 * (1 - math.exp(-0.5 * DECAY * END * excess(n))) + 0.25 / n,
         ),
     )
     note = (

@@ -40,19 +40,19 @@ class TwoDisks(Case):
             order=0.8,
             expected=1.0,
         ),
-        Measure("momentum", "", "Largest momentum of all over the sum of m |v|.", bound=lambda n: 1e-12),
+        Measure("momentum", "", "Largest momentum of all over the sum of m |v|.", bound=lambda n: 1e-13),
         Measure(
             "angular momentum",
             "",
             "Largest angular momentum of all about their centre over the sum of m R |v|.",
-            bound=lambda n: 1e-12,
+            bound=lambda n: 1e-13,
         ),
-        Measure("centre of mass", "", "Largest way of the centre of mass over the radius.", bound=lambda n: 1e-12),
+        Measure("centre of mass", "", "Largest way of the centre of mass over the radius.", bound=lambda n: 5e-13),
         Measure(
             "energy gain",
             "",
             "Largest energy of any frame over that of the start, less 1; 0 where it never grows.",
-            bound=lambda n: 1e-6,
+            bound=lambda n: 1e-12,
         ),
         Measure(
             "energy loss", "", "Part of the energy that has gone by the end.", bound=lambda n: 4.6 / n, expected=1.0

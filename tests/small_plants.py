@@ -1,0 +1,202 @@
+"""Errors of about 5 % in the physics, each as a change of one source line, and the cases that should see it."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SmallPlant:
+    """In a source file one text in place of another, `count` times.
+
+    Attributes:
+        cases: the cheapest that should see it, at their coarsest resolution.
+        missed: why none of them does; "" where one does.
+    """
+
+    file: str
+    right: str
+    wrong: str
+    cases: tuple[str, ...]
+    count: int = 1
+    missed: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.file}: {self.wrong}"
+
+
+def _of(file: str, *changes: tuple) -> tuple[SmallPlant, ...]:
+    """Return plants of one file: right, wrong, the names of cases, and why it is missed if it is."""
+    return tuple(
+        SmallPlant(file, right, wrong, tuple(cases.split()), missed="".join(missed))
+        for right, wrong, cases, *missed in changes
+    )
+
+
+TRANSFERS = (
+    *_of(
+        "solver/transfer.py",
+        ("stress_scale = kick * volume", "stress_scale = 1.05 * kick * volume", "bar_fixed_fixed"),
+        ("(mass * grid.spacing) * C[c, a] - stress", "(0.95 * mass * grid.spacing) * C[c, a] - stress", "taylor_green"),
+        ("(distance[a] - 1.0)) * grid", "(distance[a] - 1.0)) * 1.05 * grid", "bar_fixed_fixed"),
+        ("middle[d] = mass", "middle[d] = 1.05 * mass", "bar_fixed_fixed"),
+    ),
+    *_of(
+        "solver/splines.py",
+        ("0.75 - (distance", "0.7875 - (distance", "bar_fixed_fixed"),
+        ("0.5 * (1.5 - distance) ** 2", "0.525 * (1.5 - distance) ** 2", "bar_fixed_fixed"),
+    ),
+    *_of("stability/transfer_factors.py", ('"quadratic": 4', '"quadratic": 4.2', "bar_fixed_fixed")),
+    *_of("solver/nodes.py", ("value[a] / value[d] + pull[a]", "value[a] / value[d] + 1.05 * pull[a]", "take_off")),
+    *_of(
+        "solver/particle_update.py",
+        ("rate = dt * C[i, k]", "rate = 1.05 * dt * C[i, k]", "bar_fixed_fixed"),
+        ("new[i, j] += rate * H[k, j]", "new[i, j] += 0.95 * rate * H[k, j]", "sand_blocks"),
+        ("moved = x[c] + dt * v[c]", "moved = x[c] + 1.05 * dt * v[c]", "take_off"),
+    ),
+    *_of(
+        "materials/volume_relaxation.py",
+        ("(growth + growth * J_minus_1)", "(growth + 0.95 * growth * J_minus_1)", "fluid_blocks"),
+    ),
+    *_of(
+        "solver/state_bounds.py",
+        ("dt * (C.trace() +", "dt * (1.05 * C.trace() +", "hydrostatic_drop"),
+        ("dt * second_invariant(C))", "dt * 0.95 * second_invariant(C))", "elliptical_drop"),
+    ),
+)
+DRIVES = (
+    *_of(
+        "solver/forces.py",
+        ("kick * self.constant[a]", "1.05 * kick * self.constant[a]", "take_off"),
+        ("result[a] = kick * node", "result[a] = 1.05 * kick * node", "column_static"),
+    ),
+    *_of(
+        "solver/lanes.py",
+        ("own += kick * vector_of(pushes", "own += 1.05 * kick * vector_of(pushes", "mms_1d"),
+        (
+            "C[c, a] += kick *",
+            "C[c, a] += 0.95 * kick *",
+            "sand_blocks",
+            "inside a body the nodes have the slope from the velocities of its particles; this one acts at its surface",
+        ),
+    ),
+    *_of(
+        "solver/solver.py",
+        ("0.5 * (state.last_step + dt)", "0.525 * (state.last_step + dt)", "take_off"),
+        ("state.time + dt if", "state.time + 1.05 * dt if", "bar_fixed_fixed"),
+    ),
+    *_of(
+        "scene/sampling.py",
+        ("mass=body.material.density * volume", "mass=1.05 * body.material.density * volume", "bar_fixed_fixed"),
+        ("volume = form.volume / len(position)", "volume = 1.05 * form.volume / len(position)", "conservation"),
+    ),
+    *_of(
+        "scene/initial.py",
+        ("body.material.density * (position", "1.05 * body.material.density * (position", "hydrostatic"),
+        ("_offset(body, position) @ affine.T", "1.05 * _offset(body, position) @ affine.T", "metal_blocks"),
+    ),
+)
+WALLS = (
+    SmallPlant(
+        "boundaries/mirror_images.py",
+        "result[c] = -result[c]",
+        "result[c] = -0.95 * result[c]",
+        ("bar_fixed_fixed",),
+        2,
+    ),
+    SmallPlant(
+        "boundaries/mirror_images.py",
+        "elif holds:\n                        result[c] = -result[c]",
+        "elif holds:\n                        result[c] = -0.95 * result[c]",
+        ("poiseuille", "bingham"),
+        missed="the node on the wall is stopped as well, so that images are a hundredth of the error of the grid",
+    ),
+    SmallPlant(
+        "boundaries/mirror_images.py", "ti.cast(outward >= 0, int)", "ti.cast(outward > -1e30, int)", ("take_off",)
+    ),
+)
+ELASTIC = (
+    *_of(
+        "materials/elasticity.py",
+        ("youngs_modulus / (2 *", "youngs_modulus / (2.1 *", "bar_fixed_fixed"),
+        ("(1 - 2 * poissons_ratio))", "(1 - 2.1 * poissons_ratio))", "mms_2d_neo_hookean homogeneous"),
+    ),
+    *_of(
+        "materials/neo_hookean.py",
+        ("constants[MU] * (left", "1.05 * constants[MU] * (left", "mms_1d"),
+        ("= constants[LAMBDA] * log(", "= 1.05 * constants[LAMBDA] * log(", "mms_2d_neo_hookean homogeneous"),
+        ("identity = ti.Matrix.identity(float, C.n)", "identity = 1.05 * ti.Matrix.identity(float, C.n)", "mms_1d"),
+    ),
+    *_of(
+        "materials/fixed_corotated.py",
+        ("tau = constants[MU] * (", "tau = 1.05 * constants[MU] * (", "bar_fixed_fixed"),
+        (
+            "= constants[LAMBDA] * (J - 1.0) * J",
+            "= 1.05 * constants[LAMBDA] * (J - 1.0) * J",
+            "mms_2d_corotated homogeneous",
+        ),
+        ("constants[LAMBDA] * (J - 1.0) * J", "constants[LAMBDA] * (J - 1.0)", "mms_2d_corotated homogeneous"),
+    ),
+    *_of("materials/hencky.py", ("strains[i] = log(", "strains[i] = 1.05 * log(", "column_hencky")),
+)
+FLUIDS = (
+    *_of(
+        "materials/fluid.py",
+        ("spherical = constants[BULK_MODULUS] * (J", "spherical = 1.05 * constants[BULK_MODULUS] * (J", "hydrostatic"),
+        ("constants[BULK_MODULUS] * crushed", "1.05 * constants[BULK_MODULUS] * crushed", "homogeneous"),
+        ("-constants[EXPONENT] * log(crushed)", "-1.05 * constants[EXPONENT] * log(crushed)", "homogeneous"),
+        ("tau += constants[VISCOSITY]", "tau += 1.05 * constants[VISCOSITY]", "poiseuille"),
+        ("parameters.bulk_viscosity - 2 / 3", "parameters.bulk_viscosity - 0.7", "fluid_blocks"),
+        ("parameters.bulk_viscosity - 2 / 3", "1.05 * parameters.bulk_viscosity - 2 / 3", "fluid_blocks"),
+        (
+            "1.0 if parameters.tension_cutoff else LARGEST",
+            "1.05 if parameters.tension_cutoff else LARGEST",
+            "fluid_blocks",
+        ),
+    ),
+    *_of(
+        "materials/viscoplastic.py",
+        ("over = q - constants[YIELD_STRESS]", "over = q - 1.05 * constants[YIELD_STRESS]", "paste_blocks"),
+        ("share = (constants[YIELD_STRESS] +", "share = (1.05 * constants[YIELD_STRESS] +", "paste_blocks"),
+        ("modulus_time / constants", "1.05 * modulus_time / constants", "paste_blocks"),
+        ("identity(float, F.n) + constants[SHEAR", "identity(float, F.n) + 1.05 * constants[SHEAR", "paste_blocks"),
+        ("= constants[BULK_MODULUS] * (J - 1.0)", "= 1.05 * constants[BULK_MODULUS] * (J - 1.0)", "paste_blocks"),
+    ),
+    *_of("solver/frame_arrays.py", ("(-3 * ratios)", "(-3.15 * ratios)", "hydrostatic")),
+)
+PLASTIC = (
+    *_of(
+        "materials/von_mises.py",
+        ("math.sqrt(6.0)) * mu", "math.sqrt(6.6)) * mu", "metal_blocks"),
+        ("(constants[YIELD_STRESS] +", "(1.05 * constants[YIELD_STRESS] +", "metal_blocks"),
+        ("constants[HARDENING_MODULUS] * variables", "1.05 * constants[HARDENING_MODULUS] * variables", "metal_blocks"),
+        ("(3.0 * mu + constants", "(3.15 * mu + constants", "metal_blocks"),
+        ("1.0 - 3.0 * mu * flow", "1.0 - 3.15 * mu * flow", "metal_blocks"),
+        ("constants[LAMBDA] * volume", "1.05 * constants[LAMBDA] * volume", "metal_blocks"),
+        ("variables[1] = e[2]", "variables[1] = 0.95 * e[2]", "metal_blocks"),
+        ("e[2] = in_frame[2]", "e[2] = 1.05 * in_frame[2]", "metal_blocks_3d"),
+    ),
+    *_of(
+        "materials/sand.py",
+        ("math.radians(parameters", "math.radians(1.05 * parameters", "sand_shear"),
+        ("parameters.cohesion / (math", "1.05 * parameters.cohesion / (math", "sand_blocks"),
+        ("math.sqrt(2) * math.sin", "1.05 * math.sqrt(2) * math.sin", "sand_shear"),
+        ("float(parameters.volume_correction)", "0.0", "sand_blocks"),
+        ("constants[CORRECTION] * v[0]", "0.95 * constants[CORRECTION] * v[0]", "sand_blocks"),
+        ("ti.max(volume - constants[TIP], 0.0)", "0.95 * ti.max(volume - constants[TIP], 0.0)", "sand_blocks"),
+        ("deviator *= strength", "deviator *= 1.05 * strength", "sand_shear"),
+        ("spherical = constants[LAMBDA]", "spherical = 1.05 * constants[LAMBDA]", "sand_shear"),
+    ),
+    *_of(
+        "materials/snow.py",
+        (
+            "            1 - parameters.critical_compression,",
+            "1 - 1.05 * parameters.critical_compression,",
+            "snow_blocks",
+        ),
+        ("            1 + parameters.critical_stretch,", "1 + 1.05 * parameters.critical_stretch,", "snow_blocks"),
+        ("hardness = exp(constants", "hardness = exp(1.05 * constants", "snow_blocks"),
+        ("2.0 * hardness * constants[MU]", "2.1 * hardness * constants[MU]", "snow_blocks"),
+        ("= hardness * constants[LAMBDA]", "= 1.05 * hardness * constants[LAMBDA]", "snow_blocks"),
+        ("(variables[0] * lost,", "(variables[0] * lost**0.95,", "snow_blocks"),
+    ),
+)
+SMALL_PLANTS = (*TRANSFERS, *DRIVES, *WALLS, *ELASTIC, *FLUIDS, *PLASTIC)
