@@ -32,11 +32,12 @@ MATERIALS = {
 SCENES = {name: ((name,), 2, {}) for name in MATERIALS} | {
     "3D": (("fluid",), 3, {}),
     "several bodies, FLIP": (("fluid", "fluid"), 2, {"solver": {"transfer": "aflip", "flip": 0.9}}),
+    "total": (("neo_hookean", "neo_hookean"), 2, {"solver": {"solids": "total"}}),
     "forces": (("fluid", "neo_hookean"), 2, {"forces": [{"acceleration": ["3*sin(20*t) - 5*x", "2*X"]}]}),
 }
 NAMES = tuple(SCENES)
 # Scenes that are loaded into another solver, too, whose kernels are compiled anew.
-TWICE = ("snow", "several bodies, FLIP", "forces")
+TWICE = ("snow", "several bodies, FLIP", "total", "forces")
 
 
 def laws_in(name: str) -> set[str]:
@@ -48,6 +49,8 @@ def scene_named(name: str) -> Scene:
     """Return blocks that fall side by side onto a floor, fast enough to meet it within the run."""
     materials, d, more = SCENES[name]
     width = 0.8 / len(materials)
+    # Bodies on grids of their own begin apart, and fly at each other.
+    total = "solids" in more.get("solver", {})
     bodies = [
         {
             "name": f"body {k}",
@@ -55,10 +58,10 @@ def scene_named(name: str) -> Scene:
             "shape": {
                 "box": {
                     "min": [0.1 + width * k, 0.02, 0.3][:d],
-                    "max": [0.1 + width * (k + 0.8), 0.4, 0.6][:d],
+                    "max": [0.1 + width * (k + (0.6 if total else 0.8)), 0.4, 0.6][:d],
                 }
             },
-            "velocity": [1.0, -2.0, 0.5][:d],
+            "velocity": [-2.0 if total and k == 1 else 1.0, -2.0, 0.5][:d],
         }
         for k, material in enumerate(materials)
     ]

@@ -152,8 +152,8 @@ class TestWorker:
 
     @pytest.mark.usefixtures("few_optimisations")
     def test_a_column_runs_in_its_own_process(self) -> None:
-        """Of two laws, and late enough that some fluid is torn: the same steps from the kept state tear the same."""
-        with start_worker("fluid,neo_hookean", SMALL, Setting(threads=1)) as process:
+        """Of two laws, and late enough that some sand flows: the same steps from the kept state let the same flow."""
+        with start_worker("sand,neo_hookean", SMALL, Setting(threads=1)) as process:
             assert process.ready["particles"] == SMALL.particles
             assert process.ready["bytes_per_particle"] > 50
             assert process.ask("first")["seconds"] > 0

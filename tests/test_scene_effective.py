@@ -167,6 +167,7 @@ compress = false
 precision = "f32"
 kernel = "quadratic"
 transfer = "apic"
+solids = "updated"
 walls = "folded"
 """
     )

@@ -16,8 +16,8 @@ from mpmcli.solver.solver import Solver
 RUN = Path(state_run.__file__)
 
 
-# The scene of the default suite: two laws, forces and expressions.
-USUAL = ("forces",)
+# The scenes of the default suite: two laws, forces and expressions; two bodies that collide.
+USUAL = ("total", "forces")
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,10 @@ def relaxed_volume(J: float, seen: float, crossings: float, rate: float, opens: 
 @ti.func
 def opened_volume(J_minus_1: float, growth: float):
     """Return J - 1 after J grew by the factor 1 + growth, for material that remembers how far it opened."""
-    opened = ti.min(J_minus_1 + (growth + growth * J_minus_1), ti.max(J_minus_1, OPENED - 1.0))
+    opened = J_minus_1 + (growth + growth * J_minus_1)
+    # Comparisons, which NaN does not meet: a lost particle stays not finite.
+    if opened > OPENED - 1.0 and opened > J_minus_1:
+        opened = ti.max(J_minus_1, OPENED - 1.0)
     # Closing after so little begins at J = 1.
     if growth < 0.0 and J_minus_1 > 0.0 and J_minus_1 < SLACK:
         opened = growth

@@ -31,6 +31,7 @@ class Kernels:
         grid: the nodes.
         orders: the tile order of each group.
         particles: the update of particles, with the record of lost ones.
+        contact: the bins of particles of several bodies at rest on grids of their own, None where there are none.
         drift_allowed: cells that a particle may move until particles are sorted again: without atomics only as far as
             its tile's colour allows.
         step: (dt, kick, relaxed) -> what it read back, a `StepResult`; None on a GPU. Positions move on by dt, s,
@@ -58,13 +59,13 @@ class Kernels:
             walls = Walls(faces_on_grid(faces, scene.solver), PAD, self.grid.cells, self.grid.shape)
             images = MirrorImages(walls)
         nodes = NodeUpdate(self.grid, images, [walls])
-        self._contact = contact_between(groups, [len(group.bodies) for group in groups], self.grid, backend)
-        self.particles = ParticleUpdate(self.grid, faces, len(groups), self._contact, watches_box=not backend.on_cpu)
+        self.contact = contact_between(groups, [len(group.bodies) for group in groups], self.grid, backend)
+        self.particles = ParticleUpdate(self.grid, faces, len(groups), self.contact, watches_box=not backend.on_cpu)
         buffers = SortBuffers(groups)
         self.orders = [TileOrder(g, self.grid, buffers, backend.threads, backend.on_cpu) for g in groups]
         self._sorts = [build_sort(order) for order in self.orders]
         self.drift_allowed = drift_allowed(self.grid.tile, stencil) if backend.on_cpu else float(self.grid.tile)
-        if self._contact is not None:
+        if self.contact is not None:
             self.drift_allowed = DRIFT
         self._find_box = build_box_search(self.grid, self.orders, math.ceil(self.drift_allowed))
         if backend.on_cpu:
@@ -76,8 +77,8 @@ class Kernels:
         """Sort the particles of every group by tile, and find the nodes in use."""
         for sort in self._sorts:
             sort.run()
-        if self._contact is not None:
-            self._contact.fill_all(self.particles.grid.spacing)
+        if self.contact is not None:
+            self.contact.fill_all(self.particles.grid.spacing)
         self._find_box()
 
     def share_work(self) -> None:

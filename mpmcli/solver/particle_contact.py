@@ -4,6 +4,7 @@ Particles are in bins, two cells wide, by the places where they were when they w
 line between two particles, so that momentum and angular momentum are conserved (docs/theory.md, 2.6).
 """
 
+import math
 from collections.abc import Sequence
 
 import taichi as ti
@@ -41,6 +42,11 @@ def contact_between(
     return ParticleContact(grid, groups[0], runs)
 
 
+def bins_along(cells: Sequence[int]) -> tuple[int, ...]:
+    """Return the bins per axis of a domain, a margin of one on each side included."""
+    return tuple(n // BIN + 3 for n in cells)
+
+
 @ti.data_oriented
 class ParticleContact:
     """Which particles are where, for the bodies of one law of each run.
@@ -55,14 +61,21 @@ class ParticleContact:
     def __init__(self, grid: Grid, group: ParticleArrays, runs: int) -> None:
         self.group = group
         self.dimension = grid.dimension
-        self.bins = tuple(n // BIN + 3 for n in grid.cells)
-        self.count = 1
-        for n in self.bins:
-            self.count *= n
+        self.bins = bins_along(grid.cells)
+        self.count = math.prod(self.bins)
         self.first = ti.field(int, shape=runs * self.count)
         self.owner = ti.field(int, shape=runs * self.count)
         self.following = ti.field(int, shape=group.x.shape[0])
         self.meets = ti.field(int, shape=group.x.shape[0])
+
+    @staticmethod
+    def bytes_needed(cells: Sequence[int], particles: int) -> int:
+        """Return the bytes of the bins of a run."""
+        return 4 * (2 * math.prod(bins_along(cells)) + 2 * particles)
+
+    def fields(self) -> dict[str, ti.Field]:
+        """Return the fields that a step reads, by name."""
+        return {"contact.first": self.first, "contact.following": self.following, "contact.meets": self.meets}
 
     @ti.kernel
     def fill_all(self, spacing: float):

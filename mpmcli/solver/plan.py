@@ -16,6 +16,7 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import Grid, node_width, tile_edge
 from mpmcli.solver.ordering import TileOrder
+from mpmcli.solver.particle_contact import ParticleContact
 from mpmcli.solver.transfer_scheme import scheme_of
 from mpmcli.solver.volume_relaxation import needs_filling
 
@@ -161,6 +162,8 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     ]
     node_bytes = real * width * (1 + scheme.keeps_before + needs_filling(scene, members))
     tables = len(groups) * TileOrder.bytes_needed(cells, tile, backend.threads) + _contact_bytes(scene, nodes, tile)
+    if scene.solver.solids == "total" and len(scene.bodies) > 1:
+        tables += ParticleContact.bytes_needed(cells, sum(counts.values()))
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
     host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)
     passes = passes_of(sorted(bodies), scene)
@@ -168,8 +171,8 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
 
 
 def _separating_axes(scene: Scene) -> list[int]:
-    """Return the axis of every face that needs contact flags: separating ones, unless walls are zeroed."""
-    if scene.solver.walls == "zeroed":
+    """Return the axis of every face that needs contact flags: separating ones of the grid, unless walls are zeroed."""
+    if scene.solver.walls == "zeroed" or scene.solver.solids == "total":
         return []
     faces = scene.domain.walls.faces(scene.dimension)
     return [axis for axis, pair in enumerate(faces) for wall in pair if wall == "separate"]

@@ -134,7 +134,7 @@ class State(Progress):
         for group, order in zip(self._groups, self._kernels.orders, strict=True):
             fields |= {f"{group.law.name}.{name}": field for name, field in group.fields().items()}
             fields[f"{group.law.name}.tile_start"] = order.start
-        return fields
+        return fields | ({} if self._kernels.contact is None else self._kernels.contact.fields())
 
 
 def _shape(field: ti.Field) -> tuple[int, ...]:
