@@ -72,17 +72,19 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
     mean = 0.0
     least = 1e30
     if near_wall:
-        for o, _line_node in ti.static(grid.lines):
-            for k in ti.static(range(grid.scheme.spline.nodes)):
-                weight = w[k, d - 1]
-                node = base
-                node[d - 1] += k
-                for a in ti.static(range(d - 1)):
-                    weight *= w[o[a], a]
-                    node[a] += o[a]
-                held = mirrored_sum(node, grid, last, reach)
-                mean += held * weight
-                least = ti.min(least, held)
+        # Not unrolled, as below: copies of the sum over images would take half of the compile time of a 3D scene.
+        for q in range(ti.static(grid.scheme.spline.nodes**d)):
+            node, rest, weight = base, q, 1.0
+            for b in ti.static(range(d)):
+                a = ti.static((b + d - 1) % d)
+                place = rest // ti.static(grid.scheme.spline.nodes ** (d - 1 - a)) % ti.static(grid.scheme.spline.nodes)
+                node[a] += place
+                for k in ti.static(range(grid.scheme.spline.nodes)):
+                    if place == k:
+                        weight *= w[k, a]
+            held = mirrored_sum(node, grid, last, reach)
+            mean += held * weight
+            least = ti.min(least, held)
     else:
         # All numbers of a node at once, which the compiler turns into vector instructions.
         total = ti.Vector.zero(float, grid.width)
@@ -109,26 +111,25 @@ def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
     d = ti.static(grid.dimension)
     base, _ = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     least = 1e30
-    for a in ti.static(range(d)):
-        for offset in ti.static((-1, grid.scheme.spline.nodes)):
-            node = base
-            for b in ti.static(range(d)):
-                node[b] += offset if ti.static(b == a) else 1
-            share = 1.0
-            used = True
-            for b in ti.static(range(d)):
-                if node[b] < PAD:
-                    node[b] = 2 * PAD - node[b]
-                elif node[b] > last[b]:
-                    node[b] = 2 * last[b] - node[b]
-                if node[b] == PAD or node[b] == last[b]:
-                    share *= 2.0
-                # Nodes that are not in use hold what was there before.
-                used = used and node[b] >= grid.box[0, b] and node[b] < grid.box[0, b] + grid.box[1, b]
-            held = 0.0
-            if used:
-                held = grid.holding[grid.linear_index(node)][d] * share
-            least = ti.min(least, held)
+    for side in range(ti.static(2 * d)):
+        offset = ti.select(side % 2 == 0, -1, ti.static(grid.scheme.spline.nodes))
+        node = base
+        share = 1.0
+        used = True
+        for b in ti.static(range(d)):
+            node[b] += ti.select(side // 2 == b, offset, 1)
+            if node[b] < PAD:
+                node[b] = 2 * PAD - node[b]
+            elif node[b] > last[b]:
+                node[b] = 2 * last[b] - node[b]
+            if node[b] == PAD or node[b] == last[b]:
+                share *= 2.0
+            # Nodes that are not in use hold what was there before.
+            used = used and node[b] >= grid.box[0, b] and node[b] < grid.box[0, b] + grid.box[1, b]
+        held = 0.0
+        if used:
+            held = grid.holding[grid.linear_index(node)][d] * share
+        least = ti.min(least, held)
     return least
 
 
