@@ -37,7 +37,7 @@ SCENES = {name: ((name,), 2, {}) for name in MATERIALS} | {
 }
 NAMES = tuple(SCENES)
 # Scenes that are loaded into another solver, too, whose kernels are compiled anew.
-TWICE = ("snow", "several bodies, FLIP", "total", "forces")
+TWICE = ("snow", "several bodies, FLIP", "forces")
 
 
 def laws_in(name: str) -> set[str]:

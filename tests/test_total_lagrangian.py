@@ -207,7 +207,7 @@ def test_a_stretched_bar_does_not_tear(backend_of: Callable) -> None:
     assert np.abs(gaps / spacing / (0.5 * (F[1:] + F[:-1])) - 1).max() < 0.01
 
 
-@pytest.mark.parametrize("safety", [0.8, 0.98])
+@pytest.mark.parametrize("safety", [0.98, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_a_bar_bounces_off_a_wall_after_a_wave_has_gone_there_and_back(backend_of: Callable, safety: float) -> None:
     """It meets the wall where its surface does, stays for 2 L / c, and gains no energy."""
     n, speed, gap = 16, 0.1, 4
@@ -237,7 +237,7 @@ def test_a_bar_bounces_off_a_wall_after_a_wave_has_gone_there_and_back(backend_o
     assert energy.max() <= energy[0] * (1 + 1e-9)
 
 
-@pytest.mark.parametrize("word", ["separate", "slip"])
+@pytest.mark.parametrize("word", ["separate", pytest.param("slip", marks=pytest.mark.slow)])
 def test_a_block_rests_on_a_floor(backend_of: Callable, word: str) -> None:
     """It comes to rest where its weight balances the push: within a hundredth of a cell of the floor."""
     scene = body_scene(
@@ -403,7 +403,7 @@ def small_run(backend: Backend, *, bodies: int, batched: bool) -> tuple[np.ndarr
     return found[-1][0].position, [row for _, row in found]
 
 
-@pytest.mark.parametrize("bodies", [1, 2])
+@pytest.mark.parametrize("bodies", [2, pytest.param(1, marks=pytest.mark.slow)])
 def test_batches_have_the_bytes_of_a_solver(backend_of: Callable, bodies: int) -> None:
     expected, rows = small_run(backend_of("f32", 1), bodies=bodies, batched=False)
     for threads in (1, 3):
