@@ -16,8 +16,9 @@ from mpmcli.solver.solver import Solver
 WORTH_A_THREAD = 2_500
 # On a GPU, where runs advance at once; its kernels count time in double precision, which Metal lacks.
 FEW_ON_GPU, BATCHING_GPUS = 100_000, ("cuda", "vulkan")
-# Particle-steps below which the time to optimise kernels exceeds what faster steps save.
-LITTLE_WORK = 2e8
+# Particle-steps below which the time to optimise kernels exceeds what faster steps save, about a tenth: of one law. The
+# time grows faster than the number of laws, which share one kernel.
+LITTLE_WORK = 8e8
 
 
 class Engine(Protocol):
@@ -88,7 +89,8 @@ def choose_engine(
     if not backend.on_cpu:
         return backend, False
     particles = estimate_particles(scene)
-    optimisation = "few" if particles * expected_steps() < LITTLE_WORK else "most"
+    little = LITTLE_WORK * len({body.material.law for body in scene.bodies}) ** 2
+    optimisation = "few" if particles * expected_steps() < little else "most"
     count = threads or useful_threads(particles, backend.threads)
     return replace(backend, threads=count, optimisation=optimisation), True
 
