@@ -208,13 +208,11 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 moved[c, lane] = inside[c]
             beyond[lane] = outside
             rates[lane] = deformation_rate(group, C)
-            if ti.static(group.total):
-                pass
-            elif ti.static(keeps_F):
+            if ti.static(keeps_F and not group.total):
                 deformed = deformed_gradient(matrix_of(deformation, d, lane), C, dt)
                 for i, j in ti.static(ti.ndrange(d, d)):
                     after[i * d + j, lane] = deformed[i, j]
-            else:
+            if ti.static(not keeps_F):
                 after[0, lane] = group.law.grown(deformation[0, lane], volume_growth(C, dt), constants_of(rows, lane))
 
         for lane in range(count):

@@ -136,7 +136,7 @@ class ParticleContact:
         force = ti.Vector.zero(float, d)
         if self.meets[p] == 1:
             x, own = group.x[p], self.stiffness(group, p, spacing)
-            # Bins are those of the last sort, which any particle of this one may have left since.
+            # Bins are those of the last sort. Particles have moved by less than DRIFT cells since.
             k = self.bin_of(x, spacing, run)
             for beside in range(ti.static(3**self.dimension)):
                 q = self.first[k + self.offset(beside)]

@@ -121,11 +121,9 @@ class ParticleUpdate:
 
         # Deformation. The rate here, where C is at hand, takes half the time that it would take at the end.
         deforming = deformation_rate(group, C)
-        if ti.static(group.total):
-            pass
-        elif ti.static(group.law.deformation == "F"):
+        if ti.static(group.law.deformation == "F" and not group.total):
             group.displacement_gradient[p] = deformed_gradient(group.displacement_gradient[p], C, dt)
-        else:
+        if ti.static(group.law.deformation == "J"):
             growth = volume_growth(C, dt)
             if ti.static(group.law.grows_by_constants):
                 group.J_minus_1[p] = group.law.grown(group.J_minus_1[p], growth, group.constants(p))
