@@ -12,7 +12,7 @@ from mpmcli.check.scene_limits import scene_limits
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, SolverSettings, parse_scene, scene_bounds, scene_to_toml
-from mpmcli.scene.schema import USUAL_FLIP
+from mpmcli.scene.solver_settings import USUAL_FLIP
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.plan import make_plan
 from mpmcli.solver.snapshot import read_group

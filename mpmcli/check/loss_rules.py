@@ -9,8 +9,9 @@ from mpmcli.check.extent import TOUCHING, spanned_axes
 from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import expected_steps, steps_at, wave_loss
-from mpmcli.scene.schema import USUAL_FLIP, SolverSettings, Time
+from mpmcli.scene.schema import SolverSettings, Time
 from mpmcli.scene.shapes import Ball, Box, Form
+from mpmcli.scene.solver_settings import USUAL_FLIP
 from mpmcli.stability.transfer_factors import impact_loss, loss_per_step
 
 # Share of energy that a wave loses in the run, and that viscosity takes, above which they matter.

@@ -25,7 +25,7 @@ def material_findings(facts: SceneFacts) -> Iterator[Finding]:
     for body in facts.bodies:
         yield from _impact(facts, body, flowing=flowing)
         yield from _soft(facts, body)
-        yield from _locking(body)
+        yield from _locking(body, averages=facts.scene.solver.f_bar is not False)
         yield from _friction(facts, body)
     yield from _density(facts)
 
@@ -71,15 +71,25 @@ def _soft(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         )
 
 
-def _locking(body: BodyFacts) -> Iterator[Finding]:
+def _locking(body: BodyFacts, *, averages: bool) -> Iterator[Finding]:
     ratio = getattr(body.body.material, "poissons_ratio", 0.0)
-    if ratio > LOCKING:
+    if ratio > LOCKING and averages and not body.flows:
+        yield Finding(
+            "note",
+            "locking",
+            f'Body "{body.name}" has a Poisson\'s ratio of {ratio:g}: its steps are small, and as each of them damps '
+            "what moves, it swings less far than it should.",
+            f"Set poissons_ratio = {LOCKING:g} or less, where the difference does not matter.",
+            ratio,
+            body.name,
+        )
+    elif ratio > LOCKING:
         yield Finding(
             "warning",
             "locking",
             f'Body "{body.name}" has a Poisson\'s ratio of {ratio:g}: above {LOCKING:g} it bends too stiffly, its '
             "pressure varies from particle to particle, and its steps are small.",
-            f"Set poissons_ratio = {LOCKING:g} or less, or model it as a fluid or viscoplastic material.",
+            f"Set solver.f_bar = true, poissons_ratio = {LOCKING:g} or less, or model it as a fluid.",
             ratio,
             body.name,
         )

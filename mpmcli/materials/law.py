@@ -10,6 +10,7 @@ import numpy as np
 import taichi as ti
 
 from mpmcli.scene.material import Internal, MaterialParameters, SceneBounds
+from mpmcli.scene.solver_settings import NEARLY_INCOMPRESSIBLE
 
 # In bulk the pressure itself adds stiffness, because particles carry it with them: pressure waves see the sum of the
 # tangent modulus and the pressure (docs/theory.md, 6.6). For a fluid of p = K (1/J - 1) that is K at any J. At J = 0.5
@@ -94,6 +95,8 @@ class Law(ABC):
         stiffness_parameters, viscosity_parameters: names of the parameters that set the stiffness and the viscosity;
             messages name the first that is a positive number. A law that calls them otherwise lists its own.
         coherent: whether the material resists being pulled apart, so that `check` reports a J far above 1.
+        locks: whether a body has a Poisson's ratio at which its changes of volume are averaged over cells by default
+            (docs/theory.md, 4.4).
         flows: whether it is a liquid or grains, whose volume the ledger compares with what they fill on the grid.
         elastic: whether the stress is a function of F alone, so that the body can be computed on the grid of its state
             at rest (docs/theory.md, 2.5).
@@ -131,6 +134,8 @@ class Law(ABC):
         self.members = tuple(members)
         self.dimension = dimension
         self.internal: tuple[Internal, ...] = self.parameters.internal_in(dimension)
+        ratios = [getattr(member, "poissons_ratio", 0.0) for member in members]
+        self.locks = max(ratios, default=0.0) >= NEARLY_INCOMPRESSIBLE and not self.flows
 
     @property
     def terms(self) -> tuple[tuple[str, bool], ...]:

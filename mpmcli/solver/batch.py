@@ -35,6 +35,7 @@ from mpmcli.solver.particle_update import ParticleUpdate
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.transfer_scheme import scheme_of
+from mpmcli.solver.volume_average import averages_volume
 from mpmcli.solver.volume_relaxation import needs_filling
 
 
@@ -125,7 +126,10 @@ class Batch:
         scheme = scheme_of(kind.settings)
         stencil = scheme.spline.nodes
         tile = tile_edge(stencil, d, on_cpu=on_cpu)
-        grid = Grid(d, 1.0, kind.cells, width, scheme, runs, tile=tile, keeps_filling=kind.keeps_filling)
+        averaged = [averages_volume(kind.settings, law) for law in kind.members]
+        grid = Grid(
+            d, 1.0, kind.cells, width, scheme, runs, tile=tile, keeps_filling=kind.keeps_filling, averaged=averaged
+        )
         groups = [
             ParticleArrays(
                 law,
@@ -139,6 +143,7 @@ class Batch:
                 serial=on_cpu and backend.threads == 1,
                 keeps_initial=forces.initial,
                 total=kind.settings.solids == "total",
+                averaged=averages_volume(kind.settings, law),
             )
             for law, room, bodies, forces in zip(
                 kind.members, kind.particles, kind.bodies, kind.drives.forces, strict=True

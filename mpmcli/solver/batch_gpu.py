@@ -15,6 +15,7 @@ from mpmcli.solver.batch_steps import BatchSteps
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
+from mpmcli.solver.volume_average import add_volume, cell_of, missing_to_mean
 
 # Steps of a launch, after which the host attends to the runs that need it.
 STEPS = 32
@@ -39,6 +40,7 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     rates, changes = (ti.field(float, shape=(runs, len(groups))) for _ in range(2))
     widest = max(entries(group) for group in groups)
     maxima = ti.field(float, shape=(runs, len(groups), widest))
+    averages = any(group.averaged for group in groups)
     on_device = (ti.ndarray(ti.f64, (runs, layout.reals)), ti.ndarray(ti.i32, (runs, layout.counts)))
 
     @ti.func
@@ -101,6 +103,24 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
             grid.clear(grid.linear_index(grid.box_node(q)))
 
     @ti.func
+    def start_mean(g: ti.template(), w: int, p: int, counts: ti.template()):
+        h, inverse, scale, box, last, extent = place(w, counts)
+        grid, _nodes, _particles, _orders, seen = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        grid.means[g][cell_of(grid, seen[g].on_grid(p))] = ti.Vector.zero(float, 2)
+
+    @ti.func
+    def add_to_mean(g: ti.template(), w: int, p: int, counts: ti.template()):
+        h, inverse, scale, box, last, extent = place(w, counts)
+        grid, _nodes, _particles, _orders, seen = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        add_volume(grid, g, seen[g], p)
+
+    @ti.func
+    def take_mean(g: ti.template(), w: int, p: int, counts: ti.template()):
+        h, inverse, scale, box, last, extent = place(w, counts)
+        grid, _nodes, _particles, _orders, seen = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        seen[g].to_mean[p] = missing_to_mean(grid, g, seen[g], p)
+
+    @ti.func
     def scatter(g: ti.template(), w: int, p: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
         _grid, _nodes, particles, _orders, seen = ti.static(views(device, w, h, inverse, scale, box, last, extent))
@@ -160,6 +180,12 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
             if stepping[q // node_count] == 1:
                 clear(q // node_count, q % node_count, counts)
         for g, group in ti.static(members):
+            if ti.static(group.averaged):
+                for p in range(runs * room[g]):
+                    w = p // room[g]
+                    if stepping[w] == 1 and p % room[g] < counts[w, count.particles[g]]:
+                        add_to_mean(g, w, p, counts)
+        for g, group in ti.static(members):
             for p in range(runs * room[g]):
                 w = p // room[g]
                 if stepping[w] == 1 and p % room[g] < counts[w, count.particles[g]]:
@@ -212,6 +238,23 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
                     for k in ti.static(range(entries(group))):
                         numbers[w, real.maxima[g] + k] = ti.cast(maxima[w, g, k], ti.f64)
 
+    @ti.kernel
+    def average(numbers: ti.types.ndarray(ti.f64, 2), counts: ti.types.ndarray(ti.i32, 2)):
+        """Average volumes over cells, before frames are read; the constants of no step need have been set."""
+        for w in range(runs):
+            constants[w][INVERSE] = ti.cast(numbers[w, real.inverse_spacing], float)
+        for g, group in ti.static(members):
+            if ti.static(group.averaged):
+                for p in range(runs * room[g]):
+                    if p % room[g] < counts[p // room[g], count.particles[g]]:
+                        start_mean(g, p // room[g], p, counts)
+                for p in range(runs * room[g]):
+                    if p % room[g] < counts[p // room[g], count.particles[g]]:
+                        add_to_mean(g, p // room[g], p, counts)
+                for p in range(runs * room[g]):
+                    if p % room[g] < counts[p // room[g], count.particles[g]]:
+                        take_mean(g, p // room[g], p, counts)
+
     def launch(numbers: np.ndarray, counts: np.ndarray) -> None:
         own = numbers, counts
         for there, here in zip(on_device, own, strict=True):
@@ -220,6 +263,8 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
             for _ in range(STEPS):
                 step(*on_device)
         measure(*on_device)
+        if averages:
+            average(*on_device)
         for there, here in zip(on_device, own, strict=True):
             here[:] = there.to_numpy()
 

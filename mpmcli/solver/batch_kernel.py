@@ -153,7 +153,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
                     phase = -1
                     arrived, going = counts[w, count.arrived] == 1, counts[w, count.status] == GOING
                     if arrived and counts[w, count.records] == 1 and counts[w, count.status] != LOST and not recorded:
-                        phase = phases.showing
+                        phase = phases.before_showing
                     elif going and not arrived and counts[w, count.budget] > 0:
                         if numbers[w, real.drift] >= numbers[w, real.drift_allowed]:
                             phase = phases.sorts

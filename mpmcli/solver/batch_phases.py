@@ -9,7 +9,7 @@ import taichi as ti
 from mpmcli.solver.batch_device import Device, views
 from mpmcli.solver.batch_layout import Layout
 from mpmcli.solver.batch_regions import BatchRegions
-from mpmcli.solver.cpu_loops import clear_rows, scatter_pencils, update_rows
+from mpmcli.solver.cpu_loops import average_pencils, clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.frame_reader import show_range
 from mpmcli.solver.lanes import advance_range
 from mpmcli.solver.ordering import share_start
@@ -17,6 +17,7 @@ from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.sorting import count_tiles, keep, place_particles, take
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import NOTHING
+from mpmcli.solver.volume_average import average_for_frame
 
 # Parts of a loop over the particles or the nodes of a region.
 SHARES = 4
@@ -46,8 +47,11 @@ class BatchPhases:
         self.values = ti.field(float, shape=(device.runs, self.rates + 2 * len(device.groups)))
         self.colours = device.orders[0].colours
         self.relaxes = any(group.law.relaxes for group in device.groups)
-        # The first of the phases that scatter a group.
-        self.scatters = tuple(1 + g * self.colours for g in range(len(device.groups)))
+        # The first of the phases that average the volumes of a group, and of those that scatter it.
+        averaged = [g for g, group in self.members if group.averaged]
+        self.averages = {g: 1 + n * self.colours for n, g in enumerate(averaged)}
+        begun = 1 + len(averaged) * self.colours
+        self.scatters = tuple(begun + g * self.colours for g in range(len(device.groups)))
         self.relaxing = self.scatters[-1] + self.colours
         self.contact = self.relaxing + self.relaxes
         self.updating = self.contact + device.nodes.needs_contact
@@ -59,7 +63,9 @@ class BatchPhases:
         for fields in self.moved:
             firsts.append(firsts[-1] + 2 + 2 * len(fields))
         self.sorts_of, self.last_of_sort = tuple(firsts[:-1]), firsts[-1] - 1
-        self.showing = firsts[-1]
+        # Before a frame is shown volumes are averaged once more.
+        self.before_showing = firsts[-1]
+        self.showing = self.before_showing + bool(averaged)
 
     @ti.func
     def place(self, w: int, numbers: ti.template(), counts: ti.template()):
@@ -121,6 +127,11 @@ class BatchPhases:
                 if colour >= 0 and colour < self.colours:
                     last = self.device.orders[g].work[colour, region + 1]
                     parts = last - self.device.orders[g].work[colour, region]
+                if ti.static(g in self.averages):
+                    colour = phase - ti.static(self.averages[g])
+                    if colour >= 0 and colour < self.colours:
+                        last = self.device.orders[g].work[colour, region + 1]
+                        parts = last - self.device.orders[g].work[colour, region]
         return parts
 
     @ti.func
@@ -162,6 +173,17 @@ class BatchPhases:
                     first = orders[g].work[colour, region] + part
                     after = first + 1
                 scatter_pencils(particles, g, group, orders[g], colour, first, after, kick, relaxed)
+            if ti.static(g in self.averages):
+                colour = phase - ti.static(self.averages[g])
+                if colour >= 0 and colour < self.colours:
+                    first, after = 0, orders[g].pencil_count(colour)
+                    if ti.static(self.shared):
+                        first = orders[g].work[colour, region] + part
+                        after = first + 1
+                    average_pencils(grid, g, group, orders[g], colour, first, after)
+                if phase == self.before_showing and region == 0:
+                    first = w * ti.static(self.device.room[g])
+                    average_for_frame(grid, g, group, first, first + counts[w, self.count.particles[g]])
         if ti.static(nodes.needs_contact):
             if phase == self.contact:
                 first, after = self.places.even_part(nodes.images.plane_nodes(grid), region)

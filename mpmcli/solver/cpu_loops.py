@@ -3,6 +3,7 @@
 import taichi as ti
 
 from mpmcli.solver.lanes import scatter_range
+from mpmcli.solver.volume_average import average_range
 
 
 @ti.func
@@ -12,6 +13,22 @@ def clear_rows(grid: ti.template(), first: int, last: int):
         node = grid.linear_index(grid.row_start(row))
         for k in range(grid.box[1, ti.static(grid.dimension - 1)]):
             grid.clear(node + k)
+
+
+@ti.func
+def average_pencils(
+    grid: ti.template(),
+    g: ti.template(),
+    group: ti.template(),
+    order: ti.template(),
+    colour: int,
+    first: int,
+    last: int,
+):
+    """Add the particles of the g-th group in pencils first to last - 1 of a colour to their cells."""
+    for r in range(first, last):
+        tile = order.first_tile + order.pencil_start(colour, r)
+        average_range(grid, g, group, order.start[tile], order.start[tile + order.pencil])
 
 
 @ti.func

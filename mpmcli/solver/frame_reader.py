@@ -26,6 +26,7 @@ from mpmcli.solver.particle_arrays import MASS, VOLUME, ParticleArrays
 from mpmcli.solver.particle_update import SMALLEST_J
 from mpmcli.solver.state_bounds import volume_ratio
 from mpmcli.solver.sums import Sums, axis_pairs
+from mpmcli.solver.volume_average import stretch_to
 
 # Entry of the sums that is 0 where a particle is crushed, inverted or not finite, else 1.
 SOUND = 5
@@ -62,6 +63,7 @@ def show_range(
     internal, rows = zero_lanes(inners), zero_lanes(ti.static(group.table.n))
     # Energy, J, internal variables, and entries of the deformation and of the stress.
     found = zero_lanes(ti.static(2 + inners + d * d + len(entries)))
+    missing = ti.Vector.zero(float, LANES)
     turns = 1
     if ti.static(group.law.projects) or tau_at >= 0:
         turns = 2
@@ -69,11 +71,16 @@ def show_range(
     while begin < first + count:
         own = ti.min(LANES, first + count - begin)
         load_lanes(group, begin, own, affine, deformation, internal, rows)
+        if ti.static(group.averaged):
+            for lane in range(own):
+                missing[lane] = group.to_mean[begin + lane]
         # Half a step back, where the velocities are, and now: a loop, so that the law is compiled once.
         for k in range(turns):
             for lane in range(LANES):
                 C, inner = matrix_of(affine, d, lane), vector_of(internal, 0, inners, lane)
                 stored, constants = stored_of(group, deformation, lane), constants_of(rows, lane)
+                if ti.static(group.averaged):
+                    stored *= stretch_to(missing[lane], d)
                 tau, tau_zz, after, inner_after = respond_after(
                     group.law, stored, inner, C, 0.5 * (k - 1) * dt, dt, constants
                 )

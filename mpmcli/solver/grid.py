@@ -60,6 +60,8 @@ class Grid:
         filling: Vector(width) field: where the mass is in `nodes` it has the volume of particles at rest, m^3, in the
             steps that relax volumes; None where the mass says as much. keeps_filling: whether it is there.
         holding: `filling`, or else `nodes`.
+        means: Vector(2) field per group: of the particles in the cell behind a node the volume at rest times ln J, and
+            the volume at rest, m^3; None of groups that do not average them (`volume_average`). kept_means: the others.
         box: (2, d) ints: first node in use and number of nodes in use, per axis.
     """
 
@@ -74,8 +76,13 @@ class Grid:
         *,
         tile: int,
         keeps_filling: bool = False,
+        averaged: Sequence[bool] = (),
     ) -> None:
-        """Allocate nodes for a number of runs, the nodes of one after those of another."""
+        """Allocate nodes for a number of runs, the nodes of one after those of another.
+
+        Args:
+            averaged: of each group, whether it averages changes of volume over cells.
+        """
         self.dimension = dimension
         self.width = width
         self.spacing = spacing
@@ -98,6 +105,10 @@ class Grid:
         self.keeps_filling = keeps_filling
         self.filling = ti.Vector.field(width, float, shape=runs * self.node_count) if keeps_filling else None
         self.holding = self.filling if keeps_filling else self.nodes
+        self.means = tuple(
+            ti.Vector.field(2, float, shape=runs * self.node_count) if wanted else None for wanted in averaged
+        )
+        self.kept_means = tuple(means for means in self.means if means is not None)
         self.box = ti.field(int, shape=(2 * runs, dimension))
 
     @staticmethod
@@ -118,6 +129,8 @@ class Grid:
             self.before[node] = ti.Vector.zero(float, self.width)
         if ti.static(self.keeps_filling):
             self.filling[node] = ti.Vector.zero(float, self.width)
+        for means in ti.static(self.kept_means):
+            means[node] = ti.Vector.zero(float, 2)
 
     @ti.func
     def linear_index(self, base: ti.template()):

@@ -11,6 +11,7 @@ from mpmcli.solver.forces import needs_initial
 from mpmcli.solver.grid import node_width
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.plan import members_of
+from mpmcli.solver.volume_average import averages_volume
 
 
 def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles]) -> list[ParticleGroup]:
@@ -29,9 +30,10 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
     groups = []
     for name in sorted({body.material.law for body in scene.bodies}):
         members = members_of(scene, name)
+        law = laws()[name]([scene.bodies[i].material for i in members], scene.dimension)
         groups.append(
             ParticleGroup(
-                laws()[name]([scene.bodies[i].material for i in members], scene.dimension),
+                law,
                 members,
                 [particles[i] for i in members],
                 [int(first_ids[i]) for i in members],
@@ -41,6 +43,7 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
                 serial=backend.on_cpu and backend.threads == 1,
                 keeps_initial=needs_initial(scene, members),
                 total=scene.solver.solids == "total",
+                averaged=averages_volume(scene.solver, law),
             )
         )
     return groups

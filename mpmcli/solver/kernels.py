@@ -21,6 +21,7 @@ from mpmcli.solver.splines import PAD
 from mpmcli.solver.step_cpu import build_cpu_step
 from mpmcli.solver.step_gpu import build_gpu_step
 from mpmcli.solver.transfer_scheme import scheme_of
+from mpmcli.solver.volume_average import build_averaging
 from mpmcli.solver.volume_relaxation import needs_filling
 
 
@@ -34,6 +35,7 @@ class Kernels:
         contact: the bins of particles of several bodies at rest on grids of their own, None where there are none.
         drift_allowed: cells that a particle may move until particles are sorted again: without atomics only as far as
             its tile's colour allows.
+        average: averages volumes over cells before a frame is read; None where no group does.
         step: (dt, kick, relaxed) -> what it read back, a `StepResult`; None on a GPU. Positions move on by dt, s,
             velocities by kick, s: from the middle of the last step to the middle of this one (docs/theory.md, 7.1).
             Volumes relax over the time `relaxed`, s.
@@ -51,6 +53,7 @@ class Kernels:
             scheme,
             tile=tile_edge(stencil, scene.dimension, on_cpu=backend.on_cpu),
             keeps_filling=needs_filling(scene, [group.law for group in groups]),
+            averaged=[group.averaged for group in groups],
         )
         faces = scene.domain.walls.faces(scene.dimension)
         if scene.solver.walls == "zeroed":
@@ -68,6 +71,8 @@ class Kernels:
         if self.contact is not None:
             self.drift_allowed = DRIFT
         self._find_box = build_box_search(self.grid, self.orders, math.ceil(self.drift_allowed))
+        averages = any(group.averaged for group in groups)
+        self.average = build_averaging(self.grid, groups, on_cpu=backend.on_cpu) if averages else None
         if backend.on_cpu:
             self.step = build_cpu_step(self.grid, nodes, self.particles, groups, self.orders, gravity)
         else:

@@ -22,6 +22,7 @@ from mpmcli.solver.particle_update import SMALLEST_J, deformed_gradient
 from mpmcli.solver.reference_grid import pulled_back, push_of_walls
 from mpmcli.solver.state_bounds import NOTHING, deformation_rate, volume_growth, volume_ratio
 from mpmcli.solver.transfer import add_linear, centred, gather_linear, momentum, scatter_before, scatter_volume
+from mpmcli.solver.volume_average import missing_to_mean, stretch_to
 
 
 @ti.func
@@ -43,6 +44,7 @@ def scatter_range(
     rows = zero_lanes(ti.static(group.table.n))
     pushes = zero_lanes(ti.static(d + d * d if group.pushed else 1))
     change, after = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
+    missing = ti.Vector.zero(float, LANES)
     first_node, weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(nodes * d))
     middles, slopes = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
     begin = first
@@ -57,6 +59,8 @@ def scatter_range(
                 v[c, lane] = group.v[p][c]
                 if ti.static(group.total):
                     here[c, lane] = group.x[p][c]
+            if ti.static(group.averaged):
+                missing[lane] = missing_to_mean(grid, g, group, p)
             if ti.static(particles.touches):
                 push = particles.contact.push(group, p, grid.spacing, particles.run)
                 for c in ti.static(range(d)):
@@ -73,10 +77,16 @@ def scatter_range(
             C = matrix_of(affine, d, lane)
             place, own = vector_of(x, 0, d, lane), vector_of(v, 0, d, lane)
             state = stored_of(group, deformation, lane)
+            seen, share = state, 1.0
+            if ti.static(group.averaged):
+                share = stretch_to(missing[lane], d)
+                seen = share * state
             stress, _, state_after, inner_after = group.law.respond(
-                state, vector_of(internal, 0, inners, lane), C, kick, constants_of(rows, lane)
+                seen, vector_of(internal, 0, inners, lane), C, kick, constants_of(rows, lane)
             )
-            difference = state_after - state
+            difference = state_after - seen
+            if ti.static(group.averaged):
+                difference /= share
             if ti.static(keeps_F):
                 for i, j in ti.static(ti.ndrange(d, d)):
                     change[i * d + j, lane] = difference[i, j]

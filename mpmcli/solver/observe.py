@@ -31,7 +31,7 @@ class Observation:
 def respond_later(group: ti.template(), p: int, later: float, dt: float):
     """Return what the law of particle p gives in the next step, dt (s), if it deforms on for a time `later`, s."""
     _, C = group.motion(p)
-    return respond_after(group.law, group.stored(p), group.inner(p), C, later, dt, group.constants(p))
+    return respond_after(group.law, group.seen(p), group.inner(p), C, later, dt, group.constants(p))
 
 
 @ti.func
@@ -63,6 +63,7 @@ def build_observation(group: ParticleArrays) -> Callable[..., Observation]:
     placed = tuple(enumerate(stress_entries(d)))
     keeps_F = law.deformation == "F"
     inner_count = len(group.internal)
+    changed = law.projects or group.averaged
 
     @ti.kernel
     def observe(
@@ -88,7 +89,7 @@ def build_observation(group: ParticleArrays) -> Callable[..., Observation]:
                                 tau[q, column] = stress[place[0], place[1]]
                             else:
                                 tau[q, column] = stress_zz
-                    if ti.static(law.projects):
+                    if ti.static(changed):
                         if ti.static(keeps_F):
                             for i, j in ti.static(ti.ndrange(d, d)):
                                 state[q, i * d + j] = deformation[i, j]
@@ -101,9 +102,9 @@ def build_observation(group: ParticleArrays) -> Callable[..., Observation]:
         real, width = group.real, d * d if keeps_F else 1
         entries = np.empty((n if stress else 1, len(placed)), real)
         energy = np.empty(n, real)
-        state = np.empty((n if law.projects else 1, width + inner_count), real)
+        state = np.empty((n if changed else 1, width + inner_count), real)
         observe(dt, first, stress, entries, energy, state)
-        if not law.projects:
+        if not changed:
             deformation, internal = stored[0], list(stored[1].T)
         else:
             internal = list(state[:, width:].T)

@@ -6,6 +6,7 @@ from copy import copy
 import numpy as np
 import taichi as ti
 
+from mpmcli.materials.elementary import exp
 from mpmcli.materials.law import Law
 
 # Entries of the per-body table that come before the constants of the law.
@@ -33,6 +34,9 @@ class ParticleArrays:
         total: whether the body is on the grid of its state at rest, see `reference_grid`.
         initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force, or
             since they are `total`.
+        averaged: whether particles of a cell share their change of volume (`volume_average`).
+        to_mean: (n), of groups that are `averaged`: ln J during P2G, and where a frame is read what it lacks to the
+            mean of its cell.
         force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
         table: per body a row of particle mass, particle volume and the constants of the law.
         real: numpy's type of the real fields.
@@ -51,6 +55,7 @@ class ParticleArrays:
         serial: bool,
         keeps_initial: bool = False,
         total: bool = False,
+        averaged: bool = False,
     ) -> None:
         """Allocate.
 
@@ -74,6 +79,9 @@ class ParticleArrays:
         self.total = total
         self.keeps_initial = keeps_initial or total
         self.initial = ti.Vector.field(d, float, shape=count, layout=layout) if self.keeps_initial else None
+        self.averaged = averaged
+        self.cell = ti.field(int, shape=count) if averaged else None
+        self.to_mean = ti.field(float, shape=count) if averaged else None
         self.pushed = False
         self.force = None
         self.run = 0
@@ -214,6 +222,14 @@ class ParticleArrays:
             return F
         else:
             return 1.0 + self.J_minus_1[p]
+
+    @ti.func
+    def seen(self, p: int):
+        """Return what the law sees of the deformation of particle p, where a frame is read."""
+        if ti.static(self.averaged):
+            return self.stored(p) * exp(self.to_mean[p] * ti.static(1.0 / self.dimension))
+        else:
+            return self.stored(p)
 
     @ti.func
     def inner(self, p: int):

@@ -63,7 +63,7 @@ class ParticleUpdate:
         One that is crushed or inverted is lost: its stress would spread NaN over the grid.
         """
         if volume_ratio(group, group.stored(p)) > SMALLEST_J:
-            scatter(group, self, p, kick)
+            scatter(g, group, self, p, kick)
         else:
             ti.atomic_min(self.lost[self.first_lost + g], p)
         if ti.static(self.grid.keeps_filling):

@@ -75,6 +75,7 @@ class ParticleGroup(ParticleArrays):
         serial: bool,
         keeps_initial: bool = False,
         total: bool = False,
+        averaged: bool = False,
     ) -> None:
         self.bodies = tuple(bodies)
         self.first, self.count = 0, sum(len(b.position) for b in particles)
@@ -90,6 +91,7 @@ class ParticleGroup(ParticleArrays):
             serial=serial,
             keeps_initial=keeps_initial,
             total=total,
+            averaged=averaged,
         )
         self.rows = rows.astype(self.real)
         self.table.from_numpy(self.rows)

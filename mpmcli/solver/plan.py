@@ -18,6 +18,7 @@ from mpmcli.solver.grid import Grid, node_width, tile_edge
 from mpmcli.solver.ordering import TileOrder
 from mpmcli.solver.particle_contact import ParticleContact
 from mpmcli.solver.transfer_scheme import scheme_of
+from mpmcli.solver.volume_average import averages_volume
 from mpmcli.solver.volume_relaxation import needs_filling
 
 # Taichi addresses fields with 32-bit integers, and a particle has at most 3 x 4 numbers in one field.
@@ -94,7 +95,13 @@ class Plan:
 
 
 def fields_of(
-    law: type[Law], dimension: int, backend: Backend, *, several_bodies: bool, keeps_initial: bool = False
+    law: type[Law],
+    dimension: int,
+    backend: Backend,
+    *,
+    several_bodies: bool,
+    keeps_initial: bool = False,
+    averaged: bool = False,
 ) -> dict[str, int]:
     """Return the bytes of each field of one particle of a law, by name."""
     real = 8 if backend.precision == "f64" else 4
@@ -107,15 +114,18 @@ def fields_of(
         fields["volume_ratio"] = real
     fields |= {variable.name: real for variable in law.parameters.internal_in(dimension)}
     fields |= {"initial_position": dimension * real} if keeps_initial else {}
+    fields |= {"volume_to_mean": real, "cell": 4} if averaged else {}
     return fields | {"id": 4} | ({"body": 4} if several_bodies else {})
 
 
-def passes_of(names: Sequence[str], scene: Scene) -> tuple[str, ...]:
+def passes_of(members: Sequence[Law], scene: Scene) -> tuple[str, ...]:
     """Return the loops of one step: the particles of each law, and the grid."""
+    names = [law.name for law in members]
     separate = bool(_separating_axes(scene))
     pushed = {name for name in names if forces_on(scene, members_of(scene, name))}
     return (
         "clear grid",
+        *(f"average volumes of {law.name}" for law in members if averages_volume(scene.solver, law)),
         *(f"scatter {name}" + (" with forces" if name in pushed else "") for name in names),
         *(("find contact",) if separate else ()),
         "update grid",
@@ -138,6 +148,10 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     counts = Counter[str]()
     for body in scene.bodies:
         counts[body.material.law] += estimate_body(body, scene.domain.spacing)
+    members = [
+        laws()[name]([scene.bodies[i].material for i in members_of(scene, name)], dimension) for name in sorted(bodies)
+    ]
+    averaged = [averages_volume(scene.solver, law) for law in members]
     groups = tuple(
         LawPlan(
             name,
@@ -148,25 +162,23 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 backend,
                 several_bodies=bodies[name] > 1,
                 keeps_initial=scene.solver.solids == "total" or needs_initial(scene, members_of(scene, name)),
+                averaged=shares,
             ),
         )
-        for name in sorted(bodies)
+        for name, shares in zip(sorted(bodies), averaged, strict=True)
     )
     # The widest field is a matrix; sources and keys are integers.
     widest = max(size for group in groups for size in group.fields.values())
     scheme = scheme_of(scene.solver)
     tile = tile_edge(scheme.spline.nodes, dimension, on_cpu=backend.on_cpu)
     nodes = Grid.nodes_needed(cells, tile)
-    members = [
-        laws()[name]([scene.bodies[i].material for i in members_of(scene, name)], dimension) for name in sorted(bodies)
-    ]
-    node_bytes = real * width * (1 + scheme.keeps_before + needs_filling(scene, members))
+    node_bytes = real * (width * (1 + scheme.keeps_before + needs_filling(scene, members)) + 2 * sum(averaged))
     tables = len(groups) * TileOrder.bytes_needed(cells, tile, backend.threads) + _contact_bytes(scene, nodes, tile)
     if scene.solver.solids == "total" and len(scene.bodies) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(counts.values()))
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
     host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)
-    passes = passes_of(sorted(bodies), scene)
+    passes = passes_of(members, scene)
     return Plan(groups, nodes, widest + 8, node_bytes, nodes * node_bytes + tables, host_bytes, passes)
 
 

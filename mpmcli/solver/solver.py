@@ -19,7 +19,7 @@ from mpmcli.solver.run import COLLAPSE, Run
 from mpmcli.solver.state import State
 from mpmcli.solver.state_bounds import build_measurement
 from mpmcli.solver.step_control import StepControl
-from mpmcli.solver.sums import NO_STEPS, Sums
+from mpmcli.solver.sums import NO_STEPS, StepsTaken, Sums
 
 # Cells that a particle of a GPU run may move in a step beyond the estimate.
 UNSEEN = 0.05
@@ -153,6 +153,11 @@ class Solver(Run):
         self._kernels.particles.lost.fill(NOT_LOST)
         self.state.drift = math.inf
         self.measure_state(self.last_step)
+
+    def frame(self, index: int = 0, taken: StepsTaken = NO_STEPS) -> tuple[Frame, LedgerRow]:
+        if self._kernels.average is not None:
+            self._kernels.average()
+        return super().frame(index, taken)
 
     def _read(self, arrays: FrameArrays) -> list[Sums]:
         found = [

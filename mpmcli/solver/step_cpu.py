@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
-from mpmcli.solver.cpu_loops import clear_rows, scatter_pencils, update_rows
+from mpmcli.solver.cpu_loops import average_pencils, clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid
 from mpmcli.solver.lanes import advance_range
@@ -70,6 +70,7 @@ def build_cpu_step(
     )
     read_back = (*largest_rate, *(field for fields in maxima for field in fields))
     relaxes = any(group.law.relaxes for group in groups)
+    averages = any(group.averaged for group in groups)
     largest_change = tuple(ti.field(float, shape=()) for _ in groups)
     changes = ti.types.vector(len(groups), float)
     numbers = ti.types.vector(1 + len(read_back), float)
@@ -93,13 +94,31 @@ def build_cpu_step(
         for k in ti.static(range(len(maxima[g]))):
             ti.atomic_max(maxima[g][k][None], own[k])
 
+    # A kernel of its own, as all particles of a cell have to be added before one of them is scattered.
+    @ti.kernel
+    def average(part: int):
+        """Add some colours to their cells, after clearing the grid for the first ones."""
+        ti.loop_config(serialize=alone)
+        for q in range(CHUNK * threads):
+            if q % CHUNK == 0:
+                rows, t = grid.row_count() if part == 0 else 0, q // CHUNK
+                clear_rows(grid, share_start(rows, t, threads), share_start(rows, t + 1, threads))
+        for g, group, order in ti.static(pairs):
+            if ti.static(group.averaged):
+                ti.loop_config(serialize=alone)
+                for q in range(CHUNK * threads):
+                    if q % CHUNK == 0:
+                        t = q // CHUNK
+                        first, last = order.work[part, t], order.work[part, t + 1]
+                        average_pencils(grid, g, group, order, part, first, last)
+
     @ti.kernel
     def p2g(part: int, kick: float, relaxed: float):
         """Scatter some colours, after clearing the grid for the first ones."""
         ti.loop_config(serialize=alone)
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
-                rows = grid.row_count() if part == 0 else 0
+                rows = grid.row_count() if part == ti.static(-1 if averages else 0) else 0
                 t = q // CHUNK
                 clear_rows(grid, share_start(rows, t, threads), share_start(rows, t + 1, threads))
         for g, group, order in ti.static(pairs):
@@ -163,6 +182,8 @@ def build_cpu_step(
         return result
 
     def step(dt: float, kick: float, relaxed: float) -> StepResult:
+        for part in range(orders[0].colours if averages else 0):
+            average(part)
         for part in range(orders[0].colours // together):
             p2g(part, kick, relaxed)
         changed = relax(relaxed).to_list() if relaxes and relaxed > 0 else [0.0] * len(groups)

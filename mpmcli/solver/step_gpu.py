@@ -9,6 +9,7 @@ from mpmcli.solver.grid import Grid
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.particle_update import ParticleUpdate
 from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.volume_average import add_volume
 
 
 def build_gpu_step(
@@ -21,6 +22,10 @@ def build_gpu_step(
     def step(dt: float, kick: float, relaxed: float):
         for q in range(grid.box_nodes()):
             grid.clear(grid.linear_index(grid.box_node(q)))
+        for g, group in ti.static(numbered):
+            if ti.static(group.averaged):
+                for p in range(group.count):
+                    add_volume(grid, g, group, p)
         for g, group in ti.static(numbered):
             for p in range(group.count):
                 particles.scatter(g, group, p, kick, relaxed)

@@ -11,10 +11,11 @@ import taichi as ti
 
 from mpmcli.solver.particle_arrays import MASS, VOLUME
 from mpmcli.solver.reference_grid import pulled_back, push_of_walls
+from mpmcli.solver.volume_average import missing_to_mean, stretch_to
 
 
 @ti.func
-def scatter(group: ti.template(), particles: ti.template(), p: int, kick: float):
+def scatter(g: ti.template(), group: ti.template(), particles: ti.template(), p: int, kick: float):
     """Add the mass and the momentum of particle p, stress included, to the nodes around it, with atomics.
 
     A law with plastic flow projects the particle's state first. Forces change what is scattered: v by kick a, and C by
@@ -27,9 +28,17 @@ def scatter(group: ti.template(), particles: ti.template(), p: int, kick: float)
     row = group.row(p)
     mass = row[MASS]
     v, C = group.motion(p)
-    stress, _, deformation, inner = group.law.respond(group.stored(p), group.inner(p), C, kick, group.constants(p))
+    seen = group.stored(p)
+    share = 1.0
+    if ti.static(group.averaged):
+        share = stretch_to(missing_to_mean(grid, g, group, p), ti.static(group.dimension))
+        seen *= share
+    stress, _, deformation, inner = group.law.respond(seen, group.inner(p), C, kick, group.constants(p))
     if ti.static(group.law.projects):
-        group.store(p, deformation, inner)
+        if ti.static(group.averaged):
+            group.store(p, group.stored(p) + (deformation - seen) / share, inner)
+        else:
+            group.store(p, deformation, inner)
     if ti.static(group.pushed):
         push, slope = group.force.acceleration(group, p, ti.static(group.force.spreads and affine))
         v += kick * push

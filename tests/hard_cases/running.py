@@ -34,6 +34,7 @@ def scene(
     precision: str = "f32",
     origin: float = 0.0,
     fields: Sequence[str] = ("velocity", "volume_ratio", "affine"),
+    step: float | str = "auto",
 ) -> Scene:
     """Return a scene of these cells, gravity (m/s^2) downwards and the lower corner at `origin` on each axis."""
     d = len(cells)
@@ -46,7 +47,7 @@ def scene(
                 "gravity": [0.0] * (d - 1) + [-gravity],
                 "origin": [origin] * d,
             },
-            "time": {"end": float(end), "frames": frames},
+            "time": {"end": float(end), "frames": frames, "step": step},
             "output": {"fields": list(fields)},
             "solver": {"precision": precision},
             "bodies": list(bodies),

@@ -1,0 +1,127 @@
+"""Lets the particles of a cell share their change of volume, so that nearly incompressible material does not lock.
+
+The law of a particle sees F (J'/J)^(1/d), where ln J' is the mean of ln J over the particles of its cell, weighted by
+their volumes at rest: F-bar (de Souza Neto et al. 1996) with the projection of B-bar (Hughes 1980). See docs/theory.md,
+4.4. Only groups that ask for it (`ParticleArrays.averaged`) have any of this compiled.
+"""
+
+from collections.abc import Callable, Sequence
+
+import taichi as ti
+
+from mpmcli.materials.elementary import exp
+from mpmcli.materials.law import SMALLEST, Law
+from mpmcli.materials.tensors import log_ratio, volume_strain
+from mpmcli.scene.schema import SolverSettings
+from mpmcli.solver.grid import Grid
+from mpmcli.solver.lane_state import LANES, load_deformation, matrix_of, vector_of, zero_lanes
+from mpmcli.solver.particle_arrays import VOLUME, ParticleArrays
+from mpmcli.solver.splines import PAD
+
+
+def averages_volume(settings: SolverSettings, law: Law) -> bool:
+    """Return whether the particles of a law share their change of volume."""
+    if settings.f_bar == "auto":
+        return law.locks
+    return settings.f_bar and law.deformation == "F"
+
+
+@ti.func
+def cell_of(grid: ti.template(), x: ti.template()):
+    """Return the linear index of the first node of the cell of a point."""
+    cell = ti.Vector.zero(int, ti.static(grid.dimension))
+    for a in ti.static(range(grid.dimension)):
+        cell[a] = ti.cast(ti.floor(x[a] * grid.inverse_spacing), int) + PAD
+    return grid.linear_index(cell)
+
+
+@ti.func
+def log_volume(H: ti.template()):
+    """Return ln J from F - I, finite where a particle is crushed or inverted, too."""
+    return log_ratio(ti.max(volume_strain(H), ti.static(SMALLEST - 1.0)))
+
+
+@ti.func
+def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int):
+    """Add particles first to last - 1 of the g-th group to their cells; no other thread may write to these."""
+    d = ti.static(group.dimension)
+    x, deformation = zero_lanes(d), zero_lanes(ti.static(d * d))
+    volumes, logs, cells = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES), ti.Vector.zero(int, LANES)
+    begin = first
+    while begin < last:
+        count = ti.min(LANES, last - begin)
+        for lane in range(LANES):
+            p = begin + ti.min(lane, count - 1)
+            load_deformation(group, p, lane, deformation)
+            at = group.on_grid(p)
+            for a in ti.static(range(d)):
+                x[a, lane] = at[a]
+            volumes[lane] = group.row(p)[VOLUME]
+        for lane in range(LANES):
+            logs[lane] = volumes[lane] * log_volume(matrix_of(deformation, d, lane))
+            cells[lane] = cell_of(grid, vector_of(x, 0, d, lane))
+        for lane in range(count):
+            group.cell[begin + lane] = cells[lane]
+            group.to_mean[begin + lane] = logs[lane] / volumes[lane]
+            grid.means[g][cells[lane]] = grid.means[g][cells[lane]] + ti.Vector([logs[lane], volumes[lane]])
+        begin += LANES
+
+
+@ti.func
+def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
+    """Add particle p to its cell, with atomics."""
+    H = ti.Matrix.zero(float, group.dimension, group.dimension)
+    for i, j in ti.static(ti.ndrange(group.dimension, group.dimension)):
+        H[i, j] = group.displacement_gradient[p][i, j]
+    own = log_volume(H)
+    group.to_mean[p] = own
+    volume, cell = group.row(p)[VOLUME], cell_of(grid, group.on_grid(p))
+    ti.atomic_add(grid.means[g][cell][0], volume * own)
+    ti.atomic_add(grid.means[g][cell][1], volume)
+
+
+@ti.func
+def missing_to_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
+    """Return the mean of ln J over the cell of particle p less its own, once all were added."""
+    sums = grid.means[g][group.cell[p]]
+    return sums[0] / sums[1] - group.to_mean[p]
+
+
+@ti.func
+def stretch_to(missing: float, d: ti.template()):
+    """Return the factor of F by which ln J grows by `missing`."""
+    return exp(missing * ti.static(1.0 / d))
+
+
+@ti.func
+def average_for_frame(grid: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int):
+    """Leave in `to_mean` of all particles of a run what `missing_to_mean` returns; on one thread."""
+    for p in range(first, last):
+        grid.means[g][cell_of(grid, group.on_grid(p))] = ti.Vector.zero(float, 2)
+    average_range(grid, g, group, first, last)
+    for p in range(first, last):
+        group.to_mean[p] = missing_to_mean(grid, g, group, p)
+
+
+def build_averaging(grid: Grid, groups: Sequence[ParticleArrays], *, on_cpu: bool) -> Callable[[], None]:
+    """Return what does so for groups of one run, before a frame is read."""
+    members = tuple((g, group, group.x.shape[0]) for g, group in enumerate(groups) if group.averaged)
+
+    @ti.kernel
+    def average_serially():
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            for g, group, count in ti.static(members):
+                average_for_frame(grid, g, group, 0, count)
+
+    @ti.kernel
+    def average_at_once():
+        for g, group, count in ti.static(members):
+            for p in range(count):
+                grid.means[g][cell_of(grid, group.on_grid(p))] = ti.Vector.zero(float, 2)
+            for p in range(count):
+                add_volume(grid, g, group, p)
+            for p in range(count):
+                group.to_mean[p] = missing_to_mean(grid, g, group, p)
+
+    return average_serially if on_cpu else average_at_once

@@ -1,0 +1,137 @@
+"""Particles of a cell share their change of volume (docs/theory.md, 4.4)."""
+
+from collections.abc import Callable
+
+import mpm_reference as reference
+import numpy as np
+import pytest
+from solver_state import scene_of
+
+from mpmcli.scene import Scene
+from mpmcli.solver.solver import Solver
+
+H = 0.1
+E, NU, DENSITY = 1e5, 0.49, 1000.0
+MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
+
+
+def block(dimension: int = 2, *, law: str = "neo_hookean", solids: str = "updated", **more: object) -> Scene:
+    """Return a block that flies freely."""
+    material = {"law": law, "density": DENSITY, "youngs_modulus": E, "poissons_ratio": NU} | more.pop("material", {})
+    d = dimension
+    solver = {"precision": "f64", "solids": solids} | more.pop("solver", {})
+    return scene_of(
+        domain={"size": [1.0] * d, "spacing": H},
+        time={"end": more.pop("end", 0.3), "frames": 6},
+        solver=solver,
+        output={"fields": ["velocity", "pressure", "volume_ratio"]},
+        bodies=[
+            {
+                "name": "block",
+                "material": material,
+                "shape": {"box": {"min": [0.33] * d, "max": [0.63] * d}},
+                "velocity": ["sin(9*Y)", "-sin(7*X)", "0.4*sin(8*Y)"][:d],
+                **more,
+            }
+        ],
+    )
+
+
+def shared(x: np.ndarray, F: np.ndarray, volume: np.ndarray) -> np.ndarray:
+    """Return F with ln J replaced by its mean over the particles of a cell, weighted by their volumes at rest."""
+    d = x.shape[1]
+    theta = np.log(np.linalg.det(F))
+    cells = np.unique(np.floor(x / H).astype(int), axis=0, return_inverse=True)[1].ravel()
+    mean = (np.bincount(cells, volume * theta) / np.bincount(cells, volume))[cells]
+    return F * np.exp((mean - theta) / d)[:, None, None]
+
+
+@pytest.mark.parametrize(
+    ("dimension", "solids"), [(2, "updated"), (2, "total"), pytest.param(3, "updated", marks=pytest.mark.slow)]
+)
+def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int, solids: str) -> None:
+    """Stress of F with the mean of ln J of the cell, the one at rest where bodies are on the grid at rest."""
+    d = dimension
+    scene = block(d, solids=solids)
+    solver = Solver(scene, backend_of("f64", 1))
+    group, rng = solver.groups[0], np.random.default_rng(1)
+    n = group.count
+    group.set_motion(rng.uniform(-1, 1, (n, d)), rng.uniform(-3, 3, (n, d, d)))
+    group.set_deformation(np.eye(d) + rng.uniform(-0.2, 0.2, (n, d, d)))
+    x = group.x.to_numpy()
+    group.x.from_numpy(x + rng.uniform(-0.02, 0.02, x.shape))
+    solver.state_was_replaced()
+    before = group.to_numpy()
+    sample, kick, dt = solver._particles[0], 0.5e-4, 1e-4
+    mass, volume, F = np.full(n, sample.mass), np.full(n, sample.volume), before["deformation"]
+    place = before["x"] if solids == "updated" else group.initial.to_numpy()
+    seen = shared(place, F, volume)
+    assert np.abs(np.linalg.det(seen) - np.linalg.det(F)).max() > 0.05
+    tau = reference.neo_hookean_stress(np.full(n, MU), np.full(n, LAMBDA))
+    C = before["C"]
+    if solids == "updated":
+        stress = lambda F, p: tau(seen[p], p)  # noqa: E731
+    else:
+        C = C @ F
+        stress = lambda F, p: tau(seen[p], p) @ np.linalg.inv(F).T  # noqa: E731
+    box = reference.Box(scene.domain.cells, H, np.zeros(d), [("slip", "slip")] * d)
+    particles = reference.Particles(place, before["v"], C, F, mass, volume, stress)
+    velocity = reference.update(*reference.scatter([particles], box, kick), box, kick)
+    (after,) = reference.gather([particles], velocity, box, dt)
+    solver.step(dt)
+    found = group.to_numpy()
+    same = np.argsort(found["id"])[np.argsort(np.argsort(before["id"]))]
+    assert np.abs(found["v"][same] - after.v).max() < 1e-12 * np.abs(after.v).max()
+    # F itself is that of the particle: only what the law sees is shared.
+    grown = F + dt * (after.C @ F if solids == "updated" else after.C)
+    assert np.abs(found["deformation"][same] - grown).max() < 1e-13
+    # What a frame shows is what the law sees, at the places of the frame.
+    place = found["x"] if solids == "updated" else group.initial.to_numpy()
+    J = np.linalg.det(shared(place, found["deformation"], volume))
+    frame, _ = solver.frame()
+    assert np.abs(frame.fields["volume_ratio"][found["id"]] - J).max() < 1e-6
+
+
+@pytest.mark.parametrize("law", ["neo_hookean", "fixed_corotated", "von_mises"])
+def test_momenta_stay_and_energy_does_not_grow(backend_of: Callable, law: str) -> None:
+    """The mean of the strain and that of the stress are the same projection, so that the force is that of an energy."""
+    more = {"poissons_ratio": 0.4999} | ({"yield_stress": 3e3} if law == "von_mises" else {})
+    scene = block(law=law, material=more, end=0.2)
+    rows = [row for _, row in Solver(scene, backend_of("f64", 1)).frames()]
+    momentum = np.array([row.linear_momentum for row in rows])
+    assert np.abs(momentum - momentum[0]).max() < 1e-13 * scene.bodies[0].material.density
+    spin = np.array([row.angular_momentum[0] for row in rows])
+    assert np.abs(spin - spin[0]).max() < 1e-11 * abs(spin[0])
+    energy = np.array([row.energy for row in rows])
+    assert (energy < 1.001 * energy[0]).all() and energy[-1] > 0.2 * energy[0]
+
+
+def test_a_uniform_change_of_volume_is_not_changed(backend_of: Callable) -> None:
+    """Where all particles have one J the mean is J, and the run is that without averaging, to round-off."""
+
+    def run(f_bar: bool) -> np.ndarray:
+        scene = block(deformation=[[1.1, 0.0], [0.0, 1.2]], velocity=[0.0, 0.0], solver={"f_bar": f_bar})
+        solver = Solver(scene, backend_of("f64", 1))
+        solver.step(1e-4)
+        return solver.groups[0].to_numpy()["v"]
+
+    plain, averaged = run(False), run(True)
+    assert np.abs(plain).max() > 1e-3
+    assert np.abs(averaged - plain).max() < 1e-12 * np.abs(plain).max()
+
+
+@pytest.mark.parametrize(
+    ("material", "setting", "averages"),
+    [
+        ({"law": "neo_hookean", "poissons_ratio": 0.44}, "auto", False),
+        ({"law": "neo_hookean", "poissons_ratio": 0.45}, "auto", True),
+        ({"law": "neo_hookean", "poissons_ratio": 0.2}, True, True),
+        ({"law": "neo_hookean", "poissons_ratio": 0.49}, False, False),
+        ({"law": "sand", "friction_angle": 30.0, "poissons_ratio": 0.46}, "auto", False),
+    ],
+)
+def test_who_averages(backend_of: Callable, material: dict, setting: object, averages: bool) -> None:
+    solver = Solver(block(material=material, law=material["law"], solver={"f_bar": setting}), backend_of("f64", 1))
+    assert solver.groups[0].averaged == averages
+    # The plan says so, and what does not average has no field for it.
+    assert (solver.groups[0].to_mean is not None) == averages == bool(solver.grid.kept_means)
