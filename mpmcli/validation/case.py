@@ -76,7 +76,7 @@ class Case(ABC):
         measures: the measures; the first one is the error of the case.
         varies: the fields of `Setting` that are varied.
         finer: factor on the particles per cell and axis of the setting.
-        solids: grid of elastic bodies, as in a scene.
+        solids: grid of elastic bodies, as in a scene; f_bar: whether volumes are averaged over cells, as in a scene.
         note: remarks on the result, such as the origin of a bound; may be "".
     """
 
@@ -90,6 +90,7 @@ class Case(ABC):
     varies: ClassVar[tuple[str, ...]] = ("precision", "kernel", "transfer", "walls", "per_axis", "safety")
     finer: ClassVar[int] = 1
     solids: str = "updated"
+    f_bar: ClassVar[bool | str] = "auto"
     note: ClassVar[str] = ""
 
     @abstractmethod
@@ -104,7 +105,9 @@ class Case(ABC):
             "title": self.title,
             **tables,
             "time": {**tables["time"], "safety": setting.safety},
-            "solver": setting.solver_table() | ({"solids": "total"} if self.solids == "total" else {}),
+            "solver": setting.solver_table()
+            | ({"solids": "total"} if self.solids == "total" else {})
+            | ({"f_bar": self.f_bar} if self.f_bar != "auto" else {}),
             "bodies": [{**body, "particles_per_cell": per_cell} for body in tables["bodies"]],
         }
 
