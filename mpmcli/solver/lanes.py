@@ -206,7 +206,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 C = C @ (grown + ti.Matrix.identity(float, d)).inverse()
             for c, a in ti.static(ti.ndrange(d, d)):
                 gradients[lane, a * width + c] = C[c, a]
-            inside, left, outside = particles.moved(place, vector_of(remainders, 0, d, lane), velocity, dt)
+            inside, left, outside = particles.moved(group, place, vector_of(remainders, 0, d, lane), velocity, dt)
             for c in ti.static(range(d)):
                 moved[c, lane] = inside[c]
                 if ti.static(group.carries):

@@ -26,9 +26,9 @@ class ParticleArrays:
         dimension: d.
         x: position relative to the origin of the domain, (n) Vector(d), m.
         v: velocity, (n) Vector, m/s, as wide as a node of the grid; the first d entries count.
-        gradient: of the velocity, (n) matrix of d rows as wide, 1/s: row a holds dv/dx_a, the transpose of C, and behind
-            these d entries the remainder of the position along a where it `carries` one, m.
-        carries: whether particles keep what rounding takes from their positions, and move on by it: in single precision.
+        gradient: of the velocity, (n) matrix of d rows as wide, 1/s: row a holds dv/dx_a, the transpose of C, and then
+            the remainder of x along a, m, where the group `carries` one.
+        carries: whether particles carry what rounding takes from x, see `ParticleUpdate.moved`: in single precision.
         displacement_gradient: F - I, (n) matrix of d rows, each as wide as a node; None where the law keeps J.
         J_minus_1: J - 1, (n); None where the law keeps F. Both are stored as the difference from rest: a step adds
             strains of 1e-6 and less, which single precision would round off next to 1.

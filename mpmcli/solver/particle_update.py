@@ -102,7 +102,7 @@ class ParticleUpdate:
         if ti.static(group.carries):
             for c in ti.static(range(d)):
                 remainder[c] = group.gradient[p][c, d]
-        inside, after, beyond = self.moved(x, remainder, v, dt)
+        inside, after, beyond = self.moved(group, x, remainder, v, dt)
         if ti.static(self.grid.scheme.keeps_before):
             kept = self.unseen_velocity(group, p)
             for c in ti.static(range(d)):
@@ -151,12 +151,12 @@ class ParticleUpdate:
         return deforming
 
     @ti.func
-    def moved(self, x: ti.template(), remainder: ti.template(), v: ti.template(), dt: float):
+    def moved(self, group: ti.template(), x: ti.template(), remainder: ti.template(), v: ti.template(), dt: float):
         """Return where a particle at x moves in dt, clamped to the domain, and how far it would leave it, m.
 
         Args:
             remainder: what rounding took from x, m; the one after the move is returned in between. Their sum loses
-                nothing (Dekker 1971; docs/theory.md, 8.3), as long as no compiler reorders it.
+                nothing (Dekker 1971; docs/theory.md, 8.3).
         """
         inside = ti.Vector.zero(float, self.dimension)
         after = ti.Vector.zero(float, self.dimension)
@@ -167,7 +167,8 @@ class ParticleUpdate:
             inside[c] = ti.select(moved > 0.0, moved, 0.0)
             inside[c] = ti.select(inside[c] < self.extent[c], inside[c], self.extent[c])
             beyond += ti.abs(moved - inside[c])
-            after[c] = ti.select(moved == inside[c], way - (moved - x[c]), 0.0)
+            if ti.static(group.carries):
+                after[c] = ti.select(moved == inside[c], way - (opaque(inside[c]) - x[c]), 0.0)
         return inside, after, beyond
 
     @ti.func
@@ -183,6 +184,15 @@ class ParticleUpdate:
         for c in ti.static(range(self.dimension)):
             kept[c] = self.grid.scheme.flip * (group.v[p][c] - before[c])
         return kept
+
+
+@ti.func
+def opaque(x: float):
+    """Return a number of single precision that is not negative, as no compiler can tell.
+
+    Those of Vulkan and Metal reorder sums, and would find that a rounded sum less its first term is the second.
+    """
+    return ti.bit_cast(ti.max(ti.bit_cast(x, ti.i32), 0), ti.f32)
 
 
 @ti.func
