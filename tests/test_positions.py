@@ -5,8 +5,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import taichi as ti
+from made_result import made_frame, made_header
 from solver_state import scene_of
 
+from mpmcli.check.finding import FrameFindings
+from mpmcli.check.result_state import StateCheck
+from mpmcli.output.header import RunHeader
 from mpmcli.scene import Scene
 from mpmcli.solver.engine import build_engine
 from mpmcli.solver.solver import Solver
@@ -92,3 +96,49 @@ def test_remainders(backend_of: Callable) -> None:
     # A sum of three has an error of its own: of the way, not of the position.
     error = np.abs(inside + after - (x + way))[~held]
     assert (error <= 2.0**-23 * np.abs(way)[~held] + 2.0**-47).all()
+
+
+@pytest.mark.parametrize(
+    ("walls", "settings", "holds"),
+    [
+        ("slip", {}, False),
+        pytest.param("separate", {"walls": "zeroed"}, True, marks=pytest.mark.slow),
+        pytest.param("separate", {}, False, marks=pytest.mark.slow),
+        pytest.param("stick", {}, False, marks=pytest.mark.slow),
+        pytest.param("slip", {"transfer": "aflip"}, False, marks=pytest.mark.slow),
+        pytest.param("slip", {"kernel": "cubic"}, False, marks=pytest.mark.slow),
+        pytest.param("slip", {"walls": "zeroed"}, True, marks=pytest.mark.slow),
+    ],
+)
+def test_folded_walls_hold_no_particle(
+    backend_of: Callable, few_optimisations: None, walls: str, settings: dict, holds: bool
+) -> None:
+    """A block of liquid splashes in a corner, at the whole of the stable step: none is put on a wall of its domain."""
+    scene = scene_of(
+        domain={"size": [1.0, 1.0], "cells": [32, 32], "gravity": [0.0, -10.0], "walls": walls},
+        time={"end": 0.5, "frames": 50, "safety": 1.0},
+        solver=settings,
+        bodies=[
+            {
+                "name": "liquid",
+                "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},
+                "shape": {"box": {"min": [0.125, 0.125], "max": [0.5, 0.5]}},
+                "velocity": [-3.0, -2.0],
+            }
+        ],
+    )
+    engine = build_engine(scene, backend_of("f32", 1), batched=True)
+    on_walls = [((f.position <= 0) | (f.position >= 1)).any(axis=1).sum() for f, _ in engine.frames(lambda: False)]
+    assert (max(on_walls) > 0) == holds
+
+
+@pytest.mark.parametrize("held", [0, 1])
+def test_check_counts_what_walls_hold(held: int) -> None:
+    """Of four particles one on a wall, after the start: noted with its share; before, the scene put it there."""
+    findings, frames = FrameFindings(), [made_frame(k, 2) for k in range(3)]
+    check = StateCheck(RunHeader.read(made_header(2)), findings)
+    for frame in frames:
+        frame.position[:held, 0] = 0.0
+        check.check(frame.index, frame, np.arange(4), 4)
+    told = [(f.rule, f.severity, f.frame, f.value) for f in findings.found() if f.rule == "held-positions"]
+    assert told == ([("held-positions", "note", 1, 0.25)] if held else [])
