@@ -9,6 +9,8 @@ from mpmcli.plain_text import counted
 
 # No law is valid for J below the first. Coherent material would have torn for J above the second.
 CRUSHED, BLOWN_UP = 0.1, 10.0
+# Share of the particles of a frame on walls from which on it is said: where walls are folded there are none.
+HELD = 0.01
 LOOK = "Look at this particle, and lower time.safety or refine the domain where it is."
 TOUCHED = "The file was changed after the run; copy it again or run the scene again."
 
@@ -85,6 +87,8 @@ class StateCheck:
         low, high = header.origin - tolerance, header.upper + tolerance
         # A NaN fails both comparisons and is ignored below; it has its own finding.
         lowest, highest = extent(frame.position)
+        if number > 0 and not ((lowest > header.origin).all() and (highest < header.upper).all()):
+            self._held(number, frame)
         if (lowest >= low).all() and (highest <= high).all():
             return
         beyond = np.fmax(header.origin - frame.position, frame.position - header.upper).max(1)
@@ -98,6 +102,18 @@ class StateCheck:
             f'of them, number {p} of body "{body}", by {beyond[p]:.4g} m'
         )
         self._findings.add("error", "escaped", number, what, LOOK, value=float(beyond[p]), body=body)
+
+    def _held(self, number: int, frame: Frame) -> None:
+        """Find particles that would have left, and that the domain put on a wall (docs/theory.md, 3.4)."""
+        on_wall = ((frame.position <= self._header.origin) | (frame.position >= self._header.upper)).any(1)
+        held = int(on_wall.sum())
+        if held > HELD * len(on_wall):
+            what = (
+                f"In frame {number} {held} of {counted(len(on_wall), 'particle')} lie on a wall, where the domain "
+                "holds what would leave it: the rest of their way is lost"
+            )
+            fix = 'Walls that are "folded" let none so near; with solids = "total" a stiffer material gives way less.'
+            self._findings.add("note", "held-positions", number, what, fix, value=held / len(on_wall))
 
     def _labels(self, number: int, frame: Frame, first: Frame, ids: np.ndarray) -> None:
         n = len(frame.position)

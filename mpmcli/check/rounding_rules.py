@@ -2,13 +2,16 @@
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import Finding
+from mpmcli.scene.bounds import highest_speed
 
 # Largest relative rounding error of a number of 32 bits.
 HALF_ULP = 2.0**-24
-# Rounding of a position over the displacement of the fastest particle in a step. At 1 that particle does not move, at
-# 0.1 particles ten times slower do not (docs/theory.md, 8.3; docs/hard-cases.md, H18).
+# Rounding of a position in a frame over the way of its body in the run. A step loses nothing: particles carry what
+# rounding takes from their positions (docs/theory.md, 8.3).
 LOST_MOTION = 0.1
 # Ratio of the stress from rounding of F to the stress from gravity or speed (docs/hard-cases.md, H9).
 STRESS_NOISE = 0.01
@@ -23,21 +26,23 @@ def rounding_findings(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _positions(facts: SceneFacts) -> Iterator[Finding]:
-    """Positions are relative to the origin of the domain, so that its extent is the largest."""
-    extent = max(facts.scene.domain.size)
-    way = facts.bounds.speed * facts.taken(facts.step_at_start)
-    if way == 0:
-        return
-    share = HALF_ULP * extent / way
-    if share > LOST_MOTION:
-        yield Finding(
-            "warning",
-            "rounding-positions",
-            f"Positions in a domain of {extent:.3g} m are rounded by {HALF_ULP * extent:.2g} m in single precision, "
-            f"{100 * share:.2g} % of the {way:.2g} m that the fastest particle moves in a step: slow ones stand still.",
-            'Set solver.precision = "f64".',
-            share,
-        )
+    """Positions are relative to the origin of the domain, so that the farthest of a body is rounded most."""
+    end = facts.scene.time.end
+    deformed = any(start.deformed for start in facts.starts)
+    for body in facts.bodies:
+        farthest = float(np.max(body.body.shape.form.bounds()[1] - facts.scene.domain.origin))
+        speed = facts.bounds.speed if deformed else highest_speed(body.body)
+        way = (speed + facts.bounds.gravity * end) * end
+        if way > 0 and HALF_ULP * farthest > LOST_MOTION * way:
+            yield Finding(
+                "warning",
+                "rounding-positions",
+                f'Body "{body.name}" moves {way:.2g} m at most in the run, and its positions, up to {farthest:.3g} m '
+                f"from the corner of the domain, are rounded by {HALF_ULP * farthest:.2g} m in single precision.",
+                'Set solver.precision = "f64".',
+                HALF_ULP * farthest / way,
+                body.name,
+            )
 
 
 def _strains(facts: SceneFacts) -> Iterator[Finding]:

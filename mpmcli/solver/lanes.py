@@ -162,6 +162,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
     gradients, rates = ti.Matrix.zero(float, LANES, ti.static(d * width)), ti.Vector.zero(float, LANES)
     moved, beyond, after = zero_lanes(d), ti.Vector.zero(float, LANES), zero_lanes(ti.static(stored_entries(group)))
     here = zero_lanes(ti.static(d if group.total else 1))
+    remainders = zero_lanes(d)
     rows = zero_lanes(ti.static(group.table.n if group.law.grows_by_constants else CONSTANTS + 1))
     sharpest = NOTHING
     begin = first
@@ -174,6 +175,8 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 x[c, lane] = at[c]
                 if ti.static(group.total):
                     here[c, lane] = group.x[p][c]
+                if ti.static(group.carries):
+                    remainders[c, lane] = group.gradient[p][c, d]
             load_deformation(group, p, lane, deformation)
             if ti.static(group.law.grows_by_constants):
                 row = group.row(p)
@@ -213,9 +216,11 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 C = C @ (grown + ti.Matrix.identity(float, d)).inverse()
             for c, a in ti.static(ti.ndrange(d, d)):
                 gradients[lane, a * width + c] = C[c, a]
-            inside, outside = particles.moved(place, velocity, dt)
+            inside, left, outside = particles.moved(group, place, vector_of(remainders, 0, d, lane), velocity, dt)
             for c in ti.static(range(d)):
                 moved[c, lane] = inside[c]
+                if ti.static(group.carries):
+                    remainders[c, lane] = left[c]
             beyond[lane] = outside
             rates[lane] = deformation_rate(group, C)
             if ti.static(keeps_F and not group.total):
@@ -235,6 +240,8 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
             for a in ti.static(range(d)):
                 for c in ti.static(range(width)):
                     group.gradient[p][a, c] = gradients[lane, a * width + c]
+                if ti.static(group.carries):
+                    group.gradient[p][a, d] = remainders[a, lane]
             if ti.static(keeps_F):
                 for i, j in ti.static(ti.ndrange(d, d)):
                     group.displacement_gradient[p][i, j] = after[i * d + j, lane]

@@ -13,6 +13,11 @@ from mpmcli.materials.law import Law
 MASS, VOLUME, CONSTANTS = 0, 1, 2
 
 
+def gradient_width(width: int, dimension: int, precision: str) -> int:
+    """Return the numbers in a row of `ParticleArrays.gradient`, where the velocity has `width` of them."""
+    return max(width, dimension + (precision == "f32"))
+
+
 @ti.data_oriented
 class ParticleArrays:
     """Fields of particles of one law, of one run or of several, each of which has a contiguous range.
@@ -22,7 +27,9 @@ class ParticleArrays:
         dimension: d.
         x: position relative to the origin of the domain, (n) Vector(d), m.
         v: velocity, (n) Vector, m/s, as wide as a node of the grid; the first d entries count.
-        gradient: of the velocity, (n) matrix of d rows as wide, 1/s: row a holds dv/dx_a, the transpose of C.
+        gradient: of the velocity, (n) matrix of d rows as wide, 1/s: row a holds dv/dx_a, the transpose of C, and then
+            the remainder of x along a, m, where the group `carries` one.
+        carries: whether particles carry what rounding takes from x, see `ParticleUpdate.moved`: in single precision.
         displacement_gradient: F - I, (n) matrix of d rows, each as wide as a node; None where the law keeps J.
         J_minus_1: J - 1, (n); None where the law keeps F. Both are stored as the difference from rest: a step adds
             strains of 1e-6 and less, which single precision would round off next to 1.
@@ -67,7 +74,10 @@ class ParticleArrays:
         self.dimension = d = dimension
         self.x = ti.Vector.field(d, float, shape=count, layout=layout)
         self.v = ti.Vector.field(width, float, shape=count, layout=layout)
-        self.gradient = ti.Matrix.field(d, width, float, shape=count, layout=layout)
+        self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
+        self.carries = self.real == np.float32
+        across = gradient_width(width, d, "f32" if self.carries else "f64")
+        self.gradient = ti.Matrix.field(d, across, float, shape=count, layout=layout)
         keeps_F = law.deformation == "F"
         self.displacement_gradient = ti.Matrix.field(d, width, float, shape=count, layout=layout) if keeps_F else None
         self.J_minus_1 = None if keeps_F else ti.field(float, shape=count)
@@ -86,7 +96,6 @@ class ParticleArrays:
         self.force = None
         self.run = 0
         self.table = ti.Vector.field(table[1], float, shape=table[0])
-        self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
 
     def push_by(self, force: object) -> None:
         """Let a force act on the particles, see `forces.GroupForce`."""
@@ -191,8 +200,8 @@ class ParticleArrays:
                 self.x[p][c] = reals[q, c]
             for c in ti.static(range(width)):
                 self.v[p][c] = reals[q, d + c] if ti.static(c < d) else 0.0
-                for a in ti.static(range(d)):
-                    self.gradient[p][a, c] = reals[q, (2 + c) * d + a] if ti.static(c < d) else 0.0
+            for a, c in ti.static(ti.ndrange(d, self.gradient.m)):
+                self.gradient[p][a, c] = reals[q, (2 + c) * d + a] if ti.static(c < d) else 0.0
             start = ti.static((2 + d) * d)
             if ti.static(self.law.deformation == "F"):
                 for i, j in ti.static(ti.ndrange(d, width)):

@@ -98,7 +98,11 @@ class ParticleUpdate:
         for c in ti.static(range(d)):
             for a in ti.static(range(d)):
                 C[c, a] = gradient[a, c]
-        inside, beyond = self.moved(x, v, dt)
+        remainder = ti.Vector.zero(float, d)
+        if ti.static(group.carries):
+            for c in ti.static(range(d)):
+                remainder[c] = group.gradient[p][c, d]
+        inside, after, beyond = self.moved(group, x, remainder, v, dt)
         if ti.static(self.grid.scheme.keeps_before):
             kept = self.unseen_velocity(group, p)
             for c in ti.static(range(d)):
@@ -118,6 +122,8 @@ class ParticleUpdate:
         for a in ti.static(range(d)):
             for c in ti.static(range(group.v.n)):
                 group.gradient[p][a, c] = gradient[a, c]
+            if ti.static(group.carries):
+                group.gradient[p][a, d] = after[a]
 
         # Deformation. The rate here, where C is at hand, takes half the time that it would take at the end.
         deforming = deformation_rate(group, C)
@@ -145,16 +151,25 @@ class ParticleUpdate:
         return deforming
 
     @ti.func
-    def moved(self, x: ti.template(), v: ti.template(), dt: float):
-        """Return where a particle at x moves in dt, clamped to the domain, and how far it would leave it, m."""
+    def moved(self, group: ti.template(), x: ti.template(), remainder: ti.template(), v: ti.template(), dt: float):
+        """Return where a particle at x moves in dt, clamped to the domain, and how far it would leave it, m.
+
+        Args:
+            remainder: what rounding took from x, m; the one after the move is returned in between. Their sum loses
+                nothing (Dekker 1971; docs/theory.md, 8.3).
+        """
         inside = ti.Vector.zero(float, self.dimension)
+        after = ti.Vector.zero(float, self.dimension)
         beyond = 0.0
         for c in ti.static(range(self.dimension)):
-            moved = x[c] + dt * v[c]
+            way = dt * v[c] + remainder[c]
+            moved = x[c] + way
             inside[c] = ti.select(moved > 0.0, moved, 0.0)
             inside[c] = ti.select(inside[c] < self.extent[c], inside[c], self.extent[c])
             beyond += ti.abs(moved - inside[c])
-        return inside, beyond
+            if ti.static(group.carries):
+                after[c] = ti.select(moved == inside[c], way - (opaque(inside[c]) - x[c]), 0.0)
+        return inside, after, beyond
 
     @ti.func
     def unseen_velocity(self, group: ti.template(), p: int):
@@ -169,6 +184,15 @@ class ParticleUpdate:
         for c in ti.static(range(self.dimension)):
             kept[c] = self.grid.scheme.flip * (group.v[p][c] - before[c])
         return kept
+
+
+@ti.func
+def opaque(x: float):
+    """Return a number of single precision that is not negative, as no compiler can tell.
+
+    Those of Vulkan and Metal reorder sums, and would find that a rounded sum less its first term is the second.
+    """
+    return ti.bit_cast(ti.max(ti.bit_cast(x, ti.i32), 0), ti.f32)
 
 
 @ti.func

@@ -110,7 +110,7 @@ class ParticleGroup(ParticleArrays):
         d, width = self.dimension, self.v.n
         v = np.zeros((self.count, width), self.real)
         v[:, :d] = velocity
-        gradient = np.zeros((self.count, d, width), self.real)
+        gradient = np.zeros((self.count, d, self.gradient.m), self.real)
         gradient[:, :, :d] = C.transpose(0, 2, 1)
         self.v.from_numpy(v)
         self.gradient.from_numpy(gradient)

@@ -16,6 +16,7 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import Grid, node_width, tile_edge
 from mpmcli.solver.ordering import TileOrder
+from mpmcli.solver.particle_arrays import gradient_width
 from mpmcli.solver.particle_contact import ParticleContact
 from mpmcli.solver.transfer_scheme import scheme_of
 from mpmcli.solver.volume_average import averages_volume
@@ -107,7 +108,8 @@ def fields_of(
     real = 8 if backend.precision == "f64" else 4
     width = node_width(dimension, on_cpu=True) if backend.on_cpu else dimension
     matrix = dimension * width * real
-    fields = {"position": dimension * real, "velocity": width * real, "velocity_gradient": matrix}
+    fields = {"position": dimension * real, "velocity": width * real}
+    fields["velocity_gradient"] = dimension * real * gradient_width(width, dimension, backend.precision)
     if law.deformation == "F":
         fields["deformation_gradient"] = matrix
     else:
