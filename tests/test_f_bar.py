@@ -6,6 +6,7 @@ import mpm_reference as reference
 import numpy as np
 import pytest
 from solver_state import scene_of
+from test_batch import batch_of, outputs_of, same
 
 from mpmcli.scene import Scene
 from mpmcli.solver.solver import Solver
@@ -135,3 +136,29 @@ def test_who_averages(backend_of: Callable, material: dict, setting: object, ave
     assert solver.groups[0].averaged == averages
     # The plan says so, and what does not average has no field for it.
     assert (solver.groups[0].to_mean is not None) == averages == bool(solver.grid.kept_means)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("solids", ["updated", pytest.param("total", marks=pytest.mark.slow)])
+def test_a_gpu_follows_the_cpu(backend_of: Callable, solids: str) -> None:
+    """Alone and in a batch, with what frames show, to the rounding of sums in another order."""
+    scene = block(solids=solids, solver={"precision": "f32"}, end=0.05)
+    expected = [frame for frame, _ in Solver(scene, backend_of("f32", 1)).frames()]
+    backend = backend_of("f32", 1, "vulkan")
+    alone = [frame for frame, _ in Solver(scene, backend).frames()]
+    (batched,) = outputs_of(batch_of([scene], backend), [scene])
+    for found in (alone, [frame for frame, _ in batched]):
+        assert len(found) == len(expected) == 7
+        for frame, other in zip(found, expected, strict=True):
+            assert np.abs(frame.position - other.position).max() < 1e-5
+            scale = max(np.abs(other.fields["pressure"]).max(), 1.0)
+            assert np.abs(frame.fields["pressure"] - other.fields["pressure"]).max() < 5e-3 * scale
+
+
+def test_a_batch_has_the_bytes_of_a_solver(backend_of: Callable) -> None:
+    """On any number of threads, frames included, which average once more."""
+    scene = block(solver={"precision": "f32"}, end=0.05)
+    (expected,) = outputs_of(batch_of([scene], backend_of("f32", 1)), [scene])
+    assert list(same(expected, list(Solver(scene, backend_of("f32", 2)).frames()))) == []
+    (found,) = outputs_of(batch_of([scene], backend_of("f32", 3)), [scene])
+    assert list(same(found, expected)) == []

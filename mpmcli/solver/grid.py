@@ -37,6 +37,11 @@ def node_width(dimension: int, *, on_cpu: bool) -> int:
     return 4 if on_cpu else dimension + 1
 
 
+def gradient_width(width: int, dimension: int, precision: str) -> int:
+    """Return the numbers in a row of `ParticleArrays.gradient`, where the velocity has `width` of them."""
+    return max(width, dimension + (precision == "f32"))
+
+
 @ti.data_oriented
 class Grid:
     """A dense grid of nodes over the domain and its ghost margin, addressed by one linear index.

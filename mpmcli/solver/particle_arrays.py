@@ -8,14 +8,10 @@ import taichi as ti
 
 from mpmcli.materials.elementary import exp
 from mpmcli.materials.law import Law
+from mpmcli.solver.grid import gradient_width
 
 # Entries of the per-body table that come before the constants of the law.
 MASS, VOLUME, CONSTANTS = 0, 1, 2
-
-
-def gradient_width(width: int, dimension: int, precision: str) -> int:
-    """Return the numbers in a row of `ParticleArrays.gradient`, where the velocity has `width` of them."""
-    return max(width, dimension + (precision == "f32"))
 
 
 @ti.data_oriented
@@ -41,9 +37,8 @@ class ParticleArrays:
         total: whether the body is on the grid of its state at rest, see `reference_grid`.
         initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force, or
             since they are `total`.
-        averaged: whether particles of a cell share their change of volume (`volume_average`).
-        to_mean: (n), of groups that are `averaged`: ln J during P2G, and where a frame is read what it lacks to the
-            mean of its cell.
+        averaged: whether particles of a cell share their change of volume (`volume_average`): then each has its `cell`,
+            (n), and `to_mean`, (n), ln J during P2G, and where a frame is read what it lacks to the mean of its cell.
         force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
         table: per body a row of particle mass, particle volume and the constants of the law.
         real: numpy's type of the real fields.
@@ -90,8 +85,7 @@ class ParticleArrays:
         self.keeps_initial = keeps_initial or total
         self.initial = ti.Vector.field(d, float, shape=count, layout=layout) if self.keeps_initial else None
         self.averaged = averaged
-        self.cell = ti.field(int, shape=count) if averaged else None
-        self.to_mean = ti.field(float, shape=count) if averaged else None
+        self.cell, self.to_mean = (ti.field(kind, shape=count) if averaged else None for kind in (int, float))
         self.pushed = False
         self.force = None
         self.run = 0

@@ -14,9 +14,8 @@ from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.forces import forces_on, needs_initial
-from mpmcli.solver.grid import Grid, node_width, tile_edge
+from mpmcli.solver.grid import Grid, gradient_width, node_width, tile_edge
 from mpmcli.solver.ordering import TileOrder
-from mpmcli.solver.particle_arrays import gradient_width
 from mpmcli.solver.particle_contact import ParticleContact
 from mpmcli.solver.transfer_scheme import scheme_of
 from mpmcli.solver.volume_average import averages_volume

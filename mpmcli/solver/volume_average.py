@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 
 import taichi as ti
 
-from mpmcli.materials.elementary import exp
+from mpmcli.materials.elementary import exp, log
 from mpmcli.materials.law import SMALLEST, Law
-from mpmcli.materials.tensors import log_ratio, volume_strain
+from mpmcli.materials.tensors import volume_strain
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.grid import Grid
 from mpmcli.solver.lane_state import LANES, load_deformation, matrix_of, vector_of, zero_lanes
@@ -31,14 +31,14 @@ def cell_of(grid: ti.template(), x: ti.template()):
     """Return the linear index of the first node of the cell of a point."""
     cell = ti.Vector.zero(int, ti.static(grid.dimension))
     for a in ti.static(range(grid.dimension)):
-        cell[a] = ti.cast(ti.floor(x[a] * grid.inverse_spacing), int) + PAD
+        cell[a] = ti.cast(x[a] * grid.inverse_spacing, int) + PAD
     return grid.linear_index(cell)
 
 
 @ti.func
 def log_volume(H: ti.template()):
     """Return ln J from F - I, finite where a particle is crushed or inverted, too."""
-    return log_ratio(ti.max(volume_strain(H), ti.static(SMALLEST - 1.0)))
+    return log(1.0 + ti.max(volume_strain(H), ti.static(SMALLEST - 1.0)))
 
 
 @ti.func
@@ -58,12 +58,12 @@ def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), f
                 x[a, lane] = at[a]
             volumes[lane] = group.row(p)[VOLUME]
         for lane in range(LANES):
-            logs[lane] = volumes[lane] * log_volume(matrix_of(deformation, d, lane))
+            logs[lane] = log_volume(matrix_of(deformation, d, lane))
             cells[lane] = cell_of(grid, vector_of(x, 0, d, lane))
         for lane in range(count):
             group.cell[begin + lane] = cells[lane]
-            group.to_mean[begin + lane] = logs[lane] / volumes[lane]
-            grid.means[g][cells[lane]] = grid.means[g][cells[lane]] + ti.Vector([logs[lane], volumes[lane]])
+            group.to_mean[begin + lane] = logs[lane]
+            grid.means[g][cells[lane]] = grid.means[g][cells[lane]] + volumes[lane] * ti.Vector([logs[lane], 1.0])
         begin += LANES
 
 
@@ -76,6 +76,7 @@ def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: i
     own = log_volume(H)
     group.to_mean[p] = own
     volume, cell = group.row(p)[VOLUME], cell_of(grid, group.on_grid(p))
+    group.cell[p] = cell
     ti.atomic_add(grid.means[g][cell][0], volume * own)
     ti.atomic_add(grid.means[g][cell][1], volume)
 
