@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.wall_friction import WallFriction, rough_faces
 from mpmcli.boundaries.walls import Walls, faces_on_grid
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.scene import Scene
@@ -53,11 +54,14 @@ class Kernels:
             keeps_filling=needs_filling(scene, [group.law for group in groups]),
         )
         faces = scene.domain.walls.faces(scene.dimension)
+        friction = WallFriction(rough_faces(scene))
+        friction.write(scene)
         if scene.solver.walls == "zeroed":
-            images, walls = None, ZeroedWalls(faces, PAD, self.grid.cells)
+            images, walls = None, ZeroedWalls(faces, PAD, self.grid.cells, friction)
         else:
-            walls = Walls(faces_on_grid(faces, scene.solver), PAD, self.grid.cells, self.grid.shape)
-            images = MirrorImages(walls)
+            on_grid = faces_on_grid(faces, scene.solver)
+            walls = Walls(on_grid, PAD, self.grid.cells, self.grid.shape, friction=friction)
+            images = MirrorImages(walls, scheme.spline.on_node)
         nodes = NodeUpdate(self.grid, images, [walls])
         self.contact = contact_between(groups, [len(group.bodies) for group in groups], self.grid, backend)
         self.particles = ParticleUpdate(self.grid, faces, len(groups), self.contact, watches_box=not backend.on_cpu)

@@ -140,6 +140,10 @@ def build_cpu_step(
             ti.loop_config(serialize=alone)
             for q in range(nodes.images.plane_nodes(grid)):
                 nodes.images.find_contact(grid, q, gravity.in_step(kick, 0))
+        if ti.static(nodes.needs_friction):
+            ti.loop_config(serialize=alone)
+            for q in range(nodes.images.plane_nodes(grid)):
+                nodes.images.find_friction(grid, q, gravity.in_step(kick, 0))
         ti.loop_config(serialize=alone)
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:

@@ -32,6 +32,9 @@ def build_gpu_step(
         if ti.static(nodes.needs_contact):
             for q in range(nodes.images.plane_nodes(grid)):
                 nodes.images.find_contact(grid, q, gravity.in_step(kick, 0))
+        if ti.static(nodes.needs_friction):
+            for q in range(nodes.images.plane_nodes(grid)):
+                nodes.images.find_friction(grid, q, gravity.in_step(kick, 0))
         for q in range(grid.box_nodes()):
             node = grid.box_node(q)
             nodes.update(node, grid.linear_index(node), gravity.in_step(kick, 0))
