@@ -9,12 +9,12 @@ from collections.abc import Sequence
 
 import taichi as ti
 
-from mpmcli.boundaries.wall_friction import WallFriction
+from mpmcli.boundaries.rough_faces import RoughFaces
 from mpmcli.scene.schema import SolverSettings
 
 # Nodes on each side of a wall that can hold mass from particles of the other side.
 REACH = 2
-SMOOTH = WallFriction(())
+SMOOTH = RoughFaces(())
 # The word of a face that is no wall.
 OPEN = "open"
 
@@ -50,7 +50,7 @@ class Walls:
         cells: Sequence[int],
         shape: Sequence[int],
         runs: int = 1,
-        friction: WallFriction = SMOOTH,
+        friction: RoughFaces = SMOOTH,
     ) -> None:
         """Allocate.
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import taichi as ti
 
-from mpmcli.boundaries.wall_friction import WallFriction
+from mpmcli.boundaries.rough_faces import RoughFaces
 
 
 @ti.data_oriented
@@ -19,7 +19,7 @@ class ZeroedWalls:
     the coefficient times what the wall stops.
     """
 
-    def __init__(self, faces: Sequence[tuple[str, str]], first: int, cells: Sequence[int], friction: WallFriction):
+    def __init__(self, faces: Sequence[tuple[str, str]], first: int, cells: Sequence[int], friction: RoughFaces):
         self.dimension = len(faces)
         self.faces = tuple(tuple(pair) for pair in faces)
         self.friction = friction

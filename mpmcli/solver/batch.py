@@ -9,7 +9,7 @@ import numpy as np
 import taichi as ti
 
 from mpmcli.boundaries.mirror_images import MirrorImages
-from mpmcli.boundaries.wall_friction import WallFriction, rough_faces
+from mpmcli.boundaries.rough_faces import RoughFaces, rough_faces
 from mpmcli.boundaries.walls import Walls, faces_on_grid
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.materials.law import Law
@@ -152,7 +152,7 @@ class Batch:
             push_on(group, forces, bodies, self.values.device, backend)
             for group, bodies, forces in zip(groups, kind.bodies, kind.drives.forces, strict=True)
         ]
-        images, friction = None, WallFriction(kind.rough, runs)
+        images, friction = None, RoughFaces(kind.rough, runs)
         if kind.settings.walls == "zeroed":
             walls = ZeroedWalls(kind.faces, PAD, grid.cells, friction)
         else:

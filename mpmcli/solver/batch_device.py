@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
-from mpmcli.boundaries.wall_friction import WallFriction
+from mpmcli.boundaries.rough_faces import RoughFaces
 from mpmcli.boundaries.walls import Walls
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.solver.batch_values import BatchValues
@@ -34,7 +34,7 @@ class Device:
     groups: Sequence[ParticleArrays]
     orders: Sequence[TileOrder]
     walls: Walls | ZeroedWalls
-    friction: WallFriction
+    friction: RoughFaces
     nodes: NodeUpdate
     particles: ParticleUpdate
     values: BatchValues

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import taichi as ti
 
+from mpmcli.boundaries.wall_friction import find_friction
 from mpmcli.solver.batch_device import Device, views
 from mpmcli.solver.batch_layout import ATTEND, GOING, MEASURE, Layout
 from mpmcli.solver.batch_steps import BatchSteps
@@ -123,11 +124,11 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
             nodes.images.find_contact(grid, q, pull(w))
 
     @ti.func
-    def find_friction(w: int, q: int, counts: ti.template()):
+    def rub(w: int, q: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
         grid, nodes, _particles, _orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
         if q < nodes.images.plane_nodes(grid):
-            nodes.images.find_friction(grid, q, pull(w))
+            find_friction(nodes.images, grid, q, pull(w))
 
     @ti.func
     def update(w: int, q: int, counts: ti.template()):
@@ -186,7 +187,7 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
         if ti.static(friction):
             for q in range(runs * node_count):
                 if stepping[q // node_count] == 1:
-                    find_friction(q // node_count, q % node_count, counts)
+                    rub(q // node_count, q % node_count, counts)
         for q in range(runs * node_count):
             if stepping[q // node_count] == 1:
                 update(q // node_count, q % node_count, counts)

@@ -6,6 +6,7 @@ maxima know no order.
 
 import taichi as ti
 
+from mpmcli.boundaries.wall_friction import find_friction
 from mpmcli.solver.batch_device import Device, views
 from mpmcli.solver.batch_layout import Layout
 from mpmcli.solver.batch_regions import BatchRegions
@@ -174,7 +175,7 @@ class BatchPhases:
                 first, after = self.places.even_part(nodes.images.plane_nodes(grid), region)
                 first, after = self.share(first, after, part)
                 for q in range(first, after):
-                    nodes.images.find_friction(grid, q, gravity_step)
+                    find_friction(nodes.images, grid, q, gravity_step)
         for g, group in ti.static(self.members):
             first, after = self.places.particles_of(g, w, region, counts[w, self.count.particles[g]])
             first, after = self.share(first, after, part)

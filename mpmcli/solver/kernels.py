@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 from mpmcli.boundaries.mirror_images import MirrorImages
-from mpmcli.boundaries.wall_friction import WallFriction, rough_faces
+from mpmcli.boundaries.rough_faces import RoughFaces, rough_faces
 from mpmcli.boundaries.walls import Walls, faces_on_grid
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.scene import Scene
@@ -54,7 +54,7 @@ class Kernels:
             keeps_filling=needs_filling(scene, [group.law for group in groups]),
         )
         faces = scene.domain.walls.faces(scene.dimension)
-        friction = WallFriction(rough_faces(scene))
+        friction = RoughFaces(rough_faces(scene))
         friction.write(scene)
         if scene.solver.walls == "zeroed":
             images, walls = None, ZeroedWalls(faces, PAD, self.grid.cells, friction)

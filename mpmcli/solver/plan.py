@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import psutil
 
-from mpmcli.boundaries.wall_friction import rough_faces
+from mpmcli.boundaries.rough_faces import rough_faces
 from mpmcli.errors import InputError
 from mpmcli.materials.law import Law
 from mpmcli.materials.registry import laws
@@ -164,7 +164,9 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         laws()[name]([scene.bodies[i].material for i in members_of(scene, name)], dimension) for name in sorted(bodies)
     ]
     node_bytes = real * width * (1 + scheme.keeps_before + needs_filling(scene, members))
-    tables = len(groups) * TileOrder.bytes_needed(cells, tile, backend.threads) + _contact_bytes(scene, nodes, tile, real)
+    tables = len(groups) * TileOrder.bytes_needed(cells, tile, backend.threads) + _contact_bytes(
+        scene, nodes, tile, real
+    )
     if scene.solver.solids == "total" and len(scene.bodies) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(counts.values()))
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
