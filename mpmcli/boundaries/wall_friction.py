@@ -1,7 +1,8 @@
 """Coulomb friction of walls: what it takes from each column of nodes in a step.
 
 A column is what lies along the normal of a node on the wall. The wall takes as much tangential momentum from it as
-sticking would, and at most the coefficient times the normal momentum that it gives (docs/theory.md, 3.4).
+sticking would, and at most the coefficient times the normal momentum that it gives (docs/theory.md, 3.4). Faces are
+numbers of the kernel here: a copy of what follows for each of six faces would triple the compile time of a 3D scene.
 """
 
 import taichi as ti
@@ -15,23 +16,29 @@ def find_friction(images: ti.template(), grid: ti.template(), q: int, gravity_st
 
     `find_contact` comes before. Other walls fold here as if nothing stuck by friction.
     """
-    for r, number, axis, side in ti.static(images.walls.rough):
-        node, inside = images.plane_node(grid, q, axis, side)
-        if inside:
-            depth, mirror, upper = images.walls.place(node)
-            acts = images.walls.acting(node, depth, mirror, upper)
-            impulse = ti.Vector.zero(float, images.dimension)
-            massive = grid.nodes[grid.linear_index(node)][ti.static(images.dimension)] > 0
-            if massive and acts[axis] == 1:
-                acts[axis] = 0
-                coefficient = images.walls.friction.of(number)
-                found = column_friction(
-                    images, grid, node, mirror, acts, depth, upper, gravity_step, axis, side, coefficient
-                )
-                for c in ti.static(range(images.dimension)):
+    d = ti.static(images.dimension)
+    for r in range(ti.static(len(images.walls.rough))):
+        axis, side, number = 0, 0, 0
+        for row, of_scene, its_axis, its_side in ti.static(images.walls.rough):
+            if r == row:
+                axis, side, number = its_axis, its_side, of_scene
+        node, inside = ti.Vector.zero(int, d), True
+        rest, place = q, 0
+        for b in ti.static(range(d)):
+            if b == axis:
+                node[b] = images.walls.last[b] if side == 1 else images.walls.first
+                inside = inside and node[b] >= grid.box[0, b] and node[b] < grid.box[0, b] + grid.box[1, b]
+            else:
+                node[b] = grid.box[0, b] + rest % grid.box[1, b]
+                rest = rest // grid.box[1, b]
+                place = place * ti.static(images.walls.shape[b]) + node[b]
+        if inside and rest == 0:
+            impulse = ti.Vector.zero(float, d)
+            if grid.nodes[grid.linear_index(node)][d] > 0:
+                found = column_friction(images, grid, node, gravity_step, axis, side, images.walls.friction.of(number))
+                for c in ti.static(range(d)):
                     impulse[c] = found[c]
-            place = images.walls.plane_index(node, axis)
-            for c in ti.static(range(images.dimension)):
+            for c in ti.static(range(d)):
                 images.walls.impulse[images.walls.first_rough + r, place][c] = impulse[c]
 
 
@@ -40,58 +47,71 @@ def column_friction(
     images: ti.template(),
     grid: ti.template(),
     node: ti.template(),
-    mirror: ti.template(),
-    acts: ti.template(),
-    depth: ti.template(),
-    upper: ti.template(),
     gravity_step: ti.template(),
-    axis: ti.template(),
-    side: ti.template(),
+    axis: int,
+    side: int,
     coefficient: float,
 ):
-    """Return the entry of `Walls.impulse` for the column of a node on a wall that acts.
+    """Return the entry of `Walls.impulse` for the column of a node on a wall.
 
-    Folding and gathering take p_w + sum_j 2 (m' p + m p') / (m + m') from a column along each axis whose sign they
-    turn, with mass m and momentum p of the node w + j and m', p' of its image; the sum is that of a wall that
-    sticks. The normal part of it is what the wall pushes with.
+    With mass m and momentum p of the node w + j and m', p' of its image, folding and gathering take
 
-    Args:
-        acts: which walls act along the other axes.
+        p_w + sum_j 2 (m' p + m p') / (m + m')
+
+    from a column, along each axis whose sign they turn: along all of them where the wall sticks. The normal part is
+    what the wall pushes with.
     """
     d = ti.static(images.dimension)
+    depth, mirror, upper = images.walls.place(node)
+    acts = images.walls.acting(node, depth, mirror, upper)
     holds = images.walls.holding(node, depth, upper, False)
-    on_wall = images.image_sum(grid, grid.nodes, node, mirror, acts, depth, holds, gravity_step)
-    taken = on_wall
-    slip = ti.Vector.zero(float, d)
+    pressed = False
+    for a in ti.static(range(d)):
+        if a == axis:
+            pressed = acts[a] == 1
+            acts[a] = 0
+    taken, slip = ti.Vector.zero(float, d), ti.Vector.zero(float, d)
     compliance = 0.0
-    for k in range(ti.static(REACH)):
-        j = REACH - k
-        inner, outer = node, node
-        inner[axis] += ti.static(1 - 2 * side) * j
-        outer[axis] -= ti.static(1 - 2 * side) * j
-        here = images.image_sum(grid, grid.nodes, inner, mirror, acts, depth, holds, gravity_step)
-        there = images.image_sum(grid, grid.nodes, outer, mirror, acts, depth, holds, gravity_step)
-        mass = here[d] + there[d]
-        if mass > 0:
-            for c in ti.static(range(d)):
-                taken[c] += 2 * (there[d] * here[c] + here[d] * there[c]) / mass
-                # In the end that of the nodes beside the wall.
-                slip[c] = images.shares[1] * (here[c] + there[c]) / mass
-            compliance = images.shares[1] ** 2 / mass
-    result = ti.Vector.zero(float, d)
-    bound = coefficient * (taken[axis] if ti.static(side == 1) else -taken[axis])
-    if bound >= 0:
-        needed, speed = 0.0, 0.0
-        for c in ti.static(images.walls.lateral[axis]):
-            slip[c] += images.shares[0] * on_wall[c] / on_wall[d]
+    if pressed:
+        for j in range(ti.static(REACH + 1)):
+            inner, outer = node, node
+            for a in ti.static(range(d)):
+                if a == axis:
+                    inner[a] += j
+                    outer[a] -= j
+            # Which of them lies inside does not matter.
+            here = images.image_sum(grid, grid.nodes, inner, mirror, acts, depth, holds, gravity_step)
+            there = images.image_sum(grid, grid.nodes, outer, mirror, acts, depth, holds, gravity_step)
+            mass = here[d] + there[d]
+            if mass > 0:
+                # On the wall both are the same node, which counts once.
+                whole = 0.5 if j == 0 else 1.0
+                share = 0.0
+                if j == 0:
+                    share = images.shares[0]
+                elif j == 1:
+                    share = images.shares[1]
+                for c in ti.static(range(d)):
+                    taken[c] += 2 * whole * (there[d] * here[c] + here[d] * there[c]) / mass
+                    slip[c] += share * (here[c] + there[c]) / mass
+                compliance += share**2 / (whole * mass)
+    bound, needed, speed = 0.0, 0.0, 0.0
+    for c in ti.static(range(d)):
+        if c == axis:
+            bound = coefficient * (taken[c] if side == 1 else -taken[c])
+        else:
             needed += taken[c] ** 2
             speed += slip[c] ** 2
-        compliance += images.shares[0] ** 2 / on_wall[d]
-        if needed <= bound**2:
-            result[axis] = 1.0
-        elif speed > 0:
-            speed = ti.sqrt(speed)
+    result = ti.Vector.zero(float, d)
+    if pressed and bound >= 0:
+        sticks = needed <= bound**2
+        speed = ti.sqrt(speed)
+        size = 0.0
+        if not sticks and speed > 0:
             size = ti.min(bound, speed / compliance) / speed
-            for c in ti.static(images.walls.lateral[axis]):
+        for c in ti.static(range(d)):
+            if c != axis:
                 result[c] = -size * slip[c]
+            elif sticks:
+                result[c] = 1.0
     return result
