@@ -106,7 +106,7 @@ def test_sand_stays_on_a_gentle_slope_and_flows_on_a_steep_one(
 def test_sand_stays_on_a_rough_floor_and_slides_on_a_smooth_one(
     backend_of: Callable, beyond: float, record_property: Callable
 ) -> None:
-    """A layer that is stronger than the floor: it stays with mu = tan(theta + 4 degrees), and slides with mu = tan(theta - 4 degrees).
+    """A layer stronger than the floor stays with mu = tan(theta + 4 degrees), and slides with tan(theta - 4 degrees).
 
     It then goes down the slope as a whole, with a = g (sin(theta) - mu cos(theta)) in its middle third, to 0.4 % of g:
     elastic waves from its free end have crossed it by then.

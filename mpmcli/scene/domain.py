@@ -84,7 +84,11 @@ def _in_3d(value: Any, info: ValidationInfo) -> Any:
 
 
 def _one_number_for_all(value: object) -> object:
-    return {"default": value} if isinstance(value, int | float) and not isinstance(value, bool) else value
+    if isinstance(value, Friction | dict):
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise flaw(f'must be a number, or a table with one per face, such as {{ y_min = 0.5 }}; found "{value}"')
+    return {"default": float(value)}
 
 
 def _one_word_for_all(value: object) -> object:
