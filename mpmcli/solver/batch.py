@@ -32,6 +32,7 @@ from mpmcli.solver.observe import build_observation
 from mpmcli.solver.ordering import SortBuffers, TileOrder
 from mpmcli.solver.particle_arrays import CONSTANTS, ParticleArrays
 from mpmcli.solver.particle_contact import DRIFT, contact_between
+from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.particle_update import ParticleUpdate
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.splines import PAD
@@ -46,7 +47,8 @@ class Kind:
     Attributes:
         dimension: 2 or 3; precision: "f32" or "f64".
         settings: of the solver.
-        faces: words of the walls, per axis; rough: (axis, side) of those with friction.
+        faces: words of the walls, per axis; rough: (axis, side) of those with friction; slips: whether
+            particles remember how far they slipped.
         flags: of each law in the order of their names, the name and the terms that it has.
         cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
         keeps_filling: whether nodes keep the volume scattered to them.
@@ -59,6 +61,7 @@ class Kind:
     settings: SolverSettings
     faces: tuple[tuple[str, str], ...]
     rough: tuple[tuple[int, int], ...]
+    slips: bool
     flags: tuple[tuple, ...]
     cells: tuple[int, ...]
     particles: tuple[int, ...]
@@ -82,6 +85,7 @@ class Kind:
             scene.solver,
             tuple(tuple(pair) for pair in scene.domain.walls.faces(scene.dimension)),
             rough_faces(scene),
+            slips_in(scene),
             tuple((law.name, law.terms) for law in members),
             tuple(scene.domain.cells),
             tuple(sum(len(particles[i].position) for i in own) for own in places),
@@ -142,6 +146,7 @@ class Batch:
                 serial=on_cpu and backend.threads == 1,
                 keeps_initial=forces.initial,
                 total=kind.settings.solids == "total",
+                slips=kind.slips,
             )
             for law, room, bodies, forces in zip(
                 kind.members, kind.particles, kind.bodies, kind.drives.forces, strict=True
@@ -175,7 +180,7 @@ class Batch:
             walls,
             friction,
             NodeUpdate(grid, images, [walls]),
-            ParticleUpdate(grid, kind.faces, runs * len(groups), contact, watches_box=False),
+            ParticleUpdate(grid, kind.faces, runs * len(groups), contact, friction, watches_box=False),
             self.values,
             Gravity(kind.drives.gravity, [0.0] * d, self.values.device),
         )

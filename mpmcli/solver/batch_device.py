@@ -75,7 +75,13 @@ def views(
         images = _changed(images, walls=walls)
     nodes = _changed(device.nodes, grid=grid, images=images, boundaries=(walls,))
     particles = _changed(
-        device.particles, grid=grid, extent=extent, last=last, first_lost=w * len(device.groups), run=w
+        device.particles,
+        grid=grid,
+        extent=extent,
+        last=last,
+        first_lost=w * len(device.groups),
+        friction=friction,
+        run=w,
     )
     orders = tuple(_changed(order, grid=grid, first_tile=w * (order.tiles + 1)) for order in device.orders)
     groups = tuple(group.seen_from(w) if group.pushed else group for group in device.groups)

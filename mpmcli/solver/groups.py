@@ -9,6 +9,7 @@ from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.forces import needs_initial
 from mpmcli.solver.grid import node_width
+from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.plan import members_of
 
@@ -41,6 +42,7 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
                 serial=backend.on_cpu and backend.threads == 1,
                 keeps_initial=needs_initial(scene, members),
                 total=scene.solver.solids == "total",
+                slips=slips_in(scene),
             )
         )
     return groups

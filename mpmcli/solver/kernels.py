@@ -64,7 +64,11 @@ class Kernels:
             images = MirrorImages(walls, scheme.spline.on_node)
         nodes = NodeUpdate(self.grid, images, [walls])
         self.contact = contact_between(groups, [len(group.bodies) for group in groups], self.grid, backend)
-        self.particles = ParticleUpdate(self.grid, faces, len(groups), self.contact, watches_box=not backend.on_cpu)
+        if self.contact is not None:
+            self.contact.friction[0] = scene.contact.friction
+        self.particles = ParticleUpdate(
+            self.grid, faces, len(groups), self.contact, friction, watches_box=not backend.on_cpu
+        )
         buffers = SortBuffers(groups)
         self.orders = [TileOrder(g, self.grid, buffers, backend.threads, backend.on_cpu) for g in groups]
         self._sorts = [build_sort(order) for order in self.orders]

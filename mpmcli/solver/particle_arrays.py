@@ -33,6 +33,8 @@ class ParticleArrays:
         total: whether the body is on the grid of its state at rest, see `reference_grid`.
         initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force, or
             since they are `total`.
+        slip: how far a particle in contact has slipped, (n) Vector(d), m, where there is friction (`slips`), see
+            `particle_friction`; slip_after: after the step.
         force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
         table: per body a row of particle mass, particle volume and the constants of the law.
         real: numpy's type of the real fields.
@@ -51,6 +53,7 @@ class ParticleArrays:
         serial: bool,
         keeps_initial: bool = False,
         total: bool = False,
+        slips: bool = False,
     ) -> None:
         """Allocate.
 
@@ -74,6 +77,10 @@ class ParticleArrays:
         self.total = total
         self.keeps_initial = keeps_initial or total
         self.initial = ti.Vector.field(d, float, shape=count, layout=layout) if self.keeps_initial else None
+        self.slips = slips
+        self.slip, self.slip_after = (
+            ti.Vector.field(d, float, shape=count, layout=layout) if slips else None for _ in range(2)
+        )
         self.pushed = False
         self.force = None
         self.run = 0
@@ -95,7 +102,8 @@ class ParticleArrays:
         """Every real field that the sort must move."""
         initial = () if self.initial is None else (self.initial,)
         deformation = self.J_minus_1 if self.displacement_gradient is None else self.displacement_gradient
-        return (self.x, self.v, self.gradient, deformation, *self.internal, *initial)
+        slip = (self.slip,) if self.slips else ()
+        return (self.x, self.v, self.gradient, deformation, *self.internal, *initial, *slip)
 
     @property
     def labels(self) -> tuple[ti.Field, ...]:
@@ -199,6 +207,8 @@ class ParticleArrays:
             if ti.static(self.keeps_initial):
                 for c in ti.static(range(d)):
                     self.initial[p][c] = reals[q, start + self._deformation_width + ti.static(len(self.internal)) + c]
+            if ti.static(self.slips):
+                self.slip[p] = ti.Vector.zero(float, d)
             self.id[p] = labels[q, 0]
             if ti.static(self.several):
                 self.body[p] = labels[q, 1]
