@@ -160,11 +160,8 @@ def _pushed(scene: Scene) -> Iterator[Problem]:
 
 
 def _total(scene: Scene) -> Iterator[Problem]:
-    """Find what the grid of the state at rest cannot hold, and what only bodies on such grids have."""
+    """Find what the grid of the state at rest cannot hold."""
     if scene.solver.solids != "total":
-        if scene.contact.friction > 0:
-            said = 'is for solver.solids = "total"; bodies on one grid stick where they touch: leave it out'
-            yield Problem(("contact", "friction"), said)
         return
     where = ("solver", "solids")
     names = sorted({body.material.law for body in scene.bodies})

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, cre
 from mpmcli.scene.domain import Domain
 from mpmcli.scene.entry import PlaceVector, StartDeformation, StartMatrix, StartVector
 from mpmcli.scene.material import MaterialParameters
-from mpmcli.scene.quantity import Flag, Integer, NotNegative, Positive, Table, flaw, scene_dimension
+from mpmcli.scene.quantity import Flag, Integer, Positive, Table, flaw, scene_dimension
 from mpmcli.scene.shapes import OneShape
 
 NAME = r"^[^\W\d_][\w -]*$"
@@ -159,15 +159,6 @@ def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:
     return fields
 
 
-class Contact(Table):
-    """What bodies do to each other where they touch, beside the push."""
-
-    friction: Annotated[
-        NotNegative,
-        Field(description='Coefficient of Coulomb friction between bodies; with solver.solids = "total" only.'),
-    ] = 0.0
-
-
 class Output(Table):
     """What is stored of each particle, besides its position, body and material."""
 
@@ -263,7 +254,6 @@ class Scene(Table):
     forces: Annotated[
         tuple[Force, ...], Field(description="Accelerations beside gravity; what acts on a particle adds up.")
     ] = ()
-    contact: Annotated[Contact, Field(description="How bodies touch.")] = Contact()
     output: Annotated[Output, Field(description="What is stored.")] = Output()
     solver: Annotated[SolverSettings, Field(description="How it is computed.")] = SolverSettings()
 

@@ -102,8 +102,6 @@ class BatchRun(Run):
         """Store what does not change during the run."""
         scene, h = self.scene, self.spacing
         self.batch.device.friction.write(scene, self.slot)
-        if self.batch.kind.slips and self.batch.device.particles.touches:
-            self.batch.device.particles.contact.friction[self.slot] = scene.contact.friction
         gravity = scene.domain.gravity_at(0.0)
         for a, n in enumerate(scene.domain.cells):
             self._numbers[self._real.gravity[a]] = gravity[a]

@@ -64,8 +64,6 @@ class Kernels:
             images = MirrorImages(walls, scheme.spline.on_node)
         nodes = NodeUpdate(self.grid, images, [walls])
         self.contact = contact_between(groups, [len(group.bodies) for group in groups], self.grid, backend)
-        if self.contact is not None:
-            self.contact.friction[0] = scene.contact.friction
         self.particles = ParticleUpdate(
             self.grid, faces, len(groups), self.contact, friction, watches_box=not backend.on_cpu
         )

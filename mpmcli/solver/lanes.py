@@ -18,7 +18,7 @@ from mpmcli.solver.lane_state import (
     zero_lanes,
 )
 from mpmcli.solver.particle_arrays import CONSTANTS, MASS, VOLUME
-from mpmcli.solver.particle_friction import contact_push
+from mpmcli.solver.particle_friction import friction_of_walls
 from mpmcli.solver.particle_update import SMALLEST_J, deformed_gradient
 from mpmcli.solver.reference_grid import pulled_back, push_of_walls
 from mpmcli.solver.state_bounds import NOTHING, deformation_rate, volume_growth, volume_ratio
@@ -37,8 +37,8 @@ def scatter_range(
     keeps_F = ti.static(group.law.deformation == "F")
     inners = ti.static(internal_entries(group))
     x, v, affine = zero_lanes(d), zero_lanes(d), zero_lanes(ti.static(d * d))
-    pressed = ti.static(particles.touches or group.slips)
-    touches = zero_lanes(ti.static(d if pressed else 1))
+    touches = zero_lanes(ti.static(d if particles.touches else 1))
+    frictions = zero_lanes(ti.static(d if group.slips else 1))
     # Where particles are, if that is not where they are on the grid.
     here = zero_lanes(ti.static(d if group.total else 1))
     deformation, internal = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
@@ -59,10 +59,14 @@ def scatter_range(
                 v[c, lane] = group.v[p][c]
                 if ti.static(group.total):
                     here[c, lane] = group.x[p][c]
-            if ti.static(pressed):
-                push = contact_push(particles, group, p, kick)
+            if ti.static(particles.touches):
+                push = particles.contact.push(group, p, grid.spacing, particles.run)
                 for c in ti.static(range(d)):
                     touches[c, lane] = push[c]
+            if ti.static(group.slips):
+                friction = friction_of_walls(particles, group, p, kick, lane < count)
+                for c in ti.static(range(d)):
+                    frictions[c, lane] = friction[c]
             if ti.static(group.pushed):
                 push, slope = group.force.acceleration(group, p, ti.static(group.force.spreads and grid.scheme.affine))
                 for c in ti.static(range(d)):
@@ -92,8 +96,10 @@ def scatter_range(
                     C[c, a] += kick * pushes[d + c * d + a, lane]
             if ti.static(group.total):
                 row = vector_of(rows, 0, ti.static(group.table.n), lane)
-                if ti.static(pressed):
+                if ti.static(particles.touches):
                     own += kick * vector_of(touches, 0, d, lane)
+                if ti.static(group.slips):
+                    own += kick * vector_of(frictions, 0, d, lane)
                 at = vector_of(here, 0, d, lane)
                 own += kick * push_of_walls(particles, group, at, place, state, row, constants_of(rows, lane))
                 C = C @ state
@@ -227,8 +233,6 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
             for a in ti.static(range(d)):
                 for c in ti.static(range(width)):
                     group.gradient[p][a, c] = gradients[lane, a * width + c]
-            if ti.static(group.slips):
-                group.slip[p] = group.slip_after[p]
             if ti.static(keeps_F):
                 for i, j in ti.static(ti.ndrange(d, d)):
                     group.displacement_gradient[p][i, j] = after[i * d + j, lane]

@@ -33,8 +33,8 @@ class ParticleArrays:
         total: whether the body is on the grid of its state at rest, see `reference_grid`.
         initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force, or
             since they are `total`.
-        slip: how far a particle in contact has slipped, (n) Vector(d), m, where there is friction (`slips`), see
-            `particle_friction`; slip_after: after the step.
+        slip: how far a particle has slipped on the wall that pushes it, (n) Vector(d), m, where there is friction
+            (`slips`), see `particle_friction`.
         force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
         table: per body a row of particle mass, particle volume and the constants of the law.
         real: numpy's type of the real fields.
@@ -78,9 +78,7 @@ class ParticleArrays:
         self.keeps_initial = keeps_initial or total
         self.initial = ti.Vector.field(d, float, shape=count, layout=layout) if self.keeps_initial else None
         self.slips = slips
-        self.slip, self.slip_after = (
-            ti.Vector.field(d, float, shape=count, layout=layout) if slips else None for _ in range(2)
-        )
+        self.slip = ti.Vector.field(d, float, shape=count, layout=layout) if slips else None
         self.pushed = False
         self.force = None
         self.run = 0
@@ -208,7 +206,8 @@ class ParticleArrays:
                 for c in ti.static(range(d)):
                     self.initial[p][c] = reals[q, start + self._deformation_width + ti.static(len(self.internal)) + c]
             if ti.static(self.slips):
-                self.slip[p] = ti.Vector.zero(float, d)
+                for c in ti.static(range(d)):
+                    self.slip[p][c] = 0.0
             self.id[p] = labels[q, 0]
             if ti.static(self.several):
                 self.body[p] = labels[q, 1]

@@ -56,7 +56,6 @@ class ParticleContact:
         first: of each bin, its first particle; following: of each particle, the next one in its bin; EMPTY for none.
         owner: of each bin, the body that its particles belong to, EMPTY, or SEVERAL.
         meets: of each particle, whether another body is in its bin or beside it.
-        friction: coefficient of each run.
     """
 
     def __init__(self, grid: Grid, group: ParticleArrays, runs: int) -> None:
@@ -68,7 +67,6 @@ class ParticleContact:
         self.owner = ti.field(int, shape=runs * self.count)
         self.following = ti.field(int, shape=group.x.shape[0])
         self.meets = ti.field(int, shape=group.x.shape[0])
-        self.friction = ti.field(float, shape=runs)
 
     @staticmethod
     def bytes_needed(cells: Sequence[int], particles: int) -> int:
@@ -132,11 +130,10 @@ class ParticleContact:
         return result
 
     @ti.func
-    def push(self, group: ti.template(), p: int, spacing: float, run: int, kick: float):
-        """Return the acceleration of particle p by those of other bodies, m/s^2, and the sums of `contact_push`."""
+    def push(self, group: ti.template(), p: int, spacing: float, run: int):
+        """Return the acceleration of particle p by those of other bodies, m/s^2."""
         d = ti.static(self.dimension)
         force = ti.Vector.zero(float, d)
-        sums = ti.Vector.zero(float, d + 3)
         if self.meets[p] == 1:
             x, own = group.x[p], self.stiffness(group, p, spacing)
             # Bins are those of the last sort. Particles have moved by less than DRIFT cells since.
@@ -153,21 +150,9 @@ class ParticleContact:
                             overlap = 0.5 * RANGE * (self.extent(group, p, n) + self.extent(group, q, n)) - distance
                             if overlap > 0.0:
                                 other = self.stiffness(group, q, spacing)
-                                stiffness = own * other / (own + other)
-                                force += (stiffness * overlap) * n
-                                if ti.static(group.slips):
-                                    # Half of the slip is what the one remembers, half the other.
-                                    slip = 0.5 * (group.slip[p] - group.slip[q])
-                                    v, _ = group.motion(p)
-                                    other_v, _ = group.motion(q)
-                                    friction = self.friction[run]
-                                    found, own_sums = rub(
-                                        slip, v - other_v, n, kick, stiffness, stiffness * overlap, friction
-                                    )
-                                    force += found
-                                    sums += own_sums
+                                force += (own * other / (own + other) * overlap) * n
                     q = self.following[q]
-        return force / group.row(p)[MASS], sums
+        return force / group.row(p)[MASS]
 
     @ti.func
     def spacing_of(self, group: ti.template(), p: int):
@@ -184,34 +169,3 @@ class ParticleContact:
         """Return (lambda + 2 mu) V / (s h) of particle p, N/m."""
         volume = group.row(p)[VOLUME]
         return group.law.wave_modulus(group.constants(p)) * volume / (self.spacing_of(group, p) * spacing)
-
-
-@ti.func
-def rub(
-    slip: ti.template(),
-    v: ti.template(),
-    n: ti.template(),
-    kick: float,
-    stiffness: float,
-    push: float,
-    coefficient: float,
-):
-    """Return the friction of a contact along n, N, and its part of the sums of `contact_push`.
-
-    Args:
-        slip: before the last motion, m; v: relative velocity, m/s; their parts along n do not count.
-        kick: the time of that motion, s.
-    """
-    d = ti.static(slip.n)
-    # Where the slip is by now: with that of the last step the spring would lag behind, and feed vibrations.
-    speed = v - v.dot(n) * n
-    along = slip - slip.dot(n) * n + kick * speed
-    asked, allowed = stiffness * along.norm(), coefficient * push
-    factor = stiffness
-    if asked > allowed:
-        factor = stiffness * allowed / asked
-    sums = ti.Vector.zero(float, d + 3)
-    for c in ti.static(range(d)):
-        sums[c] = push * speed[c]
-    sums[d], sums[d + 1], sums[d + 2] = push, allowed, asked
-    return -factor * along, sums

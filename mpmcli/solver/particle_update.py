@@ -110,8 +110,6 @@ class ParticleUpdate:
                 v[c] += kept[c]
 
         # Motion.
-        if ti.static(group.slips):
-            group.slip[p] = group.slip_after[p]
         for c in ti.static(range(group.v.n)):
             group.v[p][c] = v[c]
         if ti.static(group.total):

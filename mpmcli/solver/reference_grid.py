@@ -40,8 +40,7 @@ def push_of_walls(
     d = ti.static(group.dimension)
     push = ti.Vector.zero(float, d)
     spacing = row[VOLUME] ** ti.static(1.0 / group.dimension)
-    h = particles.grid.spacing
-    stiffness = group.law.wave_modulus(constants) * row[VOLUME] / (row[MASS] * spacing * h)
+    stiffness = stiffness_of(particles, group, row, constants)
     for a in ti.static(range(d)):
         stretched = stretch_along(F, a)
         for side in ti.static(range(2)):
@@ -50,6 +49,13 @@ def push_of_walls(
                 inward = ti.static(1.0 - 2.0 * side)
                 push[a] += inward * stiffness * overlap
     return push
+
+
+@ti.func
+def stiffness_of(particles: ti.template(), group: ti.template(), row: ti.template(), constants: ti.template()):
+    """Return (lambda + 2 mu) V / (m s h) of a particle, 1/s^2."""
+    spacing = row[VOLUME] ** ti.static(1.0 / group.dimension)
+    return group.law.wave_modulus(constants) * row[VOLUME] / (row[MASS] * spacing * particles.grid.spacing)
 
 
 @ti.func
