@@ -28,6 +28,7 @@ SCENES = (
         "zeroed walls, PIC": (("fluid",), 2, {"solver": {"walls": "zeroed", "transfer": "pic"}}),
         "rough walls": (("neo_hookean",), 2, {"domain": {"walls": {"default": "separate", "y_min": "slip"}}}),
         "rough walls, 3D, AFLIP": (("snow",), 3, {"solver": {"transfer": "aflip"}}),
+        "rough walls, total": (("neo_hookean",), 2, {"solver": {"solids": "total"}}),
         "rough walls, zeroed": (("sand",), 2, {"solver": {"walls": "zeroed"}}),
         "slip and stick": (("sand",), 2, {"domain": {"walls": {"default": "slip", "y_min": "stick"}}}),
     }

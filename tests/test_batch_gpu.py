@@ -19,6 +19,7 @@ pytestmark = pytest.mark.gpu
 SLOW = (
     "neo_hookean",
     "rough walls, 3D, AFLIP",
+    "rough walls, total",
     "two laws, two bodies of one",
     "3D, AFLIP",
     "forces on one body of two",

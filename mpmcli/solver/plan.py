@@ -18,6 +18,7 @@ from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import Grid, node_width, tile_edge
 from mpmcli.solver.ordering import TileOrder
 from mpmcli.solver.particle_contact import ParticleContact
+from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.transfer_scheme import scheme_of
 from mpmcli.solver.volume_relaxation import needs_filling
 
@@ -95,7 +96,13 @@ class Plan:
 
 
 def fields_of(
-    law: type[Law], dimension: int, backend: Backend, *, several_bodies: bool, keeps_initial: bool = False
+    law: type[Law],
+    dimension: int,
+    backend: Backend,
+    *,
+    several_bodies: bool,
+    keeps_initial: bool = False,
+    slips: bool = False,
 ) -> dict[str, int]:
     """Return the bytes of each field of one particle of a law, by name."""
     real = 8 if backend.precision == "f64" else 4
@@ -108,6 +115,7 @@ def fields_of(
         fields["volume_ratio"] = real
     fields |= {variable.name: real for variable in law.parameters.internal_in(dimension)}
     fields |= {"initial_position": dimension * real} if keeps_initial else {}
+    fields |= {"slip": dimension * real} if slips else {}
     return fields | {"id": 4} | ({"body": 4} if several_bodies else {})
 
 
@@ -151,6 +159,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 backend,
                 several_bodies=bodies[name] > 1,
                 keeps_initial=scene.solver.solids == "total" or needs_initial(scene, members_of(scene, name)),
+                slips=slips_in(scene),
             ),
         )
         for name in sorted(bodies)
