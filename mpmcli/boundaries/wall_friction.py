@@ -7,7 +7,7 @@ numbers of the kernel here: a copy of what follows for each of six faces would t
 
 import taichi as ti
 
-from mpmcli.boundaries.walls import REACH
+from mpmcli.boundaries.mirror_images import pulled
 
 
 @ti.func
@@ -54,9 +54,9 @@ def column_friction(
 ):
     """Return the entry of `Walls.impulse` for the column of a node on a wall.
 
-    With mass m and momentum p of the node w + j and m', p' of its image, folding and gathering take
+    With mass m and momentum p of the node w + 1 beside the wall and m', p' of its image, folding and gathering take
 
-        p_w + sum_j 2 (m' p + m p') / (m + m')
+        p_w + 2 (m' p + m p') / (m + m')
 
     from a column, along each axis whose sign they turn: along all of them where the wall sticks. The normal part is
     what the wall pushes with.
@@ -65,23 +65,28 @@ def column_friction(
     depth, mirror, upper = images.walls.place(node)
     acts = images.walls.acting(node, depth, mirror, upper)
     holds = images.walls.holding(node, depth, upper, False)
-    pressed = False
+    pressed, others = False, 0
     for a in ti.static(range(d)):
         if a == axis:
             pressed = acts[a] == 1
             acts[a] = 0
+        others += acts[a]
     taken, slip = ti.Vector.zero(float, d), ti.Vector.zero(float, d)
     compliance = 0.0
     if pressed:
-        for j in range(ti.static(REACH + 1)):
+        # No particle inside the domain reaches the second node beyond a wall.
+        for j in range(2):
             inner, outer = node, node
             for a in ti.static(range(d)):
                 if a == axis:
                     inner[a] += j
                     outer[a] -= j
             # Which of them lies inside does not matter.
-            here = images.image_sum(grid, grid.nodes, inner, mirror, acts, depth, holds, gravity_step)
-            there = images.image_sum(grid, grid.nodes, outer, mirror, acts, depth, holds, gravity_step)
+            here = pulled(grid.nodes[grid.linear_index(inner)], d, gravity_step)
+            there = pulled(grid.nodes[grid.linear_index(outer)], d, gravity_step)
+            if others > 0:
+                here = images.image_sum(grid, grid.nodes, inner, mirror, acts, depth, holds, gravity_step)
+                there = images.image_sum(grid, grid.nodes, outer, mirror, acts, depth, holds, gravity_step)
             mass = here[d] + there[d]
             if mass > 0:
                 # On the wall both are the same node, which counts once.
