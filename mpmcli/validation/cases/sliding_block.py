@@ -22,7 +22,7 @@ class SlidingBlock(Case):
     name = "sliding_block"
     title = "Block that slides along a rough floor and stops"
     group = "solids"
-    source = "Coulomb 1785; v0^2 / (2 mu g)"
+    source = "Coulomb's law of friction: v0^2 / (2 mu g)"
     resolution = "cells along the height"
     levels = {"coarse": (4,), "default": (4, 8), "fine": (4, 8, 16)}  # noqa: RUF012
     varies = ("precision", "kernel", "transfer", "walls")
