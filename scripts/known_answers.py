@@ -65,6 +65,13 @@ def falling(result: Result) -> str:
     return f"fall of the centre of mass {percent(error)} of g t²/2 off at t = {time:.2f} s"
 
 
+def block_slide_2d(result: Result) -> str:
+    """Compare how far the block slides with v^2 / (2 mu g)."""
+    place = [frame.position[:, 0].mean(dtype=np.float64) for frame in result.frames([])]
+    distance, expected = place[-1] - place[0], 2.0**2 / (2 * 0.4 * 9.81)
+    return f"slides {distance:.3f} m, {percent(distance / expected - 1)} off v²/(2 μ g)"
+
+
 def rubber_bounce_2d(result: Result) -> str:
     """Say how high the centre of the ball comes after each bounce, beside how it falls."""
     radius = 0.15
@@ -244,6 +251,7 @@ KNOWN_ANSWERS = {
     "jelly_drop_2d": falling,
     "jelly_drop_3d": falling,
     "jelly_stack_3d": falling,
+    "block_slide_2d": block_slide_2d,
     "rubber_bounce_2d": rubber_bounce_2d,
     "snowball_wall_2d": snowball_wall,
     "snowball_wall_3d": snowball_wall,

@@ -29,11 +29,12 @@ def scene(
     frames: int = 1,
     gravity: Sequence[float] = (),
     walls: object = "separate",
+    friction: object = 0.0,
     precision: str = "f32",
     fields: Sequence[str] = ("velocity",),
 ) -> Scene:
     """Return a scene with a number of cells."""
-    domain = {"size": [n * spacing for n in cells], "spacing": spacing, "walls": walls}
+    domain = {"size": [n * spacing for n in cells], "spacing": spacing, "walls": walls, "friction": friction}
     if len(gravity) > 0:
         domain["gravity"] = [float(g) for g in gravity]
     return scene_of(

@@ -26,6 +26,10 @@ SCENES = (
         "3D, AFLIP": (("snow",), 3, {"solver": {"transfer": "aflip", "flip": 0.9}}),
         "cubic splines, f64": (("neo_hookean",), 2, {"solver": {"kernel": "cubic", "precision": "f64"}}),
         "zeroed walls, PIC": (("fluid",), 2, {"solver": {"walls": "zeroed", "transfer": "pic"}}),
+        "rough walls": (("neo_hookean",), 2, {"domain": {"walls": {"default": "separate", "y_min": "slip"}}}),
+        "rough walls, 3D, AFLIP": (("snow",), 3, {"solver": {"transfer": "aflip"}}),
+        "rough walls, total": (("neo_hookean",), 2, {"solver": {"solids": "total"}}),
+        "rough walls, zeroed": (("sand",), 2, {"solver": {"walls": "zeroed"}}),
         "slip and stick": (("sand",), 2, {"domain": {"walls": {"default": "slip", "y_min": "stick"}}}),
     }
     | dict.fromkeys(DRIVEN)
@@ -46,7 +50,13 @@ def driven(k: int) -> dict[str, tuple]:
 
 # In the default suite, with the runs that a solver repeats: the second is smaller than what the batch has room for.
 # All others, and the first runs of these, carry the marker slow.
-USUAL = {"sand": (1,), "two laws, two bodies of one": (1,), "3D, AFLIP": (1,), "forces on one body of two": (1,)}
+USUAL = {
+    "rough walls": (1,),
+    "sand": (1,),
+    "two laws, two bodies of one": (1,),
+    "3D, AFLIP": (1,),
+    "forces on one body of two": (1,),
+}
 Output = list[tuple[Frame, LedgerRow]]
 
 
@@ -73,9 +83,11 @@ def scene_named(name: str, other: bool = False) -> Scene:
         for k, law in enumerate(materials)
     ]
     cells = (17 if other else 20) if d == 2 else (11 if other else 12)
+    rough = {"friction": {"y_min": 0.4 - 0.1 * other, "x_max": 0.3 + 0.1 * other}} if "rough" in name else {}
     data = {
         "domain": {"size": [1.0] * d, "cells": [cells] * d, "gravity": [0.5 * other, -9.81, 0.0][:d]}
-        | more.get("domain", {}),
+        | more.get("domain", {})
+        | rough,
         "time": {"end": 0.05 if other else 0.06, "frames": 3, "safety": 0.7 if other else 0.8},
         "output": {"fields": ["velocity", "stress", "volume_ratio", "deformation_gradient"]},
         "bodies": bodies,

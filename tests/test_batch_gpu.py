@@ -16,10 +16,19 @@ from mpmcli.solver.solver import Solver
 pytestmark = pytest.mark.gpu
 
 
-SLOW = ("neo_hookean", "two laws, two bodies of one", "3D, AFLIP", "forces on one body of two")
+SLOW = (
+    "neo_hookean",
+    "rough walls, 3D, AFLIP",
+    "rough walls, total",
+    "two laws, two bodies of one",
+    "3D, AFLIP",
+    "forces on one body of two",
+)
 
 
-@pytest.mark.parametrize("name", ["a force of the place", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)])
+@pytest.mark.parametrize(
+    "name", ["a force of the place", "rough walls", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)]
+)
 def test_runs_follow_those_on_the_cpu(backend_of: Callable, name: str) -> None:
     """Two runs in which all numbers differ: as many steps, and what sums in another order changes by round-off."""
     scenes = [scene_named(name), scene_named(name, other=True)]

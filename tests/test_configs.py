@@ -22,6 +22,7 @@ SLOW = {f"{name}_3d" for name in ("jelly_drop", "jelly_stack", "sand_column", "s
 
 def test_these_are_the_scenes():
     assert [path.stem for path in SCENES] == [
+        "block_slide_2d",
         "clay_drop_2d",
         "dam_break_2d",
         "dam_break_3d",

@@ -18,7 +18,16 @@ WALLS = {"default": "slip", "y_min": "stick"}
 
 
 def layer(
-    name: str, material: dict, cells: int, length: int, gap: int, degrees: float, end: float, frames: int
+    name: str,
+    material: dict,
+    cells: int,
+    length: int,
+    gap: int,
+    degrees: float,
+    end: float,
+    frames: int,
+    walls: object = WALLS,
+    friction: object = 0.0,
 ) -> Scene:
     """Return a layer H deep and `length` H long, with a gap below its lower end, x down the slope."""
     return scene(
@@ -28,7 +37,8 @@ def layer(
         end,
         frames=frames,
         gravity=tilted(degrees),
-        walls=WALLS,
+        walls=walls,
+        friction=friction,
         fields=["velocity", "stress"],
     )
 
@@ -90,6 +100,38 @@ def test_sand_stays_on_a_gentle_slope_and_flows_on_a_steep_one(
     else:
         assert slips[-1] > 0.3
         assert np.array(ratios[1:]) == pytest.approx(strength, rel=0.02)
+
+
+@pytest.mark.parametrize("beyond", [4.0, -4.0], ids=["rough", "smooth"])
+def test_sand_stays_on_a_rough_floor_and_slides_on_a_smooth_one(
+    backend_of: Callable, beyond: float, record_property: Callable
+) -> None:
+    """A layer stronger than the floor stays with mu = tan(theta + 4 degrees), and slides with tan(theta - 4 degrees).
+
+    It then goes down the slope as a whole, with a = g (sin(theta) - mu cos(theta)) in its middle third, to 0.4 % of g:
+    elastic waves from its free end have crossed it by then.
+    """
+    end, frames = 2.0 * np.sqrt(H / GRAVITY), 10
+    friction = float(np.tan(np.radians(SLOPE + beyond)))
+    sand = {"law": "sand", "density": SAND, "youngs_modulus": YOUNG, "friction_angle": 42.0}
+    asked = layer(
+        "sand", sand, 6, 16, 8, SLOPE, end, frames, {"default": "slip", "y_min": "separate"}, {"y_min": friction}
+    )
+    X, Y = sample_bodies(asked)[0].position.T
+    weight = SAND * GRAVITY * (H - Y)
+    pressure = weight * np.cos(np.radians(SLOPE))
+    shear = min(friction, np.tan(np.radians(SLOPE))) * pressure
+    solver = Solver(asked, backend_of("f32"))
+    solver.groups[0].set_deformation(
+        hencky_stretch(np.stack([-pressure, shear, shear, -pressure], 1).reshape(-1, 2, 2))
+    )
+    middle = middle_third(X)
+    speeds = np.array([[frame.time, frame.velocity[middle, 0].mean()] for frame, _ in solver.frames()]).T
+    expected = GRAVITY * max(np.sin(np.radians(SLOPE)) - friction * np.cos(np.radians(SLOPE)), 0.0)
+    found = float(np.polyfit(*speeds, 1)[0])
+    record_property("acceleration / g", found / GRAVITY)
+    record_property("expected", float(expected / GRAVITY))
+    assert found == pytest.approx(expected, abs=4e-3 * GRAVITY)
 
 
 DEGREES, REYNOLDS = 60.0, 0.5

@@ -133,6 +133,7 @@ origin = [0.0, 0.0]
 spacing = 0.02
 gravity = [0.0, -9.81]
 walls = { default = "separate" }
+friction = { default = 0.0 }
 
 [time]
 end = 1.5

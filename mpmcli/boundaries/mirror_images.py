@@ -19,14 +19,21 @@ class MirrorImages:
 
     Attributes:
         walls: the mirrors.
-        needs_contact: whether `find_contact` has to run before nodes are updated.
+        needs_contact: whether `find_contact` has to run before nodes are updated; needs_friction: whether
+            `find_friction` has to, after it.
+        shares: of friction's impulse on a column, that of the node on the wall, and that of the two beside it together:
+            the spline's weights at the wall, as a shear stress up to the wall is then in balance.
+        planes: axes of the faces that either of them runs over.
         crossed: per axis, whether walls along other axes always act on its faces.
     """
 
-    def __init__(self, walls: Walls) -> None:
+    def __init__(self, walls: Walls, on_node: float) -> None:
         self.walls = walls
         self.dimension = walls.dimension
         self.needs_contact = len(walls.separating) > 0
+        self.needs_friction = len(walls.rough) > 0
+        self.shares = (on_node, 1 - on_node)
+        self.planes = tuple(a for a, _ in walls.separating) + tuple(a for _, _, a, _ in walls.rough)
         self.crossed = tuple(
             any(word != "separate" for b in walls.lateral[a] for word in walls.faces[b]) for a in range(self.dimension)
         )
@@ -37,7 +44,14 @@ class MirrorImages:
         return self.walls.near(node)
 
     @ti.func
-    def fold(self, grid: ti.template(), field: ti.template(), node: ti.template(), gravity_step: ti.template()):
+    def fold(
+        self,
+        grid: ti.template(),
+        field: ti.template(),
+        node: ti.template(),
+        gravity_step: ti.template(),
+        rubbed: ti.template(),
+    ):
         """Return the momentum and mass of a node near a wall together with its images, gravity's pull included.
 
         A node on a wall that acts is its own image, and what the wall stops cancels. At an image, whose share the node
@@ -46,6 +60,7 @@ class MirrorImages:
         Args:
             field: of the nodes: momentum and mass, or momentum alone, which gravity does not pull.
             gravity_step: change of velocity by gravity in this step, m/s.
+            rubbed: whether friction acts.
         """
         depth, mirror, upper = self.walls.place(node)
         acts = self.walls.acting(node, depth, mirror, upper)
@@ -55,20 +70,36 @@ class MirrorImages:
                 owned = False
         total = ti.Vector.zero(float, grid.width)
         if owned:
-            total = self.image_sum(grid, field, node, mirror, acts, depth, upper, gravity_step)
+            holds = self.walls.holding(node, depth, upper, rubbed)
+            total = self.image_sum(grid, field, node, mirror, acts, depth, holds, gravity_step)
+            if ti.static(rubbed):
+                for r, _number, axis, side in ti.static(self.walls.rough):
+                    if acts[axis] == 1 and depth[axis] <= 1 and upper[axis] == side:
+                        impulse = self.walls.impulse[self.walls.first_rough + r, self.walls.plane_index(node, axis)]
+                        share = self.shares[0] if depth[axis] == 0 else self.shares[1]
+                        for c in ti.static(self.walls.lateral[axis]):
+                            total[c] += share * impulse[c]
             for a in ti.static(range(self.dimension)):
                 if acts[a] == 1 and depth[a] == 0:
-                    total = self.walls.stopped(total, a, upper[a])
+                    total = self.walls.stopped(total, a, holds)
         return total
 
     @ti.func
-    def unfold(self, grid: ti.template(), field: ti.template(), node: ti.template(), value: ti.template()):
+    def unfold(
+        self,
+        grid: ti.template(),
+        field: ti.template(),
+        node: ti.template(),
+        value: ti.template(),
+        rubbed: ti.template(),
+    ):
         """Write a velocity to a node near a wall, and mirrored to its images."""
         depth, mirror, upper = self.walls.place(node)
         acts = self.walls.acting(node, depth, mirror, upper)
+        holds = self.walls.holding(node, depth, upper, rubbed)
         for images in range(ti.static(2**self.dimension)):
             if self.has_image(images, acts, depth):
-                field[self.image(grid, node, mirror, images)] = self.mirrored_value(value, images, upper)
+                field[self.image(grid, node, mirror, images)] = self.mirrored_value(value, images, holds)
 
     @ti.func
     def image_sum(
@@ -79,7 +110,7 @@ class MirrorImages:
         mirror: ti.template(),
         acts: ti.template(),
         depth: ti.template(),
-        upper: ti.template(),
+        holds: ti.template(),
         gravity_step: ti.template(),
     ):
         """Return the sum over a node and its images, each mirrored, after a step of gravity.
@@ -91,7 +122,7 @@ class MirrorImages:
         for images in range(ti.static(2**self.dimension)):
             if self.has_image(images, acts, depth):
                 value = pulled(field[self.image(grid, node, mirror, images)], self.dimension, gravity_step)
-                total += self.mirrored_value(value, images, upper)
+                total += self.mirrored_value(value, images, holds)
         return total
 
     @ti.func
@@ -112,29 +143,41 @@ class MirrorImages:
         return grid.linear_index(place)
 
     @ti.func
-    def mirrored_value(self, value: ti.template(), images: int, upper: ti.template()):
-        """Return momentum or velocity mirrored: the normal part always, the rest where the wall sticks."""
+    def mirrored_value(self, value: ti.template(), images: int, holds: ti.template()):
+        """Return momentum or velocity mirrored: the normal part always, the rest where the wall holds."""
         result = value
         for a in ti.static(range(self.dimension)):
             if images >> a & 1 == 1:
-                holds = self.walls.face_is("stick", a, upper[a])
                 for c in ti.static(range(self.dimension)):
                     if ti.static(c == a):
                         result[c] = -result[c]
-                    elif holds:
+                    elif holds[a] == 1:
                         result[c] = -result[c]
         return result
 
     @ti.func
     def plane_nodes(self, grid: ti.template()):
-        """Return the number of nodes in use of the largest plane that a separating face lies in."""
+        """Return the number of nodes in use of the largest plane that a separating or a rough face lies in."""
         most = 0
-        for f in ti.static(range(len(self.walls.separating))):
+        for f in ti.static(range(len(self.planes))):
             count = 1
-            for b in ti.static(self.walls.lateral[self.walls.separating[f][0]]):
+            for b in ti.static(self.walls.lateral[self.planes[f]]):
                 count *= grid.box[1, b]
             most = ti.max(most, count)
         return most
+
+    @ti.func
+    def plane_node(self, grid: ti.template(), q: int, axis: ti.template(), upper: ti.template()):
+        """Return the q-th node in use of the plane of a face, and whether there is one."""
+        node = ti.Vector.zero(int, self.dimension)
+        node[axis] = self.walls.last[axis] if ti.static(upper) else self.walls.first
+        rest = q
+        for b in ti.static(self.walls.lateral[axis]):
+            node[b] = grid.box[0, b] + rest % grid.box[1, b]
+            rest = rest // grid.box[1, b]
+        low = grid.box[0, axis]
+        inside = rest == 0 and node[axis] >= low and node[axis] < low + grid.box[1, axis]
+        return node, inside
 
     @ti.func
     def find_contact(self, grid: ti.template(), q: int, gravity_step: ti.template()):
@@ -146,15 +189,8 @@ class MirrorImages:
         for f in ti.static(range(len(self.walls.separating))):
             axis = ti.static(self.walls.separating[f][0])
             upper = ti.static(self.walls.separating[f][1])
-            node = ti.Vector.zero(int, self.dimension)
-            node[axis] = self.walls.last[axis] if ti.static(upper) else self.walls.first
-            rest = q
-            for b in ti.static(self.walls.lateral[axis]):
-                node[b] = grid.box[0, b] + rest % grid.box[1, b]
-                rest = rest // grid.box[1, b]
-            inside = rest == 0
-            low = grid.box[0, axis]
-            if inside and node[axis] >= low and node[axis] < low + grid.box[1, axis]:
+            node, inside = self.plane_node(grid, q, axis, upper)
+            if inside:
                 value = pulled(grid.nodes[grid.linear_index(node)], self.dimension, gravity_step)
                 if ti.static(self.crossed[axis]):
                     # What other walls fold onto this node is pressed or pulled with it.
@@ -163,7 +199,8 @@ class MirrorImages:
                     for b in ti.static(self.walls.lateral[axis]):
                         separates = self.walls.face_is("separate", b, upper_side[b])
                         acts[b] = ti.cast(depth[b] <= REACH and not separates, int)
-                    value = self.image_sum(grid, grid.nodes, node, mirror, acts, depth, upper_side, gravity_step)
+                    holds = self.walls.holding(node, depth, upper_side, False)
+                    value = self.image_sum(grid, grid.nodes, node, mirror, acts, depth, holds, gravity_step)
                 outward = value[axis]
                 if ti.static(not upper):
                     outward = -outward

@@ -1,4 +1,4 @@
-"""The walls of the domain: slip, stick and separate.
+"""The walls of the domain: slip, stick and separate, the first and the last with or without friction.
 
 A wall lies on a plane of nodes. `Walls` holds where the walls are, which of them act on a node, and what they do to its
 velocity. What particles scatter beyond them is folded back by `mirror_images` (docs/theory.md, 3).
@@ -9,10 +9,12 @@ from collections.abc import Sequence
 
 import taichi as ti
 
+from mpmcli.boundaries.rough_faces import RoughFaces
 from mpmcli.scene.schema import SolverSettings
 
 # Nodes on each side of a wall that can hold mass from particles of the other side.
 REACH = 2
+SMOOTH = RoughFaces(())
 # The word of a face that is no wall.
 OPEN = "open"
 
@@ -34,10 +36,21 @@ class Walls:
         lateral: per axis, the other axes.
         contact: (planes, nodes) int, per separating face and node of its plane, whether the material presses on it.
         first_plane: row of `contact` of the first separating face.
+        friction: the coefficients; rough: of every face that has one and is a wall here its place among these,
+            its number there, axis and side.
+        impulse: per rough face of each run and node of its plane, (d,): along the wall the momentum, kg m/s, that
+            friction adds to a column of nodes that slides; along the normal 1 where the column sticks, else 0.
+        first_rough: row of `impulse` of the first rough face.
     """
 
     def __init__(
-        self, faces: Sequence[tuple[str, str]], first: int, cells: Sequence[int], shape: Sequence[int], runs: int = 1
+        self,
+        faces: Sequence[tuple[str, str]],
+        first: int,
+        cells: Sequence[int],
+        shape: Sequence[int],
+        runs: int = 1,
+        friction: RoughFaces = SMOOTH,
     ) -> None:
         """Allocate.
 
@@ -57,8 +70,19 @@ class Walls:
         self.shape = tuple(shape)
         self.first_plane = 0
         if self.separating:
-            planes = [math.prod(self.shape[b] for b in self.lateral[a]) for a, _ in self.separating]
+            planes = [self.plane_size(a) for a, _ in self.separating]
             self.contact = ti.field(ti.i32, shape=(runs * len(planes), max(planes)))
+        self.friction = friction
+        walls = [(f, a, side) for f, (a, side) in enumerate(friction.faces) if self.faces[a][side] != OPEN]
+        self.rough = tuple((r, *face) for r, face in enumerate(walls))
+        self.first_rough = 0
+        if self.rough:
+            planes = [self.plane_size(a) for _, _, a, _ in self.rough]
+            self.impulse = ti.Vector.field(self.dimension, float, shape=(runs * len(planes), max(planes)))
+
+    def plane_size(self, axis: int) -> int:
+        """Return the nodes of a plane normal to `axis`."""
+        return math.prod(self.shape[b] for b in self.lateral[axis])
 
     @ti.func
     def constrain(self, node: ti.template(), velocity: ti.template()):
@@ -71,9 +95,10 @@ class Walls:
         if self.distance(node) <= 0:
             depth, mirror, upper = self.place(node)
             acts = self.acting(node, depth, mirror, upper)
+            holds = self.holding(node, depth, upper, True)
             for a in ti.static(range(self.dimension)):
                 if acts[a] == 1 and depth[a] == 0:
-                    result = self.stopped(result, a, upper[a])
+                    result = self.stopped(result, a, holds)
                 elif depth[a] <= 0:
                     inward = result[a] if upper[a] == 0 else -result[a]
                     if inward < 0:
@@ -153,13 +178,29 @@ class Walls:
         return result
 
     @ti.func
-    def stopped(self, value: ti.template(), axis: ti.template(), upper: int):
-        """Return momentum or velocity on a wall that acts: no normal part, and none at all where it sticks."""
+    def holding(self, node: ti.template(), depth: ti.template(), upper: ti.template(), rubbed: ti.template()):
+        """Return, per axis, whether the wall within reach lets nothing slip along it: by its word, or by friction.
+
+        Args:
+            node: one that is no image, or lies on the wall.
+            rubbed: whether friction was found.
+        """
+        holds = ti.Vector.zero(int, self.dimension)
+        for a in ti.static(range(self.dimension)):
+            holds[a] = ti.cast(self.face_is("stick", a, upper[a]), int)
+        if ti.static(rubbed):
+            for r, _number, axis, side in ti.static(self.rough):
+                if depth[axis] <= REACH and upper[axis] == side:
+                    holds[axis] = ti.cast(self.impulse[self.first_rough + r, self.plane_index(node, axis)][axis], int)
+        return holds
+
+    @ti.func
+    def stopped(self, value: ti.template(), axis: ti.template(), holds: ti.template()):
+        """Return momentum or velocity on a wall that acts: no normal part, and none at all where it holds."""
         result = value
-        holds = self.face_is("stick", axis, upper)
         for c in ti.static(range(self.dimension)):
             if ti.static(c == axis):
                 result[c] = 0.0
-            elif holds:
+            elif holds[axis] == 1:
                 result[c] = 0.0
         return result

@@ -7,18 +7,22 @@ from collections.abc import Sequence
 
 import taichi as ti
 
+from mpmcli.boundaries.rough_faces import RoughFaces
+
 
 @ti.data_oriented
 class ZeroedWalls:
     """All faces of the domain, as a boundary that acts on nodes: slip and separate stop the normal velocity, stick all.
 
     A separating face stops only what moves into it. Nothing is mirrored. What nodes hold from before stress and forces
-    is not stopped: FLIP's change of velocity contains the wall's.
+    is not stopped: FLIP's change of velocity contains the wall's. Friction takes from the velocity along a wall at most
+    the coefficient times what the wall stops.
     """
 
-    def __init__(self, faces: Sequence[tuple[str, str]], first: int, cells: Sequence[int]):
+    def __init__(self, faces: Sequence[tuple[str, str]], first: int, cells: Sequence[int], friction: RoughFaces):
         self.dimension = len(faces)
         self.faces = tuple(tuple(pair) for pair in faces)
+        self.friction = friction
         self.first = first
         self.last = tuple(first + n for n in cells)
 
@@ -44,4 +48,16 @@ class ZeroedWalls:
                 outward = velocity[c] if ti.static(side == 1) else -velocity[c]
                 if outward > 0:
                     result[c] = 0.0
+        for f in ti.static(range(len(self.friction.faces))):
+            if ti.static(self.friction.faces[f] == (axis, side)):
+                along = 0.0
+                for c in ti.static(range(self.dimension)):
+                    if ti.static(c != axis):
+                        along += result[c] ** 2
+                push = velocity[axis] if ti.static(side == 1) else -velocity[axis]
+                if push > 0 and along > 0:
+                    kept = ti.max(1.0 - self.friction.of(f) * push / ti.sqrt(along), 0.0)
+                    for c in ti.static(range(self.dimension)):
+                        if ti.static(c != axis):
+                            result[c] *= kept
         return result

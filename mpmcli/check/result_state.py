@@ -104,7 +104,7 @@ class StateCheck:
         self._findings.add("error", "escaped", number, what, LOOK, value=float(beyond[p]), body=body)
 
     def _held(self, number: int, frame: Frame) -> None:
-        """Find particles that would have left, and that the domain put on a wall (docs/theory.md, 3.4)."""
+        """Find particles that would have left, and that the domain put on a wall (docs/theory.md, 3.5)."""
         on_wall = ((frame.position <= self._header.origin) | (frame.position >= self._header.upper)).any(1)
         held = int(on_wall.sum())
         if held > HELD * len(on_wall):

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from mpmcli import __version__
 from mpmcli.scene import Scene
 from mpmcli.scene.domain import Walls
+from mpmcli.scene.quantity import AXES
 from mpmcli.scene.schema import SolverSettings, usual_particles_per_cell
 from mpmcli.scene.shapes import Shape
 
@@ -83,7 +84,7 @@ class RunHeader:
         driven: whether forces act, or gravity depends on time: energy and momentum have a source then.
         total: whether elastic bodies are on the grid of their state at rest.
         keeps_spin: whether the transfers conserve angular momentum, as those of APIC do where bodies move on the grid.
-        sticking: per axis, whether a face normal to it sticks.
+        sticking: per axis, whether a face normal to it sticks or has friction.
         bodies: in the order of their labels in the frames.
         laws: in the order of the labels in the frames.
         end: s; frames: expected, the initial one included.
@@ -164,7 +165,7 @@ class RunHeader:
             driven=timed or bool(scene.get("forces")),
             total=total,
             keeps_spin=solver.get("transfer", _TRANSFER) == "apic" and not total,
-            sticking=_sticking(domain.get("walls"), d),
+            sticking=_sticking(domain.get("walls"), domain.get("friction", 0.0), d),
             bodies=_bodies([str(name) for name in stored.get("bodies", ())], scene.get("bodies", []), d),
             laws=_laws(stored),
             end=time.get("end"),
@@ -268,12 +269,16 @@ def _volume(shape: Mapping[str, Any], d: int) -> float | None:
         return None
 
 
-def _sticking(walls: Mapping[str, str] | str | None, d: int) -> tuple[bool, ...] | None:
+def _sticking(
+    walls: Mapping[str, str] | str | None, friction: Mapping[str, float] | float, d: int
+) -> tuple[bool, ...] | None:
     if walls is None:
         return None
+    numbers = friction if isinstance(friction, Mapping) else {"default": friction}
     table = {"default": walls} if isinstance(walls, str) else walls
     try:
         faces = Walls.model_validate(table, context={"dimension": d}).faces(d)
     except ValidationError:
         return None
-    return tuple("stick" in pair for pair in faces)
+    rough = [numbers.get("default", 0) > 0 or any(numbers.get(f"{a}_{s}", 0) > 0 for s in ("min", "max")) for a in AXES]
+    return tuple("stick" in pair or rubs for pair, rubs in zip(faces, rough, strict=False))

@@ -215,7 +215,8 @@ def _nearly_held(body: Body, index: int, scene: Scene) -> Iterator[Problem]:
             elif word == "stick" and gap >= _CLEAR * h:
                 said = (
                     f'"stick" is, with solver.solids = "total", for a wall that the body touches at the start; '
-                    f'"{body.name}" begins {gap:.4g} m away, and would meet it without friction: give "separate"'
+                    f'"{body.name}" begins {gap:.4g} m away, and would not stick to it later: give "separate" and '
+                    "domain.friction"
                 )
                 yield Problem(("domain", "walls", f"{AXES[k]}_{side}"), said)
 

@@ -10,6 +10,7 @@ from mpmcli.scene.quantity import (
     AXES,
     NUMBER_WORDS,
     Integer,
+    NotNegative,
     Positive,
     Table,
     Vector,
@@ -42,9 +43,7 @@ class Walls(Table):
     @field_validator("z_min", "z_max")
     @classmethod
     def _needs_a_third_axis(cls, wall: Wall | None, info: ValidationInfo) -> Wall | None:
-        if wall is not None and scene_dimension(info) == 2:
-            raise flaw("is a face of a 3D scene and this one is 2D; leave it out")
-        return wall
+        return _in_3d(wall, info)
 
     def faces(self, dimension: int) -> tuple[tuple[Wall, Wall], ...]:
         """Return what the lower and the upper face along each axis do."""
@@ -52,6 +51,44 @@ class Walls(Table):
             (getattr(self, f"{axis}_min") or self.default, getattr(self, f"{axis}_max") or self.default)
             for axis in AXES[:dimension]
         )
+
+
+class Friction(Table):
+    """Coefficient of Coulomb friction of each face that slips or separates.
+
+    The wall takes at most the coefficient times the normal force from the force along it that would make it stick.
+    """
+
+    default: Annotated[NotNegative, Field(description="For every face that is not named and does not stick.")] = 0.0
+    x_min: Annotated[NotNegative | None, Field(description="Lower face along x.")] = None
+    x_max: Annotated[NotNegative | None, Field(description="Upper face along x.")] = None
+    y_min: Annotated[NotNegative | None, Field(description="Lower face along y.")] = None
+    y_max: Annotated[NotNegative | None, Field(description="Upper face along y.")] = None
+    z_min: Annotated[NotNegative | None, Field(description="Lower face along z; 3D only.")] = None
+    z_max: Annotated[NotNegative | None, Field(description="Upper face along z; 3D only.")] = None
+
+    @field_validator("z_min", "z_max")
+    @classmethod
+    def _needs_a_third_axis(cls, value: float | None, info: ValidationInfo) -> float | None:
+        return _in_3d(value, info)
+
+    def of(self, face: str) -> float | None:
+        """Return the coefficient that is given for a face by its name, None where there is none."""
+        return getattr(self, face)
+
+
+def _in_3d(value: Any, info: ValidationInfo) -> Any:
+    if value is not None and scene_dimension(info) == 2:
+        raise flaw("is a face of a 3D scene and this one is 2D; leave it out")
+    return value
+
+
+def _one_number_for_all(value: object) -> object:
+    if isinstance(value, Friction | dict):
+        return value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise flaw(f'must be a number, or a table with one per face, such as {{ y_min = 0.5 }}; found "{value}"')
+    return {"default": float(value)}
 
 
 def _one_word_for_all(value: object) -> object:
@@ -63,6 +100,12 @@ def _one_word_for_all(value: object) -> object:
             f'must be {", ".join(words[:-1])} or {words[-1]}, or a table with one of them per face; found "{value}"'
         )
     return {"default": value}
+
+
+def _friction_schema(schema: dict[str, Any]) -> None:
+    table = {key: schema.pop(key) for key in ("$ref", "allOf") if key in schema}
+    schema["anyOf"] = [{"type": "number", "minimum": 0}, table]
+    schema["default"] = 0
 
 
 def _walls_schema(schema: dict[str, Any]) -> None:
@@ -111,6 +154,14 @@ class Domain(Table):
             json_schema_extra=_walls_schema,
         ),
     ] = Walls()
+    friction: Annotated[
+        Friction,
+        BeforeValidator(_one_number_for_all),
+        Field(
+            description="Coefficient of friction of walls that slip or separate: one number for all, or a table.",
+            json_schema_extra=_friction_schema,
+        ),
+    ] = Friction()
 
     @field_validator("size")
     @classmethod
@@ -137,6 +188,37 @@ class Domain(Table):
                 key,
             )
         return self.model_copy(update={"spacing": spacing, "cells": cells})
+
+    @model_validator(mode="after")
+    def _friction_of_walls_that_slip(self) -> "Domain":
+        words = self._words()
+        for face, word in words.items():
+            if word == "stick" and self.friction.of(face) is not None:
+                raise flaw(
+                    f'is for a wall that can slip, and domain.walls has "stick" for {face}; leave it out, or give '
+                    f'"slip" or "separate" there',
+                    f"friction.{face}",
+                )
+        if self.friction.default > 0 and set(words.values()) == {"stick"}:
+            raise flaw('is for walls that can slip, and domain.walls has "stick" for all; leave it out', "friction")
+        return self
+
+    def _words(self) -> dict[str, Wall]:
+        pairs = self.walls.faces(len(self.size))
+        return {
+            f"{axis}_{side}": word
+            for axis, pair in zip(AXES, pairs, strict=False)
+            for side, word in zip(("min", "max"), pair, strict=True)
+        }
+
+    @property
+    def frictions(self) -> tuple[tuple[float, float], ...]:
+        """Coefficients of friction of the lower and the upper face along each axis, 0 for a wall that sticks."""
+        found = []
+        for face, word in self._words().items():
+            own = self.friction.of(face)
+            found.append(0.0 if word == "stick" else self.friction.default if own is None else own)
+        return tuple(zip(found[::2], found[1::2], strict=True))
 
     @property
     def upper(self) -> tuple[float, ...]:

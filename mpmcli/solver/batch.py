@@ -9,6 +9,7 @@ import numpy as np
 import taichi as ti
 
 from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.rough_faces import RoughFaces, rough_faces
 from mpmcli.boundaries.walls import Walls, faces_on_grid
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.materials.law import Law
@@ -31,6 +32,7 @@ from mpmcli.solver.observe import build_observation
 from mpmcli.solver.ordering import SortBuffers, TileOrder
 from mpmcli.solver.particle_arrays import CONSTANTS, ParticleArrays
 from mpmcli.solver.particle_contact import DRIFT, contact_between
+from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.particle_update import ParticleUpdate
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.splines import PAD
@@ -46,7 +48,8 @@ class Kind:
     Attributes:
         dimension: 2 or 3; precision: "f32" or "f64".
         settings: of the solver.
-        faces: words of the walls, per axis.
+        faces: words of the walls, per axis; rough: (axis, side) of those with friction; slips: whether
+            particles remember how far they slipped.
         flags: of each law in the order of their names, the name and the terms that it has.
         cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
         keeps_filling: whether nodes keep the volume scattered to them.
@@ -58,6 +61,8 @@ class Kind:
     precision: str
     settings: SolverSettings
     faces: tuple[tuple[str, str], ...]
+    rough: tuple[tuple[int, int], ...]
+    slips: bool
     flags: tuple[tuple, ...]
     cells: tuple[int, ...]
     particles: tuple[int, ...]
@@ -80,6 +85,8 @@ class Kind:
             scene.solver.precision,
             scene.solver,
             tuple(tuple(pair) for pair in scene.domain.walls.faces(scene.dimension)),
+            rough_faces(scene),
+            slips_in(scene),
             tuple((law.name, law.terms) for law in members),
             tuple(scene.domain.cells),
             tuple(sum(len(particles[i].position) for i in own) for own in places),
@@ -144,6 +151,7 @@ class Batch:
                 keeps_initial=forces.initial,
                 total=kind.settings.solids == "total",
                 averaged=averages_volume(kind.settings, law),
+                slips=kind.slips,
             )
             for law, room, bodies, forces in zip(
                 kind.members, kind.particles, kind.bodies, kind.drives.forces, strict=True
@@ -154,13 +162,13 @@ class Batch:
             push_on(group, forces, bodies, self.values.device, backend)
             for group, bodies, forces in zip(groups, kind.bodies, kind.drives.forces, strict=True)
         ]
-        images = None
+        images, friction = None, RoughFaces(kind.rough, runs)
         if kind.settings.walls == "zeroed":
-            walls = ZeroedWalls(kind.faces, PAD, grid.cells)
+            walls = ZeroedWalls(kind.faces, PAD, grid.cells, friction)
         else:
             faces = faces_on_grid(kind.faces, kind.settings)
-            walls = Walls(faces, PAD, grid.cells, grid.shape, runs)
-            images = MirrorImages(walls)
+            walls = Walls(faces, PAD, grid.cells, grid.shape, runs, friction)
+            images = MirrorImages(walls, scheme.spline.on_node)
         orders = []
         if on_cpu:
             buffers = SortBuffers(groups, runs)
@@ -175,8 +183,9 @@ class Batch:
             groups,
             orders,
             walls,
+            friction,
             NodeUpdate(grid, images, [walls]),
-            ParticleUpdate(grid, kind.faces, runs * len(groups), contact, watches_box=False),
+            ParticleUpdate(grid, kind.faces, runs * len(groups), contact, friction, watches_box=False),
             self.values,
             Gravity(kind.drives.gravity, [0.0] * d, self.values.device),
         )

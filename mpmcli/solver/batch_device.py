@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
+from mpmcli.boundaries.rough_faces import RoughFaces
 from mpmcli.boundaries.walls import Walls
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.solver.batch_values import BatchValues
@@ -22,6 +23,7 @@ class Device:
     Attributes:
         runs: number of runs; room: particles of each, per group.
         groups, orders: of each law, with the particles of all runs.
+        friction: coefficients of the walls of each run.
         values, gravity: numbers that expressions read, and gravity where it varies.
     """
 
@@ -32,6 +34,7 @@ class Device:
     groups: Sequence[ParticleArrays]
     orders: Sequence[TileOrder]
     walls: Walls | ZeroedWalls
+    friction: RoughFaces
     nodes: NodeUpdate
     particles: ParticleUpdate
     values: BatchValues
@@ -63,14 +66,22 @@ def views(
         box=box,
         first_node=w * device.grid.node_count,
     )
-    walls = _changed(device.walls, last=last)
+    friction = _changed(device.friction, first=w * len(device.friction.faces))
+    walls = _changed(device.walls, last=last, friction=friction)
     images = device.nodes.images
     if images is not None:
         walls.first_plane = w * len(walls.separating)
+        walls.first_rough = w * len(walls.rough)
         images = _changed(images, walls=walls)
     nodes = _changed(device.nodes, grid=grid, images=images, boundaries=(walls,))
     particles = _changed(
-        device.particles, grid=grid, extent=extent, last=last, first_lost=w * len(device.groups), run=w
+        device.particles,
+        grid=grid,
+        extent=extent,
+        last=last,
+        first_lost=w * len(device.groups),
+        friction=friction,
+        run=w,
     )
     orders = tuple(_changed(order, grid=grid, first_tile=w * (order.tiles + 1)) for order in device.orders)
     groups = tuple(group.seen_from(w) if group.pushed else group for group in device.groups)

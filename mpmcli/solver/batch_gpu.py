@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import taichi as ti
 
+from mpmcli.boundaries.wall_friction import find_friction
 from mpmcli.solver.batch_device import Device, views
 from mpmcli.solver.batch_layout import ATTEND, GOING, MEASURE, Layout
 from mpmcli.solver.batch_steps import BatchSteps
@@ -32,7 +33,8 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     real, count = layout.real, layout.count
     drifts = device.particles.touches or not all(group.total for group in groups)
     steps = BatchSteps(layout, [group.law for group in groups], device.values, drifts=drifts)
-    lost, node_count, contact = device.particles.lost, device.grid.node_count, device.nodes.needs_contact
+    lost, node_count = device.particles.lost, device.grid.node_count
+    contact, friction = device.nodes.needs_contact, device.nodes.needs_friction
     under_way = ti.Vector.field(WIDTH, ti.f64, shape=runs)
     limits, stepping = ti.field(int, shape=runs), ti.field(int, shape=runs)
     constants = ti.Vector.field(VECTORS + 2 * d, float, shape=runs)
@@ -142,6 +144,13 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
             nodes.images.find_contact(grid, q, pull(w))
 
     @ti.func
+    def rub(w: int, q: int, counts: ti.template()):
+        h, inverse, scale, box, last, extent = place(w, counts)
+        grid, nodes, _particles, _orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        if q < nodes.images.plane_nodes(grid):
+            find_friction(nodes.images, grid, q, pull(w))
+
+    @ti.func
     def update(w: int, q: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
         grid, nodes, _particles, _orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
@@ -201,6 +210,10 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
             for q in range(runs * node_count):
                 if stepping[q // node_count] == 1:
                     find_contact(q // node_count, q % node_count, counts)
+        if ti.static(friction):
+            for q in range(runs * node_count):
+                if stepping[q // node_count] == 1:
+                    rub(q // node_count, q % node_count, counts)
         for q in range(runs * node_count):
             if stepping[q // node_count] == 1:
                 update(q // node_count, q % node_count, counts)

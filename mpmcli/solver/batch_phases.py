@@ -6,6 +6,7 @@ maxima know no order.
 
 import taichi as ti
 
+from mpmcli.boundaries.wall_friction import find_friction
 from mpmcli.solver.batch_device import Device, views
 from mpmcli.solver.batch_layout import Layout
 from mpmcli.solver.batch_regions import BatchRegions
@@ -54,7 +55,8 @@ class BatchPhases:
         self.scatters = tuple(begun + g * self.colours for g in range(len(device.groups)))
         self.relaxing = self.scatters[-1] + self.colours
         self.contact = self.relaxing + self.relaxes
-        self.updating = self.contact + device.nodes.needs_contact
+        self.friction = self.contact + device.nodes.needs_contact
+        self.updating = self.friction + device.nodes.needs_friction
         self.last_of_step = self.updating + 1
         # Of each group: count, place, and for each of its fields keep and take.
         self.moved = tuple((*group.state, *group.labels) for group in device.groups)
@@ -190,6 +192,12 @@ class BatchPhases:
                 first, after = self.share(first, after, part)
                 for q in range(first, after):
                     nodes.images.find_contact(grid, q, gravity_step)
+        if ti.static(nodes.needs_friction):
+            if phase == self.friction:
+                first, after = self.places.even_part(nodes.images.plane_nodes(grid), region)
+                first, after = self.share(first, after, part)
+                for q in range(first, after):
+                    find_friction(nodes.images, grid, q, gravity_step)
         for g, group in ti.static(self.members):
             first, after = self.places.particles_of(g, w, region, counts[w, self.count.particles[g]])
             first, after = self.share(first, after, part)

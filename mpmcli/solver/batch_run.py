@@ -101,6 +101,7 @@ class BatchRun(Run):
     def _set_constants(self) -> None:
         """Store what does not change during the run."""
         scene, h = self.scene, self.spacing
+        self.batch.device.friction.write(scene, self.slot)
         gravity = scene.domain.gravity_at(0.0)
         for a, n in enumerate(scene.domain.cells):
             self._numbers[self._real.gravity[a]] = gravity[a]

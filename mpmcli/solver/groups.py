@@ -9,6 +9,7 @@ from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.forces import needs_initial
 from mpmcli.solver.grid import node_width
+from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.volume_average import averages_volume
@@ -44,6 +45,7 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
                 keeps_initial=needs_initial(scene, members),
                 total=scene.solver.solids == "total",
                 averaged=averages_volume(scene.solver, law),
+                slips=slips_in(scene),
             )
         )
     return groups

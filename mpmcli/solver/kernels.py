@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.rough_faces import RoughFaces, rough_faces
 from mpmcli.boundaries.walls import Walls, faces_on_grid
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.scene import Scene
@@ -56,14 +57,19 @@ class Kernels:
             averaged=[group.averaged for group in groups],
         )
         faces = scene.domain.walls.faces(scene.dimension)
+        friction = RoughFaces(rough_faces(scene))
+        friction.write(scene)
         if scene.solver.walls == "zeroed":
-            images, walls = None, ZeroedWalls(faces, PAD, self.grid.cells)
+            images, walls = None, ZeroedWalls(faces, PAD, self.grid.cells, friction)
         else:
-            walls = Walls(faces_on_grid(faces, scene.solver), PAD, self.grid.cells, self.grid.shape)
-            images = MirrorImages(walls)
+            on_grid = faces_on_grid(faces, scene.solver)
+            walls = Walls(on_grid, PAD, self.grid.cells, self.grid.shape, friction=friction)
+            images = MirrorImages(walls, scheme.spline.on_node)
         nodes = NodeUpdate(self.grid, images, [walls])
         self.contact = contact_between(groups, [len(group.bodies) for group in groups], self.grid, backend)
-        self.particles = ParticleUpdate(self.grid, faces, len(groups), self.contact, watches_box=not backend.on_cpu)
+        self.particles = ParticleUpdate(
+            self.grid, faces, len(groups), self.contact, friction, watches_box=not backend.on_cpu
+        )
         buffers = SortBuffers(groups)
         self.orders = [TileOrder(g, self.grid, buffers, backend.threads, backend.on_cpu) for g in groups]
         self._sorts = [build_sort(order) for order in self.orders]

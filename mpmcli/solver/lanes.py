@@ -18,6 +18,7 @@ from mpmcli.solver.lane_state import (
     zero_lanes,
 )
 from mpmcli.solver.particle_arrays import CONSTANTS, MASS, VOLUME
+from mpmcli.solver.particle_friction import friction_of_walls
 from mpmcli.solver.particle_update import SMALLEST_J, deformed_gradient
 from mpmcli.solver.reference_grid import pulled_back, push_of_walls
 from mpmcli.solver.state_bounds import NOTHING, deformation_rate, volume_growth, volume_ratio
@@ -38,6 +39,7 @@ def scatter_range(
     inners = ti.static(internal_entries(group))
     x, v, affine = zero_lanes(d), zero_lanes(d), zero_lanes(ti.static(d * d))
     touches = zero_lanes(ti.static(d if particles.touches else 1))
+    frictions = zero_lanes(ti.static(d if group.slips else 1))
     # Where particles are, if that is not where they are on the grid.
     here = zero_lanes(ti.static(d if group.total else 1))
     deformation, internal = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
@@ -65,6 +67,10 @@ def scatter_range(
                 push = particles.contact.push(group, p, grid.spacing, particles.run)
                 for c in ti.static(range(d)):
                     touches[c, lane] = push[c]
+            if ti.static(group.slips):
+                friction = friction_of_walls(particles, group, p, kick, lane < count)
+                for c in ti.static(range(d)):
+                    frictions[c, lane] = friction[c]
             if ti.static(group.pushed):
                 push, slope = group.force.acceleration(group, p, ti.static(group.force.spreads and grid.scheme.affine))
                 for c in ti.static(range(d)):
@@ -102,6 +108,8 @@ def scatter_range(
                 row = vector_of(rows, 0, ti.static(group.table.n), lane)
                 if ti.static(particles.touches):
                     own += kick * vector_of(touches, 0, d, lane)
+                if ti.static(group.slips):
+                    own += kick * vector_of(frictions, 0, d, lane)
                 at = vector_of(here, 0, d, lane)
                 own += kick * push_of_walls(particles, group, at, place, state, row, constants_of(rows, lane))
                 C = C @ state

@@ -35,6 +35,7 @@ class NodeUpdate:
         self.images = images
         self.mirrors = images is not None
         self.needs_contact = images is not None and images.needs_contact
+        self.needs_friction = images is not None and images.needs_friction
         self.boundaries = tuple(boundaries)
 
     @ti.func
@@ -63,7 +64,7 @@ class NodeUpdate:
         if ti.static(self.mirrors):
             mirrored = self.images.near(node)
             if mirrored:
-                total = self.images.fold(self.grid, self.grid.nodes, node, gravity_step)
+                total = self.images.fold(self.grid, self.grid.nodes, node, gravity_step, True)
                 # Entry by entry here and below: Taichi loses vectors that are assigned as a whole in static blocks.
                 for c in ti.static(range(self.grid.width)):
                     value[c] = total[c]
@@ -83,7 +84,7 @@ class NodeUpdate:
                     velocity[c] = constrained[c]
 
             # Unfold.
-            self.write(self.grid.nodes, node, index, mirrored, velocity)
+            self.write(self.grid.nodes, node, index, mirrored, velocity, True)
             if ti.static(self.grid.scheme.keeps_before):
                 self.update_before(node, index, mirrored, value[d])
             for a in ti.static(range(d)):
@@ -94,26 +95,35 @@ class NodeUpdate:
     def update_before(self, node: ti.template(), index: int, mirrored: bool, mass: float):
         """Turn the momentum from before stress and forces into velocity: fold and unfold, without any boundary.
 
-        Mirror images have it too, so that a wall that acts changes nothing but what stress does.
+        Mirror images have it too, so that a wall that acts changes nothing but what stress does. Friction does not act
+        on it: what friction changes is a change of velocity.
         """
         before = self.grid.before[index]
         if ti.static(self.mirrors):
             if mirrored:
                 total = self.images.fold(
-                    self.grid, self.grid.before, node, ti.Vector.zero(float, ti.static(self.dimension))
+                    self.grid, self.grid.before, node, ti.Vector.zero(float, ti.static(self.dimension)), False
                 )
                 for c in ti.static(range(self.grid.width)):
                     before[c] = total[c]
         for a in ti.static(range(self.dimension)):
             before[a] /= mass
-        self.write(self.grid.before, node, index, mirrored, before)
+        self.write(self.grid.before, node, index, mirrored, before, False)
 
     @ti.func
-    def write(self, field: ti.template(), node: ti.template(), index: int, mirrored: bool, value: ti.template()):
+    def write(
+        self,
+        field: ti.template(),
+        node: ti.template(),
+        index: int,
+        mirrored: bool,
+        value: ti.template(),
+        rubbed: ti.template(),
+    ):
         """Write the velocity of a node, and of its images."""
         if ti.static(self.mirrors):
             if mirrored:
-                self.images.unfold(self.grid, field, node, value)
+                self.images.unfold(self.grid, field, node, value, rubbed)
             else:
                 field[index] = value
         else:

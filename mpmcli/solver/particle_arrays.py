@@ -1,6 +1,5 @@
 """The fields of particles of one law on the device, and what kernels read of a particle."""
 
-from collections.abc import Sequence
 from copy import copy
 
 import numpy as np
@@ -9,13 +8,14 @@ import taichi as ti
 from mpmcli.materials.elementary import exp
 from mpmcli.materials.law import Law
 from mpmcli.solver.grid import gradient_width
+from mpmcli.solver.particle_exchange import ParticleExchange
 
 # Entries of the per-body table that come before the constants of the law.
 MASS, VOLUME, CONSTANTS = 0, 1, 2
 
 
 @ti.data_oriented
-class ParticleArrays:
+class ParticleArrays(ParticleExchange):
     """Fields of particles of one law, of one run or of several, each of which has a contiguous range.
 
     Attributes:
@@ -39,6 +39,8 @@ class ParticleArrays:
             since they are `total`.
         averaged: whether particles of a cell share their change of volume (`volume_average`): then each has its `cell`,
             (n), and `to_mean`, (n), ln J during P2G, and where a frame is read what it lacks to the mean of its cell.
+        slip: how far a particle has slipped on the wall that pushes it, (n) Vector(d), m, where there is friction
+            (`slips`), see `particle_friction`.
         force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
         table: per body a row of particle mass, particle volume and the constants of the law.
         real: numpy's type of the real fields.
@@ -58,6 +60,7 @@ class ParticleArrays:
         keeps_initial: bool = False,
         total: bool = False,
         averaged: bool = False,
+        slips: bool = False,
     ) -> None:
         """Allocate.
 
@@ -86,6 +89,8 @@ class ParticleArrays:
         self.initial = ti.Vector.field(d, float, shape=count, layout=layout) if self.keeps_initial else None
         self.averaged = averaged
         self.cell, self.to_mean = (ti.field(kind, shape=count) if averaged else None for kind in (int, float))
+        self.slips = slips
+        self.slip = ti.Vector.field(d, float, shape=count, layout=layout) if slips else None
         self.pushed = False
         self.force = None
         self.run = 0
@@ -106,113 +111,13 @@ class ParticleArrays:
         """Every real field that the sort must move."""
         initial = () if self.initial is None else (self.initial,)
         deformation = self.J_minus_1 if self.displacement_gradient is None else self.displacement_gradient
-        return (self.x, self.v, self.gradient, deformation, *self.internal, *initial)
+        slip = (self.slip,) if self.slips else ()
+        return (self.x, self.v, self.gradient, deformation, *self.internal, *initial, *slip)
 
     @property
     def labels(self) -> tuple[ti.Field, ...]:
         """Every integer field that the sort must move."""
         return (self.id,) if self.body is None else (self.id, self.body)
-
-    def read(self, first: int, count: int, bodies: Sequence[int], row: int = 0) -> dict[str, np.ndarray]:
-        """Return x, v, C, deformation, internal, (n, k), id and body, (n), of a range of particles, by one launch.
-
-        A launch per field would take most of the time of a frame of few particles.
-
-        Args:
-            bodies: index in the scene of each body of the group; row: of the first of them in the table.
-        """
-        d = self.dimension
-        widths = {"x": d, "v": d, "C": d * d, "deformation": self._deformation_width, "internal": len(self.internal)}
-        reals, labels = np.empty((count, sum(widths.values())), self.real), np.empty((count, 2), np.int32)
-        self._read(first, reals, labels)
-        found, end = {}, 0
-        for name, width in widths.items():
-            found[name] = reals[:, end : end + width]
-            end += width
-        found["C"] = found["C"].reshape(count, d, d)
-        if self.J_minus_1 is None:
-            found["deformation"] = np.eye(d, dtype=self.real) + found["deformation"].reshape(count, d, d)
-        else:
-            found["deformation"] = 1 + found["deformation"].reshape(count)
-        found["id"] = labels[:, 0]
-        found["body"] = np.array(bodies, np.int32)[labels[:, 1] - row]
-        return found
-
-    def write(self, first: int, found: dict[str, np.ndarray], row: np.ndarray) -> None:
-        """Set a range of particles to what `read` returned, and to their initial positions if it keeps them.
-
-        Args:
-            row: of the body of each particle in the table, (n) int, in place of `found["body"]`.
-        """
-        count = len(found["x"])
-        rest = np.eye(self.dimension) if self.J_minus_1 is None else 1.0
-        parts = (found["x"], found["v"], found["C"], found["deformation"] - rest, found["internal"])
-        if self.keeps_initial:
-            parts = (*parts, found["initial"])
-        reals = np.concatenate([part.reshape(count, -1).astype(self.real) for part in parts], axis=1)
-        labels = np.stack([found["id"], row], axis=1).astype(np.int32)
-        self._write(first, np.ascontiguousarray(reals), np.ascontiguousarray(labels))
-
-    @property
-    def _deformation_width(self) -> int:
-        return self.dimension**2 if self.J_minus_1 is None else 1
-
-    @ti.kernel
-    def _read(self, first: int, reals: ti.types.ndarray(), labels: ti.types.ndarray()):
-        ti.loop_config(serialize=self.serial)
-        for q in range(reals.shape[0]):
-            d = ti.static(self.dimension)
-            p = first + q
-            for c in ti.static(range(d)):
-                reals[q, c] = self.x[p][c]
-                reals[q, d + c] = self.v[p][c]
-                for a in ti.static(range(d)):
-                    reals[q, (2 + c) * d + a] = self.gradient[p][a, c]
-            start = ti.static((2 + d) * d)
-            if ti.static(self.law.deformation == "F"):
-                for i, j in ti.static(ti.ndrange(d, d)):
-                    reals[q, start + i * d + j] = self.displacement_gradient[p][i, j]
-            else:
-                reals[q, start] = self.J_minus_1[p]
-            for i in ti.static(range(len(self.internal))):
-                reals[q, start + self._deformation_width + i] = self.internal[i][p]
-            labels[q, 0] = self.id[p]
-            # Every entry is written: a GPU does not get the zeros of the host.
-            if ti.static(self.several):
-                labels[q, 1] = self.body[p]
-            else:
-                labels[q, 1] = 0
-
-    @ti.kernel
-    def _write(self, first: int, reals: ti.types.ndarray(), labels: ti.types.ndarray()):
-        ti.loop_config(serialize=self.serial)
-        for q in range(reals.shape[0]):
-            d = ti.static(self.dimension)
-            width = ti.static(self.v.n)
-            p = first + q
-            for c in ti.static(range(d)):
-                self.x[p][c] = reals[q, c]
-            for c in ti.static(range(width)):
-                self.v[p][c] = reals[q, d + c] if ti.static(c < d) else 0.0
-            for a, c in ti.static(ti.ndrange(d, self.gradient.m)):
-                self.gradient[p][a, c] = reals[q, (2 + c) * d + a] if ti.static(c < d) else 0.0
-            start = ti.static((2 + d) * d)
-            if ti.static(self.law.deformation == "F"):
-                for i, j in ti.static(ti.ndrange(d, width)):
-                    if ti.static(j < d):
-                        self.displacement_gradient[p][i, j] = reals[q, start + i * d + j]
-                    else:
-                        self.displacement_gradient[p][i, j] = 0.0
-            else:
-                self.J_minus_1[p] = reals[q, start]
-            for i in ti.static(range(len(self.internal))):
-                self.internal[i][p] = reals[q, start + self._deformation_width + i]
-            if ti.static(self.keeps_initial):
-                for c in ti.static(range(d)):
-                    self.initial[p][c] = reals[q, start + self._deformation_width + ti.static(len(self.internal)) + c]
-            self.id[p] = labels[q, 0]
-            if ti.static(self.several):
-                self.body[p] = labels[q, 1]
 
     @ti.func
     def stored(self, p: int):

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 import taichi as ti
 
+from mpmcli.boundaries.rough_faces import RoughFaces
+from mpmcli.boundaries.walls import SMOOTH
 from mpmcli.solver.grid import Grid
 from mpmcli.solver.particle_arrays import VOLUME
 from mpmcli.solver.particle_contact import ParticleContact
@@ -24,6 +26,7 @@ class ParticleUpdate:
     Attributes:
         extent: size of the domain, m; last: node of the upper walls, per axis; faces: words of the walls, per axis.
         contact: between elastic bodies that are `total`; touches: whether there is any.
+        friction: coefficients of the walls.
         run: number of the run that a view is for.
         watches_box: whether a particle whose stencil has left the nodes in use is lost: on a GPU, where speeds are not
             read back at every step.
@@ -37,10 +40,12 @@ class ParticleUpdate:
         faces: Sequence[tuple[str, str]],
         group_count: int,
         contact: ParticleContact | None = None,
+        friction: RoughFaces = SMOOTH,
         *,
         watches_box: bool,
     ) -> None:
         self.contact, self.touches = contact, contact is not None
+        self.friction = friction
         self.run = 0
         self.grid = grid
         self.faces = tuple(tuple(pair) for pair in faces)

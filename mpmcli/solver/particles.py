@@ -76,6 +76,7 @@ class ParticleGroup(ParticleArrays):
         keeps_initial: bool = False,
         total: bool = False,
         averaged: bool = False,
+        slips: bool = False,
     ) -> None:
         self.bodies = tuple(bodies)
         self.first, self.count = 0, sum(len(b.position) for b in particles)
@@ -92,6 +93,7 @@ class ParticleGroup(ParticleArrays):
             keeps_initial=keeps_initial,
             total=total,
             averaged=averaged,
+            slips=slips,
         )
         self.rows = rows.astype(self.real)
         self.table.from_numpy(self.rows)
@@ -101,7 +103,7 @@ class ParticleGroup(ParticleArrays):
     def fields(self) -> dict[str, ti.Field]:
         """Return every field of the particles that changes during a run or is sorted, by name."""
         names = ["position", "velocity", "velocity_gradient", "deformation", *(v.name for v in self.law.internal)]
-        initial = ["initial_position"] * self.keeps_initial
+        initial = ["initial_position"] * self.keeps_initial + ["slip"] * self.slips
         labels = ["id", "body"][: len(self.labels)]
         return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import psutil
 
+from mpmcli.boundaries.rough_faces import rough_faces
 from mpmcli.errors import InputError
 from mpmcli.materials.law import Law
 from mpmcli.materials.registry import laws
@@ -17,6 +18,7 @@ from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import Grid, gradient_width, node_width, tile_edge
 from mpmcli.solver.ordering import TileOrder
 from mpmcli.solver.particle_contact import ParticleContact
+from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.transfer_scheme import scheme_of
 from mpmcli.solver.volume_average import averages_volume
 from mpmcli.solver.volume_relaxation import needs_filling
@@ -52,7 +54,7 @@ class Plan:
         nodes: number of grid nodes.
         scratch_bytes: per particle, of the sort buffers.
         bytes_per_node: of the grid.
-        grid_bytes: of all nodes, the tables of the sort, and the contact flags of separating walls.
+        grid_bytes: of all nodes, the tables of the sort, and what is found at walls.
         host_bytes: of the arrays of one frame and of the initial state.
         passes: the loops of a step in order; loops over particles name their law.
     """
@@ -102,6 +104,7 @@ def fields_of(
     several_bodies: bool,
     keeps_initial: bool = False,
     averaged: bool = False,
+    slips: bool = False,
 ) -> dict[str, int]:
     """Return the bytes of each field of one particle of a law, by name."""
     real = 8 if backend.precision == "f64" else 4
@@ -116,6 +119,7 @@ def fields_of(
     fields |= {variable.name: real for variable in law.parameters.internal_in(dimension)}
     fields |= {"initial_position": dimension * real} if keeps_initial else {}
     fields |= {"volume_to_mean": real, "cell": 4} if averaged else {}
+    fields |= {"slip": dimension * real} if slips else {}
     return fields | {"id": 4} | ({"body": 4} if several_bodies else {})
 
 
@@ -123,12 +127,14 @@ def passes_of(members: Sequence[Law], scene: Scene) -> tuple[str, ...]:
     """Return the loops of one step: the particles of each law, and the grid."""
     names = [law.name for law in members]
     separate = bool(_separating_axes(scene))
+    rough = scene.solver.walls != "zeroed" and bool(_rough_axes(scene))
     pushed = {name for name in names if forces_on(scene, members_of(scene, name))}
     return (
         "clear grid",
         *(f"average volumes of {law.name}" for law in members if averages_volume(scene.solver, law)),
         *(f"scatter {name}" + (" with forces" if name in pushed else "") for name in names),
         *(("find contact",) if separate else ()),
+        *(("find friction",) if rough else ()),
         "update grid",
         *(f"gather {name}" for name in names),
     )
@@ -164,6 +170,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 several_bodies=bodies[name] > 1,
                 keeps_initial=scene.solver.solids == "total" or needs_initial(scene, members_of(scene, name)),
                 averaged=shares,
+                slips=slips_in(scene),
             ),
         )
         for name, shares in zip(sorted(bodies), averaged, strict=True)
@@ -174,7 +181,8 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     tile = tile_edge(scheme.spline.nodes, dimension, on_cpu=backend.on_cpu)
     nodes = Grid.nodes_needed(cells, tile)
     node_bytes = real * (width * (1 + scheme.keeps_before + needs_filling(scene, members)) + 2 * sum(averaged))
-    tables = len(groups) * TileOrder.bytes_needed(cells, tile, backend.threads) + _contact_bytes(scene, nodes, tile)
+    tables = len(groups) * TileOrder.bytes_needed(cells, tile, backend.threads)
+    tables += _contact_bytes(scene, nodes, tile, real)
     if scene.solver.solids == "total" and len(scene.bodies) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(counts.values()))
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
@@ -191,11 +199,25 @@ def _separating_axes(scene: Scene) -> list[int]:
     return [axis for axis, pair in enumerate(faces) for wall in pair if wall == "separate"]
 
 
-def _contact_bytes(scene: Scene, nodes: int, tile: int) -> int:
-    """Return the bytes of the contact of separating walls: an integer per face and node of the largest such plane."""
+def _rough_axes(scene: Scene) -> list[int]:
+    """Return the axis of every face of the grid that has friction, unless walls are zeroed."""
+    if scene.solver.walls == "zeroed":
+        return []
+    total, faces = scene.solver.solids == "total", scene.domain.walls.faces(scene.dimension)
+    return [axis for axis, side in rough_faces(scene) if not (total and faces[axis][side] == "separate")]
+
+
+def _contact_bytes(scene: Scene, nodes: int, tile: int, real: int) -> int:
+    """Return the bytes of what is found at walls, per face and node of the largest plane of its kind.
+
+    Those of separating walls have an integer, those with friction a vector.
+    """
     tiles = Grid.tile_counts(scene.domain.cells, tile)
-    planes = [nodes // (tile * tiles[axis]) for axis in _separating_axes(scene)]
-    return 4 * len(planes) * max(planes, default=0)
+    separating, rough = (
+        [nodes // (tile * tiles[axis]) for axis in axes] for axes in (_separating_axes(scene), _rough_axes(scene))
+    )
+    contact = 4 * len(separating) * max(separating, default=0)
+    return contact + real * scene.dimension * len(rough) * max(rough, default=0)
 
 
 def require_room(plan: Plan) -> None:

@@ -14,10 +14,12 @@ class QuadraticSpline:
 
     Attributes:
         nodes: of a stencil, per axis.
+        on_node: the weight of a node for a point on it.
         inverse_moment: h^2 / D.
     """
 
     nodes = 3
+    on_node = 3 / 4
     inverse_moment = INVERSE_MOMENT["quadratic"]
 
     @ti.func
@@ -44,6 +46,7 @@ class CubicSpline:
     """The cubic B-spline, whose stencil is the two nodes on either side of a point; see QuadraticSpline."""
 
     nodes = 4
+    on_node = 2 / 3
     inverse_moment = INVERSE_MOMENT["cubic"]
 
     @ti.func

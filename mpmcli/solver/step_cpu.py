@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import taichi as ti
 
+from mpmcli.boundaries.wall_friction import find_friction
 from mpmcli.solver.cpu_loops import average_pencils, clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid
@@ -159,6 +160,10 @@ def build_cpu_step(
             ti.loop_config(serialize=alone)
             for q in range(nodes.images.plane_nodes(grid)):
                 nodes.images.find_contact(grid, q, gravity.in_step(kick, 0))
+        if ti.static(nodes.needs_friction):
+            ti.loop_config(serialize=alone)
+            for q in range(nodes.images.plane_nodes(grid)):
+                find_friction(nodes.images, grid, q, gravity.in_step(kick, 0))
         ti.loop_config(serialize=alone)
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:

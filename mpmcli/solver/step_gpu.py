@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import taichi as ti
 
+from mpmcli.boundaries.wall_friction import find_friction
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid
 from mpmcli.solver.nodes import NodeUpdate
@@ -37,6 +38,9 @@ def build_gpu_step(
         if ti.static(nodes.needs_contact):
             for q in range(nodes.images.plane_nodes(grid)):
                 nodes.images.find_contact(grid, q, gravity.in_step(kick, 0))
+        if ti.static(nodes.needs_friction):
+            for q in range(nodes.images.plane_nodes(grid)):
+                find_friction(nodes.images, grid, q, gravity.in_step(kick, 0))
         for q in range(grid.box_nodes()):
             node = grid.box_node(q)
             nodes.update(node, grid.linear_index(node), gravity.in_step(kick, 0))

@@ -10,6 +10,7 @@ instructions; that halves the time of the gather in 3D.
 import taichi as ti
 
 from mpmcli.solver.particle_arrays import MASS, VOLUME
+from mpmcli.solver.particle_friction import friction_of_walls
 from mpmcli.solver.reference_grid import pulled_back, push_of_walls
 from mpmcli.solver.volume_average import missing_to_mean, stretch_to
 
@@ -45,6 +46,8 @@ def scatter(g: ti.template(), group: ti.template(), particles: ti.template(), p:
         C += kick * slope
     if ti.static(group.total):
         F = group.stored(p)
+        if ti.static(group.slips):
+            v += kick * friction_of_walls(particles, group, p, kick, True)
         v += kick * push_of_walls(particles, group, group.x[p], group.initial[p], F, row, group.constants(p))
         # Entry by entry: Taichi loses matrices that are assigned as a whole here.
         C_rest, P = C @ F, pulled_back(stress, F)
