@@ -184,6 +184,8 @@ PLASTIC = (
         ("ti.max(volume - constants[TIP], 0.0)", "0.95 * ti.max(volume - constants[TIP], 0.0)", "sand_blocks"),
         ("deviator *= strength", "deviator *= 1.05 * strength", "sand_shear"),
         ("spherical = constants[LAMBDA]", "spherical = 1.05 * constants[LAMBDA]", "sand_shear"),
+        ("log(J), log(seen)", "log(J), log(1.05 * seen)", "sand_toss"),
+        ("opens * share * opening", "0.0 * share * opening", "sand_toss"),
     ),
     *_of(
         "materials/snow.py",

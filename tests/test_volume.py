@@ -11,6 +11,8 @@ from scenes import block, scene
 
 from mpmcli.materials.fluid import RELAXATION
 from mpmcli.materials.registry import parameter_models
+from mpmcli.materials.sand import BAND
+from mpmcli.materials.sand import RELAXATION as GRAINS_RELAXATION
 from mpmcli.materials.volume_relaxation import BESIDE, DEAD_BAND, FULL, LARGEST_LACK, OPENED, SLACK
 from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_columns, ledger_csv, ledger_rows, parse_ledger_csv
 from mpmcli.scene import Scene, parse_scene
@@ -174,6 +176,70 @@ def test_volume_follows_the_grid(backend_of: Callable, densities: tuple[float, .
         assert relaxed[name].tobytes() == plain[name].tobytes()
 
 
+def test_sand_follows_the_grid(backend_of: Callable) -> None:
+    """v += max(min(g, ln s) - band, 0) + min(g + band, 0), at least 0, with g = ln s - v - tr e and s = 1/sum(w n).
+
+    Pressed sand, tr e < 0, opens by a share of it; all of it opens only where the nodes beside the stencil are filled.
+    What follows no grid keeps its v.
+    """
+    sand = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e6, "friction_angle": 30.0, "poissons_ratio": 0.3}
+    bodies = [
+        block(
+            f"sand {k}",
+            {**sand, "volume_correction": k == 0},
+            [0.6 * k, 0.0],
+            [0.6 * (k + 1), 0.5],
+            sampling="jittered",
+        )
+        for k in (0, 1)
+    ]
+    solver = Solver(scene([12, 8], H, bodies, 1.0, walls="slip", precision="f64"), backend_of("f64"))
+    (group,) = solver.groups
+    # Too thin by an eighth, on average.
+    group.x.from_numpy((group.x.to_numpy() * [1.0, 1.15]).astype(group.real))
+    solver.state_was_replaced()
+    # Sorts the particles.
+    solver.step(1e-5)
+    random = np.random.default_rng(3)
+    strain = np.where(random.uniform(size=group.count) < 0.5, -0.02, 0.0)
+    group.set_deformation(np.exp(strain / 2)[:, None, None] * np.eye(2))
+    opened = np.where(strain < 0, 0.0, random.uniform(0, 0.3, group.count))
+    group.internal[0].from_numpy(opened)
+    # What is at rest stays as it is.
+    group.set_motion(np.zeros((group.count, 2)), random.normal(size=(group.count, 2, 2)))
+    saved = solver.state.save()
+    before = group.to_numpy()
+    found = []
+    for steps in (INTERVAL - 1, 0):
+        solver.state.load(saved)
+        solver.state.unrelaxed_steps = steps
+        solver.state.unrelaxed = time = 2e-3
+        solver.step(1e-5)
+        found.append(group.to_numpy())
+    relaxed, plain = found
+    x, body = before["x"], before["body"]
+    volume = np.array([b.volume for b in solver._particles])[body]
+    seen, least, beside = seen_ratio(x, volume, solver.grid.cells)
+    gap = np.log(seen) - opened - strain
+    crossings = np.sqrt(sound_modulus(1e6, 0.3) / 1600.0) * (time + 1e-5) / H
+    share = np.where(strain < 0, GRAINS_RELAXATION * crossings / (1 + GRAINS_RELAXATION * crossings), 1.0)
+    opening = np.maximum(np.minimum(gap, np.log(seen)) - BAND, 0) * share * (beside * seen > BESIDE)
+    closing = np.minimum(gap + BAND, 0)
+    moves = (least > FULL) & (body == 0)
+    expected = np.where(moves, np.maximum(opened + opening + closing, 0), opened)
+    for changed in (moves & (opening > 0) & (strain < 0), moves & (opening > 0) & (strain == 0), moves & (closing < 0)):
+        assert changed.sum() > 5
+    assert relaxed["internal"][:, 0] == pytest.approx(expected, abs=1e-12)
+    assert plain["internal"][:, 0] == pytest.approx(opened, abs=1e-15)
+    for name in ("x", "v", "C", "deformation"):
+        assert relaxed[name].tobytes() == plain[name].tobytes()
+
+
+def sound_modulus(youngs_modulus: float, nu: float) -> float:
+    """Return lambda + 2 mu, Pa."""
+    return youngs_modulus * (1 - nu) / ((1 + nu) * (1 - 2 * nu))
+
+
 def test_nodes_keep_volume_only_where_densities_differ(backend_of: Callable) -> None:
     """The plan counts it; liquids of one density and those that are not relaxed do without."""
     backend = backend_of("f32")
@@ -200,6 +266,7 @@ def uncorrected(tables: dict) -> Scene:
     ("name", "least"),
     [
         ("toss", 0.3),
+        pytest.param("sand_toss", 0.3, marks=pytest.mark.slow),
         pytest.param("dam_at_rest", 0.05, marks=pytest.mark.slow),
         pytest.param("stirred_pool", 0.05, marks=pytest.mark.slow),
     ],
