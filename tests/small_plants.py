@@ -44,13 +44,14 @@ TRANSFERS = (
         ("0.75 - (distance", "0.7875 - (distance", "bar_fixed_fixed"),
         ("0.5 * (1.5 - distance) ** 2", "0.525 * (1.5 - distance) ** 2", "bar_fixed_fixed"),
     ),
+    *_of("solver/volume_average.py", ("exp(missing * ti", "exp(0.95 * missing * ti", "cook")),
     *_of("stability/transfer_factors.py", ('"quadratic": 4', '"quadratic": 4.2', "bar_fixed_fixed")),
     *_of("solver/nodes.py", ("value[a] / value[d] + pull[a]", "value[a] / value[d] + 1.05 * pull[a]", "take_off")),
     *_of(
         "solver/particle_update.py",
         ("rate = dt * C[i, k]", "rate = 1.05 * dt * C[i, k]", "bar_fixed_fixed"),
         ("new[i, j] += rate * H[k, j]", "new[i, j] += 0.95 * rate * H[k, j]", "sand_blocks"),
-        ("moved = x[c] + dt * v[c]", "moved = x[c] + 1.05 * dt * v[c]", "take_off"),
+        ("way = dt * v[c] + remainder[c]", "way = 1.05 * dt * v[c] + remainder[c]", "take_off"),
     ),
     *_of(
         "materials/volume_relaxation.py",
@@ -95,6 +96,7 @@ DRIVES = (
     ),
 )
 WALLS = (
+    *_of("boundaries/wall_friction.py", ("bound = coefficient * (", "bound = 1.05 * coefficient * (", "sliding_block")),
     SmallPlant(
         "boundaries/mirror_images.py",
         "result[c] = -result[c]",
@@ -104,8 +106,8 @@ WALLS = (
     ),
     SmallPlant(
         "boundaries/mirror_images.py",
-        "elif holds:\n                        result[c] = -result[c]",
-        "elif holds:\n                        result[c] = -0.95 * result[c]",
+        "elif holds[a] == 1:\n                        result[c] = -result[c]",
+        "elif holds[a] == 1:\n                        result[c] = -0.95 * result[c]",
         ("poiseuille", "bingham"),
         missed="the node on the wall is stopped as well, so that images are a hundredth of the error of the grid",
     ),

@@ -54,7 +54,6 @@ USUAL = {
     "rough walls": (1,),
     "sand": (1,),
     "two laws, two bodies of one": (1,),
-    "3D, AFLIP": (1,),
     "forces on one body of two": (1,),
 }
 Output = list[tuple[Frame, LedgerRow]]

@@ -17,6 +17,7 @@ pytestmark = pytest.mark.gpu
 
 
 SLOW = (
+    "a force of the place",
     "neo_hookean",
     "rough walls, 3D, AFLIP",
     "rough walls, total",
@@ -26,9 +27,7 @@ SLOW = (
 )
 
 
-@pytest.mark.parametrize(
-    "name", ["a force of the place", "rough walls", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)]
-)
+@pytest.mark.parametrize("name", ["rough walls", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)])
 def test_runs_follow_those_on_the_cpu(backend_of: Callable, name: str) -> None:
     """Two runs in which all numbers differ: as many steps, and what sums in another order changes by round-off."""
     scenes = [scene_named(name), scene_named(name, other=True)]

@@ -61,7 +61,7 @@ def test_force_takes_the_step_and_the_guard_ends_the_run(unstable: Path, tmp_pat
 
 def test_warnings_are_told_in_one_line_each_and_recorded(tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
-    scene.write_text(with_step("1e-5").replace("end = 0.05", "end = 1e-4"), encoding="utf-8")
+    scene.write_text(with_step("1e-5").replace("end = 0.05", "end = 1e-3"), encoding="utf-8")
     outcome = run_here("simulate", scene, "-o", tmp_path / "result")
     assert outcome.status == 0
     told = [line for line in outcome.stderr.splitlines() if line.startswith("warning: ")]

@@ -93,7 +93,9 @@ def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int, sol
     assert np.abs(frame.fields["volume_ratio"][found["id"]] - J).max() < 1e-6
 
 
-@pytest.mark.parametrize("law", ["neo_hookean", "fixed_corotated", "von_mises"])
+@pytest.mark.parametrize(
+    "law", ["neo_hookean", *(pytest.param(law, marks=pytest.mark.slow) for law in ("fixed_corotated", "von_mises"))]
+)
 def test_momenta_stay_and_energy_does_not_grow(backend_of: Callable, law: str) -> None:
     """The mean of the strain and that of the stress are the same projection, so that the force is that of an energy."""
     more = {"poissons_ratio": 0.4999} | ({"yield_stress": 3e3} if law == "von_mises" else {})
@@ -124,8 +126,8 @@ def test_a_uniform_change_of_volume_is_not_changed(backend_of: Callable) -> None
 @pytest.mark.parametrize(
     ("material", "setting", "averages"),
     [
-        ({"law": "neo_hookean", "poissons_ratio": 0.44}, "auto", False),
-        ({"law": "neo_hookean", "poissons_ratio": 0.45}, "auto", True),
+        ({"law": "neo_hookean", "poissons_ratio": 0.45}, "auto", False),
+        ({"law": "neo_hookean", "poissons_ratio": 0.46}, "auto", True),
         ({"law": "neo_hookean", "poissons_ratio": 0.2}, True, True),
         ({"law": "neo_hookean", "poissons_ratio": 0.49}, False, False),
         ({"law": "sand", "friction_angle": 30.0, "poissons_ratio": 0.46}, "auto", False),

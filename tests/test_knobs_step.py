@@ -79,7 +79,7 @@ def check_steps(scene: Scene, arrays: Arrays, tolerance: float) -> None:
     ("dimension", "knobs"),
     [
         (2, AFLIP),
-        (2, CUBIC),
+        slowly(2, CUBIC),
         (2, PIC | ZEROED),
         slowly(2, AFLIP | CUBIC),
         slowly(3, CUBIC),

@@ -169,6 +169,7 @@ precision = "f32"
 kernel = "quadratic"
 transfer = "apic"
 solids = "updated"
+f_bar = "auto"
 walls = "folded"
 """
     )

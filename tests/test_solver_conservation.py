@@ -171,7 +171,7 @@ def test_rigid_translation(spinning: Callable, precision: str) -> None:
         assert abs(energy - start) < tolerance * start
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_affine_fields_are_transferred_exactly(spinning: Callable, dimension: int) -> None:
     """v = v0 + L (x - c) with C = L, without stress: one step changes neither v nor C, for any L (Jiang 2015).
 

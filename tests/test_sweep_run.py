@@ -103,6 +103,7 @@ def test_parts_and_another_number_of_workers_make_the_same_dataset(
     assert not (tmp_path / "half").exists()
 
 
+@pytest.mark.slow
 def test_workers_of_a_running_scheduler_make_the_same_dataset(
     truth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

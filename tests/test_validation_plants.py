@@ -130,8 +130,8 @@ PLANTS = (
     Plant(
         "motion by half a step",
         "solver/particle_update.py",
-        "moved = x[c] + dt * v[c]",
-        "moved = x[c] + 0.5 * dt * v[c]",
+        "way = dt * v[c] + remainder[c]",
+        "way = 0.5 * dt * v[c] + remainder[c]",
         ("dam_break",),
     ),
     Plant(

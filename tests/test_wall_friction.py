@@ -145,10 +145,10 @@ def history(backend: object, scene: Scene) -> np.ndarray:
     ("walls", "degrees", "friction", "solids"),
     [
         ("separate", 30.0, 0.3, "updated"),
-        ("separate", 20.0, 0.2, "updated"),
-        ("slip", 30.0, 0.1, "updated"),
+        pytest.param("separate", 20.0, 0.2, "updated", marks=pytest.mark.slow),
+        pytest.param("slip", 30.0, 0.1, "updated", marks=pytest.mark.slow),
         ("separate", 30.0, 0.3, "total"),
-        ("slip", 30.0, 0.1, "total"),
+        pytest.param("slip", 30.0, 0.1, "total", marks=pytest.mark.slow),
     ],
 )
 def test_a_block_slides_down_an_incline(
@@ -167,7 +167,10 @@ def test_a_block_slides_down_an_incline(
     assert found == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize(("walls", "solids"), [("slip", "updated"), ("separate", "updated"), ("separate", "total")])
+@pytest.mark.parametrize(
+    ("walls", "solids"),
+    [pytest.param("slip", "updated", marks=pytest.mark.slow), ("separate", "updated"), ("separate", "total")],
+)
 def test_a_block_stays_on_an_incline(backend_of: Callable, walls: str, solids: str, record_property: Callable) -> None:
     """mu >= tan(theta): it drifts by less than 1e-4 of its length in a second, and by nothing but its vibration."""
     degrees = 30.0
@@ -179,7 +182,9 @@ def test_a_block_stays_on_an_incline(backend_of: Callable, walls: str, solids: s
     assert abs(drift) < 1e-4 * LENGTH
 
 
-@pytest.mark.parametrize("settings", [{}, {"transfer": "aflip"}], ids=["apic", "aflip"])
+@pytest.mark.parametrize(
+    "settings", [{}, pytest.param({"transfer": "aflip"}, marks=pytest.mark.slow)], ids=["apic", "aflip"]
+)
 def test_a_block_comes_to_rest(backend_of: Callable, settings: dict, record_property: Callable) -> None:
     """A block thrown along a floor stops after v^2 / (2 mu g), to 1 %, and stays."""
     speed, friction = 2.0, 0.3
@@ -195,7 +200,8 @@ def test_a_block_comes_to_rest(backend_of: Callable, settings: dict, record_prop
     assert abs(v[late].mean()) < 1e-3 * speed
 
 
-@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
 def test_faces_have_coefficients_of_their_own(backend_of: Callable, dimension: int) -> None:
     """A body thrown at one upper face slides by its number, and another face's number changes no byte of it."""
     backend = backend_of("f64", 1)

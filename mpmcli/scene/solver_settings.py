@@ -6,7 +6,7 @@ from pydantic import AfterValidator, Field, ValidationInfo
 
 from mpmcli.scene.quantity import Flag, Table, flaw
 
-# Poisson's ratio from which bodies lock without `f_bar`: a bent beam of four cells is 11 % too stiff at 0.49.
+# Poisson's ratio above which bodies lock without `f_bar`: a bent beam of four cells is 5 % too stiff at 0.45, 13 % at 0.49.
 NEARLY_INCOMPRESSIBLE = 0.45
 # Default of FLIP's share in AFLIP: a twentieth of the loss of APIC.
 USUAL_FLIP = 0.95
@@ -69,7 +69,7 @@ class SolverSettings(Table):
         Field(
             description="Whether particles of a cell share their change of volume (F-bar), so that material that "
             'hardly changes its volume does not lock. "auto": those of laws of which a body has a Poisson\'s ratio of '
-            f"{NEARLY_INCOMPRESSIBLE:g} or more, and does not flow."
+            f"more than {NEARLY_INCOMPRESSIBLE:g}, and does not flow."
         ),
     ] = "auto"
     walls: Annotated[
