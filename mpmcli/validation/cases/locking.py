@@ -34,7 +34,7 @@ class Membrane(Case):
     group = "solids"
     source = "Cook 1974; reference by biquadratic finite elements of our own (validation/plane_strain.py)"
     resolution = "cells along the right side"
-    varies = ("precision", "transfer")
+    varies = ("precision",)
     levels = {"coarse": (8,), "default": (8, 16), "fine": (8, 16, 32)}  # noqa: RUF012
     measures = (
         Measure(
