@@ -1,4 +1,4 @@
-"""Contact between elastic bodies on the grids of their states at rest (docs/theory.md, 2.6)."""
+"""Contact between elastic bodies on the grids of their states at rest (docs/theory.md, 2.7)."""
 
 import math
 from collections.abc import Callable

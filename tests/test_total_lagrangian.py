@@ -1,4 +1,4 @@
-"""Elastic bodies on the grid of their state at rest (docs/theory.md, 2.5)."""
+"""Elastic bodies on the grid of their state at rest (docs/theory.md, 2.6)."""
 
 import math
 from collections.abc import Callable

@@ -99,7 +99,7 @@ class Law(ABC):
             (docs/theory.md, 4.4).
         flows: whether it is a liquid or grains, whose volume the ledger compares with what they fill on the grid.
         elastic: whether the stress is a function of F alone, so that the body can be computed on the grid of its state
-            at rest (docs/theory.md, 2.5).
+            at rest (docs/theory.md, 2.6).
         sensitivity: growth of the logarithm of the largest stiffness per stored strain, dimensionless. It sets how
             often the state is measured during a run; 0 if no state is stiffer than rest (docs/theory.md, 6.7).
         hardening: the same growth caused by the internal variables, which are measured separately; 0 without any.

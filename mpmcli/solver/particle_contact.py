@@ -1,7 +1,7 @@
 """Contact between elastic bodies on the grids of their states at rest: particles of different bodies repel each other.
 
 Particles are in bins, two cells wide, by the places where they were when they were last sorted. Forces act along the
-line between two particles, so that momentum and angular momentum are conserved (docs/theory.md, 2.6).
+line between two particles, so that momentum and angular momentum are conserved (docs/theory.md, 2.7).
 """
 
 import math

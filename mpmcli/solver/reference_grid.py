@@ -1,7 +1,7 @@
 """Elastic bodies on the grid of their state at rest (total Lagrangian; de Vaucorbeil, Nguyen, Hutchinson 2020).
 
 Particles scatter and gather at the places X that they have at rest, with the first Piola-Kirchhoff stress
-P = tau F^-T and dv/dX (docs/theory.md, 2.5). No stencil ever changes. What the body meets after the start is not
+P = tau F^-T and dv/dX (docs/theory.md, 2.6). No stencil ever changes. What the body meets after the start is not
 on that grid: walls push at particles.
 """
 

@@ -25,7 +25,7 @@ def deflection(
     """Return the displacement along y of the middle of the right side under a body force along y, m.
 
     Biquadratic elements, with the volume integrated by 2 x 2 points where the shape takes 3 x 3, so that they do not
-    lock (Hughes 2000, section 4.4). Elements get narrower towards the clamped side and the faces, in whose corners
+    lock (Hughes 2000, chapter 4). Elements get narrower towards the clamped side and the faces, in whose corners
     the stress is singular.
 
     Args:

@@ -82,7 +82,7 @@ class SandColumn(Case):
                 "",
                 "Root of the mean square, over sqrt(g H0): it has come to rest.",
                 bound=lambda n: 0.02,
-                single=lambda n: 3e-4,
+                single=lambda n: 1e-3,
             ),
         )
 
