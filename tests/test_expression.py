@@ -8,7 +8,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from mpmcli.scene.derivative import derivative
-from mpmcli.scene.expression import MOST_CHARACTERS, MOST_NESTED, Expression, ExpressionError, evaluate, parse
+from mpmcli.scene.expression import Expression, ExpressionError, evaluate
+from mpmcli.scene.expression_reader import MOST_CHARACTERS, MOST_NESTED, parse
 from mpmcli.scene.functions import FUNCTIONS, OPERATORS
 
 NAMES = ("t", "x", "y", "X", "Y")

@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 from test_expression import FUNCTION_CASES
 
-from mpmcli.scene.expression import parse
+from mpmcli.scene.expression_reader import parse
 from mpmcli.scene.functions import FUNCTIONS, OPERATORS
 from mpmcli.solver.expression_functions import KERNELS
 from mpmcli.solver.expression_kernels import node_of

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mpmcli.scene.expression import evaluate, parse
+from mpmcli.scene.expression import evaluate
+from mpmcli.scene.expression_reader import parse
 from mpmcli.scene.intervals import bounds_of
 from mpmcli.scene.quadrature import Mean, largest_of, telling_times
 

@@ -7,7 +7,8 @@ import pytest
 import taichi as ti
 from scipy.integrate import quad
 
-from mpmcli.scene.expression import Tree, evaluate, parse
+from mpmcli.scene.expression import Tree, evaluate
+from mpmcli.scene.expression_reader import parse
 from mpmcli.scene.quadrature import BOUND, HALF, MIDDLE, Mean
 from mpmcli.solver.time_tables import ROOM, TimeTables, thinned
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from mpmcli.scene.expression import parse
+from mpmcli.scene.expression_reader import parse
 from mpmcli.validation.cases.mms import CASES, ManufacturedWave
 from mpmcli.validation.manufactured import AXES, StandingWave
 

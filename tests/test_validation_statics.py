@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mpmcli.scene.entry import value_of
-from mpmcli.scene.expression import parse
+from mpmcli.scene.expression_reader import parse
 from mpmcli.validation.cases import column_dynamic, column_static, spinning_disc
 from mpmcli.validation.elastica import Beam
 from mpmcli.validation.quasi_static import smooth_ramp, window_weights

@@ -7,7 +7,8 @@ import numpy as np
 from pydantic import Discriminator, GetCoreSchemaHandler, GetJsonSchemaHandler, Tag
 from pydantic_core import CoreSchema, core_schema
 
-from mpmcli.scene.expression import INITIAL, POSITION, Expression, ExpressionError, parse
+from mpmcli.scene.expression import INITIAL, POSITION, Expression, ExpressionError
+from mpmcli.scene.expression_reader import parse
 from mpmcli.scene.quantity import LARGEST, flaw, list_of_axes, scene_dimension
 from mpmcli.scene.sentences import written
 
@@ -38,7 +39,8 @@ class EntryOf:
         if isinstance(value, str):
             missing = () if scene_dimension(info) != 2 else (POSITION[2], INITIAL[2])
             try:
-                value = parse(value, [name for name in self.names if name not in missing])
+                names = [name for name in self.names if name not in missing]
+                value = parse(value, names, info.context.get("constants", {}))
             except ExpressionError as error:
                 raise flaw(str(error)) from None
             if isinstance(value, Expression):
@@ -57,7 +59,7 @@ def plain(value: object) -> object:
     """Return an entry, or lists of entries, as TOML holds them."""
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
-    return value.text if isinstance(value, Expression) else value
+    return value.said if isinstance(value, Expression) else value
 
 
 def value_of(entry: Entry, **values: np.ndarray | float) -> np.ndarray:

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from mpmcli.errors import InputError
 from mpmcli.scene.bounds import scene_bounds
 from mpmcli.scene.checks import problems_in
+from mpmcli.scene.constants import definitions
 from mpmcli.scene.expand import Laws, expand_materials
 from mpmcli.scene.locate import key_lines, line_of
 from mpmcli.scene.overrides import apply_overrides
@@ -115,7 +116,9 @@ def _validate(data: dict[str, Any], laws: Laws) -> tuple[Scene | None, list[Prob
         found: list[Problem] = []
         scene = None
         try:
-            scene = model.model_validate(expansion.data, context={"dimension": dimension_of(data)})
+            dimension = dimension_of(data)
+            constants, _ = definitions(data.get("constants"), dimension)
+            scene = model.model_validate(expansion.data, context={"dimension": dimension, "constants": constants})
         except ValidationError as error:
             unknown = [one["loc"] for one in error.errors() if one["type"] == "extra_forbidden"]
             found = [p for p in problems_of(error, expansion.data, model) if not expansion.hides(p.path)]

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal, Union, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, create_model
 
+from mpmcli.scene.constants import Constants
 from mpmcli.scene.domain import Domain
 from mpmcli.scene.entry import PlaceVector, StartDeformation, StartMatrix, StartVector
 from mpmcli.scene.material import MaterialParameters
@@ -184,6 +185,13 @@ class Scene(Table):
     """
 
     title: Annotated[str, Field(description="One line that says what the scene is.")] = ""
+    constants: Annotated[
+        Constants | None,
+        Field(
+            description="Names for numbers, or for expressions of t, x, y, z, X, Y, Z and of the names above them, "
+            "which every expression of the scene may use. Default: none."
+        ),
+    ] = None
     domain: Annotated[Domain, Field(description="The box that the scene lives in, and its grid.")]
     time: Annotated[Time, Field(description="How long, how many frames, which steps.")]
     bodies: Annotated[tuple[Body, ...], Field(min_length=1, description="The bodies, at least one.")]

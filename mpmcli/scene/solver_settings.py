@@ -6,7 +6,8 @@ from pydantic import AfterValidator, Field, ValidationInfo
 
 from mpmcli.scene.quantity import Flag, Table, flaw
 
-# Poisson's ratio above which bodies lock without `f_bar`: a bent beam of four cells is 5 % too stiff at 0.45, 13 % at 0.49.
+# Poisson's ratio above which bodies lock without `f_bar`: a bent beam of four cells is 5 % too stiff at 0.45, 13 % at
+# 0.49.
 NEARLY_INCOMPRESSIBLE = 0.45
 # Default of FLIP's share in AFLIP: a twentieth of the loss of APIC.
 USUAL_FLIP = 0.95
