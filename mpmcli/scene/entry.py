@@ -59,7 +59,7 @@ def plain(value: object) -> object:
     """Return an entry, or lists of entries, as TOML holds them."""
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
-    return value.said if isinstance(value, Expression) else value
+    return value.source if isinstance(value, Expression) else value
 
 
 def value_of(entry: Entry, **values: np.ndarray | float) -> np.ndarray:

@@ -50,12 +50,12 @@ class Expression:
     Attributes:
         text: with the constants of the scene put in.
         tree: what it means.
-        said: as it was written.
+        source: as it was written.
     """
 
     text: str
     tree: Tree = field(compare=False, repr=False)
-    said: str = field(compare=False, repr=False)
+    source: str = field(compare=False, repr=False)
 
     @property
     def names(self) -> frozenset[str]:

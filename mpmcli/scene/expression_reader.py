@@ -9,6 +9,7 @@ import ast
 import difflib
 import math
 import warnings
+from collections import Counter
 from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
@@ -29,7 +30,7 @@ from mpmcli.scene.functions import CONSTANTS, FUNCTIONS
 # An expression of a scene is a formula that a person has written; kernels hold all of it.
 MOST_CHARACTERS = 2000
 MOST_NESTED = 60
-MOST_MEANT = 20_000
+MOST_EXPANDED = 20_000
 
 _BINARY = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Mod: "%", ast.Pow: "**"}
 _COMPARED = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
@@ -73,21 +74,22 @@ def parse(
         raise ExpressionError(f'is no expression: "{_cut(source)}" cannot be read{place}') from None
     except (ValueError, RecursionError, MemoryError):
         raise ExpressionError("is no expression: it cannot be read") from None
-    meant = text
-    used = [node.id for node in ast.walk(parsed) if isinstance(node, ast.Name) and node.id in constants]
+    expanded = text
+    used = Counter(node.id for node in ast.walk(parsed) if isinstance(node, ast.Name) and node.id in constants)
     for name in used:
         inner = {node.id for node in ast.walk(constants[name]) if isinstance(node, ast.Name)}
         for quantity in sorted(inner & set(QUANTITIES) - set(names)):
             raise ExpressionError(f'uses "{name}", which depends on "{quantity}"; the names here are {_listed(names)}')
     if used:
-        meant = source = ast.unparse(_PutIn(constants).visit(parsed))
-        if len(meant) > MOST_MEANT:
+        length = len(source) + sum(count * len(ast.unparse(constants[name])) for name, count in used.items())
+        if length > MOST_EXPANDED:
             raise ExpressionError(
-                f"is too long with its constants put in: {len(meant)} characters, {MOST_MEANT} at most"
+                f"is too long with its constants put in: {length} characters, {MOST_EXPANDED} at most"
             )
+        expanded = source = ast.unparse(_PutIn(constants).visit(parsed))
         parsed = ast.parse(source, mode="eval")
     tree = _Reader(source, (*names, *constants)).read(parsed.body)
-    return tree.value if isinstance(tree, Number) else Expression(meant, tree, text)
+    return tree.value if isinstance(tree, Number) else Expression(expanded, tree, text)
 
 
 class _PutIn(ast.NodeTransformer):

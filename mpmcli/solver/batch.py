@@ -48,8 +48,7 @@ class Kind:
     Attributes:
         dimension: 2 or 3; precision: "f32" or "f64".
         settings: of the solver.
-        faces: words of the walls, per axis; rough: (axis, side) of those with friction; slips: whether
-            particles remember how far they slipped.
+        faces: words of the walls, per axis; rough: (axis, side) of those with friction.
         flags: of each law in the order of their names, the name and the terms that it has.
         cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
         keeps_filling: whether nodes keep the volume scattered to them.
@@ -62,7 +61,6 @@ class Kind:
     settings: SolverSettings
     faces: tuple[tuple[str, str], ...]
     rough: tuple[tuple[int, int], ...]
-    slips: bool
     flags: tuple[tuple, ...]
     cells: tuple[int, ...]
     particles: tuple[int, ...]
@@ -86,7 +84,6 @@ class Kind:
             scene.solver,
             tuple(tuple(pair) for pair in scene.domain.walls.faces(scene.dimension)),
             rough_faces(scene),
-            slips_in(scene),
             tuple((law.name, law.terms) for law in members),
             tuple(scene.domain.cells),
             tuple(sum(len(particles[i].position) for i in own) for own in places),
@@ -150,11 +147,11 @@ class Batch:
                 serial=on_cpu and backend.threads == 1,
                 keeps_initial=forces.initial,
                 total=kind.settings.solids == "total",
-                averaged=averages_volume(kind.settings, law),
-                slips=kind.slips,
+                averaged=shares,
+                slips=slips_in(kind.settings, kind.rough),
             )
-            for law, room, bodies, forces in zip(
-                kind.members, kind.particles, kind.bodies, kind.drives.forces, strict=True
+            for law, shares, room, bodies, forces in zip(
+                kind.members, averaged, kind.particles, kind.bodies, kind.drives.forces, strict=True
             )
         ]
         self.values = BatchValues(kind.drives, runs)

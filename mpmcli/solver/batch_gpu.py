@@ -253,7 +253,7 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
 
     @ti.kernel
     def average(numbers: ti.types.ndarray(ti.f64, 2), counts: ti.types.ndarray(ti.i32, 2)):
-        """Average volumes over cells, before frames are read; the constants of no step need have been set."""
+        """Average volumes over cells before frames are read, the first one included, which no step precedes."""
         for w in range(runs):
             constants[w][INVERSE] = ti.cast(numbers[w, real.inverse_spacing], float)
         for g, group in ti.static(members):

@@ -52,8 +52,10 @@ class BatchPhases:
         averaged = [g for g, group in self.members if group.averaged]
         self.averages = {g: 1 + n * self.colours for n, g in enumerate(averaged)}
         begun = 1 + len(averaged) * self.colours
-        self.scatters = tuple(begun + g * self.colours for g in range(len(device.groups)))
-        self.relaxing = self.scatters[-1] + self.colours
+        self.scatters = {g: begun + g * self.colours for g, _ in self.members}
+        # (group, first phase) of all phases that go over its pencils, colour by colour.
+        self.coloured = (*self.averages.items(), *self.scatters.items())
+        self.relaxing = begun + len(device.groups) * self.colours
         self.contact = self.relaxing + self.relaxes
         self.friction = self.contact + device.nodes.needs_contact
         self.updating = self.friction + device.nodes.needs_friction
@@ -124,16 +126,11 @@ class BatchPhases:
         if ti.static(self.shared):
             if phase < self.sorts or phase == self.showing:
                 parts = SHARES
-            for g in ti.static(range(len(self.members))):
-                colour = phase - self.scatters[g]
+            for g, begin in ti.static(self.coloured):
+                colour = phase - begin
                 if colour >= 0 and colour < self.colours:
                     last = self.device.orders[g].work[colour, region + 1]
                     parts = last - self.device.orders[g].work[colour, region]
-                if ti.static(g in self.averages):
-                    colour = phase - ti.static(self.averages[g])
-                    if colour >= 0 and colour < self.colours:
-                        last = self.device.orders[g].work[colour, region + 1]
-                        parts = last - self.device.orders[g].work[colour, region]
         return parts
 
     @ti.func
@@ -167,25 +164,21 @@ class BatchPhases:
                 clear_rows(grid, first, after)
             else:
                 ti.atomic_max(self.values[w, SPEED], update_rows(grid, nodes, first, after, gravity_step))
-        for g, group in ti.static(enumerate(seen)):
-            colour = phase - self.scatters[g]
+        for g, begin in ti.static(self.coloured):
+            colour = phase - begin
             if colour >= 0 and colour < self.colours:
                 first, after = 0, orders[g].pencil_count(colour)
                 if ti.static(self.shared):
                     first = orders[g].work[colour, region] + part
                     after = first + 1
-                scatter_pencils(particles, g, group, orders[g], colour, first, after, kick, relaxed)
-            if ti.static(g in self.averages):
-                colour = phase - ti.static(self.averages[g])
-                if colour >= 0 and colour < self.colours:
-                    first, after = 0, orders[g].pencil_count(colour)
-                    if ti.static(self.shared):
-                        first = orders[g].work[colour, region] + part
-                        after = first + 1
-                    average_pencils(grid, g, group, orders[g], colour, first, after)
-                if phase == self.before_showing and region == 0:
-                    first = w * ti.static(self.device.room[g])
-                    average_for_frame(grid, g, group, first, first + counts[w, self.count.particles[g]])
+                if ti.static(begin == self.scatters[g]):
+                    scatter_pencils(particles, g, seen[g], orders[g], colour, first, after, kick, relaxed)
+                else:
+                    average_pencils(grid, g, seen[g], orders[g], colour, first, after)
+        for g in ti.static(tuple(self.averages)):
+            if phase == self.before_showing and region == 0:
+                first = w * ti.static(self.device.room[g])
+                average_for_frame(grid, g, seen[g], first, first + counts[w, self.count.particles[g]])
         if ti.static(nodes.needs_contact):
             if phase == self.contact:
                 first, after = self.places.even_part(nodes.images.plane_nodes(grid), region)

@@ -3,6 +3,7 @@
 import numpy as np
 import taichi as ti
 
+from mpmcli.boundaries.rough_faces import rough_faces
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
 from mpmcli.scene import BodyParticles, Scene
@@ -45,7 +46,7 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
                 keeps_initial=needs_initial(scene, members),
                 total=scene.solver.solids == "total",
                 averaged=averages_volume(scene.solver, law),
-                slips=slips_in(scene),
+                slips=slips_in(scene.solver, rough_faces(scene)),
             )
         )
     return groups

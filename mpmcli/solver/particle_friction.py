@@ -5,17 +5,18 @@ the stiffness of the push, and at most with the coefficient times the push (Cund
 3.4). Friction that only stops the velocity would let a particle creep by what others pull at it in each step.
 """
 
+from collections.abc import Sequence
+
 import taichi as ti
 
-from mpmcli.boundaries.rough_faces import rough_faces
-from mpmcli.scene import Scene
+from mpmcli.scene import SolverSettings
 from mpmcli.solver.particle_arrays import VOLUME
 from mpmcli.solver.reference_grid import overlap_of, stiffness_of, stretch_along
 
 
-def slips_in(scene: Scene) -> bool:
-    """Return whether particles of a scene remember how far they slipped."""
-    return scene.solver.solids == "total" and bool(rough_faces(scene))
+def slips_in(settings: SolverSettings, rough: Sequence[tuple[int, int]]) -> bool:
+    """Return whether particles remember how far they slipped; `rough` are the faces with friction."""
+    return settings.solids == "total" and len(rough) > 0
 
 
 @ti.func

@@ -170,7 +170,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 several_bodies=bodies[name] > 1,
                 keeps_initial=scene.solver.solids == "total" or needs_initial(scene, members_of(scene, name)),
                 averaged=shares,
-                slips=slips_in(scene),
+                slips=slips_in(scene.solver, rough_faces(scene)),
             ),
         )
         for name, shares in zip(sorted(bodies), averaged, strict=True)
