@@ -9,6 +9,8 @@ import numpy as np
 
 from mpmcli.output.result import Result
 from mpmcli.validation.cases.elliptical_drop import half_axis
+from mpmcli.validation.kleefsman import FILM, IMPACT, impact, water_height
+from mpmcli.validation.kleefsman import measured as gauges
 from mpmcli.validation.martin_moyce import N_SQUARED, mean_error, measured
 
 # How much later than assumed the column may have been free to move, in T: the gate takes its time.
@@ -37,6 +39,23 @@ def dam_break_3d(result: Result) -> str:
     k = int(np.argmax(front >= wall))
     time = np.interp(wall, front[k - 1 : k + 1], result.times[k - 1 : k + 1])
     return f"front at the far wall at t √(g/H) = {time * math.sqrt(gravity / height):.2f}; experiments 2.4 to 2.6"
+
+
+def dam_break_obstacle_3d(result: Result) -> str:
+    """Say when the front of 99.9 % of the water is at the box, and compare heights with those of three gauges."""
+    water = result.header.bodies[0]
+    places = [frame.position.astype(np.float64) for frame in result.frames([])]
+    volume = result.ledger[0].mass / water.density / len(places[0])
+    time = impact(result.times, np.array([np.quantile(place[:, 0], FILM) for place in places]))
+    errors = []
+    for name in ("H2", "H3", "H4"):
+        gauge = gauges()[name]
+        heights = np.array([water_height(place, gauge.x, volume) for place in places])
+        errors.append(f"{100 * gauge.mean_error(result.times, heights, 1.1):.0f}")
+    return (
+        f"front at the box at t = {time:.2f} s, measured {IMPACT:.2f}; heights at the gauges H2, H3 and H4 "
+        f"{', '.join(errors[:-1])} and {errors[-1]} % off on average, up to 1.1 s"
+    )
 
 
 def elliptical_drop_2d(result: Result) -> str:
@@ -70,6 +89,20 @@ def block_slide_2d(result: Result) -> str:
     place = [frame.position[:, 0].mean(dtype=np.float64) for frame in result.frames([])]
     distance, expected = place[-1] - place[0], 2.0**2 / (2 * 0.4 * 9.81)
     return f"slides {distance:.3f} m, {percent(distance / expected - 1)} off v²/(2 μ g)"
+
+
+def couette_2d(result: Result) -> str:
+    """Compare the velocity with the series at four times: see `mpmcli.validation.cases.couette`."""
+    width, speed, viscosity, n = 0.1, 0.1, 0.01, np.arange(1, 100)
+    errors = []
+    for k in (5, 10, 25, 100):
+        frame, row = result.frame(k), result.ledger[k]
+        y = frame.position[:, 1].astype(np.float64) / width
+        fading = np.exp(-viscosity * (n * np.pi / width) ** 2 * (row.time - row.step_max / 2))
+        exact = speed * (y + np.sin(y[:, None] * n * np.pi) @ (2 / (n * np.pi) * (-1.0) ** n * fading))
+        errors.append(float(np.sqrt(((frame.velocity[:, 0] - exact) ** 2).mean())) / speed)
+    said = ", ".join(f"{error:.1e}" for error in errors)
+    return f"RMS of the velocity off the series {said} U at 0.05, 0.1, 0.25 and 1 s"
 
 
 def rubber_bounce_2d(result: Result) -> str:
@@ -236,6 +269,33 @@ def stirred_tank_2d(result: Result) -> str:
     )
 
 
+def fountain_2d(result: Result) -> str:
+    """Compare the way up of the jet's middle with v_y^2 / (2 g), and what came out with the area times the speed."""
+    (along, up), gravity, mouth, width, density = (1.0, 4.0), 9.81, 0.21, 0.1, 1000.0
+    k = int(np.argmin(np.abs(result.times - 0.6)))
+    frame = result.present_frame(k, [])
+    jet = frame.position[frame.body == 1]
+    # The parabola is widest around its middle: of its upper edge and its lower edge there, both are as far off.
+    near = np.abs(jet[:, 0] - (0.4 + along * up / gravity)) < 0.02
+    rise = 0.5 * float(jet[near, 1].max() + jet[near, 1].min()) - mouth
+    last = result.ledger[-1]
+    flow = last.emitted_mass / (density * width * float(np.hypot(along, up)) * last.time) - 1
+    return (
+        f"rises {rise:.3f} m, {percent(rise / (up**2 / (2 * gravity)) - 1)} off v_y²/(2 g); "
+        f"flow {percent(flow)} off area times speed"
+    )
+
+
+def kept_out(result: Result) -> str:
+    """Say how deep the deepest particle of all frames lies in a collider, in cells."""
+    deepest = max(
+        float(-collider.signed_distance(frame.position.astype(np.float64), frame.time).min())
+        for frame in result.frames([])
+        for collider in result.colliders
+    )
+    return f"deepest particle {max(0.0, deepest) / result.header.spacing:.2f} cells inside of a collider"
+
+
 def percent(error: float) -> str:
     """Write a relative error; what rounds to zero has no minus sign."""
     return f"{round(100 * error, 2) + 0.0:+.2f} %"
@@ -244,14 +304,18 @@ def percent(error: float) -> str:
 KNOWN_ANSWERS = {
     "dam_break_2d": dam_break_2d,
     "dam_break_3d": dam_break_3d,
+    "dam_break_obstacle_3d": dam_break_obstacle_3d,
     "elliptical_drop_2d": elliptical_drop_2d,
+    "fountain_2d": fountain_2d,
     "honey_coil_2d": falling,
     "lava_slope_2d": lava_slope_2d,
     "mud_slump_2d": mud_slump_2d,
     "jelly_drop_2d": falling,
     "jelly_drop_3d": falling,
     "jelly_stack_3d": falling,
+    "mesh_drop_3d": falling,
     "block_slide_2d": block_slide_2d,
+    "couette_2d": couette_2d,
     "rubber_bounce_2d": rubber_bounce_2d,
     "snowball_wall_2d": snowball_wall,
     "snowball_wall_3d": snowball_wall,
@@ -261,4 +325,9 @@ KNOWN_ANSWERS = {
     "metal_impact_2d": metal_impact_2d,
     "mixed_2d": falling,
     "stirred_tank_2d": stirred_tank_2d,
+    "shaken_tank_2d": kept_out,
+    "mixer_2d": kept_out,
+    "hourglass_2d": kept_out,
+    "sand_obstacles_2d": kept_out,
+    "silo_3d": kept_out,
 }

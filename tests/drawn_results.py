@@ -21,8 +21,14 @@ def row(time: float, d: int) -> LedgerRow:
     return LedgerRow(time, 1, 1e-3, 1e-3, "wave", *zeros, (0.0,) * d, (0.0,) * (2 * d - 3))
 
 
-def header(size: Sequence[float], spacing: float, materials: Sequence[dict[str, Any]], **more: Any) -> dict[str, Any]:
-    """The header of a run with one body of each material, "body 0", "body 1", ..."""
+def header(
+    size: Sequence[float],
+    spacing: float,
+    materials: Sequence[dict[str, Any]],
+    colliders: Sequence[dict[str, Any]] = (),
+    **more: Any,
+) -> dict[str, Any]:
+    """The header of a run with one body of each material, "body 0", "body 1", ..., and with colliders."""
     d = len(size)
     names = [f"body {k}" for k in range(len(materials))]
     box = {"box": {"min": [0.0] * d, "max": [float(length) for length in size]}}
@@ -35,6 +41,8 @@ def header(size: Sequence[float], spacing: float, materials: Sequence[dict[str, 
             for name, material in zip(names, materials, strict=True)
         ],
     }
+    if colliders:
+        scene["colliders"] = list(colliders)
     facts = {
         "title": scene["title"],
         "dimension": d,

@@ -106,11 +106,12 @@ WALLS = (
     ),
     SmallPlant(
         "boundaries/mirror_images.py",
-        "elif holds[a] == 1:\n                        result[c] = -result[c]",
-        "elif holds[a] == 1:\n                        result[c] = -0.95 * result[c]",
+        "elif holds[a] == 1:\n                            result[c] = -result[c]",
+        "elif holds[a] == 1:\n                            result[c] = -0.95 * result[c]",
         ("poiseuille", "bingham"),
         missed="the node on the wall is stopped as well, so that images are a hundredth of the error of the grid",
     ),
+    *_of("boundaries/walls.py", ("mass * self.velocity(axis", "1.05 * mass * self.velocity(axis", "couette")),
     SmallPlant(
         "boundaries/mirror_images.py", "ti.cast(outward >= 0, int)", "ti.cast(outward > -1e30, int)", ("take_off",)
     ),

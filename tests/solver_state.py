@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene
+from mpmcli.scene.colliders import Collider
 from mpmcli.solver.snapshot import read_group
 from mpmcli.solver.solver import Solver
 
@@ -42,6 +44,13 @@ class BodyState:
 def scene_of(**tables: object) -> Scene:
     """Return the scene of these tables."""
     return parse_scene(tables, laws=parameter_models()).scene
+
+
+def with_colliders(scene: Scene, colliders: list[dict]) -> Scene:
+    """Return a scene with colliders that its checks have not seen."""
+    tables = TypeAdapter(tuple[Collider, ...])
+    made = tables.validate_python(colliders, context={"dimension": scene.dimension, "constants": {}})
+    return scene.model_copy(update={"colliders": made})
 
 
 def bodies_of(solver: Solver) -> dict[str, BodyState]:

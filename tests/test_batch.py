@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import pytest
 import state_run
+from solver_state import with_colliders
 
 from mpmcli.errors import MpmcliError
 from mpmcli.frames.frame import Frame
@@ -19,10 +20,17 @@ from mpmcli.solver.solver import Solver
 
 # By name: materials, dimension, and further tables of the scene.
 DRIVEN = ("gravity of time", "a force of the place", "forces on one body of two")
+# What falls along x enters again at the other face.
+REPEATING = {"walls": {"default": "separate", "x_min": "periodic", "x_max": "periodic"}, "gravity": [-100.0, -9.81]}
+DOUBLY_REPEATING = {
+    "walls": {"default": "periodic", "y_min": "separate", "y_max": "separate"},
+    "gravity": [-100.0, -9.81, 50.0],
+}
 SCENES = (
     {name: ((name,), 2, {}) for name in state_run.MATERIALS}
     | {
         "two laws, two bodies of one": (("sand", "fluid", "sand"), 2, {}),
+        "3D, two laws": (("snow", "fluid"), 3, {}),
         "3D, AFLIP": (("snow",), 3, {"solver": {"transfer": "aflip", "flip": 0.9}}),
         "cubic splines, f64": (("neo_hookean",), 2, {"solver": {"kernel": "cubic", "precision": "f64"}}),
         "zeroed walls, PIC": (("fluid",), 2, {"solver": {"walls": "zeroed", "transfer": "pic"}}),
@@ -30,6 +38,16 @@ SCENES = (
         "rough walls, 3D, AFLIP": (("snow",), 3, {"solver": {"transfer": "aflip"}}),
         "rough walls, total": (("neo_hookean",), 2, {"solver": {"solids": "total"}}),
         "rough walls, zeroed": (("sand",), 2, {"solver": {"walls": "zeroed"}}),
+        "periodic, a wall moves": (("fluid",), 2, {"domain": REPEATING}),
+        "periodic, a wall moves, AFLIP": (("sand",), 2, {"domain": REPEATING, "solver": {"transfer": "aflip"}}),
+        "periodic, a wall moves, zeroed": (("sand",), 2, {"domain": REPEATING, "solver": {"walls": "zeroed"}}),
+        "periodic, 3D, f_bar": (
+            ("neo_hookean",),
+            3,
+            {"domain": DOUBLY_REPEATING, "solver": {"f_bar": True}},
+        ),
+        "colliders": (("sand",), 2, {"colliders": True}),
+        "colliders, 3D": (("neo_hookean",), 3, {"colliders": True}),
         "slip and stick": (("sand",), 2, {"domain": {"walls": {"default": "slip", "y_min": "stick"}}}),
     }
     | dict.fromkeys(DRIVEN)
@@ -48,13 +66,34 @@ def driven(k: int) -> dict[str, tuple]:
     }
 
 
+def colliders(dimension: int, k: int) -> list[dict]:
+    """Return colliders at rest and moving, with numbers that depend on k, and one more in the first run."""
+    pad = [0.5] * (dimension - 2)
+    found = [
+        {"shape": {"plane": {"point": [0.0, 0.05, *pad], "normal": [0.1 * k, 1.0, *pad]}}, "friction": 0.2 * k},
+        {"shape": {"box": {"min": [0.4, 0.2, 0.4][:dimension], "max": [0.5, 0.3, 0.6][:dimension]}}},
+        {"shape": {"ball": {"center": [0.2, 0.1, *pad], "radius": 0.04 * k}}, "wall": "stick"},
+        {"shape": {"capsule": {"start": [0.6, 0.1, *pad], "end": [0.7, 0.2, *pad], "radius": 0.05}}, "wall": "slip"},
+    ]
+    found[1] |= {"angular_velocity": f"{9 * k} * cos(30 * t)", "velocity": [0.5 * k, *[0.0] * (dimension - 1)]}
+    if dimension == 2:
+        found.append({"shape": {"polygon": {"vertices": [[0.1, 0.3], [0.2, 0.3], [0.12, 0.35]]}}})
+    else:
+        found[1] |= {"axis": [1.0, 2.0 * k, 0.5]}
+        base = {"base": [0.3, 0.1, 0.5], "axis": [1.0, 0.0, 1.0], "radius": 0.06, "height": 0.1 * k}
+        found.append({"shape": {"cylinder": base}})
+    return [{"name": f"collider {n}", **table} for n, table in enumerate(found[: 5 - (k == 2)])]
+
+
 # In the default suite, with the runs that a solver repeats: the second is smaller than what the batch has room for.
 # All others, and the first runs of these, carry the marker slow.
 USUAL = {
     "rough walls": (1,),
+    "colliders": (1,),
     "sand": (1,),
     "two laws, two bodies of one": (1,),
     "forces on one body of two": (1,),
+    "periodic, a wall moves": (1,),
 }
 Output = list[tuple[Frame, LedgerRow]]
 
@@ -83,6 +122,8 @@ def scene_named(name: str, other: bool = False) -> Scene:
     ]
     cells = (17 if other else 20) if d == 2 else (11 if other else 12)
     rough = {"friction": {"y_min": 0.4 - 0.1 * other, "x_max": 0.3 + 0.1 * other}} if "rough" in name else {}
+    if "a wall moves" in name:
+        rough = {"friction": {"y_min": 0.4 - 0.1 * other}, "wall_velocity": {"y_min": [2.0 + other, 0.0]}}
     data = {
         "domain": {"size": [1.0] * d, "cells": [cells] * d, "gravity": [0.5 * other, -9.81, 0.0][:d]}
         | more.get("domain", {})
@@ -93,7 +134,9 @@ def scene_named(name: str, other: bool = False) -> Scene:
         "forces": [{"acceleration": a} | ({"body": body} if body else {}) for body, a in forces],
         "solver": more.get("solver", {}),
     }
-    return parse_scene(data, laws=parameter_models(), source=name).scene
+    scene = parse_scene(data, laws=parameter_models(), source=name).scene
+    # They stand in the material, where they meet it at once.
+    return with_colliders(scene, colliders(d, 1 + other) if more.get("colliders") else [])
 
 
 def batch_of(scenes: Sequence[Scene], backend: object) -> Batch:

@@ -17,17 +17,21 @@ pytestmark = pytest.mark.gpu
 
 
 SLOW = (
+    "colliders, 3D",
     "a force of the place",
     "neo_hookean",
     "rough walls, 3D, AFLIP",
     "rough walls, total",
+    "periodic, a wall moves",
+    "periodic, a wall moves, AFLIP",
+    "periodic, 3D, f_bar",
     "two laws, two bodies of one",
     "3D, AFLIP",
     "forces on one body of two",
 )
 
 
-@pytest.mark.parametrize("name", ["rough walls", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)])
+@pytest.mark.parametrize("name", ["rough walls", "colliders", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)])
 def test_runs_follow_those_on_the_cpu(backend_of: Callable, name: str) -> None:
     """Two runs in which all numbers differ: as many steps, and what sums in another order changes by round-off."""
     scenes = [scene_named(name), scene_named(name, other=True)]
@@ -42,6 +46,7 @@ def test_runs_follow_those_on_the_cpu(backend_of: Callable, name: str) -> None:
         for (frame, row), (other, other_row) in zip(outcome, expected, strict=True):
             assert np.abs(frame.position - other.position).max() < steps * np.finfo(np.float32).eps
             assert row.energy == pytest.approx(other_row.energy, rel=1e-5)
+            assert np.allclose(row.collider_force, other_row.collider_force, rtol=1e-3, atol=1e-3)
             assert row.step_max == pytest.approx(other_row.step_max, rel=1e-4) and row.limit == other_row.limit
             scale = np.abs(other.fields["stress"]).max()
             assert np.abs(frame.fields["stress"] - other.fields["stress"]).max() <= 1e-3 * scale

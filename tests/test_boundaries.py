@@ -31,7 +31,7 @@ class Plate:
 
 def test_a_boundary_acts_on_nodes_and_on_their_images(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     """Water slides along the floor into a plate: nodes and ghost nodes beyond it rest, and the others move."""
-    update = lambda grid, images, boundaries: NodeUpdate(grid, images, [*boundaries, Plate()])  # noqa: E731
+    update = lambda grid, images, boundaries, *more: NodeUpdate(grid, images, [*boundaries, Plate()], *more)  # noqa: E731
     monkeypatch.setattr(kernels, "NodeUpdate", update)
     water = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}
     box = {"min": [0.2, 0.0], "max": [0.8, 0.3]}

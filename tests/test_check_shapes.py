@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mpmcli.check.distance import close_pairs, distance_between
 from mpmcli.check.extent import RESOLUTION, thickness
 from mpmcli.check.flight import arrivals
-from mpmcli.scene.shapes import Ball, Box, Cylinder, Form, Polygon
+from mpmcli.scene.shapes import Ball, Box, Capsule, Cylinder, Form, Polygon
 
 H = 1 / 64
 
@@ -49,10 +49,10 @@ def test_the_thickness_of_convex_shapes() -> None:
 @pytest.mark.parametrize("n", [3, 4, 5, 8])
 def test_the_thickness_of_a_polygon_is_its_inscribed_circle(n: int) -> None:
     """Twice the inradius, of a regular polygon, of a thin triangle (area / half perimeter), of an L of width 0.1."""
-    assert thickness(regular(n, 0.4)) == pytest.approx(0.8, abs=4 * RESOLUTION)
+    assert thickness(regular(n, 0.4)) == pytest.approx(0.8, abs=4 * RESOLUTION[2])
     triangle = polygon((0.0, 0.0), (4.0, 0.0), (4.0, 0.3))
     perimeter = 4.3 + math.hypot(4, 0.3)
-    assert thickness(triangle) == pytest.approx(4 * 0.6 / perimeter, abs=8 * RESOLUTION)
+    assert thickness(triangle) == pytest.approx(4 * 0.6 / perimeter, abs=8 * RESOLUTION[2])
 
 
 def test_an_angle_is_as_thick_as_its_arms() -> None:
@@ -61,7 +61,7 @@ def test_an_angle_is_as_thick_as_its_arms() -> None:
     angle = polygon((0.0, 0.0), (1.0, 0.0), (1.0, arm), (arm, arm), (arm, 1.0), (0.0, 1.0))
     # It touches both outer edges and the inner corner: (arm - r) sqrt(2) = r.
     expected = 2 * arm * math.sqrt(2) / (1 + math.sqrt(2))
-    assert thickness(angle) == pytest.approx(expected, abs=4 * RESOLUTION)
+    assert thickness(angle) == pytest.approx(expected, abs=4 * RESOLUTION[2])
 
 
 def test_distances_in_the_plane() -> None:
@@ -130,3 +130,19 @@ def test_what_is_thrown_up_comes_down() -> None:
     assert one.time == pytest.approx((2 + math.sqrt(4 + 20 * s)) / 10)
     (resting,) = arrivals(loaded().scene)
     assert (resting.time, resting.speed) == (0.0, 0.0)
+
+
+@given(gap=st.floats(0.01, 1.0), radius=st.floats(0.1, 1.0), tilt=st.floats(0.0, math.pi))
+def test_a_capsule_and_what_lies_beside_it(gap: float, radius: float, tilt: float) -> None:
+    """A disc at its end, a rectangle and a polygon beside it, another capsule across: gaps along the normal."""
+    axis = np.array([math.cos(tilt), math.sin(tilt)])
+    capsule = made(Capsule, 2, start=[0.0, 0.0], end=(2 * axis).tolist(), radius=radius)
+    assert thickness(capsule) == 2 * radius
+    disc = made(Ball, 2, center=((2 + radius + gap + 0.3) * axis).tolist(), radius=0.3)
+    assert distance_between(capsule, disc) == distance_between(disc, capsule) == pytest.approx(gap)
+    below = made(Box, 2, min=[-3.0, -radius - gap - 1], max=[3.0, -radius - gap])
+    roof = polygon((-3.0, -radius - gap - 1), (3.0, -radius - gap - 1), (3.0, -radius - gap), (-3.0, -radius - gap))
+    assert distance_between(below, capsule) == pytest.approx(gap)
+    assert distance_between(capsule, roof) == pytest.approx(gap)
+    across = made(Capsule, 2, start=[-3.0, -2 * radius - gap], end=[3.0, -2 * radius - gap], radius=radius)
+    assert distance_between(capsule, across) == pytest.approx(gap)

@@ -13,8 +13,10 @@ from PIL import Image
 import mpmcli.dataset
 from mpmcli.dataset.montage import TrajectoryCells, plan_montage, write_montage
 from mpmcli.errors import InputError
+from mpmcli.render.painter import set_up
 from mpmcli.render.render_scene import render_scene_of
 from mpmcli.render.request import Request
+from mpmcli.render.settings import Settings
 
 
 @pytest.fixture
@@ -127,3 +129,23 @@ def test_what_is_refused(dataset):
             plan_montage(dataset, Request(montage="2x2", frames=frame))
     with pytest.raises(InputError, match='stores no "stress"'):
         plan_montage(dataset, Request(montage="2x2", color="stress"))
+
+
+def test_each_cell_has_the_colliders_of_its_own_trajectory(tmp_path):
+    made = []
+    for number, x in enumerate((0.3, 0.7)):
+        trajectory = made_trajectory(number)
+        post = f'[[colliders]]\nname = "post"\nshape = {{ ball = {{ center = [{x}, 0.8], radius = 0.1 }} }}\n'
+        header = {**trajectory.header, "scene": trajectory.header["scene"] + post}
+        made.append(replace(trajectory, header=header))
+    cells = cells_of(write_dataset(tmp_path / "set", made), [0, 1])
+    scene = render_scene_of(cells)
+    assert [collider.form.center[0] for collider in scene.colliders] == [0.3, 0.7]
+    shown = [[scene.shows(number, cells.frame(k)) for number in range(2)] for k in range(2)]
+    assert shown == [[True, False], [False, True]]
+    setup = set_up(cells, Settings(mode="dots", color="material", size=(300, 300), camera="front"))
+    painter = setup.painter()
+    pictures = [painter.draw(cells.frame(k, ())).astype(int) for k in range(2)]
+    places = setup.view.pixels(np.array([[0.3, 0.8, 0.0], [0.7, 0.8, 0.0]]))[:, :2].astype(int)
+    white = [[bool((picture[row, column] == 255).all()) for column, row in places] for picture in pictures]
+    assert white == [[False, True], [True, False]]

@@ -240,7 +240,7 @@ def test_ledgers_of_left_out_frames_are_joined(tmp_path):
     assert found[1].steps == sum(row.steps for row in rows[1:5]) and found[1].mass == rows[4].mass
     assert found[1].step_min == min(row.step_min for row in rows[1:5])
     assert found[1].step_max == max(row.step_max for row in rows[1:5])
-    assert found[2] == joined_row(rows[5:9])
+    assert found[2] == joined_row(rows[5:9], rows[4].time)
 
 
 @pytest.mark.parametrize("form", FORMS)

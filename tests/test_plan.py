@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable
 
 import pytest
-from solver_state import scene_of
+from solver_state import scene_of, with_colliders
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
@@ -74,6 +74,20 @@ def scene_with(*materials: str, dimension: int = 2) -> Scene:
             for k, material in enumerate(materials)
         ],
     )
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_plan_counts_what_colliders_need(backend_of: Callable, dimension: int) -> None:
+    """The loads by rows of nodes, in double precision, and the distances of a union on its grid, in single."""
+    balls = [{"ball": {"center": [x] * dimension, "radius": 0.1}} for x in (0.5, 0.6)]
+    union = {"name": "union", "shape": balls[0] | {"add": [balls[1]]}}
+    plane = {"name": "plane", "shape": {"plane": {"point": [0.7] * dimension, "normal": [-1.0] * dimension}}}
+    plain = scene_with("fluid", dimension=dimension)
+    scene, backend = with_colliders(plain, [union, plane]), backend_of("f32", 1)
+    colliders = Solver(scene, backend)._kernels.colliders.colliders
+    fields = 8 * colliders.taken.n * colliders.taken.shape[0] + 4 * colliders.samples.shape[0]
+    more = make_plan(scene, backend).device_bytes - make_plan(plain, backend).device_bytes
+    assert more == fields > 0
 
 
 def test_a_scene_of_fluid_plans_nothing_of_other_laws(backend_of: Callable) -> None:

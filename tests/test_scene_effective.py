@@ -108,16 +108,16 @@ def test_loading_the_effective_scene_gives_the_same_scene(data):
 def test_a_new_list_of_tables_is_written_without_a_change_here():
     """The layout follows the model: a list of tables that the schema gains is read back as it was."""
 
-    class Collider(Table):
+    class Gadget(Table):
         center: tuple[float, float]
         keys: tuple[dict[str, float], ...] = ()
 
-    extended = create_model("Extended", __base__=scene_model(LAWS), colliders=(tuple[Collider, ...], ()))
+    extended = create_model("Extended", __base__=scene_model(LAWS), gadgets=(tuple[Gadget, ...], ()))
     tables = [{"center": [0.5, 0.25], "keys": []}, {"center": [0.0, 1.0], "keys": [{"t": 0.0, "x": 1.0}]}]
     scene = parse_scene(tomllib.loads((CONFIGS / "mixed_2d.toml").read_text(encoding="utf-8")), laws=LAWS).scene
-    colliders = tuple(map(Collider.model_validate, tables))
-    found = tomllib.loads(scene_to_toml(extended.model_construct(**dict(scene), colliders=colliders)))
-    assert found.pop("colliders") == tables
+    gadgets = tuple(map(Gadget.model_validate, tables))
+    found = tomllib.loads(scene_to_toml(extended.model_construct(**dict(scene), gadgets=gadgets)))
+    assert found.pop("gadgets") == tables
     assert found == tomllib.loads(scene_to_toml(scene))
 
 
@@ -162,6 +162,7 @@ volume_correction = true
 
 [output]
 fields = ["velocity", "density", "pressure"]
+drop_retired = false
 compress = false
 
 [solver]

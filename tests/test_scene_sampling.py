@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import KDTree
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import estimate_particles, parse_scene, sample_bodies, sampling
+from mpmcli.scene.poisson_disk import disk_radius
 
 FLUID = {"law": "fluid", "density": 800.0, "bulk_modulus": 1e5}
 
@@ -83,8 +85,10 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("way", ["lattice", "jittered"])
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize(
+    ("way", "name"),
+    [*((way, name) for way in ("lattice", "jittered") for name in SHAPES), ("poisson", "disc"), ("poisson", "polygon")],
+)
 def test_mass_is_exact_and_the_estimate_close(name, way):
     size, shape = SHAPES[name]
     scene = scene_of({"shape": shape, "sampling": way}, size=size)
@@ -163,3 +167,44 @@ def test_a_body_too_thin_for_its_lattice_is_named(monkeypatch):
     scene = scene_of({"shape": sliver})
     with pytest.raises(InputError, match='body "b0" is too thin to hold a particle'):
         sample_bodies(scene)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("per_cell", [3, 8])
+def test_a_poisson_disk_sample_is_as_dense_as_asked_and_keeps_its_radius(d, per_cell):
+    """Counts within 3 % of the volume, in the middle and along the faces alike; no two closer than the radius.
+
+    Wherever a ball of the radius finds no point, there is room: hardly anywhere after the last round.
+    """
+    edge, h = (2.0, 0.05) if d == 2 else (0.5, 0.05)
+    box = {"box": {"min": [0.0] * d, "max": [edge] * d}}
+    scene = scene_of({"shape": box, "sampling": "poisson", "particles_per_cell": per_cell}, size=(edge,) * d, spacing=h)
+    (particles,) = sample_bodies(scene)
+    expected = (edge / h) ** d * per_cell
+    assert particles.count == pytest.approx(expected, rel=0.03)
+    assert estimate_particles(scene) == pytest.approx(expected, rel=1e-6)
+    radius = disk_radius(h / per_cell ** (1 / d), d)
+    tree = KDTree(particles.position)
+    assert tree.query(particles.position, k=2)[0][:, 1].min() >= radius
+    places = np.random.default_rng(0).uniform(0.1, edge - 0.1, (20_000, d))
+    assert np.mean(tree.query(places)[0] > radius) < 0.01
+    # A layer of h along every face holds its share: five standard deviations of less than half a Poisson process.
+    layer = np.mean(((particles.position < h) | (particles.position > edge - h)).any(axis=1))
+    share = 1 - (1 - 2 * h / edge) ** d
+    assert abs(layer - share) < 2.5 * np.sqrt(share / particles.count)
+
+
+def test_a_poisson_disk_sample_is_told_by_the_seed_and_the_body_alone():
+    """As a jittered lattice is; other seeds and other bodies differ."""
+
+    def positions(seed, other=BOX):
+        bodies = ({"shape": other}, {"shape": DISC, "sampling": "poisson", "seed": seed})
+        return sample_bodies(scene_of(*bodies))[1].position
+
+    first = positions(7)
+    assert np.array_equal(first, positions(7))
+    assert np.array_equal(first, positions(7, other={"box": {"min": [0, 0], "max": [0.3, 0.3]}}))
+    assert first.shape != positions(8).shape or not np.array_equal(first, positions(8))
+    boxes = [{"shape": {"box": {"min": [x, 0], "max": [x + 1, 1]}}, "sampling": "poisson"} for x in (0, 2)]
+    a, b = sample_bodies(scene_of(*boxes))
+    assert a.position.shape != b.position.shape or not np.allclose(a.position + np.array([2, 0]), b.position)

@@ -130,13 +130,14 @@ REPLACED = [
     (
         "[time]",
         'walls = "slippery"\n[time]',
-        '6: domain.walls: must be "slip", "stick" or "separate", or a table with one of them per face; '
-        'found "slippery"',
+        '6: domain.walls: must be "slip", "stick", "separate", "periodic" or "open", or a table with one of them per '
+        'face; found "slippery"',
     ),
     (
         "[time]",
         '[domain.walls]\nx_min = "stik"\n[time]',
-        '7: domain.walls.x_min: must be "slip", "stick" or "separate"; found "stik"; did you mean "stick"?',
+        '7: domain.walls.x_min: must be "slip", "stick", "separate", "periodic" or "open"; found "stik"; '
+        'did you mean "stick"?',
     ),
     (
         "[time]",
@@ -147,17 +148,18 @@ REPLACED = [
     (
         "[bodies.material]",
         "shape.box = { min = [3, 1], max = [4, 2] }\n[bodies.material]",
-        "15: bodies[1].shape: needs exactly one of box, ball, cylinder, polygon; found box and ball",
+        "15: bodies[1].shape: needs exactly one of box, ball, capsule, cylinder, mesh, polygon, points; "
+        "found box and ball",
     ),
     (
         "shape.ball = { center = [3.0, 1.0], radius = 0.5 }",
         "shape = {}",
-        "15: bodies[1].shape: needs exactly one of box, ball, cylinder, polygon; found none",
+        "15: bodies[1].shape: needs exactly one of box, ball, capsule, cylinder, mesh, polygon, points; found none",
     ),
     (
         "shape.ball = {",
         "shape.cylinder = {",
-        "15: bodies[1].shape.cylinder: is a shape of 3D scenes and this one is 2D; use box, ball or polygon",
+        "15: bodies[1].shape.cylinder: is a shape of 3D scenes and this one is 2D; use box, ball, capsule or polygon",
     ),
     (
         "max = [1.0, 1.0]",

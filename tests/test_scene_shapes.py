@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from scipy.spatial import KDTree
 
-from mpmcli.scene import Ball, Box, Cylinder, Polygon
+from mpmcli.scene import Ball, Box, Capsule, Cylinder, Polygon
 
 IN_2D, IN_3D = {"dimension": 2}, {"dimension": 3}
 
@@ -25,6 +26,8 @@ SHAPES = [
     (make(Ball, 3, center=(1.0, 2, 3), radius=0.5), math.pi / 6),
     (make(Cylinder, 3, base=(0, 0, 1), axis=(0, 0, -3), radius=0.5, height=2), math.pi * 0.5),
     (make(Cylinder, 3, base=(1, 2, 3), axis=(1, 2, -2), radius=0.5, height=2), math.pi * 0.5),
+    (make(Capsule, 2, start=(1.0, 2), end=(-0.5, 0), radius=0.4), 2 * 0.4 * 2.5 + math.pi * 0.16),
+    (make(Capsule, 3, start=(0, 0, 1), end=(2, 1, 3), radius=0.5), math.pi * (0.75 + 1 / 6)),
     (make(Polygon, 2, vertices=L_SHAPE), 4.0),
     (make(Polygon, 2, vertices=L_SHAPE[::-1]), 4.0),
     (make(Polygon, 2, vertices=[(1e6 + x, 1e6 + y) for x, y in L_SHAPE]), 4.0),
@@ -51,6 +54,24 @@ def test_bounds_are_tight_and_hold_the_shape(shape, volume):
     inside = points[shape.contains(points)]
     assert np.all(inside >= lower) and np.all(inside <= upper)
     assert np.all(inside.min(axis=0) - lower < 0.1 * size) and np.all(upper - inside.max(axis=0) < 0.1 * size)
+
+
+@pytest.mark.parametrize(("shape", "volume"), SHAPES, ids=IDS)
+def test_the_signed_distance_is_that_of_the_nearest_point_on_the_other_side(shape, volume):
+    """Of a cloud of points: nearer than the surface is none of them, and one is little farther."""
+    lower, upper = shape.bounds()
+    size = upper - lower
+    cloud = lower - 0.2 * size + np.random.default_rng(5).random((200_000, len(lower))) * 1.4 * size
+    inside = shape.contains(cloud)
+    queries = cloud[:300]
+    found = shape.signed_distance(queries)
+    assert np.array_equal(found < 0, inside[:300])
+    # Nearest points of 140,000 at random leave a gap of (log n / n)^(1/d) of the extent at most, about.
+    gap = 3 * (math.log(140_000) / 140_000) ** (1 / len(lower)) * size.max()
+    for own, other in ((True, False), (False, True)):
+        mine = inside[:300] == own
+        nearest = KDTree(cloud[inside == other]).query(queries[mine])[0]
+        assert np.all(np.abs(found[mine]) <= nearest * (1 + 1e-9)) and np.all(nearest - np.abs(found[mine]) < gap)
 
 
 @pytest.mark.parametrize(("shape", "volume"), SHAPES, ids=IDS)

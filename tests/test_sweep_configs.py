@@ -25,7 +25,13 @@ DRAWN = 5
 
 
 def test_these_are_the_sweeps():
-    assert [path.stem for path in SWEEPS] == ["jelly_3d", "mixed_2d", "sand_boxes_2d", "water_drop_2d"]
+    assert [path.stem for path in SWEEPS] == [
+        "jelly_3d",
+        "mixed_2d",
+        "sand_boxes_2d",
+        "sand_obstacles_2d",
+        "water_drop_2d",
+    ]
     used = {load_sweep(path, laws=LAWS).base.name for path in SWEEPS}
     assert used == {path.name for path in BASES}
 

@@ -230,11 +230,13 @@ def test_a_faulty_distribution_is_named(value, sentence):
         ('"time..end" = 1', 'time..end: "time..end" is no key; a key is a path such as time.end or bodies[0].velocity'),
         (
             '"bodies.sand.name" = "a"',
-            "bodies.sand.name: vary what a body or a force holds, such as bodies.NAME.velocity, and not its name",
+            "bodies.sand.name: vary what a body, a collider or a force holds, such as bodies.NAME.velocity, "
+            "and not its name",
         ),
         (
             '"bodies.sand" = 3',
-            "bodies.sand: vary what a body or a force holds, such as bodies.NAME.velocity, and not its name",
+            "bodies.sand: vary what a body, a collider or a force holds, such as bodies.NAME.velocity, "
+            "and not its name",
         ),
     ],
 )

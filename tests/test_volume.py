@@ -308,8 +308,8 @@ def test_volume_error_of_known_blocks() -> None:
     def error_of(x: np.ndarray, volume: np.ndarray, flows: np.ndarray) -> float:
         """Return the error at the second of three times, of which the others are empty corners."""
         times = [np.zeros_like(x), x, np.zeros_like(x)]
-        alone = volume_errors(x[None], volume[None], flows, H, cells)
-        found = volume_errors(np.stack(times), np.tile(volume, (3, 1)), flows, H, cells)
+        alone = volume_errors(x[None], volume[None], flows, H, cells, (False,) * len(cells))
+        found = volume_errors(np.stack(times), np.tile(volume, (3, 1)), flows, H, cells, (False,) * len(cells))
         assert found.tolist() == [0.0, alone[0], 0.0]
         return alone[0]
 

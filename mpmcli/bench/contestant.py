@@ -1,7 +1,7 @@
 """Process of one contestant, controlled by commands on stdin, one per line.
 
-    python -m mpmcli.bench.contestant ours|peer|LAW,LAW,... --dimension 3 --cells 128 --particles 524288 --step 8e-5
-                                  [--threads 2] [--precision f32] [--arch cpu]
+    python -m mpmcli.bench.contestant ours|peer|LAW,LAW,...|FEATURE --dimension 3 --cells 128 --particles 524288
+                                  --step 8e-5 [--threads 2] [--precision f32] [--arch cpu]
 
 It answers on stdout, one JSON object per line, and waits for commands on stdin without using the processor:
 
@@ -16,6 +16,8 @@ For laws, the contestant is the column of `mpmcli.bench.materials`, which has th
     repeat STEPS SECONDS    {"steps": 400, "seconds": 1.1, "processor_seconds": 1.05}
                                                      takes STEPS steps from that state, repeated until the time is up
     flowing                 {"share": 0.93}          of the particles
+
+For a feature, a scene of `mpmcli.bench.features`, `repeat` goes on from where the scene is.
 
 A failure is answered by {"error": "a sentence"} and ends the process with status 1.
 """
@@ -169,14 +171,17 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
         from mpmcli.bench.ours import falling_block
 
         return falling_block(case, **options)
+    from mpmcli.bench.features import FEATURES, Pool
     from mpmcli.bench.materials import Column
 
+    if who in {feature.name for feature in FEATURES}:
+        return Pool(who, case, **options)
     return Column(who.split(","), case, **options)
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m mpmcli.bench.contestant")
-    parser.add_argument("who", help="ours, peer, or the names of laws, with commas between them")
+    parser.add_argument("who", help="ours, peer, the names of laws, with commas between them, or a feature")
     parser.add_argument("--dimension", type=int, choices=[2, 3], required=True)
     parser.add_argument("--cells", type=int, required=True)
     parser.add_argument("--particles", type=int, required=True)

@@ -3,6 +3,7 @@
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
+from typing import TypeVar
 
 from mpmcli.bench.cases import BenchCase
 from mpmcli.bench.compare import BLOCKS, Setting, Worker, start_worker
@@ -13,6 +14,7 @@ from mpmcli.materials.registry import laws
 
 # The laws of a column, by place; a place without a name is empty.
 Contender = tuple[str, ...]
+T = TypeVar("T")
 Start = Callable[[str, BenchCase, Setting], Worker]
 
 
@@ -59,12 +61,12 @@ def run_costs(
         tell(f"{case.name}: {case.particles:,} particles, {case.cells}^{case.dimension} cells")
         with ExitStack() as stack:
             columns = [_Column(case, contender, clock) for contender in contenders]
-            columns = _lasting(columns, lambda column: column.begin(stack, setting, start, tell), flaws)
+            columns = lasting(columns, lambda column: column.begin(stack, setting, start, tell), flaws)
             for block in range(blocks):
-                columns = _lasting(columns, lambda column: column.measure(seconds), flaws)
+                columns = lasting(columns, lambda column: column.measure(seconds), flaws)
                 last = ", ".join(f"{column.name} {1e9 * column.costs[-1]:.0f}" for column in columns)
                 tell(f"{case.name}: block {block + 1} of {blocks}, ns: {last}")
-            _lasting(columns, lambda column: results.append(column.finish()), flaws)
+            lasting(columns, lambda column: results.append(column.finish()), flaws)
     return CostReport(tuple(results), tuple(flaws), threads=threads, precision=precision, seconds=seconds)
 
 
@@ -113,14 +115,14 @@ class _Column:
         )
 
 
-def _lasting(columns: list[_Column], act: Callable[[_Column], None], flaws: list[str]) -> list[_Column]:
+def lasting(columns: list[T], act: Callable[[T], object], flaws: list[str]) -> list[T]:
     """Apply `act` to each column in turn, and return those for which it did not fail."""
-    lasting = []
+    kept = []
     for column in columns:
         try:
             act(column)
         except RunError as error:
             flaws.append(f"{column.name} at {column.case.name} could not be measured. {error}")
         else:
-            lasting.append(column)
-    return lasting
+            kept.append(column)
+    return kept

@@ -6,7 +6,7 @@ import numpy as np
 
 from mpmcli.bench.cases import BULK_MODULUS, CORNER, DENSITY, EDGE, GRAVITY, BenchCase
 from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import BodyParticles, parse_scene
+from mpmcli.scene import BodyParticles, estimate_particles, parse_scene
 
 
 def scene_of(case: BenchCase, precision: str) -> dict:
@@ -66,6 +66,7 @@ class Ours:
         arch: str,
         batched: bool = False,
         force: bool = False,
+        directory: str = ".",
     ) -> None:
         """Put the scene on the device.
 
@@ -74,16 +75,17 @@ class Ours:
             particles: one entry per body, in place of the scene's own sampling.
             batched: compute it as `mpmcli simulate` does; otherwise by a `Solver`, which tells what its parts take.
             force: take time.step above the stable step too.
+            directory: of the files that the scene names.
         """
         # Imported here, so that a scene can be described without importing Taichi.
         from mpmcli.solver.backend import choose_backend, start
         from mpmcli.solver.engine import build_engine, suits_batch, useful_threads
         from mpmcli.solver.plan import make_plan
 
-        scene = parse_scene(data, laws=parameter_models(), source=data["title"]).scene
+        scene = parse_scene(data, laws=parameter_models(), source=data["title"], directory=directory).scene
         backend = choose_backend(arch, threads, precision, compile_cache=False)
-        count = sum(body.count for body in particles or ())
-        batched = batched and suits_batch(count, backend)
+        count = sum(body.count for body in particles) if particles else estimate_particles(scene)
+        batched = batched and suits_batch(count, backend) and (backend.on_cpu or not scene.comes_and_goes)
         if batched and backend.on_cpu:
             backend = replace(backend, threads=useful_threads(count, threads))
         start(backend)

@@ -71,7 +71,7 @@ class MirrorImages:
         total = ti.Vector.zero(float, grid.width)
         if owned:
             holds = self.walls.holding(node, depth, upper, rubbed)
-            total = self.image_sum(grid, field, node, mirror, acts, depth, holds, gravity_step)
+            total = self.image_sum(grid, field, node, mirror, acts, depth, holds, upper, gravity_step)
             if ti.static(rubbed):
                 for r, _number, axis, side in ti.static(self.walls.rough):
                     if acts[axis] == 1 and depth[axis] <= 1 and upper[axis] == side:
@@ -81,7 +81,9 @@ class MirrorImages:
                             total[c] += share * impulse[c]
             for a in ti.static(range(self.dimension)):
                 if acts[a] == 1 and depth[a] == 0:
-                    total = self.walls.stopped(total, a, holds)
+                    total = self.walls.stopped(total, a, holds, upper, total[self.dimension])
+            if ti.static(self.walls.moves):
+                total = self.walls.closed(total, acts, depth)
         return total
 
     @ti.func
@@ -99,7 +101,8 @@ class MirrorImages:
         holds = self.walls.holding(node, depth, upper, rubbed)
         for images in range(ti.static(2**self.dimension)):
             if self.has_image(images, acts, depth):
-                field[self.image(grid, node, mirror, images)] = self.mirrored_value(value, images, holds)
+                mirrored = self.mirrored_value(value, images, holds, upper, 1.0)
+                field[self.image(grid, node, mirror, images)] = mirrored
 
     @ti.func
     def image_sum(
@@ -111,6 +114,7 @@ class MirrorImages:
         acts: ti.template(),
         depth: ti.template(),
         holds: ti.template(),
+        upper: ti.template(),
         gravity_step: ti.template(),
     ):
         """Return the sum over a node and its images, each mirrored, after a step of gravity.
@@ -122,7 +126,7 @@ class MirrorImages:
         for images in range(ti.static(2**self.dimension)):
             if self.has_image(images, acts, depth):
                 value = pulled(field[self.image(grid, node, mirror, images)], self.dimension, gravity_step)
-                total += self.mirrored_value(value, images, holds)
+                total += self.mirrored_value(value, images, holds, upper, value[self.dimension])
         return total
 
     @ti.func
@@ -143,16 +147,50 @@ class MirrorImages:
         return grid.linear_index(place)
 
     @ti.func
-    def mirrored_value(self, value: ti.template(), images: int, holds: ti.template()):
-        """Return momentum or velocity mirrored: the normal part always, the rest where the wall holds."""
+    def mirrored_value(
+        self, value: ti.template(), images: int, holds: ti.template(), upper: ti.template(), mass: float
+    ):
+        """Return momentum or velocity mirrored: the normal part always, the rest where the wall holds.
+
+        That is a reflection about the velocity of the wall. In an edge two of them turn the sign back, and what walls
+        of equal velocity add cancels; where they differ the velocity has a jump there, whatever an image has.
+
+        Args:
+            mass: kg, of momentum; 1 of velocity.
+        """
         result = value
         for a in ti.static(range(self.dimension)):
-            if images >> a & 1 == 1:
-                for c in ti.static(range(self.dimension)):
-                    if ti.static(c == a):
-                        result[c] = -result[c]
-                    elif holds[a] == 1:
-                        result[c] = -result[c]
+            # An image by translation has the same value.
+            if ti.static(a not in self.walls.periodic):
+                if images >> a & 1 == 1:
+                    for c in ti.static(range(self.dimension)):
+                        if ti.static(c == a):
+                            result[c] = -result[c]
+                        elif holds[a] == 1:
+                            result[c] = -result[c]
+        if ti.static(self.walls.moves):
+            shift = self.shift(images, holds, upper)
+            for c in ti.static(range(self.dimension)):
+                result[c] += mass * shift[c]
+        return result
+
+    @ti.func
+    def shift(self, images: int, holds: ti.template(), upper: ti.template()):
+        """Return what the velocity of walls adds to a mirrored velocity: twice that of the last one that turned it."""
+        result = ti.Vector.zero(float, self.dimension)
+        turned = ti.Vector.zero(int, self.dimension)
+        for a in ti.static(range(self.dimension)):
+            if ti.static(a not in self.walls.periodic):
+                if images >> a & 1 == 1:
+                    along = self.walls.velocity(a, upper[a])
+                    for c in ti.static(range(self.dimension)):
+                        # Through itself a wall does not move.
+                        turns = 1
+                        if ti.static(c != a):
+                            turns = holds[a]
+                        if turns == 1:
+                            turned[c] = 1 - turned[c]
+                            result[c] = 2 * turned[c] * along[c]
         return result
 
     @ti.func
@@ -200,7 +238,7 @@ class MirrorImages:
                         separates = self.walls.face_is("separate", b, upper_side[b])
                         acts[b] = ti.cast(depth[b] <= REACH and not separates, int)
                     holds = self.walls.holding(node, depth, upper_side, False)
-                    value = self.image_sum(grid, grid.nodes, node, mirror, acts, depth, holds, gravity_step)
+                    value = self.image_sum(grid, grid.nodes, node, mirror, acts, depth, holds, upper_side, gravity_step)
                 outward = value[axis]
                 if ti.static(not upper):
                     outward = -outward

@@ -22,6 +22,14 @@ def find_friction(images: ti.template(), grid: ti.template(), q: int, gravity_st
         for row, of_scene, its_axis, its_side in ti.static(images.walls.rough):
             if r == row:
                 axis, side, number = its_axis, its_side, of_scene
+        # What the wall moves by along itself.
+        along = ti.Vector.zero(float, d)
+        if ti.static(images.walls.moves):
+            for row, _of_scene, its_axis, its_side in ti.static(images.walls.rough):
+                if r == row:
+                    own = images.walls.velocity(its_axis, its_side)
+                    for c in ti.static(range(d)):
+                        along[c] = own[c]
         node, inside = ti.Vector.zero(int, d), True
         rest, place = q, 0
         for b in ti.static(range(d)):
@@ -34,8 +42,13 @@ def find_friction(images: ti.template(), grid: ti.template(), q: int, gravity_st
                 place = place * ti.static(images.walls.shape[b]) + node[b]
         if inside and rest == 0:
             impulse = ti.Vector.zero(float, d)
-            if grid.nodes[grid.linear_index(node)][d] > 0:
-                found = column_friction(images, grid, node, gravity_step, axis, side, images.walls.friction.of(number))
+            # What an image has fills the node of a periodic face too.
+            filled = grid.nodes[grid.linear_index(node)][d] > 0
+            if ti.static(len(images.walls.periodic) > 0):
+                filled = True
+            if filled:
+                coefficient = images.walls.friction.of(number)
+                found = column_friction(images, grid, node, gravity_step, axis, side, coefficient, along)
                 for c in ti.static(range(d)):
                     impulse[c] = found[c]
             for c in ti.static(range(d)):
@@ -51,6 +64,7 @@ def column_friction(
     axis: int,
     side: int,
     coefficient: float,
+    along: ti.template(),
 ):
     """Return the entry of `Walls.impulse` for the column of a node on a wall.
 
@@ -85,8 +99,13 @@ def column_friction(
             here = pulled(grid.nodes[grid.linear_index(inner)], d, gravity_step)
             there = pulled(grid.nodes[grid.linear_index(outer)], d, gravity_step)
             if others > 0:
-                here = images.image_sum(grid, grid.nodes, inner, mirror, acts, depth, holds, gravity_step)
-                there = images.image_sum(grid, grid.nodes, outer, mirror, acts, depth, holds, gravity_step)
+                here = images.image_sum(grid, grid.nodes, inner, mirror, acts, depth, holds, upper, gravity_step)
+                there = images.image_sum(grid, grid.nodes, outer, mirror, acts, depth, holds, upper, gravity_step)
+            if ti.static(images.walls.moves):
+                # Momentum and slip relative to the wall.
+                for c in ti.static(range(d)):
+                    here[c] -= here[d] * along[c]
+                    there[c] -= there[d] * along[c]
             mass = here[d] + there[d]
             if mass > 0:
                 # On the wall both are the same node, which counts once.

@@ -9,20 +9,30 @@ from collections.abc import Sequence
 
 import taichi as ti
 
+from mpmcli.boundaries.moving_faces import STILL, MovingFaces
 from mpmcli.boundaries.rough_faces import RoughFaces
 from mpmcli.scene.schema import SolverSettings
+from mpmcli.scene.wall_rules import PERIODIC
 
 # Nodes on each side of a wall that can hold mass from particles of the other side.
 REACH = 2
+# Nodes beyond a periodic face that particles write until they are put back into the domain: all that the grid has.
+PERIODIC_REACH = 3
 SMOOTH = RoughFaces(())
 # The word of a face that is no wall.
 OPEN = "open"
 
 
 def faces_on_grid(faces: Sequence[tuple[str, str]], settings: SolverSettings) -> tuple[tuple[str, str], ...]:
-    """Return the words of the walls that act on nodes: on the grid of the state at rest those that never let go."""
-    total = settings.solids == "total"
-    return tuple(tuple(OPEN if total and word == "separate" else word for word in pair) for pair in faces)
+    """Return the words of the walls that mirror nodes: on the grid of the state at rest those that never let go.
+
+    Where walls set velocities to zero instead, periodic faces have images all the same.
+    """
+    total, zeroed = settings.solids == "total", settings.walls == "zeroed"
+    return tuple(
+        tuple(OPEN if (total and word == "separate") or (zeroed and word != PERIODIC) else word for word in pair)
+        for pair in faces
+    )
 
 
 @ti.data_oriented
@@ -30,7 +40,8 @@ class Walls:
     """All faces of the domain, as a boundary that acts on nodes.
 
     Attributes:
-        faces: per axis the words of the lower and the upper face: "slip", "stick", "separate", or OPEN for none.
+        faces: per axis the words of the lower and the upper face: "slip", "stick", "separate", PERIODIC, or OPEN for
+            none. periodic: the axes of periodic ones; reach: nodes on each side of any face that may have images.
         first: index of the wall's node plane at the lower faces; `last`, per axis, at the upper ones.
         separating: (axis, side) of every face whose word is "separate".
         lateral: per axis, the other axes.
@@ -41,6 +52,7 @@ class Walls:
         impulse: per rough face of each run and node of its plane, (d,): along the wall the momentum, kg m/s, that
             friction adds to a column of nodes that slides; along the normal 1 where the column sticks, else 0.
         first_rough: row of `impulse` of the first rough face.
+        moving: velocities of the faces that move; moves: whether any does.
     """
 
     def __init__(
@@ -51,6 +63,7 @@ class Walls:
         shape: Sequence[int],
         runs: int = 1,
         friction: RoughFaces = SMOOTH,
+        moving: MovingFaces = STILL,
     ) -> None:
         """Allocate.
 
@@ -61,6 +74,9 @@ class Walls:
         """
         self.dimension = len(faces)
         self.faces = tuple(tuple(pair) for pair in faces)
+        self.periodic = tuple(a for a, pair in enumerate(self.faces) if PERIODIC in pair)
+        self.reach = PERIODIC_REACH if self.periodic else REACH
+        self.moving, self.moves = moving, len(moving.faces) > 0
         self.first = first
         self.last = tuple(first + n for n in cells)
         self.separating = tuple(
@@ -98,11 +114,13 @@ class Walls:
             holds = self.holding(node, depth, upper, True)
             for a in ti.static(range(self.dimension)):
                 if acts[a] == 1 and depth[a] == 0:
-                    result = self.stopped(result, a, holds)
+                    result = self.stopped(result, a, holds, upper, 1.0)
                 elif depth[a] <= 0:
                     inward = result[a] if upper[a] == 0 else -result[a]
                     if inward < 0:
                         result[a] = 0.0
+            if ti.static(self.moves):
+                result = self.closed(result, acts, depth)
         return result
 
     @ti.func
@@ -117,20 +135,29 @@ class Walls:
     @ti.func
     def near(self, node: ti.template()):
         """Return whether the node is within reach of any wall."""
-        return self.distance(node) <= REACH
+        return self.distance(node) <= self.reach
 
     @ti.func
     def place(self, node: ti.template()):
         """Return, per axis, how deep inside a wall within reach the node lies, its mirror, and which wall it is.
 
-        The depth counts nodes inwards, and is REACH + 1 where no wall is within reach.
+        The depth counts nodes inwards, and is REACH + 1 where no wall is within reach. The mirror of a periodic face is
+        the image beyond the other one, and the depth 1 inside, where nothing lies on a wall, and -1 beyond.
         """
         depth = ti.Vector.zero(int, self.dimension)
         mirror = node
         upper = ti.Vector.zero(int, self.dimension)
         for a in ti.static(range(self.dimension)):
             depth[a] = REACH + 1
-            if node[a] <= self.first + REACH:
+            if ti.static(self.faces[a][0] == PERIODIC):
+                period = self.last[a] - self.first
+                if node[a] <= self.first + PERIODIC_REACH:
+                    mirror[a] = node[a] + period
+                    depth[a] = ti.select(node[a] < self.first, -1, 1)
+                elif node[a] >= self.last[a] - PERIODIC_REACH:
+                    mirror[a] = node[a] - period
+                    depth[a] = ti.select(node[a] >= self.last[a], -1, 1)
+            elif node[a] <= self.first + REACH:
                 if ti.static(self.faces[a][0] != OPEN):
                     depth[a] = node[a] - self.first
                     mirror[a] = 2 * self.first - node[a]
@@ -195,12 +222,41 @@ class Walls:
         return holds
 
     @ti.func
-    def stopped(self, value: ti.template(), axis: ti.template(), holds: ti.template()):
-        """Return momentum or velocity on a wall that acts: no normal part, and none at all where it holds."""
+    def stopped(
+        self, value: ti.template(), axis: ti.template(), holds: ti.template(), upper: ti.template(), mass: float
+    ):
+        """Return momentum or velocity on a wall that acts: no normal part, and the wall's own where it holds.
+
+        Args:
+            mass: kg, of momentum; 1 of velocity.
+        """
         result = value
         for c in ti.static(range(self.dimension)):
             if ti.static(c == axis):
                 result[c] = 0.0
             elif holds[axis] == 1:
-                result[c] = 0.0
+                if ti.static(self.moves):
+                    result[c] = mass * self.velocity(axis, upper[axis])[c]
+                else:
+                    result[c] = 0.0
+        return result
+
+    @ti.func
+    def closed(self, value: ti.template(), acts: ti.template(), depth: ti.template()):
+        """Return it without what a moving wall drives through another one, which it meets in an edge."""
+        result = value
+        for a in ti.static(range(self.dimension)):
+            if acts[a] == 1 and depth[a] == 0:
+                result[a] = 0.0
+        return result
+
+    @ti.func
+    def velocity(self, axis: ti.template(), upper: int):
+        """Return the velocity of the face of `axis` on that side, m/s."""
+        result = ti.Vector.zero(float, self.dimension)
+        for f in ti.static(range(len(self.moving.faces))):
+            if ti.static(self.moving.faces[f][0] == axis):
+                if upper == ti.static(self.moving.faces[f][1]):
+                    for c in ti.static(range(self.dimension)):
+                        result[c] = self.moving.of(f)[c]
         return result

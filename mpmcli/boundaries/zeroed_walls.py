@@ -7,22 +7,32 @@ from collections.abc import Sequence
 
 import taichi as ti
 
+from mpmcli.boundaries.moving_faces import STILL, MovingFaces
 from mpmcli.boundaries.rough_faces import RoughFaces
+from mpmcli.scene.wall_rules import PERIODIC
 
 
 @ti.data_oriented
 class ZeroedWalls:
     """All faces of the domain, as a boundary that acts on nodes: slip and separate stop the normal velocity, stick all.
 
-    A separating face stops only what moves into it. Nothing is mirrored. What nodes hold from before stress and forces
-    is not stopped: FLIP's change of velocity contains the wall's. Friction takes from the velocity along a wall at most
-    the coefficient times what the wall stops.
+    A separating face stops only what moves into it, a periodic one nothing. Nothing is mirrored. What nodes hold from
+    before stress and forces is not stopped: FLIP's change of velocity contains the wall's. Friction takes from the
+    velocity along a wall at most the coefficient times what the wall stops. Of a wall that moves it is the velocity
+    relative to it.
     """
 
-    def __init__(self, faces: Sequence[tuple[str, str]], first: int, cells: Sequence[int], friction: RoughFaces):
+    def __init__(
+        self,
+        faces: Sequence[tuple[str, str]],
+        first: int,
+        cells: Sequence[int],
+        friction: RoughFaces,
+        moving: MovingFaces = STILL,
+    ) -> None:
         self.dimension = len(faces)
         self.faces = tuple(tuple(pair) for pair in faces)
-        self.friction = friction
+        self.friction, self.moving = friction, moving
         self.first = first
         self.last = tuple(first + n for n in cells)
 
@@ -31,16 +41,23 @@ class ZeroedWalls:
         """Return the velocity of a node after the walls."""
         result = velocity
         for a in ti.static(range(self.dimension)):
-            if node[a] <= self.first:
-                result = self.stopped(result, a, 0)
-            if node[a] >= self.last[a]:
-                result = self.stopped(result, a, 1)
+            if ti.static(self.faces[a][0] != PERIODIC):
+                if node[a] <= self.first:
+                    result = self.stopped(result, a, 0)
+                if node[a] >= self.last[a]:
+                    result = self.stopped(result, a, 1)
         return result
 
     @ti.func
     def stopped(self, velocity: ti.template(), axis: ti.template(), side: ti.template()):
         """Return the velocity at a node on or behind the lower (side 0) or the upper (1) face of an axis."""
         result = velocity
+        along_wall = ti.Vector.zero(float, self.dimension)
+        for f in ti.static(range(len(self.moving.faces))):
+            if ti.static(self.moving.faces[f] == (axis, side)):
+                for c in ti.static(range(self.dimension)):
+                    along_wall[c] = self.moving.of(f)[c]
+                    result[c] -= along_wall[c]
         for c in ti.static(range(self.dimension)):
             if ti.static(self.faces[axis][side] == "stick" or (self.faces[axis][side] == "slip" and c == axis)):
                 result[c] = 0.0
@@ -60,4 +77,8 @@ class ZeroedWalls:
                     for c in ti.static(range(self.dimension)):
                         if ti.static(c != axis):
                             result[c] *= kept
+        for f in ti.static(range(len(self.moving.faces))):
+            if ti.static(self.moving.faces[f] == (axis, side)):
+                for c in ti.static(range(self.dimension)):
+                    result[c] += along_wall[c]
         return result

@@ -2,14 +2,18 @@
 
 import math
 from collections.abc import Collection
+from itertools import product
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.scene.shapes import Ball, Box, Cylinder, Form, Polygon
+from mpmcli.scene.distance_grid import distance_grid
+from mpmcli.scene.shapes import Ball, Box, Capsule, Cylinder, Form, Mesh, Points
 
-# Accuracy of the inscribed circle of a polygon, relative to the extent of the polygon.
-RESOLUTION = 1e-3
+# Accuracy of the largest ball in a form, relative to the extent of the form, in 2D and 3D.
+RESOLUTION = {2: 1e-3, 3: 2e-2}
+# Cells along the longest axis of a mesh, at whose nodes the middle of its largest ball is sought.
+CELLS = 48
 # Distance from a wall, in cells, below which a body touches it.
 TOUCHING = 1e-3
 
@@ -32,15 +36,23 @@ def spanned_axes(scene: Scene, form: Form) -> set[int]:
 def thickness(form: Form, endless: Collection[int] = ()) -> float:
     """Return the diameter of the largest ball that fits into a shape, m: its thinnest extent where it is convex.
 
+    Of a mesh to a few cells of a grid of 48; of a union, that of its parts where they overlap; of points, that of their
+    bounding box.
+
     The axes in `endless` are ignored for a box, unless all axes are in it.
     """
-    if isinstance(form, Ball):
+    if isinstance(form, Ball | Capsule):
         return 2 * form.radius
     if isinstance(form, Cylinder):
         return min(2 * form.radius, form.height)
     if isinstance(form, Box):
         edges = [hi - lo for lo, hi in zip(form.min, form.max, strict=True)]
         return min((edge for a, edge in enumerate(edges) if a not in endless), default=max(edges))
+    if isinstance(form, Points):
+        return float(np.ptp(form.bounds(), axis=0).min()) + form.edge
+    if isinstance(form, Mesh):
+        spacing = float(np.ptp(form.bounds(), axis=0).max()) / CELLS
+        return -2 * float(distance_grid(form, spacing, 0.0)[0].min())
     return 2 * _inradius(form)
 
 
@@ -50,34 +62,23 @@ def height_along(form: Form, direction: np.ndarray) -> float:
     return float((upper - lower) @ np.abs(direction))
 
 
-def edge_distances(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Return the distance of each point, (n, 2), from the outline of a polygon, (k, 2): (n,), m."""
-    nearest = np.full(len(points), np.inf)
-    for a, b in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
-        t = np.clip((points - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
-        nearest = np.minimum(nearest, np.linalg.norm(points - a - t[:, None] * (b - a), axis=1))
-    return nearest
+def _inradius(form: Form) -> float:
+    """Return the radius of the largest ball inside a form, or a bound of it where its distance is one.
 
-
-def _inradius(form: Polygon) -> float:
-    """Return the radius of the largest circle inside a polygon.
-
-    Squares that may contain a better centre are halved until none can improve the result by RESOLUTION. No point of
-    a square is farther from the outline than the centre of the square plus half a diagonal.
+    Cells that may contain a better centre are halved until none can improve the result by RESOLUTION. No point of a
+    cell is farther from the surface than the centre of the cell plus half a diagonal.
     """
-    vertices = np.array(form.vertices)
     lower, upper = form.bounds()
-    size = float(np.max(upper - lower))
+    d, size = len(lower), float(np.max(upper - lower))
     half = float(np.min(upper - lower)) / 2
     counts = np.ceil((upper - lower) / (2 * half)).astype(int)
-    centres = lower + (np.stack(np.meshgrid(*map(np.arange, counts)), axis=-1).reshape(-1, 2) * 2 + 1) * half
+    centres = lower + (np.stack(np.meshgrid(*map(np.arange, counts)), axis=-1).reshape(-1, d) * 2 + 1) * half
+    offsets = np.array(list(product((-1, 1), repeat=d)))
     best = 0.0
     while len(centres):
-        inside = form.contains(centres)
-        distance = edge_distances(centres, vertices) * np.where(inside, 1, -1)
+        distance = -form.signed_distance(centres)
         best = max(best, float(distance.max()))
-        promising = centres[distance + math.sqrt(2) * half > best + RESOLUTION * size]
+        promising = centres[distance + math.sqrt(d) * half > best + RESOLUTION[d] * size]
         half /= 2
-        corners = half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-        centres = (promising[:, None, :] + corners).reshape(-1, 2)
+        centres = (promising[:, None, :] + half * offsets).reshape(-1, d)
     return best

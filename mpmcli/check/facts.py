@@ -132,7 +132,7 @@ class SceneFacts:
         What a start or a force can give to the fastest particle anywhere lasts a moment or does not happen: then the
         bounds of motion count as at the start.
         """
-        if not self.scene.forces and not any(start.deformed for start in self.starts):
+        if not self.scene.pushes and not any(start.deformed for start in self.starts):
             return self.step
         lasting = [limit.value for limit in self.limits if limit.bound is not None or limit.state == "rest"]
         return self.scene.time.safety * min(lasting)

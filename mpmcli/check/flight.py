@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpmcli.check.distance import image_shifts
 from mpmcli.scene import Scene
 from mpmcli.scene.initial import moves_unevenly
 
@@ -32,22 +33,26 @@ def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> li
     """Return the arrival of the bounding box of each body, from velocities, gravity, walls and the other bodies.
 
     All bodies have the same acceleration, so that two approach each other at constant velocity. Rotation and
-    deformation are ignored. If forces act, gravity or a velocity is an expression, or bodies start deformed, all bodies
-    arrive at time 0.
+    deformation are ignored, and beyond a periodic face is the other side of the domain, with its bodies. If forces act,
+    gravity or a velocity is an expression, or bodies start deformed, all bodies arrive at time 0.
 
     Args:
         scene: whose bodies.
         fastest: speed at which all arrive in those cases, m/s.
         pressed: whether any body starts deformed.
     """
-    if pressed or scene.forces or not scene.domain.steady or any(moves_unevenly(body) for body in scene.bodies):
+    if pressed or scene.pushes or not scene.domain.steady or any(moves_unevenly(body) for body in scene.bodies):
         return [Arrival(0.0, fastest)] * len(scene.bodies)
     reach = CONTACT * scene.domain.spacing
     gravity = np.array(scene.domain.gravity)
-    walls = np.array(scene.domain.origin), np.array(scene.domain.upper)
+    walls = [np.where(scene.domain.periodic, side * np.inf, at) for side, at in _ends(scene)]
     bounds = [body.shape.form.bounds() for body in scene.bodies]
     lowers, uppers = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
     velocities = np.array([body.velocity for body in scene.bodies])
+    # Images of all bodies, those themselves first.
+    shifts = image_shifts(scene)
+    lowers, uppers = (np.concatenate([found + shift for shift in shifts]) for found in (lowers, uppers))
+    velocities = np.tile(velocities, (len(shifts), 1))
     found = []
     for i, (lower, upper) in enumerate(bounds):
         falls = [
@@ -55,7 +60,7 @@ def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> li
             for sign, gaps in ((-1, lower - walls[0]), (1, walls[1] - upper))
             for a, gap in enumerate(gaps)
         ]
-        others = np.arange(len(bounds)) != i
+        others = np.arange(len(lowers)) % len(bounds) != i
         relative = velocities[i] - velocities[others]
         times = _meetings(lowers[others] - upper - reach, uppers[others] - lower + reach, relative)
         met = np.isfinite(times)
@@ -74,11 +79,17 @@ def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> li
     return found
 
 
+def _ends(scene: Scene) -> tuple[tuple[int, np.ndarray], ...]:
+    return (-1, np.array(scene.domain.origin)), (1, np.array(scene.domain.upper))
+
+
 def _fall(gap: float, speed: float, gravity: float, reach: float) -> tuple[float, float]:
     """Return the time, s, at which a gap that closes at `speed` and accelerates by `gravity` is `reach`, and the speed.
 
-    If the gap is smaller than `reach` already, the speed is that at which it closes.
+    If the gap is smaller than `reach` already, the speed is that at which it closes. An infinite one never closes.
     """
+    if math.isinf(gap):
+        return math.inf, 0.0
     left = gap - reach
     if left <= 0:
         # It accelerates over the remaining gap.

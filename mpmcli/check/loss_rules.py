@@ -10,7 +10,7 @@ from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import expected_steps, steps_at, wave_loss
 from mpmcli.scene.schema import SolverSettings, Time
-from mpmcli.scene.shapes import Ball, Box, Form
+from mpmcli.scene.shapes import Ball, Box, Form, Points
 from mpmcli.scene.solver_settings import USUAL_FLIP
 from mpmcli.stability.transfer_factors import impact_loss, loss_per_step
 
@@ -172,7 +172,8 @@ def chord(form: Form, direction: np.ndarray) -> float:
     """
     if isinstance(form, Ball):
         return form.radius * (math.pi / 2 if len(direction) == 2 else 4 / 3)
-    edges = np.ptp(form.bounds(), axis=0)
+    # The bounding box of points ends at their centres.
+    edges = np.ptp(form.bounds(), axis=0) + (form.edge if isinstance(form, Points) else 0.0)
     return float(form.volume / (np.prod(edges) * np.sum(np.abs(direction) / edges)))
 
 

@@ -39,7 +39,10 @@ class AgreementCheck:
             return
         if steps is not None and steps != row.steps:
             self._differs(number, "steps", steps, row.steps, 1.0)
+        present = frame.present
         speed = float(np.sqrt(np.einsum("ij,ij->i", frame.velocity, frame.velocity).max()))
+        if present is not None and J is not None:
+            J = J[present] if present.any() else np.ones(1)
         self._compare(number, "speed_max", speed, row.speed_max, SINGLE * max(speed, row.speed_max))
         if J is not None and np.isfinite(J).all():
             for name, found in (("volume_ratio_min", float(J.min())), ("volume_ratio_max", float(J.max()))):
@@ -50,6 +53,8 @@ class AgreementCheck:
         m = self._masses_of(frame)
         if m is None:
             return
+        if frame.present is not None:
+            m = m * frame.present
         total = float(m.sum())
         off = abs(total - row.mass) / row.mass if row.mass > 0 else 1.0
         if "mass" in frame.fields:

@@ -27,6 +27,7 @@ TOLD = {
     "energy_lost": "energy lost / turned over",
     "mass_change": "mass change",
     "momentum_drift": "momentum drift",
+    "collider_impulse": "momentum that colliders took, kg m/s",
     "courant_max": "largest Courant number",
     "deformation_max": "largest deformation in a step",
     "displacement_ratio": "displacement / reach",
@@ -56,8 +57,9 @@ class ResultCheck:
         particles: number of particles.
         figures: numbers by name, None if not available: energy_growth and energy_lost (relative to the
             energy turned over), mass_change (relative), momentum_drift (relative, far from walls), momentum_frames
-            (number of frames compared), courant_max (cells), deformation_max (in a step, if affine is stored),
-            displacement_ratio (largest displacement between frames over the largest that the ledger allows),
+            (number of frames compared), collider_impulse (momentum that colliders took, kg m/s), courant_max (cells),
+            deformation_max (in a step, if affine is stored), displacement_ratio (largest displacement between frames
+            over the largest that the ledger allows),
             ledger_difference (largest relative difference between ledger and frames), speed_max (m/s),
             volume_ratio_min, volume_ratio_max, volume_error (that lasts to the end), step_min, step_max (s), step_ratio
             (smallest over first), bytes (of particle data read).
@@ -194,13 +196,15 @@ def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindin
             J = state.volume_ratio(frame)
             if J is not None:
                 state.check_volume(number, frame, J)
-            motion.check(number, frame, row, sound)
+            if not header.drops:
+                motion.check(number, frame, row, sound)
             if sound is None:
                 steps = frame.step - before[1] if before is not None and before[0] + 1 == number else None
                 if stored:
                     agreement.check(number, frame, row, J, steps)
                 momentum.check(number, frame, row)
-                stretch.check(number, frame)
+                if not header.comes_and_goes:
+                    stretch.check(number, frame)
             else:
                 momentum.lost()
         before = (number, frame.step)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
+from itertools import pairwise
 from math import isfinite, isnan
 
 import numpy as np
@@ -38,7 +39,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
 
     Returns:
         Figures by name: energy_growth, energy_lost, mass_change, courant_max, speed_max, volume_ratio_min,
-        volume_ratio_max, volume_error, step_min, step_max, step_ratio; None if not available.
+        volume_ratio_max, volume_error, collider_impulse, step_min, step_max, step_ratio; None if not available.
     """
     rows: list[tuple[int, LedgerRow]] = []
     for entry in entries:
@@ -59,35 +60,41 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     figures["volume_ratio_max"] = max(row.volume_ratio_max for _, row in rows)
     _volume(rows, header, findings)
     figures["volume_error"] = _volume_error(rows, findings)
+    figures["collider_impulse"] = _taken(rows)
     figures |= _steps(rows, findings)
     return figures
 
 
 def _not_finite(row: LedgerRow) -> str:
     # Nearly always the sum says that all are finite.
-    several = (*row.linear_momentum, *row.angular_momentum)
+    loads = (number for vectors in (row.collider_force, row.collider_torque) for vector in vectors for number in vector)
+    several = (*row.linear_momentum, *row.angular_momentum, *loads)
     if isfinite(sum(value for value in (*vars(row).values(), *several) if isinstance(value, float | int))):
         return ""
     for entry in fields(row):
         value = getattr(row, entry.name)
+        if value is None:
+            continue
         # Files written before it was stored have no volume error.
         if entry.name == "volume_error" and isnan(value):
             continue
-        numbers = () if isinstance(value, str) else value if isinstance(value, tuple) else (value,)
-        if not all(map(isfinite, numbers)):
+        if not isinstance(value, str) and not np.isfinite(np.array(value, dtype=float)).all():
             return entry.name
     return ""
 
 
 def _mass(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> float:
     # The median identifies a single deviating row, including the first one.
-    usual = float(np.median([row.mass for _, row in rows]))
+    # What came in since the start and what left is not counted.
+    masses = [row.mass - (row.emitted_mass or 0.0) + (row.retired_mass or 0.0) for _, row in rows]
+    usual = float(np.median(masses))
     largest = 0.0
-    for number, row in rows:
-        change = abs(row.mass - usual) / usual if usual > 0 else float(row.mass != usual)
+    for (number, row), mass in zip(rows, masses, strict=True):
+        scale = max(usual, row.emitted_mass or 0.0)
+        change = abs(mass - usual) / scale if scale > 0 else float(mass != usual)
         largest = max(largest, change)
         if change > MASS_ERROR:
-            what = f"In frame {number} the mass is {row.mass:.8g} kg, where the run has {usual:.8g} kg"
+            what = f"In frame {number} the mass is {mass:.8g} kg, where the run has {usual:.8g} kg"
             findings.add("error", "mass", number, what, TOUCHED, value=change)
     return largest
 
@@ -98,10 +105,18 @@ def _energy(
     """Return the largest growth of the total energy above its running minimum, and the loss by the end.
 
     Both are relative to the energy turned over: the largest kinetic energy so far plus the ranges of potential and
-    elastic energy, since the zero of a potential is arbitrary. Both are None if forces drive the scene.
+    elastic energy, since the zero of a potential is arbitrary. Both are None if forces, or
+    colliders that move, drive the scene.
     """
-    if header.driven:
-        what = "Forces or a gravity that depends on time do work, so that energy and momentum are not conserved"
+    if header.driven or header.moved:
+        what = "Colliders that move do work, so that energy is not conserved"
+        if header.comes_and_goes:
+            what = "Material comes or goes, so that energy and momentum are not conserved"
+        elif header.driven:
+            what = (
+                "Forces, walls that move, or a gravity that depends on time or acts along a periodic axis do work, so "
+                "that energy and momentum are not conserved"
+            )
         findings.add("note", "driven", None, what, "Nothing needs to be done.")
         return None, None
     kinetic = np.array([row.kinetic for _, row in rows])
@@ -164,6 +179,16 @@ def _volume_error(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) ->
         fix = "Leave volume_correction = true in a fluid, or refine the domain."
         findings.add("note", "volume-error", last[0][0], what, fix, value=lasting)
     return lasting
+
+
+def _taken(rows: list[tuple[int, LedgerRow]]) -> float | None:
+    """Return the momentum that all colliders took, kg m/s; None without any."""
+    taken = [
+        np.sum(row.collider_force, axis=0) * (row.time - before.time)
+        for (_, before), (_, row) in pairwise(rows)
+        if row.collider_force
+    ]
+    return float(np.linalg.norm(np.sum(taken, axis=0))) if taken else None
 
 
 def _steps(rows: list[tuple[int, LedgerRow]], findings: FrameFindings) -> dict[str, float | None]:

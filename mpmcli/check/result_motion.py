@@ -59,7 +59,7 @@ class MotionCheck:
             return
         if len(frame.position) == 0:
             return
-        moved = frame.position - before.frame.position
+        moved = self._header.way(before.frame.position, frame.position)
         squares = np.einsum("ij,ij->i", moved, moved)
         squares = np.where(np.isfinite(squares), squares, 0.0) if sound is not None else squares
         allowed = reach(self._header, row, frame.position.dtype)
@@ -123,7 +123,7 @@ class MotionCheck:
         h = self._header.spacing
         if h is None:
             return
-        own = (frame.position - before.position) - 0.5 * time * (before.velocity + frame.velocity)
+        own = self._header.way(before.position, frame.position) - 0.5 * time * (before.velocity + frame.velocity)
         threshold = OUTLIER_CELLS * h + OUTLIER_PART * allowed
         squares = np.einsum("ij,ij->i", own, own)
         if squares.max() <= threshold**2:
@@ -166,10 +166,12 @@ def reach(header: RunHeader, row: LedgerRow, stored: np.dtype) -> float | None:
 class MomentumCheck:
     """Compares the momentum of the ledger with P0 + M g (t - dt/2) while no wall can have acted.
 
+    What colliders took, of which the ledger tells, counts as still there.
+
     Velocities are those in the middle of the last step, whose length is between the smallest and the largest.
     The momentum along an axis is conserved while no particle is near a wall normal to the axis or a wall with
     "stick". The angular momentum is conserved without gravity and far from all walls, if the transfer conserves it
-    (docs/theory.md, 9.2).
+    (docs/theory.md, 9.2) and the domain does not repeat.
 
     Attributes:
         drift: largest difference, relative to sqrt(2 M E_kin), a bound on sum m |v|; None if never compared.
@@ -186,6 +188,8 @@ class MomentumCheck:
         self._steps = 0
         self._kinetic = 0.0
         self._free = np.ones(header.dimension, bool)
+        self._taken = np.zeros(header.dimension)
+        self._time = first.time
         self._distance: np.ndarray | None = None
         self.drift: float | None = None
         self.frames = 0
@@ -198,6 +202,11 @@ class MomentumCheck:
             return
         self._kinetic = max(self._kinetic, row.kinetic)
         self._steps += row.steps
+        if header.collider_names and len(row.collider_force) != len(header.collider_names):
+            self.lost()
+            return
+        self._taken += np.sum(row.collider_force, axis=0) * (row.time - self._time)
+        self._time = row.time
         allowed = reach(header, row, frame.position.dtype)
         if number > 0:
             near = self.MARGIN * header.spacing
@@ -209,6 +218,7 @@ class MomentumCheck:
                 self._free[:] = False
         lowest, highest = extent(frame.position)
         self._distance = np.minimum(lowest - header.origin, header.upper - highest)
+        self._distance[header.periodic] = np.inf
         if number > 0 and self._free.any():
             self._compare(number, row)
 
@@ -222,9 +232,10 @@ class MomentumCheck:
         middle = row.time - (row.step_min + row.step_max) / 4
         expected = np.array(first.linear_momentum) + row.mass * header.gravity * (middle - first.time)
         unknown = row.mass * np.abs(header.gravity) * (row.step_max - row.step_min) / 4
-        difference = (np.abs(np.array(row.linear_momentum) - expected) - unknown)[self._free].max()
+        difference = (np.abs(np.array(row.linear_momentum) + self._taken - expected) - unknown)[self._free].max()
         angular = 0.0
-        if header.keeps_spin and not header.gravity.any() and self._free.all():
+        spins_on = header.keeps_spin and not (header.gravity.any() or header.collider_names or header.periodic.any())
+        if spins_on and self._free.all():
             turned = np.abs(np.array(row.angular_momentum) - np.array(first.angular_momentum)).max()
             angular = float(turned) / float(np.linalg.norm(header.upper - header.origin))
         if scale == 0 or not np.isfinite(scale):
@@ -236,7 +247,7 @@ class MomentumCheck:
         if drift > 1e-3 + self._steps * header.epsilon:
             what = (
                 f"By frame {number} momentum has drifted by {drift:.3g} of what moves, though no wall was near and "
-                "nothing but gravity acted"
+                f"nothing but gravity{' and colliders' if self._header.collider_names else ''} acted"
             )
             fix = 'Run it with solver.precision = "f64" to see whether it is rounding.'
             self._findings.add("warning", "momentum", number, what, fix, value=drift)

@@ -33,14 +33,14 @@ class StateCheck:
         """
         n = len(frame.position)
         first = self._first if self._first is not None else frame
-        if n != count or len(first.position) != n:
+        if n != count or (len(first.position) != n and not self._header.drops):
             expected = len(first.position) if n == count else count
             what = f"Frame {number} holds {n} particles instead of {expected}"
             fix = "No particle may come or go in a run: run the scene again."
             self._findings.add("error", "particle-count", number, what, fix, value=n - expected)
         sound = self._finite(number, frame)
         self._inside(number, frame)
-        if self._stored:
+        if self._stored and not self._header.drops:
             self._labels(number, frame, first, ids)
             self._twins(number, frame)
         self._constants(number, frame, first)
@@ -83,20 +83,30 @@ class StateCheck:
         header = self._header
         if header.origin is None or len(frame.position) == 0:
             return
-        tolerance = 4 * header.place_error(frame.position.dtype)
+        frame = frame.of_present
+        if len(frame.position) == 0:
+            return
+        tolerance = np.full(header.dimension, 4 * header.place_error(frame.position.dtype))
+        for axis, is_open in enumerate(header.open_axes):
+            # There they stay until the next sort.
+            tolerance[axis] += 2 * header.spacing * is_open
         low, high = header.origin - tolerance, header.upper + tolerance
         # A NaN fails both comparisons and is ignored below; it has its own finding.
         lowest, highest = extent(frame.position)
-        if number > 0 and not ((lowest > header.origin).all() and (highest < header.upper).all()):
+        if (
+            number > 0
+            and not any(header.open_axes)
+            and not ((lowest > header.origin).all() and (highest < header.upper).all())
+        ):
             self._held(number, frame)
         if (lowest >= low).all() and (highest <= high).all():
             return
-        beyond = np.fmax(header.origin - frame.position, frame.position - header.upper).max(1)
-        beyond = np.where(np.isfinite(beyond), beyond, -np.inf)
-        if not beyond.max() > tolerance:
+        out = np.fmax(header.origin - frame.position, frame.position - header.upper)
+        beyond = np.where(out > tolerance, out, -np.inf).max(1)
+        if not np.isfinite(beyond.max()):
             return
         p, body = int(beyond.argmax()), self._body(frame, int(beyond.argmax()))
-        outside = counted(int((beyond > tolerance).sum()), "particle")
+        outside = counted(int(np.isfinite(beyond).sum()), "particle")
         what = (
             f"In frame {number} {outside} out of the domain, the farthest "
             f'of them, number {p} of body "{body}", by {beyond[p]:.4g} m'
@@ -105,7 +115,8 @@ class StateCheck:
 
     def _held(self, number: int, frame: Frame) -> None:
         """Find particles that would have left, and that the domain put on a wall (docs/theory.md, 3.5)."""
-        on_wall = ((frame.position <= self._header.origin) | (frame.position >= self._header.upper)).any(1)
+        on_wall = (frame.position <= self._header.origin) | (frame.position >= self._header.upper)
+        on_wall = (on_wall & ~self._header.periodic).any(1)
         held = int(on_wall.sum())
         if held > HELD * len(on_wall):
             what = (
@@ -140,6 +151,7 @@ class StateCheck:
 
     def _twins(self, number: int, frame: Frame) -> None:
         """Find particles of equal position and velocity, except on walls, where several may coincide."""
+        frame = frame.of_present
         n = len(frame.position)
         keys = _hashes(frame.position)
         ordered = np.sort(keys)
@@ -160,7 +172,7 @@ class StateCheck:
     def _constants(self, number: int, frame: Frame, first: Frame) -> None:
         """Check that masses are constant, and that density times J is the density at rest."""
         mass = frame.fields.get("mass")
-        if mass is not None and len(mass) == len(first.fields["mass"]):
+        if mass is not None and not self._header.drops and len(mass) == len(first.fields["mass"]):
             changed = np.flatnonzero(mass != first.fields["mass"])
             if len(changed):
                 p = int(changed[0])

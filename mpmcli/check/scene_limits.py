@@ -13,7 +13,7 @@ from mpmcli.scene import Body, Scene, SceneBounds, highest_speed
 from mpmcli.scene.bounds import body_points
 from mpmcli.scene.initial import initial_motion, moves_unevenly
 from mpmcli.scene.schema import SolverSettings
-from mpmcli.stability.limits import FIX, WHY, deformation_limit, mode_limit, speed_limit
+from mpmcli.stability.limits import FIX, WHY, collider_limit, deformation_limit, mode_limit, speed_limit
 from mpmcli.stability.transfer_factors import step_inertia
 
 # Velocity gradient of an impact, in speeds per cell: one side of a cell stops while matter enters from two nodes.
@@ -32,7 +32,7 @@ class SceneLimit:
 
     Attributes:
         value: largest stable step, s, without the safety factor.
-        name: "wave", "viscosity", "speed" or "deformation".
+        name: "wave", "viscosity", "speed", "deformation" or "collider".
         body: name of the body that sets it, "" if there is no single one.
         state: "rest", the start of the scene, or "stiffest", the stiffest state that the scene can reach.
         meaning: the state in words.
@@ -74,12 +74,25 @@ def scene_limits(scene: Scene, bounds: SceneBounds, starts: Sequence[Start] | No
         starts: of the bodies; found if not given.
     """
     found, starts = [], starts or starts_of(scene)
-    for body, start in zip(scene.bodies, starts, strict=True):
+    begun = [*starts, *(Start() for _ in scene.emitters)]
+    for body, start in zip(scene.sources, begun, strict=True):
         law = law_of(body, scene.dimension)
         reached = joined(start.bound, law.stiffest(body.material, bounds))
         for state, bound in (("rest", start.bound), ("stiffest", reached)):
             found += _material_limits(body, law, state, bound, scene)
-    return [*found, *_motion_limits(scene, bounds, release_speed(scene, starts))]
+    return [*found, *_motion_limits(scene, bounds, release_speed(scene, starts)), *_collider_limits(scene)]
+
+
+def _collider_limits(scene: Scene) -> Iterator[SceneLimit]:
+    """Yield the limit that the fastest collider sets."""
+    h = scene.domain.spacing
+    speeds = {collider.name: collider.fastest(scene.domain, scene.time.end) for collider in scene.colliders}
+    fastest = max(speeds, key=lambda name: speeds[name], default="")
+    if speeds.get(fastest, 0.0) > 0:
+        speed, name = speeds[fastest], "collider"
+        cause = f'the fastest point of "{fastest}" moves at {speed:.4g} m/s, and a cell is {h:.4g} m wide'
+        why, fix = f"{WHY[name][:1].upper()}{WHY[name][1:]}: {cause}.", f"{FIX[name][:1].upper()}{FIX[name][1:]}."
+        yield SceneLimit(collider_limit(h, speed), name, "", "rest", f"moving at {speed:.3g} m/s", why, fix)
 
 
 def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene: Scene) -> Iterator[SceneLimit]:
@@ -132,7 +145,7 @@ def _scheme_text(settings: SolverSettings, inertia: float) -> dict[str, str]:
 def _motion_limits(scene: Scene, bounds: SceneBounds, release: float) -> Iterator[SceneLimit]:
     """Yield the limits set by speeds and velocity gradients, at the start and reachable in the scene."""
     h = scene.domain.spacing
-    fastest = max(scene.bodies, key=highest_speed)
+    fastest = max(scene.sources, key=highest_speed)
     initial, reached = highest_speed(fastest), bounds.speed
     jets = JET * math.sqrt(max(reached**2 - release**2, 0.0)) + SPRAY * release
     rates = {body.name: _initial_rate(body, scene.dimension) for body in scene.bodies}

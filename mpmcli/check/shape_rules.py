@@ -81,7 +81,9 @@ def _walls(facts: SceneFacts) -> Iterator[Finding]:
     h = domain.spacing
     for body in facts.bodies:
         lower, upper = body.body.shape.form.bounds()
-        for axis, a in zip(AXES, range(facts.scene.dimension), strict=False):
+        for a, axis in enumerate(AXES[: facts.scene.dimension]):
+            if domain.periodic[a]:
+                continue
             for face, gap in (
                 (f"{axis}_min", lower[a] - domain.origin[a]),
                 (f"{axis}_max", domain.upper[a] - upper[a]),

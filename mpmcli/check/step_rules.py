@@ -17,6 +17,7 @@ CONSEQUENCE = {
     "viscosity": LONE,
     "speed": "particles leave the nodes that they act on",
     "deformation": "particles are inverted",
+    "collider": "colliders pass the material by",
 }
 
 

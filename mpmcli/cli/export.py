@@ -29,6 +29,19 @@ from mpmcli.cli.streams import print_json, print_text
     metavar="M",
     help="Keep at most M particles of each trajectory, the same ones in all frames: of each body its share, at random.",
 )
+@click.option(
+    "--walls",
+    type=click.Choice(["none", "colliders", "all"]),
+    default="none",
+    show_default=True,
+    help="Add particles on the surfaces of colliders; all: on the walls of the domain as well.",
+)
+@click.option(
+    "--wall-spacing",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="M",
+    help="Distance between particles on walls, m; that of the others at the start by default.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an earlier export in the output directory.")
 @quiet_option
 @json_option
@@ -39,6 +52,8 @@ def command(
     trajectory: int | None,
     stride: int,
     max_particles: int | None,
+    walls: str,
+    wall_spacing: float | None,
     overwrite: bool,
     quiet: bool,
     as_json: bool,
@@ -53,7 +68,7 @@ def command(
     from mpmcli.dataset.export import ExportSettings, export
 
     opened = open_dataset(dataset)
-    settings = ExportSettings(form, output, trajectory, stride, max_particles, overwrite)
+    settings = ExportSettings(form, output, trajectory, stride, max_particles, overwrite, walls, wall_spacing)
     with ProgressBar(len(opened) if trajectory is None else 1, "trajectories", quiet=quiet) as bar, interrupts_wait():
 
         def watch(done: int) -> None:

@@ -52,6 +52,10 @@ def _of_scene(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...])
         "bodies": [
             f"{body.name}: {body.material.law}, {type(body.shape.form).__name__.lower()}" for body in scene.bodies
         ],
+        "colliders": [
+            f"{collider.name}: {type(collider.form).__name__.lower()}{', moving' if collider.motion.moves else ''}"
+            for collider in scene.colliders
+        ],
         "particles": plan.particles,
         "bytes_per_particle": plan.bytes_per_particle,
         "device_bytes": plan.device_bytes,
@@ -76,6 +80,7 @@ def _of_result(path: Path) -> dict:
         "particles": int(result.particle_counts[-1]),
         "dimension": result.dimension,
         "bodies": list(result.header.body_names),
+        "colliders": list(result.header.collider_names),
         "materials": [law.name for law in result.header.laws],
         "fields": ["velocity", *result.field_names],
         "precision": result.header.precision,

@@ -8,7 +8,7 @@ import click
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
 from mpmcli.cli.options import json_option, quiet_option
 from mpmcli.cli.streams import print_json, print_text
-from mpmcli.render.settings import MODES
+from mpmcli.render.settings import COLLIDERS, MODES
 from mpmcli.render.theme import THEMES
 
 
@@ -47,6 +47,13 @@ from mpmcli.render.theme import THEMES
 @click.option(
     "--theme", type=click.Choice(list(THEMES)), default="light", show_default=True, help="Colours around the particles."
 )
+@click.option(
+    "--colliders",
+    type=click.Choice(COLLIDERS),
+    default="solid",
+    show_default=True,
+    help="How colliders are drawn; clear: in 3D their far sides only, which hide nothing.",
+)
 @click.option("--movie", type=click.Path(path_type=Path), metavar="FILE", help="Make a film: .mp4 or .gif.")
 @click.option("--fps", type=float, help="Frames of the film per second, 30 by default.")
 @click.option("--montage", metavar="CxR", help="One picture of evenly spaced frames, in C columns and R rows.")
@@ -71,6 +78,7 @@ def command(
     size: str | None,
     camera: str,
     theme: str,
+    colliders: str,
     movie: Path | None,
     fps: float | None,
     montage: str | None,
@@ -99,7 +107,21 @@ def command(
     # Without a home directory it warns about its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     request = Request(
-        output, mode, frames, color, clim, cmap, size, camera, theme, movie, fps, montage, save_surface, overwrite
+        output,
+        mode,
+        frames,
+        color,
+        clim,
+        cmap,
+        size,
+        camera,
+        theme,
+        movie,
+        fps,
+        montage,
+        save_surface,
+        colliders,
+        overwrite,
     )
     plan = plan_montage(result, request) if is_dataset(result) else plan_render(open_result(result), request)
     with ProgressBar(plan.due, "frames", quiet=quiet) as bar, interrupts_wait():

@@ -30,6 +30,7 @@ from mpmcli.output.layout import FrameLayout
 from mpmcli.output.run_record import RECORD
 from mpmcli.output.segments import PACKED, SEGMENTS
 from mpmcli.output.series import SERIES
+from mpmcli.scene.colliders import Collider
 
 Particles = slice | np.ndarray
 ALL = slice(None)
@@ -58,6 +59,11 @@ class Trajectory(ABC):
     frames: np.ndarray
     particle_count: int
     field_names: tuple[str, ...]
+
+    @property
+    def colliders(self) -> tuple[Collider, ...]:
+        """The colliders that are known."""
+        return self.header.colliders
 
     @property
     def frame_count(self) -> int:
@@ -159,6 +165,11 @@ class _ResultTrajectory(Trajectory):
     """The result of a single run."""
 
     def __init__(self, result: Result) -> None:
+        if result.header.drops:
+            raise InputError(
+                f"{result.path} holds only the particles that are there (output.drop_retired): a trajectory has the "
+                "same ones in all frames; run the scene without it."
+            )
         counts = result.particle_counts
         if counts.min() != counts.max():
             raise InputError(
@@ -172,6 +183,10 @@ class _ResultTrajectory(Trajectory):
         self.steps = np.cumsum([row.steps for row in result.ledger])
         self.particle_count = int(counts[0])
         self.field_names = result.field_names
+
+    @property
+    def colliders(self) -> tuple[Collider, ...]:
+        return self._result.colliders
 
     @property
     def ledger(self) -> list[LedgerRow]:

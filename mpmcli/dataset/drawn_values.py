@@ -86,7 +86,7 @@ def values_of(sweep: Mapping[str, Any], drawn: Mapping[str, Any]) -> Iterator[tu
         if key in drawn:
             yield from _components(key, table, drawn[key])
     for place in placements(sweep):
-        key = f"place.{place['body']}"
+        key = f"place.{place['body']}" if "body" in place else f"place.colliders.{place['collider']}"
         bodies = drawn.get(key, [])
         if key in drawn:
             yield f"{key}.count", _source(place["count"]), len(bodies)

@@ -13,6 +13,7 @@ from mpmcli.dataset.export_directory import METADATA, check_export_directory, ne
 from mpmcli.dataset.facts import common_facts
 from mpmcli.dataset.shard import SPLITS
 from mpmcli.dataset.thinned import SEED, ThinnedTrajectory
+from mpmcli.dataset.walls import Walls
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.durable import require_free_space
 from mpmcli.plain_json import finite_json
@@ -37,6 +38,7 @@ class ExportSettings:
         trajectory: number of the one to export, all if None.
         stride: every how many frames one is taken.
         max_particles: of each trajectory, None for all.
+        walls: which have particles; wall_spacing: between these, m, None for that of the particles.
     """
 
     form: str
@@ -45,6 +47,8 @@ class ExportSettings:
     stride: int = 1
     max_particles: int | None = None
     overwrite: bool = False
+    walls: Walls = "none"
+    wall_spacing: float | None = None
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,12 @@ def export(
     directory, form = Path(settings.directory), FORMATS[settings.form]
     check_export_directory(directory, settings.overwrite)
     numbers: Sequence[int] = dataset.numbers if settings.trajectory is None else [settings.trajectory]
-    chosen = [ThinnedTrajectory(dataset[number], settings.stride, settings.max_particles) for number in numbers]
+    chosen = [
+        ThinnedTrajectory(
+            dataset[number], settings.stride, settings.max_particles, settings.walls, settings.wall_spacing
+        )
+        for number in numbers
+    ]
     for each in chosen:
         if each.particle_count == 0 or each.frame_count == 0:
             raise InputError(f"trajectory {each.source.number} of {dataset.path} is empty: there is nothing to export.")
@@ -106,8 +115,12 @@ def export(
     if any(each.particle_count < each.source.particle_count for each in chosen):
         metadata["particle_seed"] = SEED
     form.check(chosen)
+    for each in chosen:
+        _require_sound_walls(each)
     there = next(parent for parent in directory.resolve().parents if parent.exists())
     require_free_space(there, form.size(chosen), f"the export to {directory}", "nothing was written")
+    if settings.walls != "none":
+        metadata["wall_spacing"] = max(each.walls.spacing for each in chosen)
     done = 0
 
     def tick() -> None:
@@ -134,3 +147,17 @@ def export(
         bytes=sum(files.values()),
         notes=notes,
     )
+
+
+def _require_sound_walls(trajectory: ThinnedTrajectory) -> None:
+    """Refuse walls that are not known, and more particles on them than fit into memory.
+
+    Raises:
+        InputError: so.
+    """
+    walls, number = trajectory.walls, trajectory.source.number
+    if walls.walls == "none":
+        return
+    lost = set(walls.header.collider_names) - {collider.name for collider in walls.colliders}
+    if lost:
+        raise InputError(f'the collider "{min(lost)}" of trajectory {number} cannot be read: leave --walls out.')

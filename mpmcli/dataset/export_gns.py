@@ -12,12 +12,22 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli.dataset.facts import by_split, learning_facts, notes_on_domains, particle_types, require_alike, type_numbers
+from mpmcli.dataset.facts import (
+    by_split,
+    learning_facts,
+    notes_on_domains,
+    particle_types,
+    require_alike,
+    type_numbers,
+    wall_types,
+)
 from mpmcli.dataset.npz_file import write_npz
 from mpmcli.dataset.thinned import ThinnedTrajectory
 
 FORM = "GNS"
-# As in the data of DeepMind's "Learning to simulate": 5 water, 6 sand, 7 goop; 3 stands for fixed particles.
+# As in the data of DeepMind's "Learning to simulate": 5 water, 6 sand, 7 goop; 3 stands for particles whose motion is
+# given, here those on walls.
+WALL = 3
 USUAL = {"fluid": 5, "sand": 6, "viscoplastic": 7, "fixed_corotated": 0, "neo_hookean": 1, "snow": 2, "von_mises": 4}
 FREE = (8, 4, 2, 1, 0, 7)
 # Of a particle: the last 5 velocities, the distances to 2 d walls, and 16 numbers that stand for its type.
@@ -37,7 +47,7 @@ def check(trajectories: Sequence[ThinnedTrajectory]) -> None:
 def size(trajectories: Sequence[ThinnedTrajectory]) -> int:
     """Return the bytes of the files before compression."""
     m = len(differing_parameters(trajectories))
-    return sum(e.particle_count * (4 * e.layout.dimension * e.frame_count + 8 + 8 * m) for e in trajectories)
+    return sum(e.whole_count * (4 * e.layout.dimension * e.frame_count + 8 + 8 * m) for e in trajectories)
 
 
 def write(
@@ -71,7 +81,7 @@ def write(
         "material_feature_names": names,
         "material_feature_min": np.min(values, axis=0).tolist(),
         "material_feature_max": np.max(values, axis=0).tolist(),
-        "particle_types": types,
+        "particle_types": types | wall_types(trajectories, WALL, WALL),
         **statistics,
     }
     return facts, [*notes, *left_out, *notes_on_domains(trajectories)]
@@ -97,10 +107,12 @@ def _of_bodies(trajectory: ThinnedTrajectory, names: Sequence[str]) -> np.ndarra
 
 
 def _entry(trajectory: ThinnedTrajectory, types: dict[str, int], names: Sequence[str]) -> np.ndarray:
-    parts = [trajectory.read("position").astype(np.float32), particle_types(trajectory, types)]
+    positions = np.concatenate([block.astype(np.float32) for block in trajectory.whole_blocks()])
+    parts = [positions, particle_types(trajectory, types, WALL, WALL)]
     if names:
         # The loader broadcasts a single one to (N,), which it could not do with (N, 1).
         properties = _of_bodies(trajectory, names)[trajectory.label("body")]
+        properties = np.concatenate([properties, np.zeros((trajectory.walls.count, len(names)))])
         parts.append(properties[:, 0] if len(names) == 1 else properties)
     # From a tuple of arrays numpy would try to make one array of numbers, and fail.
     entry = np.empty(len(parts), object)

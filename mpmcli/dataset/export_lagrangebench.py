@@ -12,13 +12,22 @@ from typing import Any
 import h5py
 import numpy as np
 
-from mpmcli.dataset.facts import by_split, learning_facts, notes_on_domains, particle_types, require_alike, type_numbers
+from mpmcli.dataset.facts import (
+    by_split,
+    learning_facts,
+    notes_on_domains,
+    particle_types,
+    require_alike,
+    type_numbers,
+    wall_types,
+)
 from mpmcli.dataset.thinned import ThinnedTrajectory
 
 FORM = "LagrangeBench"
 # Its own types are 0 fluid, 1 solid wall, 2 moving wall, 3 rigid body, -1 padding, out of 9.
 USUAL = {"fluid": 0, "sand": 4, "viscoplastic": 5, "snow": 6, "von_mises": 7, "fixed_corotated": 8}
 FREE = (8, 7, 6, 5, 4)
+WALL, MOVING_WALL = 1, 2
 
 
 def check(trajectories: Sequence[ThinnedTrajectory]) -> None:
@@ -33,7 +42,7 @@ def check(trajectories: Sequence[ThinnedTrajectory]) -> None:
 
 def size(trajectories: Sequence[ThinnedTrajectory]) -> int:
     """Return the bytes of the files before compression."""
-    return sum(each.particle_count * (4 * each.layout.dimension * each.frame_count + 8) for each in trajectories)
+    return sum(each.whole_count * (4 * each.layout.dimension * each.frame_count + 8) for each in trajectories)
 
 
 def write(
@@ -53,21 +62,20 @@ def write(
     facts = {
         "solver": "MPM",
         "case": trajectories[0].source.header.title,
-        "periodic_boundary_conditions": [False, False, False],
         "sequence_length_train": length,
         "sequence_length_test": length,
-        "particle_types": types,
+        "particle_types": types | wall_types(trajectories, WALL, MOVING_WALL),
         **statistics,
     }
     return facts, [*notes, *left_out, *notes_on_domains(trajectories)]
 
 
 def _write_trajectory(group: h5py.Group, trajectory: ThinnedTrajectory, types: dict[str, int]) -> None:
-    shape = (trajectory.frame_count, trajectory.particle_count, trajectory.layout.dimension)
+    shape = (trajectory.frame_count, trajectory.whole_count, trajectory.layout.dimension)
     # Loaders read windows of some frames: a chunk is one.
     position = group.create_dataset("position", shape, np.float32, chunks=(1, *shape[1:]), compression="gzip")
     first = 0
-    for block in trajectory.blocks("position"):
+    for block in trajectory.whole_blocks():
         position[first : first + len(block)] = block
         first += len(block)
-    group.create_dataset("particle_type", data=particle_types(trajectory, types))
+    group.create_dataset("particle_type", data=particle_types(trajectory, types, WALL, MOVING_WALL))

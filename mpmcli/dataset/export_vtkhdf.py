@@ -8,12 +8,19 @@ import numpy as np
 
 from mpmcli.dataset.shard import LABELS, group_name
 from mpmcli.dataset.thinned import ThinnedTrajectory
+from mpmcli.errors import InputError
 from mpmcli.output.layout import POSITION
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
 
 
 def check(trajectories: Sequence[ThinnedTrajectory]) -> None:
-    """Refuse nothing: each trajectory has a file of its own."""
+    """Refuse particles on walls: a result holds those of bodies.
+
+    Raises:
+        InputError: there are some.
+    """
+    if any(each.walls.walls != "none" for each in trajectories):
+        raise InputError("--walls is for learners and numpy: mpmcli render draws the colliders of a vtkhdf itself.")
 
 
 def size(trajectories: Sequence[ThinnedTrajectory]) -> int:

@@ -10,6 +10,7 @@ from mpmcli.dataset.shard import SPLITS
 from mpmcli.dataset.statistics import motion_statistics
 from mpmcli.dataset.thinned import ThinnedTrajectory
 from mpmcli.errors import InputError
+from mpmcli.output.header import RunHeader
 
 # Neighbours of a particle on the lattice of the start lie at 1 and sqrt(2) spacings, 8 in 2D and 18 in 3D, and the next
 # ones at 2 (2D) and sqrt(3) (3D). LagrangeBench takes about the same (1.45, data_gen/.../gen_dataset.py).
@@ -46,6 +47,8 @@ def common_facts(trajectories: Sequence[ThinnedTrajectory], stride: int) -> dict
         EXPORTED_BY: f"mpmcli {__version__}",
         "title": first.title,
         "dim": first.dimension,
+        # Three entries in 2D too, as LagrangeBench has it.
+        "periodic_boundary_conditions": [*map(bool, first.periodic), False][:3],
         "bounds": np.transpose(bounds).tolist() if placed else None,
         "dt": time_between(trajectories[0]),
         "write_every": 1,
@@ -55,7 +58,7 @@ def common_facts(trajectories: Sequence[ThinnedTrajectory], stride: int) -> dict
         "cell_size": None if None in cells else max(cells),
         "default_connectivity_radius": None if dx is None else RADIUS_IN_SPACINGS * dx,
         "connectivity_radius_in_dx": RADIUS_IN_SPACINGS,
-        "num_particles_max": max(each.particle_count for each in trajectories),
+        "num_particles_max": max(each.whole_count for each in trajectories),
         "num_frames": lengths.pop() if len(lengths) == 1 else None,
         **{f"num_trajs_{split}": len(numbers[split]) for split in SPLITS},
         "trajectories": numbers,
@@ -65,14 +68,27 @@ def common_facts(trajectories: Sequence[ThinnedTrajectory], stride: int) -> dict
 def notes_on_domains(trajectories: Sequence[ThinnedTrajectory]) -> list[str]:
     """Return a sentence where the trajectories lie in different domains, for which metadata has one entry."""
     domains = {(tuple(e.source.header.origin), tuple(e.source.header.upper)) for e in trajectories}
-    return ["The domains of the trajectories differ: bounds is the box around all of them."] if len(domains) > 1 else []
+    notes = (
+        ["The domains of the trajectories differ: bounds is the box around all of them."] if len(domains) > 1 else []
+    )
+    if len({tuple(e.source.header.periodic) for e in trajectories}) > 1:
+        notes.append("The trajectories differ in periodic faces: metadata has those of the first.")
+    return notes
 
 
 def learning_facts(trajectories: Sequence[ThinnedTrajectory]) -> tuple[dict[str, list[float]], list[str]]:
     """Return the statistics of motion of the training split, or of all where it is empty, and a note if so."""
     train = [each for each in trajectories if each.source.split == "train"]
     notes = [] if train else ["No trajectory is of the training split: the statistics are those of all trajectories."]
-    return motion_statistics(each.blocks("position") for each in train or trajectories).as_dict(), notes
+    chosen = train or trajectories
+    periods = [_period(each.source.header) for each in chosen]
+    known = periods if np.isfinite(periods).any() else None
+    return motion_statistics((each.blocks("position") for each in chosen), known).as_dict(), notes
+
+
+def _period(header: RunHeader) -> np.ndarray:
+    """Return after what way the domain repeats along each axis, (d,), m, infinite where it does not."""
+    return np.where(header.periodic, header.upper - header.origin, np.inf)
 
 
 def require_alike(trajectories: Sequence[ThinnedTrajectory], form: str) -> None:
@@ -91,6 +107,11 @@ def require_alike(trajectories: Sequence[ThinnedTrajectory], form: str) -> None:
         )
     for each in trajectories:
         number, header = each.source.number, each.source.header
+        if header.comes_and_goes:
+            raise InputError(
+                f"trajectory {number} has particles that come or go, and {form} cannot say which are there: --to npz "
+                'and --to vtkhdf keep their field "status".'
+            )
         if each.frame_count != first.frame_count:
             raise InputError(
                 f"trajectory {number} has {each.frame_count} frames and trajectory {first.source.number} "
@@ -145,7 +166,16 @@ def type_numbers(
     return types | dict(zip(others, left, strict=False))
 
 
-def particle_types(trajectory: ThinnedTrajectory, types: Mapping[str, int]) -> np.ndarray:
-    """Return the type of each particle, (N,) int64."""
+def wall_types(trajectories: Sequence[ThinnedTrajectory], rests: int, moves: int) -> dict[str, int]:
+    """Return the types of particles on walls that rest and that move, by name; of those that there are."""
+    moving = [bool(moves) for each in trajectories for moves in np.unique(each.walls.moving)]
+    if rests == moves:
+        return {"wall": rests} if moving else {}
+    return ({"wall": rests} if False in moving else {}) | ({"moving_wall": moves} if True in moving else {})
+
+
+def particle_types(trajectory: ThinnedTrajectory, types: Mapping[str, int], rests: int, moves: int) -> np.ndarray:
+    """Return the type of each particle, (N + W,) int64; those on walls have one that `rests` or `moves`."""
     laws = np.array([types[law.name] for law in trajectory.source.header.laws], np.int64)
-    return laws[trajectory.label("material")]
+    walls = np.where(trajectory.walls.moving, moves, rests).astype(np.int64)
+    return np.concatenate([laws[trajectory.label("material")], walls])

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from mpmcli.render.frame_choice import evenly_spaced
 from mpmcli.render.render_plan import RenderPlan
 from mpmcli.render.request import Request, plan_render
 from mpmcli.render.settings import parse_grid
+from mpmcli.scene.colliders import Collider
 
 
 def plan_montage(path: Path, request: Request) -> RenderPlan:
@@ -102,6 +104,7 @@ class TrajectoryCells(Result):
             [each.ledger[k] for each, k in pairs],
         )
         super().__init__(dataset.path, index)
+        self.collider_frames = tuple(each.number for each in self._trajectories for _ in each.colliders)
         title = f"{first.title}, t = {number_text(times[0])} s" if np.ptp(times) == 0 else first.title
         scenes = [header.stored.get("scene", "") for header in headers]
         self.header = replace(
@@ -113,6 +116,11 @@ class TrajectoryCells(Result):
             upper=np.max([header.upper for header in headers], axis=0),
             bodies=_all_bodies(headers),
         )
+
+    @cached_property
+    def colliders(self) -> tuple[Collider, ...]:
+        """Those of all trajectories."""
+        return tuple(collider for each in self._trajectories for collider in each.colliders)
 
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
         trajectory, frame = self._trajectories[k], self._chosen[k]

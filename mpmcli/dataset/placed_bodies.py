@@ -1,18 +1,23 @@
-"""The bodies that a trajectory places: their number, extents and velocities, and then where they lie."""
+"""The bodies and colliders that a trajectory places: their number, extents and velocities, and then where they lie."""
 
 import copy
 import math
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
-from mpmcli.dataset.placement import STARTS, TRIES, NoPlace, RoundedBox, Wanted, find_places, rounded_box
+from mpmcli.dataset.placement import STARTS, TRIES, Distance, NoPlace, RoundedBox, Wanted, find_places, rounded_box
 from mpmcli.dataset.sweep import Placement
 from mpmcli.dataset.trajectory_values import TrajectoryValues
 from mpmcli.errors import InputError
-from mpmcli.scene import Shape
+from mpmcli.scene.colliders import Collider, Plane
+from mpmcli.scene.constants import definitions
+from mpmcli.scene.primitives import Ball
 from mpmcli.scene.quantity import dimension_of
+from mpmcli.scene.shapes import BodyShape
 
 # How often sizes and radii are drawn before a trajectory is given up.
 ROUNDS = 10
@@ -51,22 +56,24 @@ def place_bodies(values: TrajectoryValues, data: dict[str, Any]) -> list[list[di
         PlacementError: the bodies find no place.
     """
     placements = values.sweep.placements
-    templates = {body["name"]: body for body in data["bodies"]}
-    obstacles = _obstacles(data, {place.body for place in placements})
+    templates = {place.key: _named(data, place) for place in placements}
+    obstacles, walls = _obstacles(
+        data, {(place.list, place.template) for place in placements}, values.sweep.base.parent
+    )
     farthest: tuple[int, int, list[Wanted]] | None = None
     chosen: list[tuple[int, int]] = []
     for index, place in enumerate(placements):
-        key = f"place.{place.body}.count"
+        key = f"{place.key}.count"
         chosen += [(index, k) for k in range(1, values.value(key, key, place.count) + 1)]
-    random = [values.generator(f"place.{placements[index].body}.{k}.position") for index, k in chosen]
+    random = [values.generator(f"{placements[index].key}.{k}.position") for index, k in chosen]
     for round_number in range(ROUNDS):
         wanted = []
         for (index, k), generator in zip(chosen, random, strict=True):
             place = placements[index]
-            half, radius = _extent(values, place, k, round_number, templates[place.body]["shape"])
+            half, radius = _extent(values, place, k, round_number, templates[place.key]["shape"])
             wanted.append(_wanted(place, half, radius, generator))
         try:
-            centers = find_places(wanted, obstacles)
+            centers = find_places(wanted, obstacles, walls)
             break
         except NoPlace as found:
             if farthest is None or found.placed > farthest[1]:
@@ -80,9 +87,9 @@ def place_bodies(values: TrajectoryValues, data: dict[str, Any]) -> list[list[di
     result: list[list[dict[str, Any]]] = [[] for _ in placements]
     for (index, k), want, center in zip(chosen, wanted, centers, strict=True):
         place = placements[index]
-        body = {"name": f"{place.body}_{k}", **_shape_values(want, center)}
+        body = {"name": f"{place.template}_{k}", **_shape_values(want, center)}
         if place.velocity is not None:
-            key = f"place.{place.body}"
+            key = place.key
             body["velocity"] = copy.deepcopy(values.value(f"{key}.velocity", f"{key}.{k}.velocity", place.velocity))
         result[index].append(body)
     return result
@@ -94,11 +101,11 @@ def _extent(
     """Return half the edge lengths (d,) and the radius of body k, m: what is drawn, else that of the template."""
     name = "radius" if "ball" in shape else "size"
     distribution = getattr(place, name)
-    stream = f"place.{place.body}.{k}.{name}" + (f".{round_number}" if round_number else "")
+    stream = f"{place.key}.{k}.{name}" + (f".{round_number}" if round_number else "")
     if distribution is None:
         drawn = template_extent(shape)
     else:
-        drawn = values.value(f"place.{place.body}.{name}", stream, distribution)
+        drawn = values.value(f"{place.key}.{name}", stream, distribution)
     if name == "radius":
         return np.zeros(len(place.region.min)), float(drawn)
     return np.array(drawn, float) / 2, 0.0
@@ -126,17 +133,49 @@ def _shape_values(want: Wanted, center: np.ndarray) -> dict[str, Any]:
     return {"min": lower.tolist(), "max": upper.tolist()}
 
 
-def _obstacles(data: dict[str, Any], templates: set[str]) -> list[RoundedBox]:
-    """Return the bodies that stay; one whose shape is faulty is left to the validation of the scene."""
-    found = []
+def _named(data: dict[str, Any], place: Placement) -> dict[str, Any]:
+    """Return the template of a placement."""
+    return next(entry for entry in data[place.list] if entry["name"] == place.template)
+
+
+def _obstacles(
+    data: dict[str, Any], templates: set[tuple[str, str]], directory: Path
+) -> tuple[list[RoundedBox], list[Distance]]:
+    """Return the bodies and colliders that stay, and the signed distances of planes and containers.
+
+    One that is faulty is left to the validation of the scene.
+    """
+    dimension = dimension_of(data)
+    constants, _ = definitions(data.get("constants"), dimension)
+    context = {"dimension": dimension, "constants": constants, "directory": directory}
+    boxes: list[RoundedBox] = []
+    walls: list[Distance] = []
     for body in data["bodies"]:
-        if body["name"] not in templates:
-            try:
-                shape = Shape.model_validate(body["shape"], context={"dimension": dimension_of(data)})
-            except (ValidationError, KeyError):
-                continue
-            found.append(rounded_box(shape.form))
-    return found
+        if ("bodies", body["name"]) not in templates:
+            with suppress(ValidationError, KeyError):
+                boxes.append(rounded_box(BodyShape.model_validate(body["shape"], context=context).form))
+    for table in data.get("colliders", []):
+        if ("colliders", table["name"]) not in templates:
+            with suppress(ValidationError):
+                collider = Collider.model_validate(table, context=context)
+                if isinstance(collider.form, Ball) and collider.side == "outside":
+                    center = collider.motion.placed(np.array([collider.form.center]), 0.0)[0]
+                    boxes.append(RoundedBox(center, np.zeros(len(center)), collider.form.radius))
+                elif collider.side == "inside" or isinstance(collider.form, Plane):
+                    walls.append(collider.signed_distance)
+                else:
+                    boxes.append(_box_about(collider))
+    return boxes, walls
+
+
+def _box_about(collider: Collider) -> RoundedBox:
+    """Return the box with faces along the axes about the bounding box of a collider at time 0."""
+    lower, upper = collider.form.bounds()
+    d = len(lower)
+    corners = np.array([[upper[a] if k >> a & 1 else lower[a] for a in range(d)] for k in range(2**d)])
+    placed = collider.motion.placed(corners, 0.0)
+    lower, upper = placed.min(axis=0), placed.max(axis=0)
+    return RoundedBox((lower + upper) / 2, (upper - lower) / 2, 0.0)
 
 
 def _crowded(place: Placement, there: list[Wanted], placed: int, total: int) -> str:
@@ -144,7 +183,7 @@ def _crowded(place: Placement, there: list[Wanted], placed: int, total: int) -> 
     fill = sum(body.volume for body in there) / math.prod((there[0].upper - there[0].lower).tolist())
     measure = "area" if len(place.region.min) == 2 else "volume"
     return (
-        f"at most {placed} of {total} bodies found a place in {ROUNDS * STARTS} starts of {TRIES} tries each; "
-        f'"{place.body}" takes {100 * fill:.3g} percent of the {measure} of its region; '
-        "place fewer or smaller bodies, with a smaller min_distance, or in a larger region"
+        f"at most {placed} of {total} {place.list} found a place in {ROUNDS * STARTS} starts of {TRIES} tries each; "
+        f'"{place.template}" takes {100 * fill:.3g} percent of the {measure} of its region; '
+        f"place fewer or smaller {place.list}, with a smaller min_distance, or in a larger region"
     )

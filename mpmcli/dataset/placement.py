@@ -1,12 +1,14 @@
-"""Places for bodies: at random, inside a region, and apart from everything else."""
+"""Places for bodies and colliders: at random, inside a region, and apart from everything else."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from mpmcli.scene.shapes import Ball, Form
 
+# Signed distance of points (n, d), (n,), m.
+Distance = Callable[[np.ndarray], np.ndarray]
 # Candidates that are drawn for one body before the placement starts anew, and how often it does.
 TRIES = 256
 STARTS = 20
@@ -62,6 +64,13 @@ class NoPlace(Exception):  # noqa: N818
         self.placed = placed
 
 
+def room_before(centers: np.ndarray, half: np.ndarray, radius: float, wall: Distance) -> np.ndarray:
+    """Return how far a rounded box at each of m centres (m, d) is from a wall, (m,), m: exact for convex room."""
+    d = len(half)
+    corners = np.array([[half[a] if k >> a & 1 else -half[a] for a in range(d)] for k in range(2**d)])
+    return np.min([wall(centers + corner) for corner in np.unique(corners, axis=0)], axis=0) - radius
+
+
 def rounded_box(form: Form) -> RoundedBox:
     """Return a box or a ball itself, and of any other shape its bounding box."""
     if isinstance(form, Ball):
@@ -71,12 +80,18 @@ def rounded_box(form: Form) -> RoundedBox:
     return RoundedBox((lower + upper) / 2, (upper - lower) / 2, 0.0)
 
 
-def find_places(wanted: Sequence[Wanted], obstacles: Sequence[RoundedBox]) -> list[np.ndarray]:
+def find_places(
+    wanted: Sequence[Wanted], obstacles: Sequence[RoundedBox], walls: Sequence[Distance] = ()
+) -> list[np.ndarray]:
     """Return the centre of every body, (d,) each, m, by rejection.
 
     Each body takes the first of its candidates, uniform in its region, that keeps its distance from the obstacles
     and from the bodies before it; the largest body is the first. Where none of TRIES candidates does, all bodies
     start anew, up to STARTS times.
+
+    Args:
+        wanted: what is placed.
+        obstacles: boxes and balls in the way; walls: planes and containers, by their signed distances.
 
     Raises:
         NoPlace: no start ended well.
@@ -90,7 +105,7 @@ def find_places(wanted: Sequence[Wanted], obstacles: Sequence[RoundedBox]) -> li
             others = [*obstacles, *(body for body, _ in found)]
             apart = [wanted[i].min_distance] * len(obstacles)
             apart += [max(wanted[i].min_distance, wanted[k].min_distance) for _, k in found]
-            center = _free_center(wanted[i], others, np.array(apart))
+            center = _free_center(wanted[i], others, np.array(apart), walls)
             if center is None:
                 if len(centers) > farthest.placed:
                     farthest = NoPlace(i, len(centers))
@@ -101,22 +116,28 @@ def find_places(wanted: Sequence[Wanted], obstacles: Sequence[RoundedBox]) -> li
     raise farthest
 
 
-def _free_center(body: Wanted, others: Sequence[RoundedBox], apart: np.ndarray) -> np.ndarray | None:
+def _free_center(
+    body: Wanted, others: Sequence[RoundedBox], apart: np.ndarray, walls: Sequence[Distance]
+) -> np.ndarray | None:
     """Return the first free one of TRIES candidates, (d,), or None.
 
     Args:
         body: what is placed.
         others: n bodies in the way.
         apart: distance to keep from each, (n,), m.
+        walls: signed distances, positive where there is room.
     """
     reach = body.half + body.radius
     slack = np.maximum(0.0, body.upper - body.lower - 2 * reach)
     centers = body.lower + reach + body.generator.random((TRIES, len(body.lower))) * slack
-    if not others:
-        return centers[0]
-    distance = distances(centers, body.half, body.radius, others)
-    # Bodies that overlap have the distance 0, too.
-    free = np.all((distance >= apart) & (distance > 0), axis=1)
+    free = np.ones(TRIES, dtype=bool)
+    if others:
+        distance = distances(centers, body.half, body.radius, others)
+        # Bodies that overlap have the distance 0, too.
+        free = np.all((distance >= apart) & (distance > 0), axis=1)
+    for wall in walls:
+        room = room_before(centers, body.half, body.radius, wall)
+        free &= (room >= body.min_distance) & (room > 0)
     return centers[np.argmax(free)] if free.any() else None
 
 

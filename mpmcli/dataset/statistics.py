@@ -1,6 +1,6 @@
 """Statistics of motion that learners normalise with, streamed: displacements of frames, and their differences."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -59,30 +59,36 @@ class MotionStatistics:
         return {name: values.tolist() for name, values in asdict(self).items()}
 
 
-def motion_statistics(trajectories: Iterable[Iterable[np.ndarray]]) -> MotionStatistics:
+def motion_statistics(
+    trajectories: Iterable[Iterable[np.ndarray]], periods: Sequence[np.ndarray] | None = None
+) -> MotionStatistics:
     """Compute the statistics of trajectories, each of which is read once.
 
     Args:
         trajectories: each as consecutive blocks of positions, (t, N, d), m, with three frames or more in all.
+        periods: of each trajectory and axis, after what way, m, the domain repeats, infinite where it does not.
 
     Raises:
         ValueError: there is no trajectory, or one has fewer than three frames.
     """
-    moments = [_of_trajectory(blocks) for blocks in trajectories]
+    moments = [_of_trajectory(blocks, None if periods is None else periods[k]) for k, blocks in enumerate(trajectories)]
     if not moments:
         raise ValueError("statistics need a trajectory")
     velocity, acceleration = zip(*moments, strict=True)
     return MotionStatistics(*_over_trajectories(velocity), *_over_trajectories(acceleration))
 
 
-def _of_trajectory(blocks: Iterable[np.ndarray]) -> tuple[Moments, Moments]:
-    """Return the moments of displacements and of their differences."""
+def _of_trajectory(blocks: Iterable[np.ndarray], period: np.ndarray | None) -> tuple[Moments, Moments]:
+    """Return the moments of displacements, across periodic faces the shorter ones, and of their differences."""
     velocity = acceleration = None
     before: np.ndarray | None = None
     for block in blocks:
         positions = block.astype(np.float64)
         joined = positions if before is None else np.concatenate([before, positions])
         v = np.diff(joined, axis=0)
+        if period is not None:
+            for a in np.flatnonzero(np.isfinite(period)):
+                v[..., a] -= period[a] * np.round(v[..., a] / period[a])
         a = np.diff(v, axis=0)
         # Of the two frames that are carried over, the displacement was counted already.
         new = v if before is None else v[len(before) - 1 :]

@@ -37,23 +37,50 @@ class Region(Table):
 
 
 class Placement(Table):
-    """Bodies that take the place of one body of the base scene, at random within a region."""
+    """Bodies or colliders that take the place of one of the base scene, at random within a region."""
 
-    body: Annotated[str, Field(description="Name of a body of the base scene, a box or a ball: the template.")]
-    count: Annotated[Drawn, Field(description="Number of bodies.")]
+    body: Annotated[
+        str | None, Field(description="Name of a body of the base scene, a box or a ball: the template.")
+    ] = None
+    collider: Annotated[str | None, Field(description="Name of a collider in place of a body.")] = None
+    count: Annotated[Drawn, Field(description="Number of bodies or colliders.")]
     size: Annotated[Drawn | None, Field(description="Edge lengths of a box, m. Default: those of the template.")] = None
     radius: Annotated[Drawn | None, Field(description="Radius of a ball, m. Default: that of the template.")] = None
-    velocity: Annotated[Drawn | None, Field(description="Initial velocity, m/s. Default: that of the template.")] = None
-    region: Annotated[Region, Field(description="Box that the bodies lie in, m.")]
+    velocity: Annotated[
+        Drawn | None, Field(description="Velocity, m/s, of a body the initial one. Default: that of the template.")
+    ] = None
+    region: Annotated[Region, Field(description="Box that they lie in, m.")]
     min_distance: Annotated[
-        NotNegative, Field(description="Smallest distance to every other body, m. Default: none.")
+        NotNegative, Field(description="Smallest distance to every other body and collider, m. Default: none.")
     ] = 0.0
+
+    @model_validator(mode="after")
+    def _one_template(self) -> "Placement":
+        if (self.body is None) == (self.collider is None):
+            found = "neither" if self.body is None else "both"
+            raise flaw(f"must be the name of a body, or collider that of a collider; found {found}", "body")
+        return self
+
+    @property
+    def template(self) -> str:
+        """Name of the template."""
+        return self.collider if self.body is None else self.body
+
+    @property
+    def list(self) -> Literal["bodies", "colliders"]:
+        """The list of the scene that the template is in."""
+        return "colliders" if self.body is None else "bodies"
+
+    @property
+    def key(self) -> str:
+        """The key of what is placed among the drawn values."""
+        return f"place.{self.template}" if self.collider is None else f"place.colliders.{self.template}"
 
     @property
     def distributions(self) -> dict[str, Distribution]:
         """What is drawn, by the key under which it is drawn, such as `place.sand.size`."""
         drawn = {name: getattr(self, name) for name in ("count", "size", "radius", "velocity")}
-        return {f"place.{self.body}.{name}": one for name, one in drawn.items() if one is not None}
+        return {f"{self.key}.{name}": one for name, one in drawn.items() if one is not None}
 
 
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
@@ -83,7 +110,7 @@ class SweepTable(Table):
     method: Annotated[Method, Field(description="How continuous distributions of [vary] are drawn.")] = "random"
     accept: Annotated[Accepted, Field(description="The worst verdict of a trajectory of the dataset.")] = "stable"
     vary: Annotated[dict[str, Drawn], Field(description="Keys of the base scene and what they are drawn from.")] = {}  # noqa: RUF012
-    place: Annotated[tuple[Placement, ...], Field(description="Bodies placed at random.")] = ()
+    place: Annotated[tuple[Placement, ...], Field(description="Bodies and colliders placed at random.")] = ()
     split: Annotated[Split, Field(description="Fractions of the trajectories by their purpose.")] = Split(
         train=0.8, valid=0.1, test=0.1
     )
@@ -101,7 +128,7 @@ class Sweep:
         method: how the continuous distributions of `vary` are drawn.
         accept: the worst verdict of a trajectory that belongs to the dataset.
         vary: distributions by key of the base scene, in the order of the file.
-        placements: bodies placed at random.
+        placements: bodies and colliders placed at random.
         split: fractions of the trajectories by their purpose.
     """
 

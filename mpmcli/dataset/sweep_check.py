@@ -16,8 +16,11 @@ from mpmcli.scene.overrides import key_parts, set_value
 from mpmcli.scene.problem import Path, Problem, path_text
 from mpmcli.scene.quantity import AXES, NUMBER_WORDS
 from mpmcli.scene.sentences import listed, nearest, quoted, written
+from mpmcli.scene.shapes import COMBINED
 
 MOST_BODIES = 1000
+# The key of a placement by the list that its template is in.
+KINDS = {"bodies": "body", "colliders": "collider"}
 
 
 def sweep_problems(sweep: Sweep, laws: Laws) -> list[Problem]:
@@ -36,23 +39,25 @@ def sweep_problems(sweep: Sweep, laws: Laws) -> list[Problem]:
 
 def _misplaced(sweep: Sweep) -> Iterator[Problem]:
     """Find placements that do not fit the base scene."""
-    bodies = {body["name"]: body for body in sweep.base_data["bodies"]}
     domain = sweep.base_data["domain"]
-    names = [place.body for place in sweep.placements]
     for index, place in enumerate(sweep.placements):
         path = ("place", index)
-        if place.body not in bodies:
-            guess = nearest(place.body, list(bodies))
-            hint = f'did you mean "{guess}"?' if guess else f"the bodies are {listed(quoted(list(bodies)), 'and')}"
-            yield Problem((*path, "body"), f'no body of the base scene has the name "{place.body}"; {hint}')
-        elif place.body in names[:index]:
-            yield Problem((*path, "body"), f'"{place.body}" is placed already; a template is for one placement')
+        kind, name = KINDS[place.list], place.template
+        there = {entry["name"]: entry for entry in sweep.base_data.get(place.list, [])}
+        names = [other.template for other in sweep.placements if other.list == place.list]
+        if name not in there:
+            guess = nearest(name, list(there))
+            known = f"the {place.list} are {listed(quoted(list(there)), 'and')}" if there else "it has none"
+            hint = f'did you mean "{guess}"?' if guess else known
+            yield Problem((*path, kind), f'no {kind} of the base scene has the name "{name}"; {hint}')
+        elif place.key in [other.key for other in sweep.placements[:index]]:
+            yield Problem((*path, kind), f'"{name}" is placed already; a template is for one placement')
         else:
-            taken = [n for n in bodies if n not in names and re.fullmatch(rf"{re.escape(place.body)}_\d+", n)]
+            taken = [n for n in there if n not in names and re.fullmatch(rf"{re.escape(name)}_\d+", n)]
             if taken:
-                said = f'makes bodies of names such as "{taken[0]}", which the base scene has; rename one of them'
-                yield Problem((*path, "body"), said)
-            yield from _misshapen(place, path, bodies[place.body]["shape"])
+                said = f'makes {place.list} of names such as "{taken[0]}", which the base scene has; rename one of them'
+                yield Problem((*path, kind), said)
+            yield from _misshapen(place, path, there[name]["shape"])
         size = domain["size"]
         for k, (axis, low, high) in enumerate(zip(AXES, place.region.min, place.region.max, strict=False)):
             start = domain.get("origin", [0.0] * len(size))[k]
@@ -64,16 +69,18 @@ def _misplaced(sweep: Sweep) -> Iterator[Problem]:
 
 def _misshapen(place: Placement, path: Path, shape: dict[str, Any]) -> Iterator[Problem]:
     """Find extents that do not fit the shape of the template, and counts that are none."""
-    form = next(iter(shape))
-    if form not in ("box", "ball"):
-        yield Problem((*path, "body"), f'must be a box or a ball; "{place.body}" is a {form}')
+    form = next((name for name in shape if name not in COMBINED), "shape without a form")
+    if form not in ("box", "ball") or set(shape) & set(COMBINED):
+        found = f"{form} with others" if set(shape) & set(COMBINED) else form
+        yield Problem((*path, KINDS[place.list]), f'must be a box or a ball; "{place.template}" is a {found}')
         return
     foreign, own = ("radius", "size") if form == "box" else ("size", "radius")
     if getattr(place, foreign) is not None:
-        yield Problem((*path, foreign), f'"{place.body}" is a {form}, which has no {foreign}; give {own}')
-    counts = [count for count in place.count.extremes() if not _is_count(count)]
+        yield Problem((*path, foreign), f'"{place.template}" is a {form}, which has no {foreign}; give {own}')
+    least = 1 if place.list == "bodies" else 0
+    counts = [count for count in place.count.extremes() if not _is_count(count, least)]
     if counts:
-        right = f"must be whole numbers from 1 to {MOST_BODIES}, such as {{ integers = [1, 3] }}"
+        right = f"must be whole numbers from {least} to {MOST_BODIES}, such as {{ integers = [1, 3] }}"
         yield Problem((*path, "count"), f"{right}; found {written(counts[0])}")
     room = [high - low for low, high in zip(place.region.min, place.region.max, strict=True)]
     drawn = getattr(place, own)
@@ -90,8 +97,8 @@ def _misshapen(place: Placement, path: Path, shape: dict[str, Any]) -> Iterator[
                 yield Problem((*path, own), f"must fit into the region, {sides} m; found {found} m")
 
 
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MOST_BODIES
+def _is_count(value: object, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= MOST_BODIES
 
 
 def _is_size(value: object, dimension: int) -> bool:
@@ -100,14 +107,14 @@ def _is_size(value: object, dimension: int) -> bool:
 
 def _owners(sweep: Sweep) -> tuple[dict[Path, Path], list[Problem]]:
     """Return by path of the base scene where the sweep file sets it, and what is wrong with keys of [vary]."""
-    names = [body["name"] for body in sweep.base_data["bodies"]]
+    names = {name: [entry["name"] for entry in sweep.base_data.get(name, [])] for name in KINDS}
     problems: list[Problem] = []
     set_by: dict[Path, Path] = {}
     for k, place in enumerate(sweep.placements):
-        index = names.index(place.body)
-        set_by[("bodies", index, "shape")] = ("place", k)
+        index = names[place.list].index(place.template)
+        set_by[(place.list, index, "shape")] = ("place", k)
         if place.velocity is not None:
-            set_by[("bodies", index, "velocity")] = ("place", k, "velocity")
+            set_by[(place.list, index, "velocity")] = ("place", k, "velocity")
     data = copy.deepcopy(sweep.base_data)
     for key, distribution in sweep.vary.items():
         at = ("vary", key)
@@ -116,14 +123,14 @@ def _owners(sweep: Sweep) -> tuple[dict[Path, Path], list[Problem]]:
         except InputError as fault:
             problems.append(Problem(at, str(fault)))
             continue
-        if path[0] in ("bodies", "forces") and (len(path) < 3 or path[2] == "name"):
-            said = "vary what a body or a force holds, such as bodies.NAME.velocity, and not its name"
+        if path[0] in (*KINDS, "forces") and (len(path) < 3 or path[2] == "name"):
+            said = "vary what a body, a collider or a force holds, such as bodies.NAME.velocity, and not its name"
             problems.append(Problem(at, said))
             continue
         for other, owner in set_by.items():
             shared = min(len(path), len(other))
             if path[:shared] == other[:shared]:
-                same = path_text(owner) if owner[0] == "vary" else f'the placement of "{names[path[1]]}"'
+                same = path_text(owner) if owner[0] == "vary" else f'the placement of "{names[path[0]][path[1]]}"'
                 problems.append(Problem(at, f"sets what {same} sets as well; leave one of them out"))
                 break
         else:
@@ -170,10 +177,11 @@ def _scene_problems(sweep: Sweep, laws: Laws, set_by: dict[Path, Path], given: d
     """
     drawn = draw(sweep, 0, given)
     found: list[Problem] = []
-    for problem in scene_problems(drawn.data, laws):
+    for problem in scene_problems(drawn.data, laws, drawn.directory):
         path = problem.path
-        if path[:1] == ("bodies",) and len(path) > 1:
-            path = ("bodies", drawn.origins[int(path[1])], *path[2:])
+        for name, origins in (("bodies", drawn.origins), ("colliders", drawn.collider_origins)):
+            if path[:1] == (name,) and len(path) > 1:
+                path = (name, origins[int(path[1])], *path[2:])
         owner = next((owner for base, owner in set_by.items() if path[: len(base)] == base), None)
         sentence = problem.sentence if owner else f"{path_text(problem.path)}: {problem.sentence}"
         new = Problem(owner or (), sentence)

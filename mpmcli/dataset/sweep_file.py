@@ -41,7 +41,7 @@ def load_sweep(path: str | PathLike[str], *, laws: Laws, count: int | None = Non
     table, problems = _validate(read, dimension_of(base_data))
     if table is None:
         raise InputError(report(problems, str(path), text))
-    parse_scene(base_data, laws=laws, source=str(base), text=base_text)
+    parse_scene(base_data, laws=laws, source=str(base), text=base_text, directory=base.parent)
     sweep = Sweep(
         path=File(path),
         text=text,

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from mpmcli.dataset.dataset import ALL, Particles, Trajectory
+from mpmcli.dataset.walls import WallParticles, Walls
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.layout import FrameLayout
 
@@ -24,18 +25,39 @@ class ThinnedTrajectory:
     Attributes:
         source: the whole trajectory.
         particle_count: after thinning.
+        walls: particles on walls, which are not among these.
     """
 
-    def __init__(self, source: Trajectory, stride: int = 1, most: int | None = None) -> None:
+    def __init__(
+        self,
+        source: Trajectory,
+        stride: int = 1,
+        most: int | None = None,
+        walls: Walls = "none",
+        wall_spacing: float | None = None,
+    ) -> None:
+        """Thin a trajectory; nothing is read.
+
+        Args:
+            walls: which have particles.
+            wall_spacing: between these, m; that of the particles at the start if None.
+        """
         self.source = source
         self._stride, self._most = stride, most
         self.times, self.steps, self.frames = (table[::stride] for table in (source.times, source.steps, source.frames))
         self.particle_count = source.particle_count if most is None else min(source.particle_count, most)
+        spacing = wall_spacing or self.spacing
+        self.walls = WallParticles(source.header, source.colliders, walls if spacing else "none", spacing or 1.0)
 
     @property
     def frame_count(self) -> int:
         """Number of frames after thinning."""
         return len(self.times)
+
+    @property
+    def whole_count(self) -> int:
+        """Number of particles, those on walls included."""
+        return self.particle_count + self.walls.count
 
     @property
     def particles(self) -> Particles:
@@ -80,17 +102,37 @@ class ThinnedTrajectory:
         for first in range(0, self.source.frame_count, reach):
             yield self.source.read(name, slice(first, first + reach, step), particles)
 
+    def whole_blocks(self) -> Iterator[np.ndarray]:
+        """Read the positions of all particles, then of those on walls, as blocks of (t, N + W, d)."""
+        first = 0
+        for block in self.blocks("position"):
+            walls = self.walls.positions(self.times[first : first + len(block)])
+            yield np.concatenate([block, walls.astype(block.dtype)], axis=1)
+            first += len(block)
+
     def ledger(self) -> list[LedgerRow]:
         """Return a row for each frame: what is counted since the frame before is that of all frames between them."""
         rows = self.source.ledger
-        first = range(0, len(rows), self._stride)
-        return [joined_row(rows[max(k - self._stride + 1, 0) : k + 1]) for k in first]
+        found = []
+        for k in range(0, len(rows), self._stride):
+            first = max(k - self._stride + 1, 0)
+            found.append(joined_row(rows[first : k + 1], rows[max(first - 1, 0)].time))
+        return found
 
 
-def joined_row(rows: Sequence[LedgerRow]) -> LedgerRow:
-    """Return the row of the last of consecutive frames, as if those before it had not been stored."""
+def joined_row(rows: Sequence[LedgerRow], before: float) -> LedgerRow:
+    """Return the row of the last of consecutive frames, as if those before it had not been stored.
+
+    Args:
+        before: time of the frame before the first, s.
+    """
     if len(rows) == 1:
         return rows[0]
+    spans = np.diff([before, *(row.time for row in rows)])
+
+    def mean(vectors: Sequence[tuple[tuple[float, ...], ...]]) -> tuple[tuple[float, ...], ...]:
+        return tuple(map(tuple, np.average(np.array(vectors), axis=0, weights=spans).tolist()))
+
     smallest = min(rows, key=lambda row: row.step_min)
     return replace(
         rows[-1],
@@ -99,6 +141,8 @@ def joined_row(rows: Sequence[LedgerRow]) -> LedgerRow:
         step_max=max(row.step_max for row in rows),
         limit=smallest.limit,
         courant_max=max(row.courant_max for row in rows),
+        collider_force=mean([row.collider_force for row in rows]),
+        collider_torque=mean([row.collider_torque for row in rows]),
     )
 
 

@@ -25,6 +25,13 @@ class LedgerRow:
             kg m^2/s, one number in 2D and three in 3D.
         volume_error: volume of the cells inside liquids and grains over that of the particles in them, less 1; 0 where
             hardly any cell is inside, nan in files written before it was stored.
+        collider_force, collider_torque: on each collider, N, and about its pivot, N m: means since the previous frame
+            of the momentum that it took from the material (0 at frame 0); per metre of depth in 2D.
+        emitted, retired: particles that emitters have let in so far, and that left through open faces; emitted_mass,
+            retired_mass: theirs, kg. Sums are over those that are there.
+        blocked: particles of emitters that found their place occupied so far: they stay out for good, but where they
+            are half of a sheet or more, which then waits.
+            These five are None where no particle comes or goes.
 
     Velocities are those of the middle of the last step before `time`.
     """
@@ -45,6 +52,13 @@ class LedgerRow:
     linear_momentum: tuple[float, ...]
     angular_momentum: tuple[float, ...]
     volume_error: float = 0.0
+    collider_force: tuple[tuple[float, ...], ...] = ()
+    collider_torque: tuple[tuple[float, ...], ...] = ()
+    emitted: int | None = None
+    emitted_mass: float | None = None
+    retired: int | None = None
+    retired_mass: float | None = None
+    blocked: int | None = None
 
     @property
     def energy(self) -> float:

@@ -4,13 +4,14 @@ import tempfile
 from pathlib import Path
 
 from mpmcli.errors import InputError
+from mpmcli.output.collider_files import COLLIDER_FILES, MOVING_FRAME
 from mpmcli.output.durable import TEMPORARY_SUFFIX
 from mpmcli.output.run_record import RECORD, read_record
 from mpmcli.output.segments import PACKED, remove_segments, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_FRAME, SERIES_HEADER, SERIES_LEDGER
 
 SCENE = "scene.toml"
-NAMES = (PACKED, SCENE, SERIES, SERIES_HEADER, SERIES_LEDGER, RECORD)
+NAMES = (PACKED, SCENE, SERIES, SERIES_HEADER, SERIES_LEDGER, RECORD, *COLLIDER_FILES)
 
 
 def prepare_directory(directory: Path, overwrite: bool) -> Path:
@@ -113,7 +114,8 @@ def _remove_result(directory: Path) -> None:
 
 
 def _is_ours(name: str) -> bool:
-    return name in NAMES or SERIES_FRAME.fullmatch(name) is not None
+    frame = SERIES_FRAME.fullmatch(name) or MOVING_FRAME.fullmatch(name)
+    return name in NAMES or frame is not None
 
 
 def _holds_result(directory: Path) -> bool:

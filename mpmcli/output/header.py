@@ -7,14 +7,15 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-from pydantic import ValidationError
 
 from mpmcli import __version__
+from mpmcli.output.header_walls import sticking_axes, words_of
+from mpmcli.output.scene_header import BodyHeader, body_headers, volumes_from_files
+from mpmcli.output.stored_colliders import ColliderFacts
 from mpmcli.scene import Scene
-from mpmcli.scene.domain import Walls
-from mpmcli.scene.quantity import AXES
-from mpmcli.scene.schema import SolverSettings, usual_particles_per_cell
-from mpmcli.scene.shapes import Shape
+from mpmcli.scene.schema import SolverSettings
+from mpmcli.scene.sheets import emitted_volumes
+from mpmcli.scene.wall_rules import PERIODIC
 
 # Of a scene that does not say.
 _TRANSFER, _SOLIDS = (SolverSettings.model_fields[name].default for name in ("transfer", "solids"))
@@ -48,29 +49,7 @@ class LawHeader:
 
 
 @dataclass(frozen=True)
-class BodyHeader:
-    """A body of the scene.
-
-    Attributes:
-        name: of the body.
-        material: its table in the scene: "law", "density", and the parameters of the law; {} where not known.
-        volume: of its shape, m^3 (m^2 in 2D); None where not known.
-        particles_per_cell: at the start.
-    """
-
-    name: str
-    material: Mapping[str, Any]
-    volume: float | None
-    particles_per_cell: float
-
-    @property
-    def density(self) -> float | None:
-        """At rest, kg/m^3; None where not known."""
-        return self.material.get("density")
-
-
-@dataclass(frozen=True)
-class RunHeader:
+class RunHeader(ColliderFacts):
     """Facts of a run; those that a file does not hold are None, or empty.
 
     Attributes:
@@ -81,10 +60,14 @@ class RunHeader:
         origin, upper: corners of the domain, (d,), m; both are known, or neither.
         gravity: (d,), m/s^2; None where it depends on time.
         steady_gravity: (d,), m/s^2, with 0 for each entry that depends on time; None where not known.
-        driven: whether forces act, or gravity depends on time: energy and momentum have a source then.
+        driven: whether forces act, walls move, gravity depends on time or acts along an axis that repeats, or particles
+            come and go: energy and momentum have a source then.
+        comes_and_goes: whether the last is so; drops: whether frames hold only those that are there.
+        open_axes: per axis, whether a face normal to it is open.
         total: whether elastic bodies are on the grid of their state at rest.
         keeps_spin: whether the transfers conserve angular momentum, as those of APIC do where bodies move on the grid.
         sticking: per axis, whether a face normal to it sticks or has friction.
+        periodic: (d,), whether the domain repeats along each axis.
         bodies: in the order of their labels in the frames.
         laws: in the order of the labels in the frames.
         end: s; frames: expected, the initial one included.
@@ -101,9 +84,13 @@ class RunHeader:
     gravity: np.ndarray | None
     steady_gravity: np.ndarray | None
     driven: bool
+    comes_and_goes: bool
+    drops: bool
+    open_axes: tuple[bool, ...]
     total: bool
     keeps_spin: bool
     sticking: tuple[bool, ...] | None
+    periodic: np.ndarray
     bodies: tuple[BodyHeader, ...]
     laws: tuple[LawHeader, ...]
     end: float | None
@@ -128,7 +115,8 @@ class RunHeader:
                 "spacing": scene.domain.spacing,
                 "origin": list(scene.domain.origin),
                 "size": list(scene.domain.size),
-                "bodies": [body.name for body in scene.bodies],
+                "bodies": [body.name for body in scene.sources],
+                **volumes_from_files(scene),
                 "materials": [law.name for law in laws],
                 "laws": [
                     {"deformation": law.deformation, "coherent": law.coherent, "projects": law.projects} for law in laws
@@ -137,6 +125,7 @@ class RunHeader:
                 "backend": dict(backend),
                 "scene": text,
             }
+            | ({"emitter_volumes": emitted_volumes(scene)} if scene.emitters else {})
         )
 
     @classmethod
@@ -151,7 +140,15 @@ class RunHeader:
         gravity = domain.get("gravity", ())
         timed = any(isinstance(entry, str) for entry in gravity)
         steady = _vector([0.0 if isinstance(entry, str) else entry for entry in gravity], d)
+        words = words_of(domain.get("walls"), d)
+        periodic = np.array([PERIODIC in pair for pair in words] if words else [False] * d)
+        runs_on = steady is not None and bool(steady[periodic].any())
         total = solver.get("solids", _SOLIDS) == "total"
+        opens = tuple("open" in pair for pair in words or ())
+        # The volume of an emitter is that of all its particles, which its shape alone does not say.
+        tables = [*scene.get("bodies", []), *scene.get("emitters", [])]
+        own = stored.get("volumes") or [None] * len(scene.get("bodies", []))
+        volumes = [*own, *stored.get("emitter_volumes", ())]
         return cls(
             stored=dict(stored),
             title=str(stored.get("title") or ""),
@@ -162,11 +159,19 @@ class RunHeader:
             upper=origin + size if placed else None,
             gravity=None if timed else steady,
             steady_gravity=steady,
-            driven=timed or bool(scene.get("forces")),
+            driven=timed
+            or runs_on
+            or bool(domain.get("wall_velocity"))
+            or any(map(scene.get, ("forces", "impulses", "emitters")))
+            or any(opens),
+            comes_and_goes=bool(scene.get("emitters")) or any(opens),
+            drops=bool(scene.get("output", {}).get("drop_retired")),
+            open_axes=opens,
             total=total,
             keeps_spin=solver.get("transfer", _TRANSFER) == "apic" and not total,
-            sticking=_sticking(domain.get("walls"), domain.get("friction", 0.0), d),
-            bodies=_bodies([str(name) for name in stored.get("bodies", ())], scene.get("bodies", []), d),
+            sticking=sticking_axes(words, domain.get("friction", 0.0)),
+            periodic=periodic,
+            bodies=body_headers([str(name) for name in stored.get("bodies", ())], tables, volumes, d),
             laws=_laws(stored),
             end=time.get("end"),
             frames=time["frames"] + 1 if isinstance(time.get("frames"), int) else None,
@@ -209,13 +214,24 @@ class RunHeader:
         """Return the rounding of a position in a file of this type, m, that of the solver included."""
         return self.step_error + float(np.finfo(stored).eps) * self.farthest
 
+    def way(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Return the shortest ways from some places to others, (..., d), m: across a periodic face where that is less.
+
+        That is what a particle moved between two frames, if it is less than half of the domain.
+        """
+        found = end - start
+        for a in np.flatnonzero(self.periodic):
+            size = (self.upper - self.origin)[a].astype(found.dtype)
+            found[..., a] -= size * np.round(found[..., a] / size)
+        return found
+
     def body_name(self, label: int) -> str:
         """Return the name of a body, or its number where it has none."""
         return self.bodies[label].name if 0 <= label < len(self.bodies) else f"number {label}"
 
     def masses(self, body: np.ndarray) -> np.ndarray | None:
         """Return the mass of each particle, (n,) float64, kg, from the labels (n,); None where it is not known."""
-        if not self.densities or len(body) == 0 or body.min() < 0 or body.max() >= len(self.bodies):
+        if self.drops or not self.densities or len(body) == 0 or body.min() < 0 or body.max() >= len(self.bodies):
             return None
         counts = np.bincount(body, minlength=len(self.bodies))
         volumes = np.array([body.volume for body in self.bodies]) / np.maximum(counts, 1)
@@ -246,39 +262,3 @@ def _laws(stored: Mapping[str, Any]) -> tuple[LawHeader, ...]:
 
     known = {name: LawHeader(name, law.deformation, law.coherent) for name, law in laws().items()}
     return tuple(known.get(name, LawHeader(name, "F", False)) for name in names)
-
-
-def _bodies(names: Sequence[str], tables: Sequence[Mapping[str, Any]], d: int) -> tuple[BodyHeader, ...]:
-    """Return the bodies with these names; where the scene has other ones, their names are all that is known."""
-    tables = tables if len(tables) == len(names) else [{} for _ in names]
-    return tuple(
-        BodyHeader(
-            name,
-            table.get("material", {}),
-            _volume(table.get("shape", {}), d),
-            table.get("particles_per_cell", usual_particles_per_cell(d)),
-        )
-        for name, table in zip(names, tables, strict=True)
-    )
-
-
-def _volume(shape: Mapping[str, Any], d: int) -> float | None:
-    try:
-        return Shape.model_validate(shape, context={"dimension": d}).form.volume
-    except (ValidationError, StopIteration):
-        return None
-
-
-def _sticking(
-    walls: Mapping[str, str] | str | None, friction: Mapping[str, float] | float, d: int
-) -> tuple[bool, ...] | None:
-    if walls is None:
-        return None
-    numbers = friction if isinstance(friction, Mapping) else {"default": friction}
-    table = {"default": walls} if isinstance(walls, str) else walls
-    try:
-        faces = Walls.model_validate(table, context={"dimension": d}).faces(d)
-    except ValidationError:
-        return None
-    rough = [numbers.get("default", 0) > 0 or any(numbers.get(f"{a}_{s}", 0) > 0 for s in ("min", "max")) for a in AXES]
-    return tuple("stick" in pair or rubs for pair, rubs in zip(faces, rough, strict=False))

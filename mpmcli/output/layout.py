@@ -169,8 +169,9 @@ class FrameLayout:
 def _named_arrays(frame: Frame) -> Iterator[tuple[str, np.ndarray]]:
     n = len(frame.position)
     yield POSITION, frame.position
-    # Row i is particle i, so ids need no storage in a Frame; in the file they let ParaView follow one.
-    yield "id", np.arange(n, dtype=np.int32 if n < 2**31 else np.int64)
+    # Row i is particle i, so ids need no storage in most Frames; in the file they let ParaView follow one.
+    whole = np.int32 if n < 2**31 else np.int64
+    yield "id", np.arange(n, dtype=whole) if frame.id is None else frame.id.astype(whole)
     for name in STANDARD[1:]:
         yield name, getattr(frame, name)
     for name, array in frame.fields.items():

@@ -4,6 +4,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 from xml.etree import ElementTree
@@ -11,8 +12,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mpmcli.errors import InputError
-from mpmcli.frames.frame import Frame
+from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.collider_files import read_stored_surfaces
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import POSITION, STANDARD, FrameLayout
@@ -21,6 +23,7 @@ from mpmcli.output.run_record import read_record
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_HEADER, SERIES_LEDGER, read_vtu
 from mpmcli.output.vtkhdf import FORMAT, open_vtkhdf, read_array, read_index
+from mpmcli.scene.colliders import Collider
 
 Kind = Literal["packed", "segments", "series"]
 
@@ -41,9 +44,11 @@ class Result(ABC):
         dimension: 2 or 3.
         field_names: the fields of each Frame, without position, velocity, body and material.
         record: content of run.json, None where there is none.
+        collider_frames: for each collider the number of the only frame that it is in; None where all are in all.
     """
 
     kind: Kind
+    collider_frames: tuple[int, ...] | None = None
 
     def __init__(self, path: Path, index: FrameIndex) -> None:
         self.path = path
@@ -57,6 +62,13 @@ class Result(ABC):
         names = [name for name in index.layout.arrays if name not in (POSITION, *STANDARD)]
         self.field_names: tuple[str, ...] = tuple(names)
         self.record = read_record(path if path.is_dir() else path.parent)
+
+    @cached_property
+    def colliders(self) -> tuple[Collider, ...]:
+        """The colliders of the scene; one whose mesh is neither found nor stored beside the frames is left out."""
+        directory = self.path if self.path.is_dir() else self.path.parent
+        found = self.header.read_colliders(read_stored_surfaces(directory))
+        return tuple(collider for collider in found if collider is not None)
 
     @property
     def frame_count(self) -> int:
@@ -83,6 +95,12 @@ class Result(ABC):
         stored = self._read(k, names)
         index = self._index
         return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
+
+    def present_frame(self, k: int, fields: Sequence[str] | None = None) -> Frame:
+        """Read the k-th frame as `frame` does, of the particles that are there alone, where some come or go."""
+        if STATUS in self.field_names and fields is not None and STATUS not in fields:
+            fields = (*fields, STATUS)
+        return self.frame(k, fields).of_present
 
     def numbered_frame(self, k: int) -> tuple[Frame, np.ndarray]:
         """Read the k-th frame with all its fields, and the particle number that the file gives to each row.

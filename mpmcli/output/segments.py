@@ -3,18 +3,19 @@
 import os
 import re
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 from mpmcli.errors import RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.collider_files import write_collider_files
 from mpmcli.output.durable import TEMPORARY_SUFFIX, sealed, sync_directory
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.pack import pack_segments
 from mpmcli.output.store import Store
-from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
+from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, read_index
 
 PACKED = "particles.vtkhdf"
 SEGMENTS = "segments"
@@ -43,15 +44,16 @@ class SegmentStore(Store):
     file.
     """
 
-    def __init__(self, directory: Path, header: dict[str, Any], *, compress: bool = False, hold: float = 0.0) -> None:
-        super().__init__(directory, header, compress=compress, hold=hold)
+    def __init__(self, directory: Path, header: dict[str, Any], **options: Any) -> None:
+        super().__init__(directory, header, **options)
         self.place = self._directory / SEGMENTS
         self._sealed: set[str] = set()
 
     def finish(self) -> Path | None:
         """Seal the waiting frames, pack all segments, verify the packed file, and remove the segments.
 
-        A single segment becomes the packed file as it is, unless that is compressed.
+        A single segment becomes the packed file as it is, unless that is compressed. The surfaces of colliders go
+        beside it.
 
         Returns:
             The packed file; None when no frame was written.
@@ -75,6 +77,10 @@ class SegmentStore(Store):
             sync_directory(self._directory)
         else:
             pack_segments(segments, packed, compress=self._compress)
+        if self._colliders:
+            with closing(open_vtkhdf(packed)) as file:
+                times = read_index(file).times.tolist()
+            write_collider_files(self._directory, self._header, times, self._colliders)
         # The result is complete; a segment that somebody holds open may stay beside it.
         with suppress(OSError):
             remove_segments(self._directory)

@@ -16,6 +16,7 @@ from mpmcli import __version__
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.collider_files import write_collider_series
 from mpmcli.output.durable import sealed, write_text
 from mpmcli.output.layout import POSITION, FrameLayout
 from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_csv
@@ -41,14 +42,16 @@ class VtkSeriesStore(Store):
     zlib in the .vtu files.
     """
 
-    def __init__(self, directory: Path, header: dict[str, Any], *, compress: bool = False, hold: float = 0.0) -> None:
-        super().__init__(directory, header, compress=compress, hold=hold)
+    def __init__(self, directory: Path, header: dict[str, Any], **options: Any) -> None:
+        super().__init__(directory, header, **options)
         self._times: list[float] = []
         self._frames: dict[str, list[int]] = {name: [] for name in FRAME_COLUMNS}
         self._rows: list[LedgerRow] = []
 
     def finish(self) -> Path | None:
-        """Return the .pvd, which is complete after every frame; None where no frame was written."""
+        """Write the colliders, and return the .pvd, complete after every frame; None where no frame was written."""
+        if self.frames_written:
+            write_collider_series(self._directory, self._header, self._times, self._colliders)
         return self._directory / SERIES if self.frames_written else None
 
     def _holds_result(self) -> bool:

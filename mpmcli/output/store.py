@@ -10,7 +10,9 @@ from mpmcli.errors import InputError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import require_free_space
+from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
+from mpmcli.scene.colliders import Collider
 
 # Bytes of waiting frames above which they are sealed.
 MOST_WAITING = 32 * 1024 * 1024
@@ -29,13 +31,23 @@ class Store(ABC):
         header: entries of a `RunHeader` that JSON can hold.
         compress: whether the result is compressed.
         hold: longest time between the write of a frame and its seal, s, if `seal_due` is called; 0 seals each at once.
+        colliders: of the run, None for those that the header tells.
 
     Attributes:
         place: where frames are written.
         frames_written: number of frames that a crash can no longer harm.
     """
 
-    def __init__(self, directory: Path, header: dict[str, Any], *, compress: bool = False, hold: float = 0.0) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        header: dict[str, Any],
+        *,
+        compress: bool = False,
+        hold: float = 0.0,
+        colliders: Sequence[Collider] | None = None,
+    ) -> None:
+        self._colliders = RunHeader.read(header).colliders if colliders is None else tuple(colliders)
         self._directory = self.place = Path(directory)
         self._header = header
         self._compress = compress

@@ -77,6 +77,9 @@ def read_history(result: Result) -> History:
         raise InputError(f"{result.path} is damaged: it has {result.frame_count} frames and {len(rows)} ledger rows.")
     columns, broken = {}, []
     for name in (entry.name for entry in fields(LedgerRow) if entry.name != TEXT):
+        if rows and getattr(rows[0], name) is None:
+            # Of scenes in which particles come and go.
+            continue
         values = np.array([getattr(row, name) for row in rows], dtype=np.float64)
         columns[name] = np.where(np.isfinite(values), values, np.nan)
         broken.append(~np.isfinite(values).reshape(len(rows), -1).all(1))
@@ -110,7 +113,7 @@ def _reach(result: Result, chosen: Sequence[int]) -> Reach:
     bodies = result.header.body_names
     apart = 1 < len(bodies) <= BODIES_MAX
     labels = range(len(bodies)) if apart else [None]
-    found = [[_extent(frame, label) for label in labels] for frame in (result.frame(k, ()) for k in chosen)]
+    found = [[_extent(frame, label) for label in labels] for frame in (result.present_frame(k, ()) for k in chosen)]
     both = np.array(found).reshape(len(chosen), len(labels), 2, result.dimension)
     names = bodies if apart else (bodies[0] if len(bodies) == 1 else "all bodies",)
     names = tuple(one_line(name) for name in names)

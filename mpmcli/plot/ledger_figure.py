@@ -4,9 +4,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mpmcli.plain_text import one_line
 from mpmcli.plot.history import History
 from mpmcli.plot.panels import Panel
 from mpmcli.plot.style import THEMES, ThemeName, drawing, pixels
+from mpmcli.scene.sentences import listed
 from mpmcli.stability.limits import COURANT
 
 if TYPE_CHECKING:
@@ -15,6 +17,8 @@ if TYPE_CHECKING:
 AXES = "xyz"
 # Characters of the title of a scene.
 TITLE_MAX = 64
+# More colliders than this are shown as one.
+COLLIDERS_MAX = 6
 # The order of the colours is that of the legend.
 LIMITS = ("wave", "speed", "force", "viscosity", "deformation", "forced", "maximum")
 
@@ -37,8 +41,9 @@ def draw_ledger(figure: "Figure", history: History, theme: ThemeName) -> list[st
     """Draw a run into an empty figure and return the titles of its panels, in the order of its axes."""
     d = history.header.dimension
     # Each row for itself, as they differ in their number of panels.
-    rows = figure.add_gridspec(3, 1)
-    places = [cell for row, count in enumerate((4, 4, d)) for cell in rows[row].subgridspec(1, count)]
+    counts = (4, 4, d, d) if history.header.collider_names else (4, 4, d)
+    rows = figure.add_gridspec(len(counts), 1)
+    places = [cell for row, count in enumerate(counts) for cell in rows[row].subgridspec(1, count)]
     panels = [Panel(figure.add_subplot(place), history.times, THEMES[theme]) for place in places]
     _energy(panels[0], panels[1], history)
     _momentum(panels[2], history)
@@ -47,8 +52,10 @@ def draw_ledger(figure: "Figure", history: History, theme: ThemeName) -> list[st
     _courant(panels[5], history)
     _volume(panels[6], history)
     _speed(panels[7], history)
-    for axis, panel in enumerate(panels[8:]):
+    for axis, panel in enumerate(panels[8 : 8 + d]):
         _reach(panel, history, axis)
+    for axis, panel in enumerate(panels[8 + d :]):
+        _load(panel, history, axis)
     for panel in panels:
         panel.finish()
     status = f", {history.status}" if history.status else ""
@@ -80,7 +87,9 @@ def _energy(parts: Panel, change: Panel, history: History) -> None:
     ):
         parts.line(values, name, k)
     largest = float(np.nanmax(total)) if np.isfinite(total).any() else 0.0
-    work = ", while forces do work" if history.header.driven else ""
+    sources = [("forces", history.header.driven), ("colliders", history.header.moved)]
+    work = " and ".join(name for name, there in sources if there)
+    work = f", while {work} do work" if work else ""
     change.title("Change of total energy", f"(E - E₀) / largest E{work}")
     if largest > 0:
         change.line((total - total[_first(total)]) / largest, "", None)
@@ -97,7 +106,7 @@ def _momentum(panel: Panel, history: History) -> None:
     if header.gravity is None:
         panel.title("Momentum (gravity is not constant)", f"P - P₀, {unit}")
     else:
-        what = "walls and forces" if header.driven else "walls"
+        what = listed(["walls", *["colliders"] * bool(header.collider_names), *["forces"] * header.driven], "and")
         panel.title(f"Impulse of the {what}", f"P - P₀ - M g t, {unit}")
         # Velocities are those of the middle of the last step.
         middle = history.times - (columns["step_min"] + columns["step_max"]) / 4
@@ -159,3 +168,18 @@ def _reach(panel: Panel, history: History, axis: int) -> None:
     if header.origin is not None and header.upper is not None:
         panel.level(float(header.origin[axis]), "walls")
         panel.level(float(header.upper[axis]))
+
+
+def _load(panel: Panel, history: History, axis: int) -> None:
+    """Draw the mean force on each collider between frames, or on all of them."""
+    unit = "N/m" if history.header.dimension == 2 else "N"
+    panel.title(f"Force on colliders along {AXES[axis]}", f"mean since the frame before, {unit}")
+    forces, names = history.columns["collider_force"], history.header.collider_names
+    if forces.ndim != 3:
+        panel.say("not in this ledger")
+        return
+    if len(names) > COLLIDERS_MAX:
+        forces, names = forces.sum(axis=1, keepdims=True), ("all together",)
+    for k, name in enumerate(names):
+        panel.steps(forces[:, k, axis], k, one_line(name))
+    panel.level(0.0)

@@ -40,9 +40,10 @@ class Panel:
         keywords = {"color": self._color(color), "linewidth": linewidth, "label": self._name(name)}
         self.axes.plot(self._times, values, marker=self._marker(values), markersize=3.5, **keywords)
 
-    def steps(self, values: np.ndarray, color: int | None) -> None:
+    def steps(self, values: np.ndarray, color: int | None, name: str = "") -> None:
         """Draw values (T,) that hold from the frame before to each frame."""
-        self.axes.step(self._times[1:], values[1:], where="pre", color=self._color(color), linewidth=1.4)
+        keywords = {"color": self._color(color), "linewidth": 1.4, "label": self._name(name)}
+        self.axes.step(self._times[1:], values[1:], where="pre", **keywords)
 
     def band(self, low: np.ndarray, high: np.ndarray, name: str, color: int, times: np.ndarray | None = None) -> None:
         """Fill between two series, at the times of the frames or at others."""

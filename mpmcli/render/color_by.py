@@ -133,7 +133,7 @@ def _field(name: str, result: Result) -> _Value:
         values = frame.velocity if field == "velocity" else frame.fields[field]
         return np.asarray(values, dtype=np.float64).reshape(len(frame.position), -1)
 
-    width = array(result.frame(0, fields)).shape[1]
+    width = array(result.present_frame(0, fields)).shape[1]
     plain = field.replace("_", " ")
     if not component:
         if width == 1:
@@ -166,7 +166,7 @@ def _limits(value: _Value, result: Result) -> tuple[float, float]:
     lows, highs = [], []
     for k in evenly_spaced(range(result.frame_count), LOOKED_AT):
         with np.errstate(all="ignore"):
-            values = value.of(result.frame(k, value.fields))
+            values = value.of(result.present_frame(k, value.fields))
         values = np.clip(values[np.isfinite(values)], -LIMIT_MAX, LIMIT_MAX)
         if len(values):
             low, high = np.quantile(values, (OUTSIDE, 1.0 - OUTSIDE))

@@ -4,11 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.frames.frame import Frame
+from mpmcli.errors import InputError
+from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.output.header import RunHeader
 from mpmcli.output.result import Result
 from mpmcli.render.color_by import color_map
 from mpmcli.render.coloring import Coloring
+from mpmcli.render.flat_colliders import FlatColliders
 from mpmcli.render.frame_choice import evenly_spaced
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.theme import Theme, rgb_bytes
@@ -58,6 +60,8 @@ def grid_density(frame: Frame, header: RunHeader, plane: Slice) -> np.ndarray:
     cells = np.rint((header.upper - header.origin) / h).astype(int)
     masses = header.masses(frame.body)
     place = (np.asarray(frame.position, dtype=np.float64) - header.origin) / h
+    if frame.present is not None:
+        place[~frame.present] = np.nan
     kept = np.isfinite(place).all(axis=1) & (place >= 0).all(axis=1) & (place <= cells).all(axis=1)
     weight = np.ones(len(place)) if masses is None else masses / h**d
     if plane.normal is not None:
@@ -100,10 +104,15 @@ def density_colors(
     result: Result, plane: Slice, theme: Theme, limits: tuple[float, float] | None = None, cmap: str | None = None
 ) -> Coloring:
     """Return the colouring of a density; by default at most 1 % of the nodes with mass exceed the upper limit."""
+    if result.header.drops:
+        raise InputError(
+            f"{result.path} holds only particles that are there (output.drop_retired), which do not say their masses: "
+            "density needs all of them; run the scene without it, or choose another --mode."
+        )
     if limits is None:
         found = [0.0]
         for k in evenly_spaced(range(result.frame_count), LOOKED_AT):
-            density = grid_density(result.frame(k, ()), result.header, plane)
+            density = grid_density(result.frame(k, {STATUS} & set(result.field_names)), result.header, plane)
             if (density > 0).any():
                 found.append(float(np.quantile(density[density > 0], 1.0 - OUTSIDE)))
         limits = 0.0, max(found) or 1.0
@@ -129,6 +138,19 @@ class DensityPainter:
         across = list(plane.across)
         corners[:, across] = np.stack([low, high])[:, across]
         self._box = view.pixels(corners)[:, :2]
+        (left, bottom), (right, top) = self._box.tolist()
+
+        backwards = np.array([right < left, bottom < top])
+        start = corners[0].copy()
+        start[across] = np.where(backwards, corners[1, across], corners[0, across])
+
+        def place(places: np.ndarray) -> np.ndarray:
+            points = np.tile(start, (len(places), 1))
+            points[:, across] += np.where(backwards, -places, places)
+            return points[:, : scene.dimension]
+
+        ends = (min(left, right), max(bottom, top), max(left, right), min(bottom, top))
+        self._solid = FlatColliders(scene, view, theme, place, ends)
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return (h, w, 3) uint8."""
@@ -141,7 +163,9 @@ class DensityPainter:
         inside = ((v >= 0) & (v <= density.shape[1] - 1))[:, None] & ((u >= 0) & (u <= density.shape[0] - 1))
         there = np.clip(values / (FADING * self._colors.limits[1]), 0.0, 1.0) * inside
         picture = self._ground + there[:, :, None] * (self._colors.rgb(values) - self._ground)
-        return (picture + 0.5).astype(np.uint8)
+        picture /= 255.0
+        self._solid.draw(picture, frame)
+        return (255.0 * picture + 0.5).astype(np.uint8)
 
 
 def _between(table: np.ndarray, places: np.ndarray) -> np.ndarray:

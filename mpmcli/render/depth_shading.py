@@ -18,20 +18,30 @@ MOST = 1.5
 DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 
 
-def depth_shaded(picture: np.ndarray, depth: np.ndarray, diameter: float, view: View, samples: int) -> np.ndarray:
+def depth_shaded(
+    picture: np.ndarray,
+    depth: np.ndarray,
+    diameter: float,
+    view: View,
+    samples: int,
+    dots: np.ndarray | None = None,
+) -> np.ndarray:
     """Darken what lies deeper than its surroundings (eye-dome lighting, C. Boucheny, PhD thesis, Grenoble 2009).
 
     Args:
         picture: (h, w, 3) uint8.
         depth: (h * samples, w * samples), m; inf where there is nothing.
         diameter: of the dots, m.
+        dots: the same as `depth` of what is compared, where there is more in the picture; the rest is not darkened.
 
     Returns:
         (h, w, 3) uint8.
     """
     # The nearest of the samples of a pixel: its edges belong to what is in front.
     height, width = view.size[1], view.size[0]
-    nearest = depth.reshape(height, samples, width, samples).min(axis=(1, 3))
+    nearest = first = depth.reshape(height, samples, width, samples).min(axis=(1, 3))
+    if dots is not None:
+        nearest = dots.reshape(height, samples, width, samples).min(axis=(1, 3))
     solid = np.isfinite(nearest)
     if not solid.any():
         return picture
@@ -44,5 +54,5 @@ def depth_shaded(picture: np.ndarray, depth: np.ndarray, diameter: float, view: 
         other = padded[reach + i * reach :, reach + j * reach :][:height, :width]
         gap += np.clip((bare - other) / np.float32(DEEP * diameter), 0.0, MOST)
     shade = np.exp(-STRENGTH * 2.0 * gap / len(DIRECTIONS) * 2.0)
-    shade[~solid] = 1.0
+    shade[~solid | (first < nearest)] = 1.0
     return (picture * shade[:, :, None] + 0.5).astype(np.uint8)

@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpmcli.frames.frame import Frame
+from mpmcli.render.collider_actors import ColliderActors
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.depth_shading import depth_shaded
+from mpmcli.render.flat_colliders import flat_colliders
 from mpmcli.render.hidden import hidden
 from mpmcli.render.offscreen import OffscreenRenderer
 from mpmcli.render.render_scene import RenderScene
@@ -53,9 +55,11 @@ class DotsPainter:
         self._levels = self._all_levels()
         self._corner = np.array(scene.lower)
         self._actors: dict[int, tuple[pv.PolyData, pv.Actor]] = {}
+        self._ground = flat_colliders(scene, view, theme) if self._flat and scene.colliders else None
         if not self._flat:
             self._offscreen.add_light()
             self._offscreen.add_box(scene.lower, scene.upper, theme.wall)
+            self._colliders = ColliderActors(scene, theme, self._offscreen)
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return (h, w, 3) uint8; particles without a place are left out."""
@@ -72,13 +76,24 @@ class DotsPainter:
         for level, size in enumerate(self._levels.tolist()):
             chosen = level_of == level
             self._set(level, points[chosen], colors[chosen], size)
+        if not self._flat:
+            self._colliders.pose(frame)
         self._offscreen.render()
         picture = self._offscreen.picture()
         if self._flat:
-            return picture
-        return depth_shaded(
-            picture, self._offscreen.depth(), float(self._diameters.max()), self._view, self._offscreen.samples
-        )
+            return picture if self._ground is None else self._above_colliders(picture, frame)
+        depth, others = self._offscreen.depth(), None
+        if self._colliders.meshes:
+            others = self._colliders.depth_without(self._offscreen)
+        return depth_shaded(picture, depth, float(self._diameters.max()), self._view, self._offscreen.samples, others)
+
+    def _above_colliders(self, picture: np.ndarray, frame: Frame) -> np.ndarray:
+        """Draw colliders between the dots: what lies in a collider is not hidden by it."""
+        samples, (width, height) = self._offscreen.samples, self._view.size
+        free = ~np.isfinite(self._offscreen.depth()).reshape(height, samples, width, samples)
+        image = picture / np.float32(255)
+        self._ground.draw(image, frame, free.mean(axis=(1, 3), dtype=np.float32))
+        return (255.0 * image + 0.5).astype(np.uint8)
 
     def _pixels(self, points: np.ndarray, body: np.ndarray) -> np.ndarray:
         """Return the diameter of each dot in pixels, (n,)."""

@@ -93,6 +93,11 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
         InputError: the colours, the camera or the size are not possible.
     """
     scene, theme = render_scene_of(result), THEMES[settings.theme]
+    scene = replace(
+        scene,
+        colliders=() if settings.colliders == "none" else scene.colliders,
+        clear=settings.colliders == "clear",
+    )
     camera = settings.camera
     colors: Coloring | Categories | None
     if settings.mode == "density":

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mpmcli.errors import InputError
-from mpmcli.frames.frame import Frame
+from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.output.result import Result, open_result
 from mpmcli.processes.pool import render_frames
 from mpmcli.render.coloring import Coloring
@@ -94,8 +94,13 @@ class PictureRenderer:
         """
         setup, drawn, times, missing = self._setup, [], [], 0
         captions = [setup.captions[k] for k in ks] if setup.captions else None
+        density = setup.settings.mode == "density"
         for k in ks:
-            frame = setup.result.frame(k, self._painter.fields)
+            if density:
+                # Which needs to know how many particles share the mass of a body.
+                frame = setup.result.frame(k, (*self._painter.fields, *({STATUS} & set(setup.result.field_names))))
+            else:
+                frame = setup.result.present_frame(k, self._painter.fields)
             drawn.append(self._painter.draw(frame))
             times.append(frame.time)
             outcome = Outcome(self._missing(frame), int((~np.isfinite(frame.position).all(axis=1)).sum()))

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 
 from mpmcli.errors import InputError
+from mpmcli.frames.frame import Frame
 from mpmcli.output.header import BodyHeader
 from mpmcli.output.result import Result
 from mpmcli.plain_text import one_line
 from mpmcli.render.appearance import OTHERS, Appearance, appearance_of
-from mpmcli.scene.schema import usual_particles_per_cell
+from mpmcli.scene.colliders import Collider
+from mpmcli.scene.lattice import usual_particles_per_cell
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,8 @@ class RenderScene:
         distances: (b,) between neighbouring particles at the start, m.
         densities: (b,) at rest, kg/m^3.
         fields: names of the stored fields, without position, velocity, body and material.
+        colliders: that are drawn; collider_frames: the frame that each is in, by its number, None where all are in all.
+        clear: whether things in 3D show their far sides only, as containers do, so that they hide nothing.
     """
 
     title: str
@@ -44,6 +48,13 @@ class RenderScene:
     distances: tuple[float, ...]
     densities: tuple[float, ...]
     fields: tuple[str, ...]
+    colliders: tuple[Collider, ...] = ()
+    collider_frames: tuple[int, ...] | None = None
+    clear: bool = False
+
+    def shows(self, number: int, frame: Frame) -> bool:
+        """Say whether a collider is in a frame."""
+        return self.collider_frames is None or self.collider_frames[number] == frame.index
 
 
 def render_scene_of(result: Result) -> RenderScene:
@@ -72,6 +83,8 @@ def render_scene_of(result: Result) -> RenderScene:
         distances=tuple(header.spacing / body.particles_per_cell ** (1 / d) for body in bodies),
         densities=tuple(body.density or 1000.0 for body in bodies),
         fields=result.field_names,
+        colliders=result.colliders,
+        collider_frames=result.collider_frames,
     )
 
 

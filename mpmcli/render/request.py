@@ -14,7 +14,7 @@ from mpmcli.render.painter import set_up, usual_color
 from mpmcli.render.pictures import FOREIGN, PlannedPicture, is_foreign, picture_digest, picture_name, plan_pictures
 from mpmcli.render.render_plan import RenderPlan
 from mpmcli.render.render_scene import render_scene_of
-from mpmcli.render.settings import Mode, Settings, parse_grid, parse_limits, parse_size
+from mpmcli.render.settings import Colliders, Mode, Settings, parse_grid, parse_limits, parse_size
 from mpmcli.render.surfaces.save_surface import surface_paths
 from mpmcli.render.view import CAMERAS
 
@@ -43,6 +43,7 @@ class Request:
     fps: float | None = None
     montage: str | None = None
     save_surface: Path | None = None
+    colliders: Colliders = "solid"
     overwrite: bool = False
 
     @property
@@ -80,6 +81,7 @@ def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()
         limits=parse_limits(request.clim) if request.clim else None,
         cmap=request.cmap,
         grid=grid,
+        colliders=request.colliders,
     )
     setup = replace(set_up(result, settings), captions=captions)
     if (request.clim or request.cmap) and not isinstance(setup.colors, Coloring):

@@ -9,6 +9,8 @@ from mpmcli.errors import InputError
 
 Mode = Literal["dots", "surface", "fluid", "density"]
 MODES: tuple[Mode, ...] = ("dots", "surface", "fluid", "density")
+Colliders = Literal["solid", "clear", "none"]
+COLLIDERS: tuple[Colliders, ...] = ("solid", "clear", "none")
 # Pixels along a side, and in all: more would not fit into the memory of a renderer.
 SIDE_MIN, SIDE_MAX = 64, 16_384
 PIXELS_MAX = 64_000_000
@@ -29,6 +31,7 @@ class Settings:
         limits: of the colours, None where they have none.
         cmap: colour map of matplotlib, None for the one that suits the values.
         grid: columns and rows of a montage, (1, 1) for a picture of one frame.
+        colliders: how they are drawn; "clear": in 3D their far sides only, as containers are.
     """
 
     mode: Mode
@@ -39,6 +42,7 @@ class Settings:
     limits: tuple[float, float] | None = None
     cmap: str | None = None
     grid: tuple[int, int] = (1, 1)
+    colliders: Colliders = "solid"
 
 
 def parse_size(text: str) -> tuple[int, int | None]:

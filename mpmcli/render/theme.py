@@ -15,7 +15,7 @@ class Theme:
         sky, horizon: of the background of a 3D scene, above and below.
         floor: what shadows fall on.
         text: titles and numbers; faint: secondary marks.
-        wall: lines of the domain.
+        wall: lines of the domain; solid: colliders.
         missing: values that are not numbers.
     """
 
@@ -27,12 +27,13 @@ class Theme:
     text: str
     faint: str
     wall: str
+    solid: str
     missing: str = "#ff00c8"
 
 
 THEMES: dict[str, Theme] = {
-    "light": Theme("light", "#ffffff", "#dfe8f2", "#ffffff", "#eceff3", "#1c2330", "#6b7482", "#3f4856"),
-    "dark": Theme("dark", "#11141a", "#0d1016", "#232a36", "#1b2029", "#e8ebf1", "#8b94a4", "#aeb7c6"),
+    "light": Theme("light", "#ffffff", "#dfe8f2", "#ffffff", "#eceff3", "#1c2330", "#6b7482", "#3f4856", "#8e97a6"),
+    "dark": Theme("dark", "#11141a", "#0d1016", "#232a36", "#1b2029", "#e8ebf1", "#8b94a4", "#aeb7c6", "#6d7686"),
 }
 
 

@@ -8,13 +8,14 @@ from mpmcli.scene.load import LoadedScene, load_scene, parse_scene
 from mpmcli.scene.material import MaterialParameters, SceneBounds
 from mpmcli.scene.sampling import BodyParticles, estimate_particles, sample_bodies
 from mpmcli.scene.schema import Body, Output, ParticleField, Scene, SolverSettings, Time, scene_model
-from mpmcli.scene.shapes import Ball, Box, Cylinder, Polygon, Shape
+from mpmcli.scene.shapes import Ball, Box, Capsule, Cylinder, Polygon, Shape
 
 __all__ = [
     "Ball",
     "Body",
     "BodyParticles",
     "Box",
+    "Capsule",
     "Cylinder",
     "Domain",
     "LoadedScene",

@@ -5,8 +5,10 @@ from itertools import product
 import numpy as np
 
 from mpmcli.scene.drive import Drive, force_drive, gravity_drive
+from mpmcli.scene.emitters import Emitter
 from mpmcli.scene.initial import initial_motion, moves_unevenly
 from mpmcli.scene.material import SceneBounds
+from mpmcli.scene.points import Points
 from mpmcli.scene.sampling import estimate_body, particle_places
 from mpmcli.scene.schema import Body, Scene
 
@@ -26,9 +28,13 @@ def scene_bounds(scene: Scene) -> SceneBounds:
     highest matter above the lowest point of the domain, both measured against gravity; v0 alone where
     there is no gravity. height = H, or the largest extent of the matter where there is no gravity.
 
+    The speed is that of the fastest wall, and of the fastest point of a collider, at least. Along a periodic axis there
+    is no lowest point: gravity along it adds its impulse over the run, and no height.
+
     For gravity that depends on time, the strongest counts, and the largest H of any instant; its impulse bounds the
     speed too. Forces of magnitude a add min(2 a L, I^2) to the square of the speed, L the largest extent of the domain
     and I their impulse over the run, and a to the gravity that presses. See `drive` for where they are looked at.
+    Impulses add their strength to the speed.
     """
     pull, gravities = gravity_drive(scene)
     push = Drive()
@@ -39,29 +45,45 @@ def scene_bounds(scene: Scene) -> SceneBounds:
         ]
         push = Drive(max(one.largest for one in drives), max(one.impulse for one in drives))
     g = pull.largest
-    initial = max(highest_speed(body) for body in scene.bodies)
-    corners = np.concatenate([_corners(*body.shape.form.bounds()) for body in scene.bodies])
-    if g > 0:
-        height = max(_height(scene, corners, gravity) for gravity in gravities if gravity.any())
+    pushed_by = [collider.fastest(scene.domain, scene.time.end) for collider in scene.colliders]
+    initial = max(scene.domain.wall_speed, *pushed_by, *(highest_speed(body) for body in scene.sources))
+    closed = ~np.array(scene.domain.periodic)
+    corners = np.concatenate([_corners(*body.shape.form.bounds()) for body in scene.sources])
+    if any((gravity * closed).any() for gravity in gravities):
+        height = max(_height(scene, corners, gravity * closed) for gravity in gravities if (gravity * closed).any())
     else:
         height = float(np.max(np.ptp(corners, axis=0)))
-    fallen = 2 * g * height if scene.domain.steady else min(2 * g * height, pull.impulse**2)
+    # What presses on no face pulls as long as the run.
+    weight = g if closed.all() else max(float(np.linalg.norm(gravity * closed)) for gravity in gravities)
+    fallen = 2 * weight * height if scene.domain.steady else min(2 * weight * height, pull.impulse**2)
+    if not closed.all():
+        initial += max(float(np.linalg.norm(gravity[~closed])) for gravity in gravities) * scene.time.end
     pushed = min(2 * push.largest * max(scene.domain.size), push.impulse**2)
     return SceneBounds(
         dimension=scene.dimension,
         spacing=scene.domain.spacing,
         gravity=g + push.largest,
-        speed=float(np.sqrt(initial**2 + fallen + pushed)),
+        speed=float(np.sqrt(initial**2 + fallen + pushed)) + sum(abs(one.strength) for one in scene.impulses),
         height=height,
-        density=max(body.material.density for body in scene.bodies),
+        density=max(body.material.density for body in scene.sources),
     )
 
 
-def highest_speed(body: Body) -> float:
+def highest_speed(body: Body | Emitter) -> float:
     """Return a bound on the initial speed of a body, m/s: that at the corners of its bounding box.
 
-    For a velocity that is an expression, it is the largest over a lattice of points of the body.
+    For a velocity that is an expression, it is the largest over a lattice of points of the body. The largest of the
+    velocities that stand beside points in a file is added.
     """
+    if isinstance(body, Emitter):
+        return float(np.linalg.norm(body.velocity))
+    own = _speed_of_table(body)
+    if isinstance(form := body.shape.form, Points) and form.file_velocity is not None:
+        return own + float(np.linalg.norm(form.file_velocity, axis=1).max())
+    return own
+
+
+def _speed_of_table(body: Body) -> float:
     if moves_unevenly(body):
         speeds = np.linalg.norm(initial_motion(body, body_points(body))[0], axis=1)
         return float(np.max(speeds, initial=0.0, where=np.isfinite(speeds)))
@@ -76,6 +98,8 @@ def highest_speed(body: Body) -> float:
 def body_points(body: Body) -> np.ndarray:
     """Return points of a body, (n, d), m: those of a lattice over its bounding box that lie inside."""
     form = body.shape.form
+    if isinstance(form, Points):
+        return form.position
     points = _lattice(*form.bounds(), POINTS[len(body.velocity)])
     inside = form.contains(points)
     return points[inside] if inside.any() else points

@@ -8,7 +8,10 @@ from typing import get_args
 
 import numpy as np
 
+from mpmcli.scene.collider_checks import collider_problems
+from mpmcli.scene.emitter_checks import emitter_problems
 from mpmcli.scene.initial import has_expressions, initial_faults
+from mpmcli.scene.mesh import Mesh, leaving, moved_inside
 from mpmcli.scene.problem import Problem
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sampling import holds_particles, lattice_points, lattice_spacing, no_particles, particle_places
@@ -34,16 +37,20 @@ def problems_in(scene: Scene) -> list[Problem]:
     # A body that is much too large is reported, and not filled.
     empty = [] if outside else list(_empty(scene))
     unstarted = [] if outside or empty else list(_initial(scene))
+    colliding = [] if outside or empty else list(collider_problems(scene))
     where = [*_repeated_names(scene), *outside, *_overlaps(scene), *empty]
-    return [*where, *unstarted, *_pushed(scene), *_unstored(scene), *_total(scene)]
+    found = [*where, *unstarted, *colliding, *_pushed(scene), *_unstored(scene), *_total(scene)]
+    return [*found, *emitter_problems(scene)]
 
 
 def _repeated_names(scene: Scene) -> Iterator[Problem]:
-    first: dict[str, int] = {}
-    for i, body in enumerate(scene.bodies):
-        if first.setdefault(body.name, i) != i:
-            sentence = f'"{body.name}" is the name of bodies[{first[body.name]}] already; every body needs its own'
-            yield Problem(("bodies", i, "name"), sentence)
+    first: dict[str, str] = {}
+    for table, entries, one in (("bodies", scene.bodies, "body"), ("emitters", scene.emitters, "emitter")):
+        for i, body in enumerate(entries):
+            place = f"{table}[{i}]"
+            if first.setdefault(body.name, place) != place:
+                sentence = f'"{body.name}" is the name of {first[body.name]} already; every {one} needs its own'
+                yield Problem((table, i, "name"), sentence)
 
 
 def _outside(scene: Scene) -> Iterator[Problem]:
@@ -63,7 +70,11 @@ def _outside(scene: Scene) -> Iterator[Problem]:
         ]
         if said:
             ways = " and ".join(said)
-            sentence = f'body "{body.name}" leaves the domain through {ways}; move it or enlarge the domain'
+            corners, instead, too_large = (np.array(domain.origin), np.array(domain.upper)), "move it", ""
+            if isinstance(form := body.shape.form, Mesh):
+                too_large, instead = leaving(form, *corners), f"give translate = {moved_inside(form, *corners)}"
+            how = f": {too_large}" if too_large else f" through {ways}; {instead} or enlarge the domain"
+            sentence = f'body "{body.name}" leaves the domain{how}'
             yield Problem(("bodies", i, "shape"), sentence)
 
 
@@ -99,14 +110,17 @@ def _common_point(first: Body, second: Body, lower: np.ndarray, upper: np.ndarra
     counts = [int(np.clip(math.ceil(min(r, most)), 8, most)) for r in (upper - lower) / finest]
     axes = [lo + (np.arange(n) + 0.5) * (hi - lo) / n for lo, hi, n in zip(lower, upper, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(lower))
-    inside = np.logical_and(*(form.contains(points, inset=_TOLERANCE * h) for form in forms))
-    return points[np.argmax(inside)] if inside.any() else None
+    # Distances from a surface cost more than the side, and points of both are few.
+    for inset in (0.0, _TOLERANCE * h):
+        for form in forms:
+            points = points[form.contains(points, inset=inset)]
+    return points[0] if len(points) else None
 
 
 def _empty(scene: Scene) -> Iterator[Problem]:
     h = scene.domain.spacing
     for i, body in enumerate(scene.bodies):
-        if isinstance(body.shape.form, Box):
+        if isinstance(body.shape.form, Box) and body.sampling != "poisson":
             continue  # its lattice is fitted to it, and has a point at least
         if lattice_points(body, h) <= _MOST_SEARCHED and not holds_particles(body, i, h):
             yield Problem(("bodies", i, "shape"), no_particles(body, h))
@@ -151,12 +165,13 @@ def _hydrostatic(body: Body, scene: Scene) -> Iterator[tuple[str, str]]:
 
 def _pushed(scene: Scene) -> Iterator[Problem]:
     """Find forces on bodies that do not exist."""
-    names = [body.name for body in scene.bodies]
-    for k, force in enumerate(scene.forces):
-        if force.body is not None and force.body not in names:
-            guess = nearest(force.body, names)
-            hint = f'did you mean "{guess}"?' if guess else f"the bodies are {listed(names, 'and')}"
-            yield Problem(("forces", k, "body"), f'no body has the name "{force.body}"; {hint}')
+    names = [body.name for body in scene.sources]
+    for table, entries in (("forces", scene.forces), ("impulses", scene.impulses)):
+        for k, force in enumerate(entries):
+            if force.body is not None and force.body not in names:
+                guess = nearest(force.body, names)
+                hint = f'did you mean "{guess}"?' if guess else f"the bodies are {listed(names, 'and')}"
+                yield Problem((table, k, "body"), f'no body has the name "{force.body}"; {hint}')
 
 
 def _total(scene: Scene) -> Iterator[Problem]:
@@ -179,6 +194,9 @@ def _total(scene: Scene) -> Iterator[Problem]:
             said = 'must be left out with solver.solids = "total", whose state at rest is the one at the start'
             yield Problem(("bodies", i, "deformation"), said)
         yield from _nearly_held(body, i, scene)
+    if any(scene.domain.periodic):
+        said = '"total" keeps bodies whole on a grid that does not repeat; give solids = "updated", or other walls'
+        yield Problem(where, said)
     if scene.solver.walls == "zeroed":
         yield Problem(where, '"total" needs walls = "folded"')
 
@@ -223,7 +241,7 @@ def _nearly_held(body: Body, index: int, scene: Scene) -> Iterator[Problem]:
 
 def _unstored(scene: Scene) -> Iterator[Problem]:
     """Find output fields that are internal variables of laws which no body follows."""
-    stored = {variable.name for body in scene.bodies for variable in body.material.internal_in(scene.dimension)}
+    stored = {variable.name for body in scene.sources for variable in body.material.internal_in(scene.dimension)}
     available = [*get_args(ParticleField), *sorted(stored)]
     for k, name in enumerate(scene.output.fields):
         if name not in available:

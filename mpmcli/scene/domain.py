@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
+from mpmcli.scene.cell_counts import MOST_CELLS, cells_of, spacing_of
 from mpmcli.scene.entry import TimeVector, value_of, varies
 from mpmcli.scene.quantity import (
     AXES,
@@ -17,19 +18,23 @@ from mpmcli.scene.quantity import (
     flaw,
     scene_dimension,
 )
+from mpmcli.scene.wall_rules import PERIODIC, WallVelocity, require_grip, require_pairs
 
-Wall = Literal["slip", "stick", "separate"]
+Wall = Literal["slip", "stick", "separate", "periodic", "open"]
 WALLS: tuple[str, ...] = get_args(Wall)
-MOST_CELLS = 2**31 - 1
+# Those on which nothing slips.
 # Each wall acts on nodes up to two cells away from it, and no node may belong to both walls of an axis.
 FEWEST_CELLS = 5
+# Faces without friction: nothing slips along them, or they are no wall.
+_NEVER_SLIP = ("stick", PERIODIC, "open")
 
 
 class Walls(Table):
     """What each face of the domain does to the material that meets it.
 
     slip: no motion through the wall, free motion along it. stick: no motion at all.
-    separate: as slip, but the material may leave the wall.
+    separate: as slip, but the material may leave the wall. periodic: what leaves here enters at the opposite face.
+    open: no wall; what passes the face is gone.
     """
 
     default: Annotated[Wall, Field(description="For every face that is not named.")] = "separate"
@@ -51,6 +56,10 @@ class Walls(Table):
             (getattr(self, f"{axis}_min") or self.default, getattr(self, f"{axis}_max") or self.default)
             for axis in AXES[:dimension]
         )
+
+    def any_open(self, dimension: int) -> bool:
+        """Return whether material can leave through a face."""
+        return any("open" in pair for pair in self.faces(dimension))
 
 
 class Friction(Table):
@@ -150,7 +159,7 @@ class Domain(Table):
         Walls,
         BeforeValidator(_one_word_for_all),
         Field(
-            description="slip, stick or separate: one word for all faces, or a table.",
+            description="slip, stick, separate, periodic or open: one word for all faces, or a table.",
             json_schema_extra=_walls_schema,
         ),
     ] = Walls()
@@ -162,6 +171,9 @@ class Domain(Table):
             json_schema_extra=_friction_schema,
         ),
     ] = Friction()
+    wall_velocity: Annotated[
+        WallVelocity | None, Field(description="Velocity along themselves of walls that stick or have friction, m/s.")
+    ] = None
 
     @field_validator("size")
     @classmethod
@@ -178,8 +190,8 @@ class Domain(Table):
         if self.spacing is not None and self.cells is not None:
             raise flaw('"spacing" is given as well; leave one of them out', "cells")
         key = "cells" if self.spacing is None else "spacing"
-        spacing = self.spacing or _spacing_of(self.size, self.cells)
-        cells = self.cells or _cells_of(self.size, self.spacing)
+        spacing = self.spacing or spacing_of(self.size, self.cells)
+        cells = self.cells or cells_of(self.size, self.spacing)
         if min(cells) < FEWEST_CELLS:
             axis = cells.index(min(cells))
             raise flaw(
@@ -193,14 +205,23 @@ class Domain(Table):
     def _friction_of_walls_that_slip(self) -> "Domain":
         words = self._words()
         for face, word in words.items():
-            if word == "stick" and self.friction.of(face) is not None:
+            if word in _NEVER_SLIP and self.friction.of(face) is not None:
                 raise flaw(
-                    f'is for a wall that can slip, and domain.walls has "stick" for {face}; leave it out, or give '
+                    f'is for a wall that can slip, and domain.walls has "{word}" for {face}; leave it out, or give '
                     f'"slip" or "separate" there',
                     f"friction.{face}",
                 )
-        if self.friction.default > 0 and set(words.values()) == {"stick"}:
-            raise flaw('is for walls that can slip, and domain.walls has "stick" for all; leave it out', "friction")
+        if self.friction.default > 0 and set(words.values()) <= {*_NEVER_SLIP}:
+            found = " or ".join(f'"{word}"' for word in sorted({*words.values()}, reverse=True))
+            raise flaw(f"is for walls that can slip, and domain.walls has {found} for all; leave it out", "friction")
+        return self
+
+    @model_validator(mode="after")
+    def _walls_that_belong_together(self) -> "Domain":
+        words = self._words()
+        require_pairs(words, self.cells)
+        if self.wall_velocity is not None:
+            require_grip(self.wall_velocity, words, dict(zip(words, sum(self.frictions, ()), strict=True)))
         return self
 
     def _words(self) -> dict[str, Wall]:
@@ -213,12 +234,29 @@ class Domain(Table):
 
     @property
     def frictions(self) -> tuple[tuple[float, float], ...]:
-        """Coefficients of friction of the lower and the upper face along each axis, 0 for a wall that sticks."""
+        """Coefficients of friction of the lower and the upper face along each axis, 0 for one that never slips."""
         found = []
         for face, word in self._words().items():
             own = self.friction.of(face)
-            found.append(0.0 if word == "stick" else self.friction.default if own is None else own)
+            found.append(0.0 if word in _NEVER_SLIP else self.friction.default if own is None else own)
         return tuple(zip(found[::2], found[1::2], strict=True))
+
+    @property
+    def wall_velocities(self) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
+        """Velocities of the lower and the upper face along each axis, m/s."""
+        still, given = (0.0,) * len(self.size), self.wall_velocity or WallVelocity()
+        found = [given.of(face) or still for face in self._words()]
+        return tuple(zip(found[::2], found[1::2], strict=True))
+
+    @property
+    def wall_speed(self) -> float:
+        """Speed of the fastest wall, m/s."""
+        return max(float(np.linalg.norm(velocity)) for pair in self.wall_velocities for velocity in pair)
+
+    @property
+    def periodic(self) -> tuple[bool, ...]:
+        """Whether the faces along each axis are periodic."""
+        return tuple(PERIODIC in pair for pair in self.walls.faces(len(self.size)))
 
     @property
     def upper(self) -> tuple[float, ...]:
@@ -233,34 +271,3 @@ class Domain(Table):
     def gravity_at(self, time: float) -> np.ndarray:
         """Return gravity at a time (s), (d,), m/s^2."""
         return np.array([float(value_of(entry, t=time)) for entry in self.gravity])
-
-
-def _cells_of(size: tuple[float, ...], spacing: float) -> tuple[int, ...]:
-    ratios = [s / spacing for s in size]
-    if max(ratios) > MOST_CELLS:
-        raise flaw(f"makes more than {MOST_CELLS} cells along an axis; make it coarser", "spacing")
-    # A relative 1e-6 counts as round-off, but never more than a hundredth of a cell.
-    broken = [k for k, r in enumerate(ratios) if round(r) < 1 or abs(r - round(r)) > min(1e-6 * r, 1e-2)]
-    if not broken:
-        return tuple(round(r) for r in ratios)
-    said = []
-    for k in broken:
-        below = int(ratios[k])
-        nearest = " or ".join(f"{n * spacing:.8g}" for n in (below, below + 1) if n)
-        said.append(f"{size[k]:.8g} m is {ratios[k]:.6g} cells along {AXES[k]}, {nearest} m would fit")
-    raise flaw(f"must be a whole number of cells of spacing {spacing:.8g} m: {'; '.join(said)}", "size")
-
-
-def _spacing_of(size: tuple[float, ...], cells: tuple[int, ...]) -> float:
-    if len(cells) != len(size):
-        raise flaw(f"needs {NUMBER_WORDS[len(size)]} numbers, as domain.size has; found {len(cells)}", "cells")
-    spacings = [s / n for s, n in zip(size, cells, strict=True)]
-    if max(spacings) - min(spacings) > 1e-6 * max(spacings):
-        found = ", ".join(f"{h:.6g} m along {axis}" for axis, h in zip(AXES, spacings, strict=False))
-        fitting = ", ".join(str(max(1, round(s / spacings[0]))) for s in size)
-        raise flaw(
-            f"must make {'square' if len(size) == 2 else 'cubic'} cells; found {found}; "
-            f"nearest to the size is [{fitting}]",
-            "cells",
-        )
-    return spacings[0]

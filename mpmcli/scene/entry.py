@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Discriminator, GetCoreSchemaHandler, GetJsonSchemaHandler, Tag
 from pydantic_core import CoreSchema, core_schema
 
-from mpmcli.scene.expression import INITIAL, POSITION, Expression, ExpressionError
+from mpmcli.scene.expression import INITIAL, POSITION, Expression, ExpressionError, Number, Tree
 from mpmcli.scene.expression_reader import parse
 from mpmcli.scene.quantity import LARGEST, flaw, list_of_axes, scene_dimension
 from mpmcli.scene.sentences import written
@@ -65,6 +65,11 @@ def plain(value: object) -> object:
 def value_of(entry: Entry, **values: np.ndarray | float) -> np.ndarray:
     """Return the value of an entry in float64."""
     return entry(**values) if isinstance(entry, Expression) else np.float64(entry)
+
+
+def tree_of(entry: Entry) -> Tree:
+    """Return the tree of a number or an expression."""
+    return entry.tree if isinstance(entry, Expression) else Number(float(entry))
 
 
 def varies(*entries: Entry) -> bool:

@@ -28,14 +28,14 @@ class Expansion:
         problems: what is wrong with presets and knobs.
         renames: path of each parameter that a knob set -> path of the knob.
         faulty: paths of the materials that are None.
-        notes: by index of the body, what each knob did.
+        notes: by table and index of the body or emitter, what each knob did.
     """
 
     data: dict[str, Any]
     problems: list[Problem] = field(default_factory=list)
     renames: Renames = field(default_factory=dict)
     faulty: set[Path] = field(default_factory=set)
-    notes: dict[int, list[str]] = field(default_factory=dict)
+    notes: dict[tuple[str, int], list[str]] = field(default_factory=dict)
 
     def hides(self, path: Path) -> bool:
         """Say whether a path lies in a material that has its problem already."""
@@ -50,13 +50,14 @@ def expand_materials(data: dict[str, Any], laws: Laws) -> Expansion:
         laws: parameter models of the constitutive laws that a material may follow.
     """
     expansion = Expansion(copy.deepcopy(data))
-    bodies = expansion.data.get("bodies")
-    for i, body in enumerate(bodies if isinstance(bodies, list) else []):
-        if isinstance(body, dict) and "material" in body:
-            one = _Material(expansion, i, laws)
-            body["material"] = one.expanded(body["material"])
-            if body["material"] is None:
-                expansion.faulty.add(one.path)
+    for table in ("bodies", "emitters"):
+        bodies = expansion.data.get(table)
+        for i, body in enumerate(bodies if isinstance(bodies, list) else []):
+            if isinstance(body, dict) and "material" in body:
+                one = _Material(expansion, (table, i), laws)
+                body["material"] = one.expanded(body["material"])
+                if body["material"] is None:
+                    expansion.faulty.add(one.path)
     return expansion
 
 
@@ -69,10 +70,10 @@ def available_presets(laws: Laws) -> list[str]:
 class _Material:
     """One material of a scene on its way to a law's table."""
 
-    def __init__(self, expansion: Expansion, body: int, laws: Laws) -> None:
+    def __init__(self, expansion: Expansion, body: tuple[str, int], laws: Laws) -> None:
         self.expansion = expansion
         self.body = body
-        self.path: Path = ("bodies", body, "material")
+        self.path: Path = (*body, "material")
         self.laws = {_law_name(law): law for law in laws}
         self.presets = available_presets(laws)
 

@@ -21,6 +21,7 @@ from mpmcli.scene.overrides import apply_overrides
 from mpmcli.scene.problem import Path, Problem, path_text
 from mpmcli.scene.quantity import dimension_of
 from mpmcli.scene.repair import Renames, original_path, repaired
+from mpmcli.scene.sampling import points_per_cell
 from mpmcli.scene.schema import Scene, scene_model
 from mpmcli.scene.sentences import problems_of
 
@@ -63,7 +64,8 @@ def load_scene(path: str | PathLike[str], overrides: Sequence[str] = (), *, laws
         InputError: one line per fault: `FILE:LINE: KEY PATH: what is wrong and what would be right`.
     """
     text, data = read_toml(path)
-    return parse_scene(data, laws=laws, source=str(path), text=text, overrides=overrides)
+    directory = File(path).parent
+    return parse_scene(data, laws=laws, source=str(path), text=text, overrides=overrides, directory=directory)
 
 
 def parse_scene(
@@ -73,6 +75,7 @@ def parse_scene(
     source: str = "<scene>",
     text: str = "",
     overrides: Sequence[str] = (),
+    directory: str | PathLike[str] = ".",
 ) -> LoadedScene:
     """Build a scene from parsed TOML.
 
@@ -82,23 +85,26 @@ def parse_scene(
         source: what to call the scene in errors.
         text: the TOML text of `data`, for line numbers in errors.
         overrides: as for `load_scene`.
+        directory: that of the scene, to which the paths in it are relative.
 
     Raises:
         InputError: as for `load_scene`.
     """
     data, overridden = apply_overrides(data, overrides)
-    scene, problems, notes = _validate(data, laws)
+    scene, problems, notes = _validate(data, laws, directory)
     if problems or scene is None:
         raise InputError(report(problems, source, text, overridden))
     return _resolve(scene, notes, source)
 
 
-def scene_problems(data: dict[str, Any], laws: Laws) -> list[Problem]:
+def scene_problems(data: dict[str, Any], laws: Laws, directory: str | PathLike[str] = ".") -> list[Problem]:
     """Return everything for which `parse_scene` would refuse parsed TOML."""
-    return _validate(data, laws)[1]
+    return _validate(data, laws, directory)[1]
 
 
-def _validate(data: dict[str, Any], laws: Laws) -> tuple[Scene | None, list[Problem], dict[int, list[str]]]:
+def _validate(
+    data: dict[str, Any], laws: Laws, directory: str | PathLike[str]
+) -> tuple[Scene | None, list[Problem], dict[tuple[str, int], list[str]]]:
     """Expand and validate until no key is unknown, so that a misspelled key does not hide other faults.
 
     Returns the scene, what is wrong with it at the user's own paths, and what the knobs of each body did.
@@ -118,7 +124,8 @@ def _validate(data: dict[str, Any], laws: Laws) -> tuple[Scene | None, list[Prob
         try:
             dimension = dimension_of(data)
             constants, _ = definitions(data.get("constants"), dimension)
-            scene = model.model_validate(expansion.data, context={"dimension": dimension, "constants": constants})
+            context = {"dimension": dimension, "constants": constants, "directory": directory}
+            scene = model.model_validate(expansion.data, context=context)
         except ValidationError as error:
             unknown = [one["loc"] for one in error.errors() if one["type"] == "extra_forbidden"]
             found = [p for p in problems_of(error, expansion.data, model) if not expansion.hides(p.path)]
@@ -130,15 +137,21 @@ def _validate(data: dict[str, Any], laws: Laws) -> tuple[Scene | None, list[Prob
         renames = {**renames, **{p: original_path(old, renames) for p, old in new.items()}}
 
 
-def _resolve(scene: Scene, knobs: dict[int, list[str]], source: str) -> LoadedScene:
+def _resolve(scene: Scene, knobs: dict[tuple[str, int], list[str]], source: str) -> LoadedScene:
     """Set the "auto" parameters of every material from the speeds and pressures that the scene can reach."""
     bounds = scene_bounds(scene)
-    bodies, notes = [], []
-    for i, body in enumerate(scene.bodies):
-        material, sentences = body.material.resolve(bounds)
-        bodies.append(body.model_copy(update={"material": material}))
-        notes += [f"{body.name}: {sentence}" for sentence in (*knobs.get(i, []), *sentences)]
-    return LoadedScene(scene.model_copy(update={"bodies": tuple(bodies)}), tuple(notes), source)
+    resolved, notes = {}, []
+    for table in ("bodies", "emitters"):
+        found = []
+        for i, body in enumerate(getattr(scene, table)):
+            material, sentences = body.material.resolve(bounds)
+            changes: dict[str, object] = {"material": material}
+            if table == "bodies":
+                changes["particles_per_cell"] = points_per_cell(body, bounds.spacing)
+            found.append(body.model_copy(update=changes))
+            notes += [f"{body.name}: {sentence}" for sentence in (*knobs.get((table, i), []), *sentences)]
+        resolved[table] = tuple(found)
+    return LoadedScene(scene.model_copy(update=resolved), tuple(notes), source)
 
 
 def report(

@@ -108,7 +108,7 @@ def set_value(data: dict[str, Any], parts: list[str], value: object) -> Path:
 
 
 def _is_material(path: Path) -> bool:
-    return len(path) == 3 and path[0] == "bodies" and path[2] == "material"
+    return len(path) == 3 and path[0] in ("bodies", "emitters") and path[2] == "material"
 
 
 def _index(entries: list[Any], part: str, path: Path) -> int:

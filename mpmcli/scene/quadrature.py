@@ -187,6 +187,14 @@ class Mean:
         return self._kept[k]
 
 
+def integral_of(tree: Tree, start: float, end: float) -> float:
+    """Return the integral of a tree of t between two times, s."""
+    if not end > start:
+        return 0.0
+    parts = parts_of(tree, start, end)
+    return float(_rule(parts.values, parts.low, parts.high).sum())
+
+
 def largest_of(tree: Tree, start: float, end: float) -> float:
     """Return a bound on |value| of a tree of t between two times, s; of the samples where bounds are not known."""
     low, high = bounds_of(tree, {"t": (np.float64(start), np.float64(max(start, end)))})

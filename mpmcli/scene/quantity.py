@@ -7,6 +7,8 @@ from pydantic_core import PydanticCustomError
 
 NUMBER_WORDS = {2: "two", 3: "three"}
 AXES = "xyz"
+# What names of bodies, colliders and so on look like.
+NAME = r"^[^\W\d_][\w -]*$"
 LARGEST = 1e15
 
 

@@ -3,17 +3,19 @@
 from functools import lru_cache
 from typing import Annotated, Any, Literal, Union, get_args
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, create_model
+from pydantic import AfterValidator, Field, create_model
 
+from mpmcli.scene.colliders import Collider
 from mpmcli.scene.constants import Constants
 from mpmcli.scene.domain import Domain
+from mpmcli.scene.emitters import Emitter
 from mpmcli.scene.entry import PlaceVector, StartDeformation, StartMatrix, StartVector
+from mpmcli.scene.impulses import Impulse
+from mpmcli.scene.lattice import ParticlesPerCell
 from mpmcli.scene.material import MaterialParameters
-from mpmcli.scene.quantity import Flag, Integer, Positive, Table, flaw, scene_dimension
+from mpmcli.scene.quantity import NAME, Flag, Integer, Positive, Table, flaw
 from mpmcli.scene.shapes import OneShape
 from mpmcli.scene.solver_settings import SolverSettings
-
-NAME = r"^[^\W\d_][\w -]*$"
 
 ParticleField = Literal[
     "velocity",
@@ -56,31 +58,6 @@ class Time(Table):
     ] = 0.8
 
 
-def usual_particles_per_cell(dimension: int) -> int:
-    """Return the particles per cell of a body that does not give them: two per axis."""
-    return 2**dimension
-
-
-def _filled_lattice(value: object, info: ValidationInfo) -> object:
-    return usual_particles_per_cell(scene_dimension(info) or 2) if value is None else value
-
-
-def _whole_lattice(count: int, info: ValidationInfo) -> int:
-    """Refuse a lattice whose number of particles per cell is no square (2D) or cube (3D)."""
-    dimension = scene_dimension(info)
-    if dimension is None or info.data.get("sampling") != "lattice":
-        return count
-    root = round(count ** (1 / dimension))
-    if root**dimension == count:
-        return count
-    below = root if root**dimension < count else root - 1
-    nearest = f"{below**dimension} or {(below + 1) ** dimension}"
-    raise flaw(
-        f"must be a {'square' if dimension == 2 else 'cube'} number for a lattice in {dimension}D, "
-        f'for example {nearest}; found {count}. With sampling = "jittered" any number will do'
-    )
-
-
 class Body(Table):
     """One body: a shape filled with particles of one material."""
 
@@ -89,7 +66,12 @@ class Body(Table):
         MaterialParameters,
         Field(description="A preset in quotes, or a table: a law or a preset, with parameters and knobs."),
     ]
-    shape: Annotated[OneShape, Field(description="Exactly one of box, ball, cylinder (3D), polygon (2D).")]
+    shape: Annotated[
+        OneShape,
+        Field(
+            description="Exactly one of box, ball, capsule, cylinder or mesh (3D), polygon (2D), points; add, subtract."
+        ),
+    ]
     velocity: Annotated[
         StartVector,
         Field(
@@ -121,20 +103,13 @@ class Body(Table):
         ),
     ] = None
     sampling: Annotated[
-        Literal["lattice", "jittered"],
-        Field(description="Particles on a lattice, or one at random in each cell of that lattice."),
-    ] = "lattice"
-    particles_per_cell: Annotated[
-        Integer,
-        Field(ge=1, le=10**4),
-        BeforeValidator(_filled_lattice),
-        AfterValidator(_whole_lattice),
+        Literal["lattice", "jittered", "poisson"],
         Field(
-            validate_default=True,
-            description="Particles per cell of the grid; a square (2D) or cube (3D) number for a lattice. "
-            "Default: 4 in 2D, 8 in 3D.",
+            description="Particles on a lattice, one at random in each cell of that lattice, or a Poisson-disk sample: "
+            "as many at random, none closer than 0.82 (2D) or 0.87 (3D) of its spacing to another."
         ),
-    ] = None  # type: ignore[assignment]
+    ] = "lattice"
+    particles_per_cell: ParticlesPerCell = None  # type: ignore[assignment]
     seed: Annotated[
         Integer, Field(ge=0, le=2**63 - 1, description="Seed of the random positions; unused by a lattice.")
     ] = 0
@@ -173,6 +148,9 @@ class Output(Table):
             "initial_position (m)."
         ),
     ] = ("velocity", "density", "pressure")
+    drop_retired: Annotated[
+        Flag, Field(description="Store only the particles that are there, so that frames differ in their numbers.")
+    ] = False
     compress: Annotated[
         Flag, Field(description="Compress the stored file with gzip: smaller, and slower to write.")
     ] = False
@@ -195,8 +173,15 @@ class Scene(Table):
     domain: Annotated[Domain, Field(description="The box that the scene lives in, and its grid.")]
     time: Annotated[Time, Field(description="How long, how many frames, which steps.")]
     bodies: Annotated[tuple[Body, ...], Field(min_length=1, description="The bodies, at least one.")]
+    emitters: Annotated[tuple[Emitter, ...], Field(description="Where material flows in. Default: none.")] = ()
     forces: Annotated[
         tuple[Force, ...], Field(description="Accelerations beside gravity; what acts on a particle adds up.")
+    ] = ()
+    colliders: Annotated[
+        tuple[Collider, ...], Field(description="Rigid things that the material meets, at rest or moving.")
+    ] = ()
+    impulses: Annotated[
+        tuple[Impulse, ...], Field(description="Pushes on what is near a place, at a time or over an interval.")
     ] = ()
     output: Annotated[Output, Field(description="What is stored.")] = Output()
     solver: Annotated[SolverSettings, Field(description="How it is computed.")] = SolverSettings()
@@ -205,6 +190,26 @@ class Scene(Table):
     def dimension(self) -> int:
         """Return 2 or 3."""
         return len(self.domain.size)
+
+    @property
+    def sources(self) -> "tuple[Body | Emitter, ...]":
+        """Everything that particles belong to, in the order of their labels: the bodies, then the emitters."""
+        return (*self.bodies, *self.emitters)
+
+    @property
+    def pushes(self) -> tuple[Force, ...]:
+        """All forces, those of the impulses included."""
+        interval = self.time.end / self.time.frames
+        made = [
+            Force.model_construct(name=one.name, body=one.body, acceleration=one.acceleration(interval))
+            for one in self.impulses
+        ]
+        return (*self.forces, *made)
+
+    @property
+    def comes_and_goes(self) -> bool:
+        """Whether particles enter or leave during the run."""
+        return bool(self.emitters) or self.domain.walls.any_open(self.dimension)
 
 
 @lru_cache
@@ -221,10 +226,20 @@ def scene_model(laws: tuple[type[MaterialParameters], ...]) -> type[Scene]:
         tuple[body, ...],  # type: ignore[valid-type]
         Field(min_length=1, description=Scene.model_fields["bodies"].description),
     ]
+    emitter = create_model("Emitter", __base__=Emitter, __doc__=Emitter.__doc__, material=(described, ...))
+    emitters = Annotated[
+        tuple[emitter, ...],  # type: ignore[valid-type]
+        Field(description=Scene.model_fields["emitters"].description),
+    ]
     output = _output_model(laws)
     described_output = Annotated[output, Field(description=Scene.model_fields["output"].description)]
     return create_model(
-        "Scene", __base__=Scene, __doc__=Scene.__doc__, bodies=(bodies, ...), output=(described_output, output())
+        "Scene",
+        __base__=Scene,
+        __doc__=Scene.__doc__,
+        bodies=(bodies, ...),
+        emitters=(emitters, ()),
+        output=(described_output, output()),
     )
 
 

@@ -44,7 +44,7 @@ class Runner:
         for scene in scenes:
             particles = sample_bodies(scene)
             backend = self._choose(scene)
-            if not backend.on_cpu or not _keeps(particles, backend):
+            if not backend.on_cpu or not _keeps(scene, particles, backend):
                 continue
             kind = Kind.of(scene, particles)
             place = next((i for i, known in enumerate(kinds) if known.joined(kind) is not None), None)
@@ -64,7 +64,7 @@ class Runner:
         """
         particles = sample_bodies(scene)
         backend = self._choose(scene)
-        if _keeps(particles, backend):
+        if _keeps(scene, particles, backend):
             backend = replace(backend, threads=1) if backend.on_cpu else backend
             engine = BatchRun(self._batch_for(Kind.of(scene, particles), backend), 0, scene, particles)
         else:
@@ -88,7 +88,7 @@ class Runner:
             except MpmcliError as error:
                 yield place, error
                 continue
-            if backend.on_cpu or not _keeps(particles, backend):
+            if backend.on_cpu or not _keeps(scene, particles, backend):
                 alone.append(place)
                 continue
             sampled[place] = particles
@@ -167,15 +167,23 @@ class Runner:
         return self._batches[-1]
 
 
-def _keeps(particles: Sequence[BodyParticles], backend: Backend) -> bool:
+def _keeps(scene: Scene, particles: Sequence[BodyParticles], backend: Backend) -> bool:
     """Return whether a scene with these particles is computed by kernels that are kept for others."""
     count = sum(len(body.position) for body in particles)
+    if scene.comes_and_goes and not backend.on_cpu:
+        # There a batch does not sort.
+        return False
     return suits_batch(count, backend) and (count < FEW_PARTICLES or not backend.on_cpu)
 
 
 def _roomy(kind: Kind) -> Kind:
     """Return a kind with some room to spare, so that few sizes occur and compiled kernels are found again."""
-    return replace(kind, particles=tuple(map(_rounded, kind.particles)), bodies=tuple(map(_power, kind.bodies)))
+    return replace(
+        kind,
+        particles=tuple(map(_rounded, kind.particles)),
+        bodies=tuple(map(_power, kind.bodies)),
+        comings=replace(kind.comings, cells=_power(kind.comings.cells) if kind.comings.cells else 0),
+    )
 
 
 def _rounded(count: int) -> int:

@@ -100,7 +100,8 @@ def simulate(
     record.write()
     header = RunHeader.of(scene, text, [laws()[name] for name in solver.laws], summary.backend)
     kind = VtkSeriesStore if settings.form == "vtk" else SegmentStore
-    store = kind(settings.directory, header.stored, compress=scene.output.compress, hold=HOLD)
+    options = {"compress": scene.output.compress, "hold": HOLD, "colliders": scene.colliders}
+    store = kind(settings.directory, header.stored, **options)
 
     clock = Stopwatch(summary.timings, began)
     failure: dict = {}

@@ -8,14 +8,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import taichi as ti
 
-from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.build_walls import build_walls
+from mpmcli.boundaries.collider_kind import ColliderKind
+from mpmcli.boundaries.collider_motion import ColliderMotion
+from mpmcli.boundaries.colliders import Colliders
+from mpmcli.boundaries.moving_faces import MovingFaces, moving_faces
 from mpmcli.boundaries.rough_faces import RoughFaces, rough_faces
-from mpmcli.boundaries.walls import Walls, faces_on_grid
-from mpmcli.boundaries.zeroed_walls import ZeroedWalls
+from mpmcli.errors import InputError
 from mpmcli.materials.law import Law
 from mpmcli.materials.registry import laws
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.scene.schema import SolverSettings
+from mpmcli.solver.activity import Comings, Emission
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.batch_device import Device
 from mpmcli.solver.batch_gpu import build_gpu_launch
@@ -34,6 +38,7 @@ from mpmcli.solver.particle_arrays import CONSTANTS, ParticleArrays
 from mpmcli.solver.particle_contact import DRIFT, contact_between
 from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.particle_update import ParticleUpdate
+from mpmcli.solver.period import Period
 from mpmcli.solver.plan import members_of
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.transfer_scheme import scheme_of
@@ -48,11 +53,13 @@ class Kind:
     Attributes:
         dimension: 2 or 3; precision: "f32" or "f64".
         settings: of the solver.
-        faces: words of the walls, per axis; rough: (axis, side) of those with friction.
+        faces: words of the walls, per axis; rough, moving: (axis, side) of those with friction, and that move.
         flags: of each law in the order of their names, the name and the terms that it has.
         cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
         keeps_filling: whether nodes keep the volume scattered to them.
-        drives: gravity that varies, and forces.
+        colliders: their forms, and which of them move.
+        drives: gravity that varies, forces, and motions of colliders.
+        comings: what lets particles come and go.
         members: the laws.
     """
 
@@ -61,21 +68,24 @@ class Kind:
     settings: SolverSettings
     faces: tuple[tuple[str, str], ...]
     rough: tuple[tuple[int, int], ...]
+    moving: tuple[tuple[int, int], ...]
     flags: tuple[tuple, ...]
     cells: tuple[int, ...]
     particles: tuple[int, ...]
     bodies: tuple[int, ...]
     keeps_filling: bool
+    colliders: ColliderKind
     drives: Drives
+    comings: Comings
     members: tuple[Law, ...] = field(compare=False, repr=False)
 
     @staticmethod
     def of(scene: Scene, particles: Sequence[BodyParticles]) -> "Kind":
         """Return the kind of a scene with these particles, one entry per body."""
-        names = sorted({body.material.law for body in scene.bodies})
+        names = sorted({body.material.law for body in scene.sources})
         places = [members_of(scene, name) for name in names]
         members = tuple(
-            laws()[name]([scene.bodies[i].material for i in own], scene.dimension)
+            laws()[name]([scene.sources[i].material for i in own], scene.dimension)
             for name, own in zip(names, places, strict=True)
         )
         return Kind(
@@ -84,12 +94,15 @@ class Kind:
             scene.solver,
             tuple(tuple(pair) for pair in scene.domain.walls.faces(scene.dimension)),
             rough_faces(scene),
+            moving_faces(scene),
             tuple((law.name, law.terms) for law in members),
             tuple(scene.domain.cells),
             tuple(sum(len(particles[i].position) for i in own) for own in places),
             tuple(len(own) for own in places),
             needs_filling(scene, members),
+            ColliderKind.of(scene),
             Drives.of(scene, places)[0],
+            Comings.of(scene, names),
             members,
         )
 
@@ -101,8 +114,12 @@ class Kind:
             name: tuple(map(max, getattr(self, name), getattr(other, name)))
             for name in ("cells", "particles", "bodies")
         }
-        wide = replace(self, **room)
-        return wide if replace(other, **room) == wide else None
+        room["colliders"] = self.colliders.joined(other.colliders)
+        if room["colliders"] is None:
+            return None
+        cells = max(self.comings.cells, other.comings.cells)
+        wide, fits = (replace(one, comings=replace(one.comings, cells=cells), **room) for one in (self, other))
+        return wide if fits == wide else None
 
 
 class Batch:
@@ -126,13 +143,27 @@ class Batch:
         d = kind.dimension
         self.kind, self.runs, self.backend = kind, runs, backend
         on_cpu = backend.on_cpu
+        if kind.comings.any and not on_cpu:
+            raise InputError("a batch on a GPU knows no emitters and no open faces; run these scenes one by one.")
         width = node_width(d, on_cpu=on_cpu)
         scheme = scheme_of(kind.settings)
         stencil = scheme.spline.nodes
         tile = tile_edge(stencil, d, on_cpu=on_cpu)
         averaged = [averages_volume(kind.settings, law) for law in kind.members]
+        period = Period(kind.faces, runs, at_once=not on_cpu)
         grid = Grid(
-            d, 1.0, kind.cells, width, scheme, runs, tile=tile, keeps_filling=kind.keeps_filling, averaged=averaged
+            d,
+            1.0,
+            kind.cells,
+            width,
+            scheme,
+            runs,
+            tile=tile,
+            keeps_filling=kind.keeps_filling,
+            averaged=averaged,
+            period=period,
+            walls_move=len(kind.moving) > 0,
+            opens=kind.comings.opens,
         )
         groups = [
             ParticleArrays(
@@ -149,6 +180,7 @@ class Batch:
                 total=kind.settings.solids == "total",
                 averaged=shares,
                 slips=slips_in(kind.settings, kind.rough),
+                comes_and_goes=kind.comings.any,
             )
             for law, shares, room, bodies, forces in zip(
                 kind.members, averaged, kind.particles, kind.bodies, kind.drives.forces, strict=True
@@ -159,19 +191,22 @@ class Batch:
             push_on(group, forces, bodies, self.values.device, backend)
             for group, bodies, forces in zip(groups, kind.bodies, kind.drives.forces, strict=True)
         ]
-        images, friction = None, RoughFaces(kind.rough, runs)
-        if kind.settings.walls == "zeroed":
-            walls = ZeroedWalls(kind.faces, PAD, grid.cells, friction)
-        else:
-            faces = faces_on_grid(kind.faces, kind.settings)
-            walls = Walls(faces, PAD, grid.cells, grid.shape, runs, friction)
-            images = MirrorImages(walls, scheme.spline.on_node)
+        for group in groups:
+            group.repeat(period)
+        friction, moving = RoughFaces(kind.rough, runs), MovingFaces(kind.moving, d, runs)
+        walls, images = build_walls(
+            kind.faces, kind.settings, PAD, grid.cells, grid.shape, scheme.spline.on_node, friction, moving, runs
+        )
         orders = []
         if on_cpu:
             buffers = SortBuffers(groups, runs)
             sharing = backend.threads if runs == 1 else 1
             orders = [TileOrder(group, grid, buffers, sharing, True, runs) for group in groups]
         contact = contact_between(groups, kind.bodies, grid, backend, runs)
+        colliders = motion = None
+        if kind.colliders.count:
+            colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, on_cpu=on_cpu)
+            motion = ColliderMotion(colliders, runs) if kind.colliders.moving else None
         self.device = Device(
             runs,
             kind.particles,
@@ -181,12 +216,16 @@ class Batch:
             orders,
             walls,
             friction,
-            NodeUpdate(grid, images, [walls]),
-            ParticleUpdate(grid, kind.faces, runs * len(groups), contact, friction, watches_box=False),
+            moving,
+            NodeUpdate(grid, images, [walls], colliders),
+            ParticleUpdate(grid, kind.faces, runs * len(groups), contact, friction, moving, watches_box=False),
             self.values,
             Gravity(kind.drives.gravity, [0.0] * d, self.values.device),
+            colliders,
+            motion,
+            Emission(kind.comings, d, runs) if kind.comings.groups else None,
         )
-        self.layout = Layout(d, [len(law.internal) for law in kind.members])
+        self.layout = Layout(d, [len(law.internal) for law in kind.members], len(kind.comings.groups))
         self.numbers = np.zeros((runs, self.layout.reals))
         self.counts = np.zeros((runs, self.layout.counts), np.int32)
         constants = {"drift_allowed": DRIFT if contact else drift_allowed(tile, stencil)}
@@ -197,7 +236,8 @@ class Batch:
         self.seconds = self.first_seconds = 0.0
         self.shown = self._room = np.zeros((runs, 1), groups[0].real)
         if on_cpu:
-            self.notes = np.zeros((runs, MOST_FRAMES, len(NOTES) + len(groups) * sum_entries(d)))
+            loads = kind.colliders.count * colliders.loads if colliders else 0
+            self.notes = np.zeros((runs, MOST_FRAMES, len(NOTES) + len(groups) * sum_entries(d) + loads))
         build = build_batch_kernel if on_cpu else build_gpu_launch
         self._launch = build(self.device, self.layout)
 

@@ -4,9 +4,13 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
+from mpmcli.boundaries.collider_motion import ColliderMotion
+from mpmcli.boundaries.colliders import Colliders
+from mpmcli.boundaries.moving_faces import MovingFaces
 from mpmcli.boundaries.rough_faces import RoughFaces
 from mpmcli.boundaries.walls import Walls
 from mpmcli.boundaries.zeroed_walls import ZeroedWalls
+from mpmcli.solver.activity import Emission
 from mpmcli.solver.batch_values import BatchValues
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid
@@ -23,8 +27,10 @@ class Device:
     Attributes:
         runs: number of runs; room: particles of each, per group.
         groups, orders: of each law, with the particles of all runs.
-        friction: coefficients of the walls of each run.
+        friction, moving: coefficients and velocities of the walls of each run.
+        colliders, motion: those of each run, and how they move; None where there are none.
         values, gravity: numbers that expressions read, and gravity where it varies.
+        emission: the mouths of emitters, None where there are none.
     """
 
     runs: int
@@ -35,10 +41,19 @@ class Device:
     orders: Sequence[TileOrder]
     walls: Walls | ZeroedWalls
     friction: RoughFaces
+    moving: MovingFaces
     nodes: NodeUpdate
     particles: ParticleUpdate
     values: BatchValues
     gravity: Gravity
+    colliders: Colliders | None = None
+    motion: ColliderMotion | None = None
+    emission: Emission | None = None
+
+    @property
+    def comes_and_goes(self) -> bool:
+        """Whether particles come or go."""
+        return self.groups[0].comes_and_goes
 
 
 def _changed(thing: object, **attributes: object) -> object:
@@ -65,15 +80,22 @@ def views(
         gradient_scale=scale,
         box=box,
         first_node=w * device.grid.node_count,
+        period=device.grid.period.seen_from(w),
     )
     friction = _changed(device.friction, first=w * len(device.friction.faces))
-    walls = _changed(device.walls, last=last, friction=friction)
+    moving = _changed(device.moving, first=w * len(device.moving.faces))
+    walls = _changed(device.walls, last=last, friction=friction, moving=moving)
     images = device.nodes.images
     if images is not None:
-        walls.first_plane = w * len(walls.separating)
-        walls.first_rough = w * len(walls.rough)
-        images = _changed(images, walls=walls)
-    nodes = _changed(device.nodes, grid=grid, images=images, boundaries=(walls,))
+        # Beside walls that set velocities to zero only periodic faces have images.
+        mirrors = walls if images.walls is device.walls else _changed(images.walls, last=last)
+        mirrors.first_plane = w * len(mirrors.separating)
+        mirrors.first_rough = w * len(mirrors.rough)
+        images = _changed(images, walls=mirrors)
+    colliders = device.colliders
+    if colliders is not None:
+        colliders = _changed(colliders, run=w, spacing=h)
+    nodes = _changed(device.nodes, grid=grid, images=images, boundaries=(walls,), colliders=colliders)
     particles = _changed(
         device.particles,
         grid=grid,
@@ -81,8 +103,11 @@ def views(
         last=last,
         first_lost=w * len(device.groups),
         friction=friction,
+        moving=moving,
         run=w,
     )
-    orders = tuple(_changed(order, grid=grid, first_tile=w * (order.tiles + 1)) for order in device.orders)
-    groups = tuple(group.seen_from(w) if group.pushed else group for group in device.groups)
+    orders = tuple(
+        _changed(order, grid=grid, extent=extent, first_tile=w * (order.bins + 1)) for order in device.orders
+    )
+    groups = tuple(group.seen_from(w) if group.pushed or group.repeats else group for group in device.groups)
     return grid, nodes, particles, orders, groups

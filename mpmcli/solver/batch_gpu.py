@@ -16,7 +16,7 @@ from mpmcli.solver.batch_steps import BatchSteps
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
-from mpmcli.solver.volume_average import add_volume, cell_of, missing_to_mean
+from mpmcli.solver.volume_average import add_volume, clear_mean, missing_to_mean
 
 # Steps of a launch, after which the host attends to the runs that need it.
 STEPS = 32
@@ -32,6 +32,7 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     members = tuple(enumerate(groups))
     real, count = layout.real, layout.count
     drifts = device.particles.touches or not all(group.total for group in groups)
+    moves = device.motion is not None
     steps = BatchSteps(layout, [group.law for group in groups], device.values, drifts=drifts)
     lost, node_count = device.particles.lost, device.grid.node_count
     contact, friction = device.nodes.needs_contact, device.nodes.needs_friction
@@ -93,6 +94,10 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
                     for a in ti.static(range(d)):
                         own[VECTORS + a] = pulled[a]
                 constants[w] = own
+                if ti.static(moves):
+                    start = numbers[w, real.time]
+                    device.values.set_motions(w, device.motion, start, start + dt)
+                    device.motion.advance(w, dt)
                 for g in ti.static(range(len(groups))):
                     rates[w, g] = NOTHING
                     changes[w, g] = 0.0
@@ -108,7 +113,7 @@ def build_gpu_launch(device: Device, layout: Layout) -> Callable[[np.ndarray, np
     def start_mean(g: ti.template(), w: int, p: int, counts: ti.template()):
         h, inverse, scale, box, last, extent = place(w, counts)
         grid, _nodes, _particles, _orders, seen = ti.static(views(device, w, h, inverse, scale, box, last, extent))
-        grid.means[g][cell_of(grid, seen[g].on_grid(p))] = ti.Vector.zero(float, 2)
+        clear_mean(grid, g, seen[g], p)
 
     @ti.func
     def add_to_mean(g: ti.template(), w: int, p: int, counts: ti.template()):

@@ -11,7 +11,9 @@ from mpmcli.solver.batch import Batch
 class BatchGroup:
     """The particles of one law of one run; attributes as of `ParticleGroup`, and its first particle and table row."""
 
-    def __init__(self, batch: Batch, g: int, slot: int, law: Law, bodies: list[int], rows: np.ndarray, count: int):
+    def __init__(
+        self, batch: Batch, g: int, slot: int, law: Law, bodies: list[int], rows: np.ndarray, count: int, active: int
+    ):
         self.law, self.bodies, self.count = law, tuple(bodies), count
         self.arrays = batch.device.groups[g]
         self.total = self.arrays.total
@@ -19,6 +21,14 @@ class BatchGroup:
         self.rows = rows.astype(self.real)
         self.first = slot * batch.kind.particles[g]
         self.row = slot * batch.kind.bodies[g]
+        self.floor: np.ndarray | None = None
+        self._counts, self._column = batch.counts[slot], batch.layout.count.particles[g]
+        self._counts[self._column], self._counts[batch.layout.count.capacity[g]] = active, count
+
+    @property
+    def active(self) -> int:
+        """Particles that take part, which come first."""
+        return int(self._counts[self._column])
 
     def to_numpy(self) -> dict[str, np.ndarray]:
         """Return x, v, C, deformation, internal, (n, k), id and body, (n), in the solver's order."""

@@ -11,6 +11,7 @@ import numpy as np
 import taichi as ti
 
 from mpmcli.solver.batch_device import Device, views
+from mpmcli.solver.batch_emission import BatchEmission
 from mpmcli.solver.batch_layout import ATTEND, GOING, LOST, MEASURE, NOTES, Layout
 from mpmcli.solver.batch_phases import BatchPhases
 from mpmcli.solver.batch_steps import BatchSteps
@@ -35,10 +36,11 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
     team = BatchThreads(phases, device.runs)
     noted = tuple((k, getattr(real, name)) for k, name in enumerate(NOTES) if hasattr(real, name))
     counted = tuple((k, getattr(count, name)) for k, name in enumerate(NOTES) if hasattr(count, name))
-    alone = threads == 1
+    alone, collides = threads == 1, device.colliders is not None
     next_run = ti.field(int, shape=())
     # Of each run and axis the first and the last node at which a stencil began when particles were sorted.
     stencils = ti.field(int, shape=(2 * device.runs, d))
+    emission = BatchEmission(device, layout, stencils)
 
     @ti.func
     def measure(w: int, numbers: ti.template(), counts: ti.template()):
@@ -58,6 +60,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
         """Find the range of the stencils of particles that were sorted."""
         low = ti.Vector([2**30] * d)
         high = ti.Vector([-1] * d)
+        emission.count_active(w, counts)
         h, inverse, scale, box, last, extent = phases.place(w, numbers, counts)
         _grid, _nodes, _particles, orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
         if ti.static(device.particles.touches):
@@ -69,9 +72,22 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
                 low, high = ti.min(low, base), ti.max(high, base)
             if ti.static(phases.shared):
                 phases.places.divide(g, own)
+        if ti.static(device.comes_and_goes):
+            # Where none takes part there is a box all the same.
+            if high[0] < 0:
+                for a in ti.static(range(d)):
+                    low[a], high[a] = PAD, PAD
         for a in ti.static(range(d)):
             stencils[w * 2, a], stencils[w * 2 + 1, a] = low[a], high[a]
         numbers[w, real.drift] = 0.0
+
+    @ti.func
+    def enter(w: int, numbers: ti.template(), counts: ti.template()):
+        """Let the sheets of emitters enter that are due."""
+        if numbers[w, real.due] <= numbers[w, real.time]:
+            h, inverse, scale, box, last, extent = phases.place(w, numbers, counts)
+            _grid, _nodes, _particles, orders, _all = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+            emission.enter(orders, w, numbers, counts)
 
     @ti.func
     def sort_on(w: int, phase: int, numbers: ti.template(), counts: ti.template()):
@@ -88,7 +104,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
         drift = ti.cast(ti.ceil(numbers[w, real.drift]), int)
         for a in ti.static(range(d)):
             last_wall = PAD + counts[w, count.cells[a]]
-            first, last = box_of(device.grid, stencils[w * 2, a], stencils[w * 2 + 1, a], drift, last_wall)
+            first, last = box_of(device.grid, a, stencils[w * 2, a], stencils[w * 2 + 1, a], drift, last_wall)
             device.grid.box[w * 2, a] = first
             device.grid.box[w * 2 + 1, a] = last - first + 1
         if ti.static(phases.shared):
@@ -105,6 +121,8 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
                 notes[w, frame, ti.static(len(NOTES) + g * sum_entries(d)) + k] = sums[k]
             if sums[ti.static(SOUND)] == 0:
                 sound = False
+        if ti.static(collides):
+            device.colliders.sum_up(w, frame, ti.static(len(NOTES) + len(groups) * sum_entries(d)), notes)
         for k, column in ti.static(noted):
             notes[w, frame, k] = numbers[w, column]
         for k, column in ti.static(counted):
@@ -112,7 +130,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
         if sound:
             counts[w, count.recorded] = frame + 1
             for g in ti.static(range(len(groups))):
-                counts[w, count.row] += counts[w, count.particles[g]]
+                counts[w, count.row] += counts[w, count.capacity[g]]
             if counts[w, count.frame] < counts[w, count.frames]:
                 counts[w, count.frame] += 1
                 steps.aim(w, numbers, counts)
@@ -155,6 +173,8 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
                     if arrived and counts[w, count.records] == 1 and counts[w, count.status] != LOST and not recorded:
                         phase = phases.before_showing
                     elif going and not arrived and counts[w, count.budget] > 0:
+                        if ti.static(emission.needed):
+                            enter(w, numbers, counts)
                         if numbers[w, real.drift] >= numbers[w, real.drift_allowed]:
                             phase = phases.sorts
                         else:

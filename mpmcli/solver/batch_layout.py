@@ -12,28 +12,32 @@ from mpmcli.solver.state_bounds import ENTRIES
 # that ends beyond its time tables.
 IDLE, MEASURE, GOING, ATTEND, LOST, COLLAPSED, BEYOND = range(7)
 # Bounds on the step by their code; of equal ones the lower code counts, as in a comparison of `Limit`s.
-LIMITS = ("", "deformation", "force", "forced", "maximum", "speed", "viscosity", "wave")
+LIMITS = ("", "collider", "deformation", "force", "forced", "maximum", "speed", "viscosity", "wave")
 
 # Columns of a `HeldBound`, in its order.
 HELD = ("held", "low", "low_before", "held_steps")
-# Columns of the numbers, float64. The last four are constants: a literal in a kernel has the precision of particles.
+# Columns of the numbers, float64. `due` is when the next sheet of an emitter enters, `slowest` the least bound on the
+# speed that counts. Those of the last line but one are constants: a literal in a kernel has the precision of particles.
 REALS = (
     *("time", "target", "last_step", "unrelaxed", "speed", "courant", "drift", "owed", "stiffness"),
     *HELD,
     *("smallest", "smallest_courant", "largest", "largest_courant"),
-    *("growth_allowed", "safety", "maximum", "pull", "force", "collapse", "horizon", "end"),
-    *("spacing", "inverse_spacing", "gradient_scale"),
+    *("growth_allowed", "safety", "maximum", "pull", "force", "collider", "collapse", "horizon", "end"),
+    *("spacing", "inverse_spacing", "gradient_scale", "wall_speed"),
     *("drift_allowed", "hold", "rise", "slack", "infinity"),
+    *("due", "slowest"),
 )
 # Columns of the counts, int32. `records` is 1 where the kernel records frames, the next being `frame` of `frames`;
 # `recorded` is the number of those of this launch, for at most `room` of which `shown` has rows, from `row` on;
-# `affine`, `gradient` and `tau` are columns there.
+# `affine`, `gradient`, `tau` and `activity` are columns there. `blocked` is
+# the number of particles that found no room.
 COUNTS = (
     *("status", "arrived", "steps", "unrelaxed_steps", "budget", "limit", "stiffness_limit", "forced", "longest"),
-    *("records", "frame", "frames", "recorded", "room", "row", "affine", "gradient", "tau"),
+    *("records", "frame", "frames", "recorded", "room", "row", "affine", "gradient", "tau", "activity"),
+    "blocked",
 )
 # Columns of the notes on a recorded frame, float64, before the sums of each group.
-NOTES = ("time", "last_step", "smallest", "smallest_courant", "largest", "largest_courant", "limit", "steps")
+NOTES = ("time", "last_step", "smallest", "smallest_courant", "largest", "largest_courant", "limit", "steps", "blocked")
 # Most frames that a launch records of a run.
 MOST_FRAMES = 128
 
@@ -55,12 +59,14 @@ class Layout:
 
     Attributes:
         real: column of each number by name: those of REALS; `gravity` and `extent`, per axis; `rate`, `change`,
-            `hardened`, `sensitivity`, `hardening` and (the first of) `maxima`, per group.
-        count: column of each count by name: those of COUNTS; `cells`, per axis; `particles`, `unwatched`, per group.
+            `hardened`, `sensitivity`, `hardening` and (the first of) `maxima`, per group; `due_of`, `period` and
+            `until`, per emitter.
+        count: column of each count by name: those of COUNTS; `cells`, per axis; `particles`, those that take part,
+            `capacity`, all of them, and `unwatched`, per group; `entered`, `sheets` and `waits`, per emitter.
         reals, counts: number of columns.
     """
 
-    def __init__(self, dimension: int, internal: Sequence[int]) -> None:
+    def __init__(self, dimension: int, internal: Sequence[int], emitters: int = 0) -> None:
         """Assign columns; `internal` are the numbers of internal variables of the laws."""
         columns: dict[str, object] = _columns(0, REALS)
         end, groups = len(REALS), [1] * len(internal)
@@ -68,12 +74,16 @@ class Layout:
             columns[name], end = _blocks(end, [1] * dimension)
         for name in ("rate", "change", "hardened", "sensitivity", "hardening"):
             columns[name], end = _blocks(end, groups)
+        for name in ("due_of", "period", "until"):
+            columns[name], end = _blocks(end, [1] * emitters)
         columns["maxima"], self.reals = _blocks(end, [ENTRIES + 2 * n for n in internal])
         self.real = SimpleNamespace(**columns)
         columns = _columns(0, COUNTS)
         columns["cells"], end = _blocks(len(COUNTS), [1] * dimension)
-        for name in ("particles", "unwatched"):
+        for name in ("particles", "capacity", "unwatched"):
             columns[name], end = _blocks(end, groups)
+        for name in ("entered", "sheets", "waits"):
+            columns[name], end = _blocks(end, [1] * emitters)
         self.counts = end
         self.count = SimpleNamespace(**columns)
 

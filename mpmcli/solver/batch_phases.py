@@ -12,13 +12,13 @@ from mpmcli.solver.batch_layout import Layout
 from mpmcli.solver.batch_regions import BatchRegions
 from mpmcli.solver.cpu_loops import average_pencils, clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.frame_reader import show_range
-from mpmcli.solver.lanes import advance_range
+from mpmcli.solver.lanes import advance_range, scatter_range
 from mpmcli.solver.ordering import share_start
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.sorting import count_tiles, keep, place_particles, take
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import NOTHING
-from mpmcli.solver.volume_average import average_for_frame
+from mpmcli.solver.volume_average import average_for_frame, average_range
 
 # Parts of a loop over the particles or the nodes of a region.
 SHARES = 4
@@ -47,15 +47,18 @@ class BatchPhases:
         self.rates = VECTORS + self.dimension
         self.values = ti.field(float, shape=(device.runs, self.rates + 2 * len(device.groups)))
         self.colours = device.orders[0].colours
+        self.moves = device.motion is not None
+        # What has come in since the sort follows all colours, on one thread.
+        passes = self.colours + device.comes_and_goes
         self.relaxes = any(group.law.relaxes for group in device.groups)
         # The first of the phases that average the volumes of a group, and of those that scatter it.
         averaged = [g for g, group in self.members if group.averaged]
-        self.averages = {g: 1 + n * self.colours for n, g in enumerate(averaged)}
-        begun = 1 + len(averaged) * self.colours
-        self.scatters = {g: begun + g * self.colours for g, _ in self.members}
+        self.averages = {g: 1 + n * passes for n, g in enumerate(averaged)}
+        begun = 1 + len(averaged) * passes
+        self.scatters = {g: begun + g * passes for g, _ in self.members}
         # (group, first phase) of all phases that go over its pencils, colour by colour.
         self.coloured = (*self.averages.items(), *self.scatters.items())
-        self.relaxing = begun + len(device.groups) * self.colours
+        self.relaxing = begun + len(device.groups) * passes
         self.contact = self.relaxing + self.relaxes
         self.friction = self.contact + device.nodes.needs_contact
         self.updating = self.friction + device.nodes.needs_friction
@@ -103,8 +106,13 @@ class BatchPhases:
             for a in ti.static(range(self.dimension)):
                 pull = ti.cast(numbers[w, self.real.gravity[a]], float)
                 self.values[w, VECTORS + a] = self.values[w, KICK] * pull
+        if ti.static(self.moves):
+            start = numbers[w, self.real.time]
+            self.device.values.set_motions(w, self.device.motion, start, start + dt)
+            self.device.motion.advance(w, dt)
         for g in ti.static(range(len(self.members))):
-            self.values[w, self.rates + 2 * g] = NOTHING
+            # A law may have no particle yet.
+            self.values[w, self.rates + 2 * g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
             self.values[w, self.rates + 2 * g + 1] = 0.0
 
     @ti.func
@@ -175,6 +183,14 @@ class BatchPhases:
                     scatter_pencils(particles, g, seen[g], orders[g], colour, first, after, kick, relaxed)
                 else:
                     average_pencils(grid, g, seen[g], orders[g], colour, first, after)
+            if ti.static(self.device.comes_and_goes):
+                if colour == self.colours and region == 0 and part == 0:
+                    first = orders[g].start[orders[g].first_tile + orders[g].tiles]
+                    after = w * ti.static(self.device.room[g]) + counts[w, self.count.particles[g]]
+                    if ti.static(begin == self.scatters[g]):
+                        scatter_range(particles, g, seen[g], first, after, kick, relaxed)
+                    else:
+                        average_range(grid, g, seen[g], first, after)
         for g in ti.static(tuple(self.averages)):
             if phase == self.before_showing and region == 0:
                 first = w * ti.static(self.device.room[g])
@@ -204,10 +220,16 @@ class BatchPhases:
                 sharpest = advance_range(particles, g, group, first, after, self.values[w, MOVED])
                 ti.atomic_max(self.values[w, self.rates + 2 * g], sharpest)
             if phase == self.showing:
+                if ti.static(self.device.comes_and_goes):
+                    # All of them, those that wait and those that left included.
+                    first, after = self.places.even_part(counts[w, self.count.capacity[g]], region)
+                    first += w * ti.static(self.device.room[g])
+                    after += w * ti.static(self.device.room[g])
+                    first, after = self.share(first, after, part)
                 row, last_step = counts[w, self.count.row], ti.cast(numbers[w, self.real.last_step], float)
                 affine, gradient = counts[w, self.count.affine], counts[w, self.count.gradient]
-                tau = counts[w, self.count.tau]
-                show_range(group, first, after - first, last_step, row, affine, gradient, tau, shown)
+                tau, activity = counts[w, self.count.tau], counts[w, self.count.activity]
+                show_range(seen[g], first, after - first, last_step, row, affine, gradient, tau, activity, shown)
         if phase >= self.sorts and phase <= self.last_of_sort:
             self.do_sort(orders, w, phase, region, counts)
 
@@ -215,7 +237,7 @@ class BatchPhases:
     def do_sort(self, orders: ti.template(), w: int, phase: int, region: int, counts: ti.template()):
         """Do the share of a region in a phase of the sort."""
         for g, group in ti.static(self.members):
-            first, count = w * ti.static(self.device.room[g]), counts[w, self.count.particles[g]]
+            first, count = w * ti.static(self.device.room[g]), counts[w, self.count.capacity[g]]
             begin, end = self.places.even_part(count, region)
             # Other runs may be at other groups, which begin elsewhere: the scratch memory of a run is that of no other.
             own = w * ti.static(self.device.orders[g].buffers.room)

@@ -54,15 +54,17 @@ class BatchRecorder:
         if count == 0:
             return []
         moments = []
-        for note in self._batch.notes[self._slot, :count, : len(NOTES)].tolist():
-            now, last_step, smallest, courant, largest, largest_courant, limit, steps = note
+        loads = self._loads(count)
+        for n, note in enumerate(self._batch.notes[self._slot, :count, : len(NOTES)].tolist()):
+            now, last_step, smallest, courant, largest, largest_courant, limit, steps, blocked = note
             step = before + int(steps)
             taken = NO_STEPS
             if step > self._steps:
                 taken = StepsTaken(
                     step - self._steps, (smallest, courant, LIMITS[int(limit)]), largest, largest_courant
                 )
-            moments.append(Moment(self._index, now, step, last_step, taken))
+            own = None if loads is None else loads[n]
+            moments.append(Moment(self._index, now, step, last_step, taken, own, int(blocked)))
             self._index, self._steps = self._index + 1, step
         rows = self._batch.shown[self._batch.first_row(self._slot) :][: count * self._particles]
         arrays = FrameArrays(builder.columns, rows.reshape(count, self._particles, -1))
@@ -85,10 +87,20 @@ class BatchRecorder:
         arrays.reals[0] = rows[:, : arrays.columns.count]
         return sums if sound else None
 
+    def _loads(self, count: int) -> np.ndarray | None:
+        """Return what each collider took up to the first frames of the last launch, (count, colliders, k)."""
+        colliders = self._batch.device.colliders
+        if colliders is None:
+            return None
+        first = len(NOTES) + len(self._batch.kind.members) * sum_entries(self._batch.kind.dimension)
+        own = self._batch.notes[self._slot, :count, first:].reshape(count, colliders.room, colliders.loads)
+        return own[:, : colliders.count[self._slot]].copy()
+
     def _sums(self, count: int) -> tuple[list[Sums], bool]:
         """Return the sums of each group at the first frames of the last launch, and whether all were sound."""
         d = self._batch.kind.dimension
-        own = self._batch.notes[self._slot, :count, len(NOTES) :].copy()
-        parts = np.split(own, own.shape[1] // sum_entries(d), axis=1)
+        groups = len(self._batch.kind.members)
+        own = self._batch.notes[self._slot, :count, len(NOTES) :][:, : groups * sum_entries(d)].copy()
+        parts = np.split(own, groups, axis=1)
         found = [sums_of(part, d) for part in parts]
         return [sums for sums, _ in found], all(sound.all() for _, sound in found)

@@ -11,11 +11,13 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.batch import Batch
+from mpmcli.solver.batch_emission import begin_emission
 from mpmcli.solver.batch_exchange import Exchange
 from mpmcli.solver.batch_group import BatchGroup
 from mpmcli.solver.batch_layout import ATTEND, BEYOND, COLLAPSED, GOING, IDLE, LOST, MEASURE, Row
 from mpmcli.solver.batch_recorder import BatchRecorder, steps_of
 from mpmcli.solver.batch_values import Drives
+from mpmcli.solver.collider_steps import read_loads
 from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.groups import require_inside
@@ -25,7 +27,7 @@ from mpmcli.solver.plan import members_of
 from mpmcli.solver.run import COLLAPSE, Run
 from mpmcli.solver.run_values import RunValues
 from mpmcli.solver.state import Progress
-from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
+from mpmcli.solver.state_bounds import Measurement, entries, floor_of, state_bounds_of
 from mpmcli.solver.step_control import StepControl
 from mpmcli.solver.sums import Sums
 
@@ -71,12 +73,13 @@ class BatchRun(Run):
         for g, shared in enumerate(batch.kind.members):
             bodies = members_of(scene, shared.name)
             own = [self._particles[i] for i in bodies]
-            law = type(shared)([scene.bodies[i].material for i in bodies], scene.dimension)
+            law = type(shared)([scene.sources[i].material for i in bodies], scene.dimension)
             count = sum(len(b.position) for b in own)
-            group = BatchGroup(batch, g, slot, law, bodies, table_of(law, own), count)
+            active = sum(len(b.position) for b in own if not b.waits)
+            group = BatchGroup(batch, g, slot, law, bodies, table_of(law, own), count, active)
+            group.floor = floor_of(scene, law, bodies)
             group.write(initial_states(law, own, [int(first_ids[i]) for i in bodies], self._origin))
             self.groups.append(group)
-            self._counts[self._count.particles[g]] = count
             lost = batch.device.particles.lost
             if lost[slot * len(batch.kind.members) + g] != NOT_LOST:
                 lost[slot * len(batch.kind.members) + g] = NOT_LOST
@@ -88,20 +91,13 @@ class BatchRun(Run):
         self._set_constants()
         self._row.set_counts(status=MEASURE)
 
-    @property
-    def step_count(self) -> int:
-        """Steps taken."""
-        return self.state.step_count if self._begun else 0
-
-    @property
-    def measure_seconds(self) -> float:
-        """Wall time spent so far on measuring the state for the limits."""
-        return self.state.step_control.seconds if self._begun else 0.0
-
     def _set_constants(self) -> None:
         """Store what does not change during the run."""
         scene, h = self.scene, self.spacing
-        self.batch.device.friction.write(scene, self.slot)
+        device = self.batch.device
+        for data in (device.friction, device.moving, device.grid.period, device.colliders, device.motion):
+            if data is not None:
+                data.write(scene, self.slot)
         gravity = scene.domain.gravity_at(0.0)
         for a, n in enumerate(scene.domain.cells):
             self._numbers[self._real.gravity[a]] = gravity[a]
@@ -111,13 +107,16 @@ class BatchRun(Run):
         self._row.set(
             spacing=h,
             inverse_spacing=1 / h,
-            gradient_scale=self.batch.device.grid.scheme.spline.inverse_moment / h,
+            gradient_scale=device.grid.scheme.spline.inverse_moment / h,
             safety=scene.time.safety,
             maximum=maximum,
             end=scene.time.end,
             horizon=-math.inf if self._means else math.inf,
             force=math.inf,
+            wall_speed=scene.domain.wall_speed,
+            collider=self._collider_bound,
         )
+        begin_emission(self.batch, self.slot, scene, self._particles)
         self._row.set_counts(forced=self._forced)
 
     def _measurement(self, g: int) -> Measurement:
@@ -254,6 +253,10 @@ class BatchRun(Run):
         if self.state.step_control.fresh:
             self.state.speed = self.state.step_control.speed
 
+    @property
+    def _blocked(self) -> int:
+        return self._row.count("blocked")
+
     def _fill_tables(self) -> None:
         """Let the kernel go on from the time that velocities have."""
         since = self.state.velocity_time
@@ -272,6 +275,10 @@ class BatchRun(Run):
         if sums is None:
             self._stop(self.last_step, self._lost())
         return sums
+
+    def _loads(self) -> np.ndarray | None:
+        colliders = self.batch.device.colliders
+        return None if colliders is None else read_loads(colliders, self.slot, len(self.scene.colliders))
 
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield as `Solver.frames`, where this is the only run of its batch.

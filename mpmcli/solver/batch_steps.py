@@ -13,8 +13,8 @@ from mpmcli.solver.batch_values import BatchValues
 from mpmcli.solver.volume_relaxation import INTERVAL
 from mpmcli.stability.limits import COURANT, DEFORMATION
 
-DEFORMING, FORCE, FORCED, MAXIMUM, CROSSING = (
-    LIMITS.index(name) for name in ("deformation", "force", "forced", "maximum", "speed")
+COLLIDER, DEFORMING, FORCE, FORCED, MAXIMUM, CROSSING = (
+    LIMITS.index(name) for name in ("collider", "deformation", "force", "forced", "maximum", "speed")
 )
 
 
@@ -46,7 +46,10 @@ class BatchSteps:
         kick = ti.min(due_kick, dt / numbers[w, self.real.safety])
         since = self.velocity_time(w, numbers)
         # First: as long as the tables hold another time, the step means nothing.
-        if since + kick > numbers[w, self.real.horizon]:
+        ends = since + kick
+        if ti.static(len(self.values.motions) > 0):
+            ends = ti.max(ends, numbers[w, self.real.time] + dt)
+        if ends > numbers[w, self.real.horizon]:
             counts[w, self.count.status] = BEYOND
             dt = 0.0 * dt
         elif largest < numbers[w, self.real.collapse]:
@@ -84,7 +87,8 @@ class BatchSteps:
         counts[w, self.count.budget] -= 1
         if speed >= 0:
             courant = dt * speed / numbers[w, self.real.spacing]
-            numbers[w, self.real.speed] = speed
+            # What waits for an emitter counts from the start.
+            numbers[w, self.real.speed] = ti.max(speed, numbers[w, self.real.slowest])
             numbers[w, self.real.courant] = courant
             if ti.static(self.drifts):
                 numbers[w, self.real.drift] = numbers[w, self.real.drift] + courant
@@ -113,7 +117,7 @@ class BatchSteps:
             value = deformation
             limit = DEFORMING
         value = ti.min(value, numbers[w, self.real.held])
-        speed = numbers[w, self.real.speed]
+        speed = ti.max(numbers[w, self.real.speed], numbers[w, self.real.wall_speed])
         pull = numbers[w, self.real.pull]
         if ti.static(self.values.gravity_varies):
             # The next kick ends in the middle of a step that is no longer than the other bounds allow.
@@ -130,6 +134,10 @@ class BatchSteps:
         if force < value or (force == value and limit > FORCE):
             value = force
             limit = FORCE
+        collider = numbers[w, self.real.collider]
+        if collider < value or (collider == value and limit > COLLIDER):
+            value = collider
+            limit = COLLIDER
         value = numbers[w, self.real.safety] * value
         maximum = numbers[w, self.real.maximum]
         if maximum < value:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from mpmcli.scene import Scene
-from mpmcli.scene.expression import Tree
+from mpmcli.scene.expression import Tree, names_in
 from mpmcli.solver.forces import ForceTerms, gravity_terms
 from mpmcli.solver.run_values import DeviceValues, Entries, Place
 from mpmcli.solver.time_tables import TimeTables
@@ -19,11 +19,13 @@ class Drives:
     Attributes:
         gravity: along each axis, of the numbers of a run; nothing where it is steady.
         forces: on the particles of each law.
+        motions: of each collider that moves, for velocity and spin the place of what depends on time, None of others.
         timed: of each number of a run whether it depends on time.
     """
 
     gravity: tuple[Tree | Place, ...]
     forces: tuple[ForceTerms, ...]
+    motions: tuple[tuple[Place | None, ...], ...]
     timed: tuple[bool, ...]
 
     @staticmethod
@@ -32,7 +34,9 @@ class Drives:
         entries = Entries(scene.domain.origin, constant=True)
         gravity = gravity_terms(scene, entries)
         forces = tuple(ForceTerms.of(scene, own, entries, several=True) for own in members)
-        return Drives(gravity, forces, entries.timed), entries.found
+        moving = [collider.motion.rates for collider in scene.colliders if collider.motion.moves]
+        motions = tuple(tuple(entries.placed(tree) if names_in(tree) else None for tree in rates) for rates in moving)
+        return Drives(gravity, forces, motions, entries.timed), entries.found
 
 
 @ti.data_oriented
@@ -50,6 +54,13 @@ class BatchValues:
         # Each number that depends on time, with its table.
         self.timed = tuple(enumerate(timed))
         self.tables = TimeTables(runs, len(timed)) if timed else None
+        # Of the colliders that move: (which, of velocity and spin which, table).
+        self.motions = tuple(
+            (m, a, timed.index(leaf.index))
+            for m, places in enumerate(drives.motions)
+            for a, leaf in enumerate(places)
+            if leaf is not None
+        )
         self.gravity_varies = bool(drives.gravity)
         self.gravity = tuple(
             (leaf.index, timed.index(leaf.index) if leaf.index in timed else -1) for leaf in drives.gravity
@@ -61,6 +72,13 @@ class BatchValues:
         for table, k in ti.static(self.timed):
             row = w * ti.static(len(self.timed)) + table
             self.device.field[w, k] = ti.cast(self.tables.mean(row, start, end), float)
+
+    @ti.func
+    def set_motions(self, w: int, motion: ti.template(), start: ti.f64, end: ti.f64):
+        """Set the rates of the colliders of a run that depend on time to their means over a step."""
+        for m, a, table in ti.static(self.motions):
+            row = w * ti.static(len(self.timed)) + table
+            motion.rates[w * ti.static(len(motion.moving)) + m, a] = self.tables.mean(row, start, end)
 
     @ti.func
     def largest_gravity(self, w: int, start: ti.f64, end: ti.f64):

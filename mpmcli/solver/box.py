@@ -11,7 +11,7 @@ from mpmcli.solver.splines import PAD
 
 
 @ti.func
-def box_of(grid: ti.template(), low: int, high: int, drift: int, last_wall: int):
+def box_of(grid: ti.template(), axis: ti.template(), low: int, high: int, drift: int, last_wall: int):
     """Return the first and the last node in use along an axis.
 
     Args:
@@ -23,10 +23,19 @@ def box_of(grid: ti.template(), low: int, high: int, drift: int, last_wall: int)
     first = low - drift
     last = high + drift + reach
     # A box that comes near a wall holds the images beyond it too: they are read and written.
-    if first <= PAD + REACH:
-        first = PAD - REACH
-    if last >= last_wall - REACH:
-        last = last_wall + REACH
+    if ti.static(axis in grid.period.axes):
+        if first <= PAD + PAD or last >= last_wall - PAD:
+            first = 0
+            last = last_wall + PAD
+    else:
+        if ti.static((axis, 0) in grid.opens):
+            first = ti.max(first, 0)
+        elif first <= PAD + REACH:
+            first = PAD - REACH
+        if ti.static((axis, 1) in grid.opens):
+            last = ti.min(last, last_wall + PAD)
+        elif last >= last_wall - REACH:
+            last = last_wall + REACH
     return first, last
 
 
@@ -38,6 +47,7 @@ def build_box_search(grid: Grid, orders: Sequence[TileOrder], drift: int) -> Cal
     """
     d = grid.dimension
     orders = tuple(orders)
+    may_be_empty = any(order.bins > order.tiles for order in orders)
     tile_low = ti.field(int, shape=d)
     tile_high = ti.field(int, shape=d)
 
@@ -57,7 +67,10 @@ def build_box_search(grid: Grid, orders: Sequence[TileOrder], drift: int) -> Cal
                         rest = rest // ti.static(grid.tiles[a])
         for a in ti.static(range(d)):
             low, high = grid.tile * tile_low[a], grid.tile * tile_high[a] + grid.tile - 1
-            first, last = box_of(grid, low, high, drift, ti.static(PAD + grid.cells[a]))
+            if ti.static(may_be_empty):
+                if tile_high[a] < 0:
+                    low, high = PAD, PAD
+            first, last = box_of(grid, a, low, high, drift, ti.static(PAD + grid.cells[a]))
             grid.box[0, a] = first
             grid.box[1, a] = last - first + 1
 

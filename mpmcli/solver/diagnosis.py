@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpmcli.errors import RunError
-from mpmcli.scene import Scene
+from mpmcli.scene import Domain, Scene
 from mpmcli.solver.particle_update import SMALLEST_J
 from mpmcli.solver.snapshot import Snapshot
 from mpmcli.stability.limits import Limit
@@ -83,8 +83,8 @@ def rate_of_change(snapshot: Snapshot, spacing: float) -> np.ndarray:
     return speed / spacing + np.abs(snapshot.C.astype(np.float64)).sum((1, 2))
 
 
-def cause_of(snapshot: Snapshot, p: int, dt: float, size: tuple[float, ...]) -> str:
-    """Return what happened to particle p (in solver order) in a step of dt (s) in a domain of this size, m."""
+def cause_of(snapshot: Snapshot, p: int, dt: float, domain: Domain) -> str:
+    """Return what happened to particle p (in solver order) in a step of dt (s) in a domain."""
     values = (snapshot.x[p], snapshot.v[p], snapshot.C[p], snapshot.deformation[p])
     if not all(np.isfinite(value).all() for value in values):
         return NOT_FINITE
@@ -95,7 +95,7 @@ def cause_of(snapshot: Snapshot, p: int, dt: float, size: tuple[float, ...]) -> 
         return f"{CRUSHED} (J = {J:.3g})"
     speed = float(np.linalg.norm(snapshot.v[p].astype(np.float64)))
     going = snapshot.x[p].astype(np.float64) + dt * snapshot.v[p]
-    if (going < 0).any() or (going > np.array(size)).any():
+    if (((going < 0) | (going > np.array(domain.size))) & ~np.array(domain.periodic)).any():
         return f"{LEFT} at {speed:.4g} m/s"
     return f"{OUTRAN} at {speed:.4g} m/s"
 
@@ -118,7 +118,7 @@ def diagnose(
         step,
         time,
         int(snapshot.id[p]),
-        scene.bodies[int(snapshot.body[p])].name,
+        scene.sources[int(snapshot.body[p])].name,
         tuple((snapshot.x[p].astype(np.float64) + scene.domain.origin).tolist()),
         cause,
         limit.name,

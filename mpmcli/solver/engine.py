@@ -89,7 +89,7 @@ def choose_engine(
     if not backend.on_cpu:
         return backend, False
     particles = estimate_particles(scene)
-    little = LITTLE_WORK * len({body.material.law for body in scene.bodies}) ** 2
+    little = LITTLE_WORK * len({body.material.law for body in scene.sources}) ** 2
     optimisation = "few" if particles * expected_steps() < little else "most"
     count = threads or useful_threads(particles, backend.threads)
     return replace(backend, threads=count, optimisation=optimisation), True

@@ -7,9 +7,10 @@ from functools import partial
 import numpy as np
 
 from mpmcli.scene import Scene
+from mpmcli.scene.entry import tree_of
 from mpmcli.scene.quadrature import largest_of
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.forces import ForceTerms, Gravity, GroupForce, build_push, gravity_terms, tree_of
+from mpmcli.solver.forces import ForceTerms, Gravity, GroupForce, build_push, gravity_terms
 from mpmcli.solver.particle_arrays import ParticleArrays
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.run_values import DeviceValues, Entries, RunValues

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import taichi as ti
 
 from mpmcli.scene import Scene
-from mpmcli.scene.entry import Entry
+from mpmcli.scene.entry import tree_of
 from mpmcli.scene.expression import INITIAL, POSITION, Number, Tree, names_in
 from mpmcli.scene.schema import Force
 from mpmcli.solver.backend import Backend
@@ -30,15 +30,10 @@ STEEPEST = 1e30
 RECURSION = 4000
 
 
-def tree_of(entry: Entry) -> Tree:
-    """Return the tree of a number or an expression."""
-    return Number(entry) if isinstance(entry, float) else entry.tree
-
-
 def forces_on(scene: Scene, members: Sequence[int]) -> tuple[Force, ...]:
     """Return the forces that act on any of some bodies, given by their indices."""
-    names = {scene.bodies[i].name for i in members}
-    return tuple(force for force in scene.forces if force.body is None or force.body in names)
+    names = {scene.sources[i].name for i in members}
+    return tuple(force for force in scene.pushes if force.body is None or force.body in names)
 
 
 def needs_initial(scene: Scene, members: Sequence[int]) -> bool:
@@ -85,7 +80,7 @@ class ForceTerms:
             several: whether particles know their body.
         """
         forces = forces_on(scene, members)
-        names = [scene.bodies[i].name for i in members]
+        names = [scene.sources[i].name for i in members]
         terms, found = [], frozenset()
         for force in forces:
             trees = [tree_of(entry) for entry in force.acceleration]
@@ -174,8 +169,9 @@ class GroupForce:
         X = ti.Vector.zero(float, d)
         a = ti.Vector.zero(float, d)
         slope = ti.Matrix.zero(float, d, d)
+        here = group.place(p)
         for c in ti.static(range(d)):
-            x[c] = group.x[p][c]
+            x[c] = here[c]
             if ti.static(group.keeps_initial):
                 X[c] = group.initial[p][c]
         if ti.static(self.moves and with_slope):

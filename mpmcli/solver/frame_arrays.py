@@ -24,21 +24,25 @@ class FrameColumns:
 
     In this order: x relative to the origin of the domain, m, and v, m/s, d each; the stored energy per volume at rest,
     J/m^3, half a step earlier, where the velocities are; J or det F and the internal variables of the law after plastic
-    flow; and, where a field needs it, C, F after plastic flow, d^2 each, and tau, Pa, see `stress_entries`.
+    flow; and, where a field needs it, C, F after plastic flow, d^2 each, and tau, Pa, see `stress_entries`; and where
+    particles come and go their status, see `solver.activity`.
 
     Attributes:
-        first: the first column of each, by name: "x", "v", "energy", "J", "internal", "affine", "gradient", "tau"; -1
-            where it is left out.
+        first: the first column of each, by name: "x", "v", "energy", "J", "internal", "affine", "gradient", "tau",
+            "activity"; -1 where it is left out.
         widths: number of columns of each that is there.
         count: of all columns; dimension: d.
     """
 
-    def __init__(self, dimension: int, internal: int, fields: Collection[str] = ()) -> None:
+    def __init__(
+        self, dimension: int, internal: int, fields: Collection[str] = (), *, comes_and_goes: bool = False
+    ) -> None:
         """Assign columns.
 
         Args:
             internal: most internal variables of a law of the run.
             fields: of the frames.
+            comes_and_goes: whether particles come and go.
         """
         d = dimension
         widths = {"x": d, "v": d, "energy": 1, "J": 1, "internal": internal}
@@ -48,8 +52,10 @@ class FrameColumns:
             widths["gradient"] = d * d
         if not set(STRESSES).isdisjoint(fields):
             widths["tau"] = len(stress_entries(d))
+        if comes_and_goes:
+            widths["activity"] = 1
         self.dimension, self.widths, self.count = d, widths, 0
-        self.first = dict.fromkeys(("affine", "gradient", "tau"), -1)
+        self.first = dict.fromkeys(("affine", "gradient", "tau", "activity"), -1)
         for name, width in widths.items():
             self.first[name] = self.count
             self.count += width
@@ -67,9 +73,9 @@ class FrameArrays:
     reals: np.ndarray
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return the columns of a name, a view of `reals`: (T, n) of the energy and of J, else (T, n, columns)."""
+        """Return the columns of a name, a view of `reals`: (T, n) of energy, J and status, else (T, n, columns)."""
         first = self.columns.first[name]
-        if name in ("energy", "J"):
+        if name in ("energy", "J", "activity"):
             return self.reals[..., first]
         return self.reals[..., first : first + self.columns.widths[name]]
 

@@ -31,7 +31,7 @@ from mpmcli.solver.volume_average import stretch_to
 # Entry of the sums that is 0 where a particle is crushed, inverted or not finite, else 1.
 SOUND = 5
 # Columns of a frame that may be left out.
-CHOSEN = ("affine", "gradient", "tau")
+CHOSEN = ("affine", "gradient", "tau", "activity")
 
 
 @ti.func
@@ -44,6 +44,7 @@ def show_range(
     affine_at: int,
     gradient_at: int,
     tau_at: int,
+    activity_at: int,
     shown: ti.template(),
 ):
     """Write what some particles show, as `FrameColumns` has it, each to the row of its number after `row`.
@@ -52,7 +53,7 @@ def show_range(
 
     Args:
         dt: the last step, s.
-        affine_at, gradient_at, tau_at: columns, -1 where they are left out.
+        affine_at, gradient_at, tau_at, activity_at: columns, -1 where they are left out.
     """
     d = ti.static(group.dimension)
     keeps_F = ti.static(group.law.deformation == "F")
@@ -106,8 +107,9 @@ def show_range(
             p = begin + lane
             r = row + group.id[p]
             velocity, C = group.motion(p)
+            place = group.place(p)
             for c in ti.static(range(d)):
-                shown[r, c] = group.x[p][c]
+                shown[r, c] = place[c]
                 shown[r, d + c] = velocity[c]
             for i in ti.static(range(2 + inner_count)):
                 shown[r, 2 * d + i] = found[i, lane]
@@ -126,6 +128,8 @@ def show_range(
             if tau_at >= 0:
                 for column in ti.static(range(len(entries))):
                     shown[r, tau_at + column] = found[2 + inners + d * d + column, lane]
+            if ti.static(group.comes_and_goes):
+                shown[r, activity_at] = ti.cast(group.activity[p], float)
         begin += LANES
 
 
@@ -148,6 +152,9 @@ def sum_range(group: ti.template(), first: int, count: int, row: int, shown: ti.
         m = ti.cast(table[MASS], ti.f64)
         velocity, C = group.motion(p)
         place = ti.cast(group.x[p], ti.f64)
+        if ti.static(group.repeats):
+            for c in ti.static(range(d)):
+                place[c] = ti.cast(shown[row + group.id[p], c], ti.f64)
         speed = ti.cast(velocity, ti.f64)
         affine = ti.cast(C, ti.f64)
         total[0] += m
@@ -187,10 +194,10 @@ def sums_of(found: np.ndarray, dimension: int) -> tuple[Sums, np.ndarray]:
 
 
 def build_frame_reader(group: ParticleArrays) -> Callable[[float, int, int, FrameArrays], tuple[Sums, bool]]:
-    """Return the reader of a range of particles: a function (dt, first, count, arrays).
+    """Return the reader of a range of particles: a function (dt, first, count, active, arrays).
 
     Its `dt` is the last step, s. It fills the rows of those particles in `arrays`, which have one time, and returns the
-    sums, and whether every particle is sound.
+    sums over those that take part, the first `active` ones, and whether each of these is sound.
     """
     d, serial = group.dimension, group.serial
     width = sum_entries(d)
@@ -200,25 +207,27 @@ def build_frame_reader(group: ParticleArrays) -> Callable[[float, int, int, Fram
         dt: float,
         first: int,
         count: int,
+        active: int,
         affine_at: int,
         gradient_at: int,
         tau_at: int,
+        activity_at: int,
         shown: ti.types.ndarray(),
         sums: ti.types.ndarray(),
     ):
         ti.loop_config(serialize=serial)
         for chunk in range((count + LANES - 1) // LANES):
             own = ti.min(LANES, count - chunk * LANES)
-            show_range(group, first + chunk * LANES, own, dt, 0, affine_at, gradient_at, tau_at, shown)
+            show_range(group, first + chunk * LANES, own, dt, 0, affine_at, gradient_at, tau_at, activity_at, shown)
         ti.loop_config(serialize=True)
         for _ in range(1):
-            total = sum_range(group, first, count, 0, shown)
+            total = sum_range(group, first, active, 0, shown)
             for k in ti.static(range(width)):
                 sums[k] = total[k]
 
-    def reader(dt: float, first: int, count: int, arrays: FrameArrays) -> tuple[Sums, bool]:
+    def reader(dt: float, first: int, count: int, active: int, arrays: FrameArrays) -> tuple[Sums, bool]:
         found = np.empty(width)
-        read(dt, first, count, *chosen_columns(arrays.columns), arrays.reals[0], found)
+        read(dt, first, count, active, *chosen_columns(arrays.columns), arrays.reals[0], found)
         sums, sound = sums_of(found[None], d)
         return sums, bool(sound[0])
 

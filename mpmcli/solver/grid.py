@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 import taichi as ti
 
+from mpmcli.solver.period import Period
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.transfer_scheme import TransferScheme
 
@@ -67,6 +68,9 @@ class Grid:
         holding: `filling`, or else `nodes`.
         means: Vector(2) field per group: of the particles in the cell behind a node the volume at rest times ln J, and
             the volume at rest, m^3; None of groups that do not average them (`volume_average`). kept_means: the others.
+        period: the axes along which the domain repeats.
+        weighs_before: whether `before` holds masses too, of which walls that move ask for.
+        opens: (axis, side) of every face that material may leave through: nodes beyond it are like all others.
         box: (2, d) ints: first node in use and number of nodes in use, per axis.
     """
 
@@ -82,11 +86,15 @@ class Grid:
         tile: int,
         keeps_filling: bool = False,
         averaged: Sequence[bool] = (),
+        period: Period | None = None,
+        walls_move: bool = False,
+        opens: Sequence[tuple[int, int]] = (),
     ) -> None:
         """Allocate nodes for a number of runs, the nodes of one after those of another.
 
         Args:
             averaged: of each group, whether it averages changes of volume over cells.
+            opens: (axis, side) of every open face.
         """
         self.dimension = dimension
         self.width = width
@@ -103,6 +111,7 @@ class Grid:
             (o, sum(n * stride for n, stride in zip(o, self.strides, strict=False)))
             for o in product(range(scheme.spline.nodes), repeat=dimension - 1)
         )
+        self.opens = tuple(opens)
         self.first_node = 0
         self.node_count = int(np.prod(self.shape))
         self.nodes = ti.Vector.field(width, float, shape=runs * self.node_count)
@@ -114,6 +123,8 @@ class Grid:
             ti.Vector.field(2, float, shape=runs * self.node_count) if wanted else None for wanted in averaged
         )
         self.kept_means = tuple(means for means in self.means if means is not None)
+        self.period = period or Period((("slip", "slip"),) * dimension, at_once=False)
+        self.weighs_before = walls_move and scheme.keeps_before
         self.box = ti.field(int, shape=(2 * runs, dimension))
 
     @staticmethod
@@ -144,6 +155,16 @@ class Grid:
         for a in ti.static(range(self.dimension)):
             index += base[a] * self.strides[a]
         return index
+
+    @ti.func
+    def place_of(self, index: int):
+        """Return the integer coordinates of the node with a linear index."""
+        place = ti.Vector.zero(int, self.dimension)
+        rest = index - self.first_node
+        for a in ti.static(range(self.dimension)):
+            place[a] = rest // ti.static(self.strides[a])
+            rest = rest % ti.static(self.strides[a])
+        return place
 
     @ti.func
     def row_count(self):

@@ -13,6 +13,7 @@ from mpmcli.solver.grid import node_width
 from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.plan import members_of
+from mpmcli.solver.state_bounds import floor_of
 from mpmcli.solver.volume_average import averages_volume
 
 
@@ -30,9 +31,9 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
     first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
     layout = ti.Layout.AOS if backend.on_cpu else ti.Layout.SOA
     groups = []
-    for name in sorted({body.material.law for body in scene.bodies}):
+    for name in sorted({body.material.law for body in scene.sources}):
         members = members_of(scene, name)
-        law = laws()[name]([scene.bodies[i].material for i in members], scene.dimension)
+        law = laws()[name]([scene.sources[i].material for i in members], scene.dimension)
         groups.append(
             ParticleGroup(
                 law,
@@ -47,6 +48,8 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
                 total=scene.solver.solids == "total",
                 averaged=averages_volume(scene.solver, law),
                 slips=slips_in(scene.solver, rough_faces(scene)),
+                comes_and_goes=scene.comes_and_goes,
+                floor=floor_of(scene, law, members),
             )
         )
     return groups

@@ -3,20 +3,22 @@
 import math
 from collections.abc import Sequence
 
-from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.build_walls import build_walls
+from mpmcli.boundaries.moving_faces import MovingFaces, moving_faces
 from mpmcli.boundaries.rough_faces import RoughFaces, rough_faces
-from mpmcli.boundaries.walls import Walls, faces_on_grid
-from mpmcli.boundaries.zeroed_walls import ZeroedWalls
 from mpmcli.scene import Scene
+from mpmcli.solver.activity import open_faces
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.box import build_box_search
+from mpmcli.solver.collider_steps import ColliderSteps
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid, drift_allowed, node_width, tile_edge
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.ordering import SortBuffers, TileOrder
 from mpmcli.solver.particle_contact import DRIFT, contact_between
-from mpmcli.solver.particle_update import ParticleUpdate
+from mpmcli.solver.particle_update import BEYOND, ParticleUpdate
 from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.period import Period
 from mpmcli.solver.sorting import build_sort
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.step_cpu import build_cpu_step
@@ -34,6 +36,7 @@ class Kernels:
         orders: the tile order of each group.
         particles: the update of particles, with the record of lost ones.
         contact: the bins of particles of several bodies at rest on grids of their own, None where there are none.
+        colliders: those of the scene, None where there are none.
         drift_allowed: cells that a particle may move until particles are sorted again: without atomics only as far as
             its tile's colour allows.
         average: averages volumes over cells before a frame is read; None where no group does.
@@ -46,6 +49,13 @@ class Kernels:
         width = node_width(scene.dimension, on_cpu=backend.on_cpu)
         scheme = scheme_of(scene.solver)
         stencil = scheme.spline.nodes
+        faces = scene.domain.walls.faces(scene.dimension)
+        friction, moving = RoughFaces(rough_faces(scene)), MovingFaces(moving_faces(scene), scene.dimension)
+        period = Period(faces, at_once=not backend.on_cpu)
+        for data in (friction, moving, period):
+            data.write(scene)
+        for group in groups:
+            group.repeat(period)
         self.grid = Grid(
             scene.dimension,
             scene.domain.spacing,
@@ -55,20 +65,20 @@ class Kernels:
             tile=tile_edge(stencil, scene.dimension, on_cpu=backend.on_cpu),
             keeps_filling=needs_filling(scene, [group.law for group in groups]),
             averaged=[group.averaged for group in groups],
+            period=period,
+            walls_move=len(moving.faces) > 0,
+            opens=open_faces(faces),
         )
-        faces = scene.domain.walls.faces(scene.dimension)
-        friction = RoughFaces(rough_faces(scene))
-        friction.write(scene)
-        if scene.solver.walls == "zeroed":
-            images, walls = None, ZeroedWalls(faces, PAD, self.grid.cells, friction)
-        else:
-            on_grid = faces_on_grid(faces, scene.solver)
-            walls = Walls(on_grid, PAD, self.grid.cells, self.grid.shape, friction=friction)
-            images = MirrorImages(walls, scheme.spline.on_node)
-        nodes = NodeUpdate(self.grid, images, [walls])
+        walls, images = build_walls(
+            faces, scene.solver, PAD, self.grid.cells, self.grid.shape, scheme.spline.on_node, friction, moving
+        )
+        self.colliders = None
+        if scene.colliders:
+            self.colliders = ColliderSteps(scene, self.grid.shape, PAD, backend.arch)
+        nodes = NodeUpdate(self.grid, images, [walls], self.colliders and self.colliders.colliders)
         self.contact = contact_between(groups, [len(group.bodies) for group in groups], self.grid, backend)
         self.particles = ParticleUpdate(
-            self.grid, faces, len(groups), self.contact, friction, watches_box=not backend.on_cpu
+            self.grid, faces, len(groups), self.contact, friction, moving, watches_box=not backend.on_cpu
         )
         buffers = SortBuffers(groups)
         self.orders = [TileOrder(g, self.grid, buffers, backend.threads, backend.on_cpu) for g in groups]
@@ -76,6 +86,10 @@ class Kernels:
         self.drift_allowed = drift_allowed(self.grid.tile, stencil) if backend.on_cpu else float(self.grid.tile)
         if self.contact is not None:
             self.drift_allowed = DRIFT
+        if self.grid.opens:
+            # What passes an open face is retired before it leaves the grid.
+            self.drift_allowed = min(self.drift_allowed, BEYOND)
+        self._groups = groups if scene.comes_and_goes else ()
         self._find_box = build_box_search(self.grid, self.orders, math.ceil(self.drift_allowed))
         averages = any(group.averaged for group in groups)
         self.average = build_averaging(self.grid, groups, on_cpu=backend.on_cpu) if averages else None
@@ -88,6 +102,8 @@ class Kernels:
         """Sort the particles of every group by tile, and find the nodes in use."""
         for sort in self._sorts:
             sort.run()
+        for group, order in zip(self._groups, self.orders, strict=False):
+            group.set_active(int(order.start[order.tiles]))
         if self.contact is not None:
             self.contact.fill_all(self.particles.grid.spacing)
         self._find_box()

@@ -5,6 +5,7 @@ from typing import Protocol
 
 import taichi as ti
 
+from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.mirror_images import MirrorImages
 from mpmcli.solver.grid import Grid
 
@@ -27,9 +28,16 @@ class NodeUpdate:
     Attributes:
         images: mirror images behind walls, None where walls do not mirror.
         boundaries: what constrains the velocity, in turn.
+        colliders: what does so after them, None where there are none.
     """
 
-    def __init__(self, grid: Grid, images: MirrorImages | None, boundaries: Sequence[Boundary]) -> None:
+    def __init__(
+        self,
+        grid: Grid,
+        images: MirrorImages | None,
+        boundaries: Sequence[Boundary],
+        colliders: Colliders | None = None,
+    ) -> None:
         self.grid = grid
         self.dimension = grid.dimension
         self.images = images
@@ -37,6 +45,7 @@ class NodeUpdate:
         self.needs_contact = images is not None and images.needs_contact
         self.needs_friction = images is not None and images.needs_friction
         self.boundaries = tuple(boundaries)
+        self.collides, self.colliders = colliders is not None, colliders
 
     @ti.func
     def update(self, node: ti.template(), index: int, gravity_step: ti.template()):
@@ -47,7 +56,11 @@ class NodeUpdate:
         """
         speed_squared = 0.0
         # Where an image beyond a wall has mass, so has the node inside: a stencil that reaches the one holds the other.
-        if self.grid.nodes[index][ti.static(self.dimension)] > 0:
+        massive = self.grid.nodes[index][ti.static(self.dimension)] > 0
+        if ti.static(len(self.grid.period.axes) > 0):
+            # Not so beyond a periodic face.
+            massive = massive or self.images.near(node)
+        if massive:
             speed_squared = self.update_massive(node, index, gravity_step)
         return speed_squared
 
@@ -82,6 +95,11 @@ class NodeUpdate:
                 constrained = boundary.constrain(node, velocity)
                 for c in ti.static(range(d)):
                     velocity[c] = constrained[c]
+
+            if ti.static(self.collides):
+                met = self.colliders.constrain(node, velocity, value[d])
+                for c in ti.static(range(d)):
+                    velocity[c] = met[c]
 
             # Unfold.
             self.write(self.grid.nodes, node, index, mirrored, velocity, True)

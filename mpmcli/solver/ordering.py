@@ -13,6 +13,8 @@ import taichi as ti
 from mpmcli.solver.grid import Grid
 from mpmcli.solver.particle_arrays import ParticleArrays
 
+# Whether a particle waits, takes part, or has left, see `solver.activity`.
+WAITING, ACTIVE, RETIRED = range(3)
 # Taichi gives a CPU thread at least this many iterations of a parallel loop.
 CHUNK = 512
 # Tiles per entry of the two-level prefix sum.
@@ -55,7 +57,7 @@ class TileOrder:
     """The tile order of one group.
 
     Attributes:
-        start: (tiles + 1) int, first particle of each tile.
+        start: (bins + 1) int, first particle of each bin: the tiles, and see `bin_of`.
         first_tile: place in `start` of tile 0.
         work: (colours, threads + 1) int, first pencil of a colour of each thread.
     """
@@ -71,12 +73,16 @@ class TileOrder:
         self.tiles = 1
         for n in grid.tiles:
             self.tiles *= n
+        # Behind the tiles, where particles come and go, one bin of those that wait and one of those that left.
+        self.comes_and_goes = group.comes_and_goes
+        self.bins = self.tiles + 2 * self.comes_and_goes
+        self.extent = tuple(n * grid.spacing for n in grid.cells)
         self.pencil = grid.tiles[-1]
         self.colours = 2 ** (grid.dimension - 1)
-        self.spans = -(-self.tiles // SPAN)
+        self.spans = -(-self.bins // SPAN)
         self.first_tile = 0
-        self.start = ti.field(int, shape=runs * (self.tiles + 1))
-        self.cursor = ti.field(int, shape=(runs * self.tiles, threads))
+        self.start = ti.field(int, shape=runs * (self.bins + 1))
+        self.cursor = ti.field(int, shape=(runs * self.bins, threads))
         self.span_sum = ti.field(int, shape=self.spans)
         self.work = ti.field(int, shape=(self.colours, threads + 1))
 
@@ -95,6 +101,12 @@ class TileOrder:
         return base
 
     @ti.func
+    def settle(self, p: int):
+        """Put particle p back into the domain where that repeats."""
+        if ti.static(len(self.grid.period.axes) > 0):
+            self.grid.period.settle(self.group, p)
+
+    @ti.func
     def tile_of(self, p: int):
         """Return the linear index of the tile that holds the stencil's first node of particle p."""
         base = self.first_node_of(p)
@@ -102,6 +114,34 @@ class TileOrder:
         for a in ti.static(range(self.grid.dimension)):
             tile = tile * ti.static(self.grid.tiles[a]) + ti.raw_div(base[a], ti.static(self.grid.tile))
         return tile
+
+    @ti.func
+    def bin_of(self, p: int):
+        """Return the bin of particle p, its tile if it takes part; what lies beyond an open face is retired."""
+        place = 0
+        if ti.static(self.comes_and_goes):
+            status = self.group.activity[p]
+            if status == ACTIVE:
+                for axis, side in ti.static(self.grid.opens):
+                    x = self.group.x[p][axis]
+                    if ti.static(side == 0):
+                        if x < 0.0:
+                            status = RETIRED
+                            self.group.x[p][axis] = 0.0
+                    elif x > self.extent[axis]:
+                        status = RETIRED
+                        self.group.x[p][axis] = self.extent[axis]
+                if status == RETIRED:
+                    self.group.activity[p] = RETIRED
+                    for c in ti.static(range(self.group.v.n)):
+                        self.group.v[p][c] = 0.0
+            if status == ACTIVE:
+                place = self.tile_of(p)
+            else:
+                place = self.tiles + ti.cast(status == RETIRED, int)
+        else:
+            place = self.tile_of(p)
+        return place
 
     @ti.func
     def pencils_along(self, colour: int, axis: ti.template()):

@@ -9,6 +9,7 @@ from mpmcli.materials.elementary import exp
 from mpmcli.materials.law import Law
 from mpmcli.solver.grid import gradient_width
 from mpmcli.solver.particle_exchange import ParticleExchange
+from mpmcli.solver.period import Period
 
 # Entries of the per-body table that come before the constants of the law.
 MASS, VOLUME, CONSTANTS = 0, 1, 2
@@ -41,6 +42,8 @@ class ParticleArrays(ParticleExchange):
             (n), and `to_mean`, (n), ln J during P2G, and where a frame is read what it lacks to the mean of its cell.
         slip: how far a particle has slipped on the wall that pushes it, (n) Vector(d), m, where there is friction
             (`slips`), see `particle_friction`.
+        activity: (n) int, whether each waits, takes part or has left (`solver.activity`); None where all take part
+            always (`comes_and_goes` is false).
         force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
         table: per body a row of particle mass, particle volume and the constants of the law.
         real: numpy's type of the real fields.
@@ -61,6 +64,7 @@ class ParticleArrays(ParticleExchange):
         total: bool = False,
         averaged: bool = False,
         slips: bool = False,
+        comes_and_goes: bool = False,
     ) -> None:
         """Allocate.
 
@@ -91,8 +95,12 @@ class ParticleArrays(ParticleExchange):
         self.cell, self.to_mean = (ti.field(kind, shape=count) if averaged else None for kind in (int, float))
         self.slips = slips
         self.slip = ti.Vector.field(d, float, shape=count, layout=layout) if slips else None
+        self.comes_and_goes = comes_and_goes
+        self.activity = ti.field(int, shape=count) if comes_and_goes else None
         self.pushed = False
         self.force = None
+        self.period: Period | None = None
+        self.repeats = False
         self.run = 0
         self.table = ti.Vector.field(table[1], float, shape=table[0])
 
@@ -100,10 +108,16 @@ class ParticleArrays(ParticleExchange):
         """Let a force act on the particles, see `forces.GroupForce`."""
         self.pushed, self.force = True, force
 
+    def repeat(self, period: Period) -> None:
+        """Let the domain repeat along the periodic axes, if there are any."""
+        self.period, self.repeats = period, len(period.axes) > 0
+
     def seen_from(self, run: object) -> "ParticleArrays":
         """Return the view that a run has: its number, a variable of a kernel, counts where forces are evaluated."""
         view = copy(self)
         view.run = run
+        if self.repeats:
+            view.period = self.period.seen_from(run)
         return view
 
     @property
@@ -117,7 +131,12 @@ class ParticleArrays(ParticleExchange):
     @property
     def labels(self) -> tuple[ti.Field, ...]:
         """Every integer field that the sort must move."""
-        return (self.id,) if self.body is None else (self.id, self.body)
+        return tuple(label for label in (self.id, self.body, self.activity) if label is not None)
+
+    @property
+    def moved(self) -> tuple[ti.Field, ...]:
+        """Every field that moves with a particle from place to place."""
+        return (*self.state, *self.labels)
 
     @ti.func
     def stored(self, p: int):
@@ -178,6 +197,16 @@ class ParticleArrays(ParticleExchange):
             for a in ti.static(range(d)):
                 C[c, a] = self.gradient[p][a, c]
         return v, C
+
+    @ti.func
+    def place(self, p: int):
+        """Return where particle p is in the domain, m: on the CPU one may have left a periodic one since the sort."""
+        result = self.x[p]
+        if ti.static(self.repeats):
+            inside = self.period.inside(result)
+            for c in ti.static(range(self.dimension)):
+                result[c] = inside[c]
+        return result
 
     @ti.func
     def on_grid(self, p: int):

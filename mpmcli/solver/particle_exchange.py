@@ -20,7 +20,7 @@ class ParticleExchange:
         """
         d = self.dimension
         widths = {"x": d, "v": d, "C": d * d, "deformation": self._deformation_width, "internal": len(self.internal)}
-        reals, labels = np.empty((count, sum(widths.values())), self.real), np.empty((count, 2), np.int32)
+        reals, labels = np.empty((count, sum(widths.values())), self.real), np.empty((count, 3), np.int32)
         self._read(first, reals, labels)
         found, end = {}, 0
         for name, width in widths.items():
@@ -33,6 +33,8 @@ class ParticleExchange:
             found["deformation"] = 1 + found["deformation"].reshape(count)
         found["id"] = labels[:, 0]
         found["body"] = np.array(bodies, np.int32)[labels[:, 1] - row]
+        if self.comes_and_goes:
+            found["activity"] = labels[:, 2]
         return found
 
     def write(self, first: int, found: dict[str, np.ndarray], row: np.ndarray) -> None:
@@ -47,7 +49,7 @@ class ParticleExchange:
         if self.keeps_initial:
             parts = (*parts, found["initial"])
         reals = np.concatenate([part.reshape(count, -1).astype(self.real) for part in parts], axis=1)
-        labels = np.stack([found["id"], row], axis=1).astype(np.int32)
+        labels = np.stack([found["id"], row, np.broadcast_to(found.get("activity", 1), count)], axis=1).astype(np.int32)
         self._write(first, np.ascontiguousarray(reals), np.ascontiguousarray(labels))
 
     @property
@@ -79,6 +81,8 @@ class ParticleExchange:
                 labels[q, 1] = self.body[p]
             else:
                 labels[q, 1] = 0
+            if ti.static(self.comes_and_goes):
+                labels[q, 2] = self.activity[p]
 
     @ti.kernel
     def _write(self, first: int, reals: ti.types.ndarray(), labels: ti.types.ndarray()):
@@ -113,3 +117,5 @@ class ParticleExchange:
             self.id[p] = labels[q, 0]
             if ti.static(self.several):
                 self.body[p] = labels[q, 1]
+            if ti.static(self.comes_and_goes):
+                self.activity[p] = labels[q, 2]

@@ -40,9 +40,14 @@ def friction_of_walls(particles: ti.template(), group: ti.template(), p: int, ki
         if meets:
             # The slip by now: with that before the last motion the spring would lag behind, and feed vibrations.
             slip, length = ti.Vector.zero(float, d), 0.0
+            along = ti.Vector.zero(float, d)
+            for k in ti.static(range(len(particles.moving.faces))):
+                if ti.static(particles.moving.faces[k] == (a, side)):
+                    for c in ti.static(range(d)):
+                        along[c] = particles.moving.of(k)[c]
             for c in ti.static(range(d)):
                 if ti.static(c != a):
-                    slip[c] = group.slip[p][c] + kick * v[c]
+                    slip[c] = group.slip[p][c] + kick * (v[c] - along[c])
                     length += slip[c] ** 2
             length, allowed = ti.sqrt(length), particles.friction.of(f) * overlap
             if length > allowed:

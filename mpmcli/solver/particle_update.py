@@ -4,11 +4,13 @@ from collections.abc import Sequence
 
 import taichi as ti
 
+from mpmcli.boundaries.moving_faces import STILL, MovingFaces
 from mpmcli.boundaries.rough_faces import RoughFaces
 from mpmcli.boundaries.walls import SMOOTH
 from mpmcli.solver.grid import Grid
 from mpmcli.solver.particle_arrays import VOLUME
 from mpmcli.solver.particle_contact import ParticleContact
+from mpmcli.solver.rounding import opaque
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import deformation_rate, volume_growth, volume_ratio
 from mpmcli.solver.transfer import gather, scatter, scatter_volume
@@ -17,6 +19,8 @@ from mpmcli.solver.volume_relaxation import relax_volume
 NOT_LOST = 2**31 - 1
 # A particle crushed to less than this fraction of its volume is lost: near zero J is round-off, not physics.
 SMALLEST_J = 1e-6
+# Cells beyond an open face at which particles stay until the next sort retires them: as far as nodes reach.
+BEYOND = 1.99
 
 
 @ti.data_oriented
@@ -26,7 +30,7 @@ class ParticleUpdate:
     Attributes:
         extent: size of the domain, m; last: node of the upper walls, per axis; faces: words of the walls, per axis.
         contact: between elastic bodies that are `total`; touches: whether there is any.
-        friction: coefficients of the walls.
+        friction, moving: coefficients and velocities of the walls.
         run: number of the run that a view is for.
         watches_box: whether a particle whose stencil has left the nodes in use is lost: on a GPU, where speeds are not
             read back at every step.
@@ -41,11 +45,12 @@ class ParticleUpdate:
         group_count: int,
         contact: ParticleContact | None = None,
         friction: RoughFaces = SMOOTH,
+        moving: MovingFaces = STILL,
         *,
         watches_box: bool,
     ) -> None:
         self.contact, self.touches = contact, contact is not None
-        self.friction = friction
+        self.friction, self.moving = friction, moving
         self.run = 0
         self.grid = grid
         self.faces = tuple(tuple(pair) for pair in faces)
@@ -159,6 +164,8 @@ class ParticleUpdate:
     def moved(self, group: ti.template(), x: ti.template(), remainder: ti.template(), v: ti.template(), dt: float):
         """Return where a particle at x moves in dt, clamped to the domain, and how far it would leave it, m.
 
+        Along a periodic axis it may leave it.
+
         Args:
             remainder: what rounding took from x, m; the one after the move is returned in between. Their sum loses
                 nothing (Dekker 1971; docs/theory.md, 8.3).
@@ -169,11 +176,24 @@ class ParticleUpdate:
         for c in ti.static(range(self.dimension)):
             way = dt * v[c] + remainder[c]
             moved = x[c] + way
-            inside[c] = ti.select(moved > 0.0, moved, 0.0)
-            inside[c] = ti.select(inside[c] < self.extent[c], inside[c], self.extent[c])
-            beyond += ti.abs(moved - inside[c])
-            if ti.static(group.carries):
-                after[c] = ti.select(moved == inside[c], way - (opaque(inside[c]) - x[c]), 0.0)
+            if ti.static(c in self.grid.period.axes):
+                inside[c], after[c], out = self.grid.period.moved(group, x[c], way, self.extent[c], c)
+                beyond += out * self.grid.spacing
+            else:
+                low, high = 0.0, self.extent[c]
+                # Until the next sort, which retires it, a particle moves on beyond an open face.
+                if ti.static((c, 0) in self.grid.opens):
+                    low = -BEYOND * self.grid.spacing
+                if ti.static((c, 1) in self.grid.opens):
+                    high = self.extent[c] + BEYOND * self.grid.spacing
+                inside[c] = ti.select(moved > low, moved, low)
+                inside[c] = ti.select(inside[c] < high, inside[c], high)
+                beyond += ti.abs(moved - inside[c])
+                if ti.static(group.carries):
+                    after[c] = ti.select(moved == inside[c], way - (opaque(inside[c]) - x[c]), 0.0)
+                    if ti.static((c, 0) in self.grid.opens):
+                        # `opaque` is for numbers that are not negative.
+                        after[c] = ti.select(inside[c] > 0.0, after[c], 0.0)
         return inside, after, beyond
 
     @ti.func
@@ -189,15 +209,6 @@ class ParticleUpdate:
         for c in ti.static(range(self.dimension)):
             kept[c] = self.grid.scheme.flip * (group.v[p][c] - before[c])
         return kept
-
-
-@ti.func
-def opaque(x: float):
-    """Return a number of single precision that is not negative, as no compiler can tell.
-
-    Those of Vulkan and Metal reorder sums, and would find that a rounded sum less its first term is the second.
-    """
-    return ti.bit_cast(ti.max(ti.bit_cast(x, ti.i32), 0), ti.f32)
 
 
 @ti.func

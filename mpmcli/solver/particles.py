@@ -47,6 +47,7 @@ def initial_states(
                 "deformation": np.repeat(rest, n, 0) if body.deformation is None else body.deformation[own],
                 "internal": np.tile(at_rest, (n, 1)),
                 "id": first_id + np.arange(first, own.stop),
+                "activity": 0 if body.waits else 1,
             }
             yield before + first, found, np.full(n, place)
         before += count
@@ -59,6 +60,8 @@ class ParticleGroup(ParticleArrays):
     Attributes:
         bodies: index in the scene of each body of the group.
         first: index of its first particle in the fields; count: number of particles n.
+        active: number of those that take part, which come first; live: the same on the device, None where all do.
+        floor: the least maxima of a measurement, where particles may come in; None elsewhere.
         rows: host copy of `table`.
     """
 
@@ -77,9 +80,12 @@ class ParticleGroup(ParticleArrays):
         total: bool = False,
         averaged: bool = False,
         slips: bool = False,
+        comes_and_goes: bool = False,
+        floor: np.ndarray | None = None,
     ) -> None:
         self.bodies = tuple(bodies)
         self.first, self.count = 0, sum(len(b.position) for b in particles)
+        self.active, self.floor = sum(len(b.position) for b in particles if not b.waits), floor
         rows = table_of(law, particles)
         super().__init__(
             law,
@@ -94,17 +100,34 @@ class ParticleGroup(ParticleArrays):
             total=total,
             averaged=averaged,
             slips=slips,
+            comes_and_goes=comes_and_goes,
         )
+        self.live = ti.field(int, shape=()) if comes_and_goes else None
+        if comes_and_goes:
+            self.live[None] = self.active
         self.rows = rows.astype(self.real)
         self.table.from_numpy(self.rows)
         for first, found, row in initial_states(law, particles, first_ids, origin):
             self.write(first, found, row)
 
+    @ti.func
+    def present(self):
+        """Return the number of particles that take part."""
+        if ti.static(self.comes_and_goes):
+            return self.live[None]
+        else:
+            return self.count
+
+    def set_active(self, count: int) -> None:
+        """Let the first `count` particles take part."""
+        self.active = count
+        self.live[None] = count
+
     def fields(self) -> dict[str, ti.Field]:
         """Return every field of the particles that changes during a run or is sorted, by name."""
         names = ["position", "velocity", "velocity_gradient", "deformation", *(v.name for v in self.law.internal)]
         initial = ["initial_position"] * self.keeps_initial + ["slip"] * self.slips
-        labels = ["id", "body"][: len(self.labels)]
+        labels = ["id"] + ["body"] * (self.body is not None) + ["activity"] * self.comes_and_goes
         return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
 
     def set_motion(self, velocity: np.ndarray, C: np.ndarray) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import psutil
 
+from mpmcli.boundaries.collider_kind import ColliderKind
 from mpmcli.boundaries.rough_faces import rough_faces
 from mpmcli.errors import InputError
 from mpmcli.materials.law import Law
@@ -13,6 +14,7 @@ from mpmcli.materials.registry import laws
 from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
+from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import Grid, gradient_width, node_width, tile_edge
@@ -54,7 +56,7 @@ class Plan:
         nodes: number of grid nodes.
         scratch_bytes: per particle, of the sort buffers.
         bytes_per_node: of the grid.
-        grid_bytes: of all nodes, the tables of the sort, and what is found at walls.
+        grid_bytes: of all nodes, the tables of the sort, what is found at walls, and what colliders need.
         host_bytes: of the arrays of one frame and of the initial state.
         passes: the loops of a step in order; loops over particles name their law.
     """
@@ -105,6 +107,7 @@ def fields_of(
     keeps_initial: bool = False,
     averaged: bool = False,
     slips: bool = False,
+    comes_and_goes: bool = False,
 ) -> dict[str, int]:
     """Return the bytes of each field of one particle of a law, by name."""
     real = 8 if backend.precision == "f64" else 4
@@ -120,7 +123,8 @@ def fields_of(
     fields |= {"initial_position": dimension * real} if keeps_initial else {}
     fields |= {"volume_to_mean": real, "cell": 4} if averaged else {}
     fields |= {"slip": dimension * real} if slips else {}
-    return fields | {"id": 4} | ({"body": 4} if several_bodies else {})
+    fields |= {"id": 4} | ({"body": 4} if several_bodies else {})
+    return fields | ({"activity": 4} if comes_and_goes else {})
 
 
 def passes_of(members: Sequence[Law], scene: Scene) -> tuple[str, ...]:
@@ -135,14 +139,14 @@ def passes_of(members: Sequence[Law], scene: Scene) -> tuple[str, ...]:
         *(f"scatter {name}" + (" with forces" if name in pushed else "") for name in names),
         *(("find contact",) if separate else ()),
         *(("find friction",) if rough else ()),
-        "update grid",
+        "update grid" + (" with colliders" if scene.colliders else ""),
         *(f"gather {name}" for name in names),
     )
 
 
 def members_of(scene: Scene, law: str) -> list[int]:
     """Return the indices of the bodies that follow a law."""
-    return [i for i, body in enumerate(scene.bodies) if body.material.law == law]
+    return [i for i, body in enumerate(scene.sources) if body.material.law == law]
 
 
 def make_plan(scene: Scene, backend: Backend) -> Plan:
@@ -151,12 +155,14 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     cells = scene.domain.cells
     real = 8 if backend.precision == "f64" else 4
     width = node_width(dimension, on_cpu=backend.on_cpu)
-    bodies = Counter(body.material.law for body in scene.bodies)
+    bodies = Counter(body.material.law for body in scene.sources)
     counts = Counter[str]()
     for body in scene.bodies:
         counts[body.material.law] += estimate_body(body, scene.domain.spacing)
+    for emitter in scene.emitters:
+        counts[emitter.material.law] += sheets_of(emitter, scene).particles
     members = [
-        laws()[name]([scene.bodies[i].material for i in members_of(scene, name)], dimension) for name in sorted(bodies)
+        laws()[name]([scene.sources[i].material for i in members_of(scene, name)], dimension) for name in sorted(bodies)
     ]
     averaged = [averages_volume(scene.solver, law) for law in members]
     groups = tuple(
@@ -171,6 +177,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 keeps_initial=scene.solver.solids == "total" or needs_initial(scene, members_of(scene, name)),
                 averaged=shares,
                 slips=slips_in(scene.solver, rough_faces(scene)),
+                comes_and_goes=scene.comes_and_goes,
             ),
         )
         for name, shares in zip(sorted(bodies), averaged, strict=True)
@@ -183,8 +190,9 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     node_bytes = real * (width * (1 + scheme.keeps_before + needs_filling(scene, members)) + 2 * sum(averaged))
     tables = len(groups) * TileOrder.bytes_needed(cells, tile, backend.threads)
     tables += _contact_bytes(scene, nodes, tile, real)
-    if scene.solver.solids == "total" and len(scene.bodies) > 1:
+    if scene.solver.solids == "total" and len(scene.sources) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(counts.values()))
+    tables += ColliderKind.of(scene).bytes_needed(dimension, nodes // (tile * Grid.tile_counts(cells, tile)[-1]))
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
     host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)
     passes = passes_of(members, scene)

@@ -10,6 +10,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.backend import Backend
+from mpmcli.solver.collider_steps import collider_bound
 from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError, cause_of, diagnose, first_unsound, rate_of_change
 from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.frame_builder import FrameBuilder, Moment
@@ -37,6 +38,8 @@ class Run:
 
     groups: Sequence
     state: Progress
+    # Whether there is a state.
+    _begun = True
     # What reads frames of each group on a GPU.
     _observations: Sequence[Callable[..., Observation]]
 
@@ -58,6 +61,7 @@ class Run:
         self._origin = np.array(scene.domain.origin)
         self._particles = particles or sample_bodies(scene)
         self.particle_count = sum(len(b.position) for b in self._particles)
+        self._collider_bound = collider_bound(scene)
 
     @property
     def laws(self) -> tuple[str, ...]:
@@ -79,7 +83,7 @@ class Run:
     @property
     def step_count(self) -> int:
         """Steps taken."""
-        return self.state.step_count
+        return self.state.step_count if self._begun else 0
 
     @property
     def last_step(self) -> float:
@@ -102,9 +106,12 @@ class Run:
             # The next kick ends in the middle of a step that is no longer than the other bounds allow.
             ahead = min(self.scene.time.safety * state.step_control.nearest.value, self.scene.time.end)
         pull = forces.pull(state.velocity_time, state.time + ahead)
-        limits = [Limit(speed_limit(self.spacing, state.speed, pull), "speed", "")]
+        speed = max(state.speed, self.scene.domain.wall_speed)
+        limits = [Limit(speed_limit(self.spacing, speed, pull), "speed", "")]
         if forces.pushes:
             limits.append(Limit(force_limit(forces.slope), "force", ""))
+        if self.scene.colliders:
+            limits.append(Limit(self._collider_bound, "collider", ""))
         return limits
 
     @property
@@ -126,7 +133,7 @@ class Run:
     @property
     def measure_seconds(self) -> float:
         """Wall time spent so far on measuring the state for the limits."""
-        return self.state.step_control.seconds
+        return self.state.step_control.seconds if self._begun else 0.0
 
     def _stop(self, dt: float, lost: Sequence[int | None]) -> None:
         """Stop at a lost particle; if none is known, at the first one that is not sound.
@@ -138,7 +145,7 @@ class Run:
             snapshot = read_group(group)
             p = first_unsound(snapshot) if known is None else known
             if p is not None:
-                cause = cause_of(snapshot, p, dt, self.scene.domain.size)
+                cause = cause_of(snapshot, p, dt, self.scene.domain)
                 raise UnstableRunError(self._diagnose(snapshot, p, cause, dt))
         raise AssertionError("a step reported a lost particle and kept no trace of it")
 
@@ -167,10 +174,15 @@ class Run:
         columns = self._builder.columns
         arrays = FrameArrays(columns, np.empty((1, self.particle_count, columns.count), self.groups[0].real))
         sums = self._read(arrays) if self.backend.on_cpu else self._observe(arrays)
-        moment = Moment(index, self.time, self.step_count, self.last_step, taken)
+        moment = Moment(index, self.time, self.step_count, self.last_step, taken, self._loads(), self._blocked)
         (built,) = self._builder.build([moment], arrays, sums)
         self.frame_seconds += time.perf_counter() - began
         return built
+
+    @property
+    def _blocked(self) -> int:
+        """Particles of emitters that found no room so far."""
+        raise NotImplementedError
 
     @cached_property
     def _builder(self) -> FrameBuilder:
@@ -182,6 +194,10 @@ class Run:
         Raises:
             UnstableRunError: see `frame`.
         """
+        raise NotImplementedError
+
+    def _loads(self) -> np.ndarray | None:
+        """Return what colliders have taken since the last frame, (colliders, k); None where there are none."""
         raise NotImplementedError
 
     def _observe(self, arrays: FrameArrays) -> list[Sums]:

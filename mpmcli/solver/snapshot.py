@@ -9,6 +9,7 @@ import numpy as np
 from mpmcli.materials.tensors import determinant
 from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.observe import Observation
+from mpmcli.solver.ordering import ACTIVE
 from mpmcli.solver.particle_arrays import MASS, VOLUME
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.sums import Sums, axis_pairs
@@ -25,6 +26,7 @@ class Snapshot:
         x: (n, d) relative to the origin of the domain, m; v: (n, d); C: (n, d, d); deformation: (n) or (n, d, d).
         internal: (n, k), the internal variables of the law.
         id, body: (n) int.
+        activity: (n) int, see `solver.activity`; None where all particles take part.
     """
 
     group: ParticleGroup
@@ -35,6 +37,7 @@ class Snapshot:
     internal: np.ndarray
     id: np.ndarray
     body: np.ndarray
+    activity: np.ndarray | None = None
 
     @cached_property
     def volume_ratio(self) -> np.ndarray:
@@ -72,6 +75,8 @@ def _fill(arrays: FrameArrays, snapshot: Snapshot, seen: Observation) -> None:
         arrays["gradient"][0, rows] = F.reshape(-1, d * d)
     if first["tau"] >= 0:
         arrays["tau"][0, rows] = seen.tau
+    if first["activity"] >= 0:
+        arrays["activity"][0, rows] = snapshot.activity
 
 
 def _sums(snapshot: Snapshot, seen: Observation) -> Sums:
@@ -79,7 +84,11 @@ def _sums(snapshot: Snapshot, seen: Observation) -> Sums:
     count, d = snapshot.x.shape
     products = np.zeros((1 + 2 * d + d * d,) * 2)
     spins = np.zeros((d, d))
-    mass = snapshot.per_body(MASS)
+    mass, volume = snapshot.per_body(MASS), snapshot.per_body(VOLUME)
+    if snapshot.activity is not None:
+        # What waits or has left weighs nothing, and its energy does not count.
+        takes_part = snapshot.activity == ACTIVE
+        mass, volume = mass * takes_part, volume * takes_part
     for first in range(0, count, ROWS):
         rows = slice(first, first + ROWS)
         C = snapshot.C[rows].astype(np.float64)
@@ -103,6 +112,6 @@ def _sums(snapshot: Snapshot, seen: Observation) -> Sums:
         affine=np.array([products[C, C].trace()]),
         turning=np.array([[turning[a, b] - turning[b, a] for a, b in pairs]]),
         spin=np.array([[spins[b, a] - spins[a, b] for a, b in pairs]]),
-        elastic=np.array([snapshot.per_body(VOLUME) @ seen.energy.astype(np.float64)]),
+        elastic=np.array([volume @ seen.energy.astype(np.float64)]),
         speed_squared=np.array([np.einsum("pc,pc->p", snapshot.v, snapshot.v).max()], np.float64),
     )

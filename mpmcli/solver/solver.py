@@ -4,10 +4,14 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 
+import numpy as np
+
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
+from mpmcli.solver.collider_steps import read_loads
+from mpmcli.solver.emission_kernels import SolverEmission
 from mpmcli.solver.external_forces import drive
 from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.frame_reader import build_frame_reader
@@ -56,7 +60,13 @@ class Solver(Run):
         self._readers = [build_frame_reader(group) for group in self.groups]
         measurements = [build_measurement(group, backend) for group in self.groups]
         step_control = StepControl(scene, self.groups, measurements, on_cpu=backend.on_cpu)
-        self.state = State(self.groups, self._kernels, step_control, forces)
+        self._emission = None
+        if scene.emitters:
+            counts = [len(b.position) for b in self._particles]
+            self._emission = SolverEmission(scene, self.groups, self._kernels, counts)
+        self._slowest = 0.0 if self._emission is None else self._emission.slowest
+        schedule = None if self._emission is None else self._emission.schedule
+        self.state = State(self.groups, self._kernels, step_control, forces, schedule)
         self._begin()
 
     def begin(self) -> None:
@@ -78,7 +88,11 @@ class Solver(Run):
             UnstableRunError: a particle left the domain, was inverted or became non-finite.
         """
         began, state = time.perf_counter(), self.state
-        if state.drift >= self._kernels.drift_allowed:
+        sorts = state.drift >= self._kernels.drift_allowed
+        if self._emission is not None and self._emission.schedule.next <= state.time:
+            self._emission.enter(state.time)
+            sorts = sorts or self._emission.sorts
+        if sorts:
             self._kernels.sort()
             state.drift = 0.0
         # Velocities belong to the middle of steps. They advance from the middle of the last step to that of this one,
@@ -88,6 +102,8 @@ class Solver(Run):
         kick = min(due_kick, dt / self.scene.time.safety)
         state.owed = due_kick - kick
         state.external_forces.begin_step(since, since + kick)
+        if self._kernels.colliders is not None:
+            self._kernels.colliders.begin_step(state.time, dt)
         result = self._kernels.step(dt, kick, state.relaxed_in(dt))
         state.time = state.time + dt if until is None else until
         state.last_step = dt
@@ -97,11 +113,11 @@ class Solver(Run):
         if result is not None:
             if not result.speed >= 0:
                 self._stop(dt, self._lost())
-            state.speed = result.speed
+            state.speed = max(result.speed, self._slowest)
         else:
             # Not read back: bounded by what gravity and forces add.
             state.speed += kick * state.external_forces.pull(since, since + kick)
-        state.courant = dt * state.speed / self.spacing
+        state.courant = dt * (state.speed if result is None else result.speed) / self.spacing
         # On a GPU stress may double the speed; `ParticleUpdate.advance` flags particles that went further.
         unseen = 2 * state.courant + UNSEEN if result is None else 0.0
         if self._drifts:
@@ -161,12 +177,20 @@ class Solver(Run):
 
     def _read(self, arrays: FrameArrays) -> list[Sums]:
         found = [
-            reader(self.last_step, group.first, group.count, arrays)
+            reader(self.last_step, group.first, group.count, group.active, arrays)
             for reader, group in zip(self._readers, self.groups, strict=True)
         ]
         if not all(sound for _, sound in found):
             self._stop(self.last_step, self._lost())
         return [sums for sums, _ in found]
+
+    def _loads(self) -> np.ndarray | None:
+        colliders = self._kernels.colliders
+        return None if colliders is None else read_loads(colliders.colliders, 0, len(self.scene.colliders))
+
+    @property
+    def _blocked(self) -> int:
+        return 0 if self._emission is None else self._emission.schedule.blocked
 
     def _lost(self) -> list[int | None]:
         """Return a lost particle of each group, in solver order, None where none is known."""

@@ -11,11 +11,12 @@ from mpmcli.solver.ordering import CHUNK, SPAN, TileOrder, entry_count, share_st
 @ti.func
 def count_tiles(order: ti.template(), run: int, t: int, first: int, begin: int, end: int):
     """Count the particles of each tile in share t of those of a run, which begin at `first`: from `begin` to `end`."""
-    cursor, own = run * ti.static(order.tiles), run * ti.static(order.buffers.room)
-    for tile in range(order.tiles):
+    cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.room)
+    for tile in range(order.bins):
         order.cursor[cursor + tile, t] = 0
     for q in range(begin, end):
-        tile = order.tile_of(first + q)
+        order.settle(first + q)
+        tile = order.bin_of(first + q)
         order.buffers.key[own + q] = tile
         order.cursor[cursor + tile, t] = order.cursor[cursor + tile, t] + 1
 
@@ -23,20 +24,20 @@ def count_tiles(order: ti.template(), run: int, t: int, first: int, begin: int, 
 @ti.func
 def find_places(order: ti.template(), run: int, first: int):
     """Set the first particle of each tile of a run, and where each share places its particles of the tile."""
-    cursor, place = run * ti.static(order.tiles), 0
-    for tile in range(order.tiles):
+    cursor, place = run * ti.static(order.bins), 0
+    for tile in range(order.bins):
         order.start[order.first_tile + tile] = first + place
         for t in range(ti.static(order.threads)):
             size = order.cursor[cursor + tile, t]
             order.cursor[cursor + tile, t] = place
             place += size
-    order.start[order.first_tile + order.tiles] = first + place
+    order.start[order.first_tile + order.bins] = first + place
 
 
 @ti.func
 def place_particles(order: ti.template(), run: int, t: int, first: int, begin: int, end: int):
     """Note, at the place of each particle of a share, where it comes from; see `count_tiles`."""
-    cursor, own = run * ti.static(order.tiles), run * ti.static(order.buffers.room)
+    cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.room)
     for q in range(begin, end):
         tile = cursor + order.buffers.key[own + q]
         order.buffers.order[own + order.cursor[tile, t]] = first + q
@@ -94,7 +95,7 @@ def build_sort(order: TileOrder) -> Sort:
     """Compile-ready kernels of one group's sort."""
     group, buffers = order.group, order.buffers
     key, source = buffers.key, buffers.order
-    n, threads, tiles = group.count, order.threads, order.tiles
+    n, threads, tiles = group.count, order.threads, order.bins
     moved = (*group.state, *group.labels)
 
     @ti.kernel
@@ -103,7 +104,8 @@ def build_sort(order: TileOrder) -> Sort:
             for t in range(threads):
                 order.cursor[tile, t] = 0
         for p in range(n):
-            key[p] = order.tile_of(p)
+            order.settle(p)
+            key[p] = order.bin_of(p)
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
                 t = q // CHUNK
@@ -115,7 +117,8 @@ def build_sort(order: TileOrder) -> Sort:
         for tile in range(tiles):
             order.cursor[tile, 0] = 0
         for p in range(n):
-            key[p] = order.tile_of(p)
+            order.settle(p)
+            key[p] = order.bin_of(p)
             order.cursor[key[p], 0] += 1
 
     @ti.kernel

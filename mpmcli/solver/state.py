@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.kernels import Kernels
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.schedule import Schedule
 from mpmcli.solver.step_control import StepControl
 from mpmcli.solver.volume_relaxation import INTERVAL
 
@@ -93,13 +95,17 @@ class State(Progress):
         kernels: Kernels,
         step_control: StepControl,
         external_forces: ExternalForces,
+        schedule: Schedule | None = None,
     ) -> None:
+        self._schedule = schedule
         self._groups = groups
         self._kernels = kernels
         super().__init__(step_control, external_forces)
 
     def begin(self) -> None:
         super().begin()
+        if self._schedule is not None:
+            self._schedule.begin()
         self._kernels.particles.lost.fill(NOT_LOST)
 
     def save(self) -> SavedState:
@@ -107,6 +113,10 @@ class State(Progress):
         numbers = {name: getattr(self, name) for name in self.NUMBERS}
         numbers["step_control"] = self.step_control.save()
         numbers["external_forces"] = self.external_forces.save()
+        if self._schedule is not None:
+            numbers["schedule"] = {name: copy(getattr(self._schedule, name)) for name in self._schedule.STATE}
+        if self._groups[0].comes_and_goes:
+            numbers["active"] = [group.active for group in self._groups]
         return SavedState(numbers, {name: field.to_numpy() for name, field in self._fields().items()})
 
     def load(self, saved: SavedState) -> None:
@@ -125,6 +135,10 @@ class State(Progress):
             setattr(self, name, saved.numbers[name])
         self.step_control.load(saved.numbers["step_control"])
         self.external_forces.load(saved.numbers["external_forces"])
+        for name, value in saved.numbers.get("schedule", {}).items():
+            setattr(self._schedule, name, copy(value))
+        for group, count in zip(self._groups, saved.numbers.get("active", ()), strict=False):
+            group.set_active(count)
         self._kernels.particles.lost.fill(NOT_LOST)
         self._kernels.share_work()
 
@@ -134,6 +148,8 @@ class State(Progress):
         for group, order in zip(self._groups, self._kernels.orders, strict=True):
             fields |= {f"{group.law.name}.{name}": field for name, field in group.fields().items()}
             fields[f"{group.law.name}.tile_start"] = order.start
+        if self._kernels.colliders is not None:
+            fields |= self._kernels.colliders.fields()
         return fields | ({} if self._kernels.contact is None else self._kernels.contact.fields())
 
 

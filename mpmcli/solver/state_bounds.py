@@ -3,9 +3,11 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import taichi as ti
 
-from mpmcli.materials.law import StateBound
+from mpmcli.materials.law import Law, StateBound
+from mpmcli.scene import Scene, highest_speed
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.ordering import CHUNK, share_start
 from mpmcli.solver.particles import ParticleGroup
@@ -150,10 +152,24 @@ def widen_internal(group: ti.template(), own: ti.template(), p: int, first: ti.t
 
 
 def state_bounds_of(group: ParticleGroup, maxima: Sequence[float]) -> StateBounds:
-    """Return the bounds that these maxima represent."""
+    """Return the bounds that these maxima represent, what may come in included."""
+    if group.floor is not None:
+        maxima = np.maximum(maxima, group.floor).tolist()
     internal = _ranges(group, maxima[ENTRIES:])
     bound = StateBound(-maxima[MINUS_J_MIN], maxima[J_MAX], maxima[STRETCH_SQUARED], internal)
     return StateBounds(maxima[SPEED_SQUARED] ** 0.5, maxima[RATE], bound)
+
+
+def floor_of(scene: Scene, law: Law, members: Sequence[int]) -> np.ndarray | None:
+    """Return the maxima of the particles at rest that a law may get: as fast as its emitters, or none where there are.
+
+    None where no particle of a run comes or goes.
+    """
+    if not scene.comes_and_goes:
+        return None
+    speeds = [highest_speed(scene.sources[i]) for i in members if i >= len(scene.bodies)]
+    at_rest = [value for v in law.internal for value in (float(v.at_rest), -float(v.at_rest))]
+    return np.array([max(speeds, default=0.0) ** 2, 0.0, 1.0, -1.0, 1.0, *at_rest])
 
 
 def _ranges(group: ParticleGroup, maxima: Sequence[float]) -> dict[str, tuple[float, float]]:
@@ -175,8 +191,12 @@ def build_measurement(group: ParticleGroup, backend: Backend) -> Measurement:
 
     state = build_maxima(entries(group), widen_all, backend)
     internal = build_maxima(2 * len(group.internal), widen_inner, backend)
-    own = group.first, group.count, 0
-    return Measurement(lambda: state_bounds_of(group, state(*own)), lambda: _ranges(group, internal(*own)))
+
+    def internal_ranges() -> dict[str, tuple[float, float]]:
+        found = internal(group.first, group.active, 0)
+        return _ranges(group, found if group.floor is None else np.maximum(found, group.floor[ENTRIES:]).tolist())
+
+    return Measurement(lambda: state_bounds_of(group, state(group.first, group.active, 0)), internal_ranges)
 
 
 def build_maxima(size: int, widen: Callable, backend: Backend) -> Callable[[int, int, int], list[float]]:

@@ -65,7 +65,7 @@ class StepControl:
             on_cpu: whether every step reads back the speed and the rates of deformation.
         """
         self._groups = groups
-        self._names = tuple(body.name for body in scene.bodies)
+        self._names = tuple(body.name for body in scene.sources)
         self._spacing = scene.domain.spacing
         self._inertia = step_inertia(scene.solver)
         self._measure = measurements
@@ -76,7 +76,7 @@ class StepControl:
         self._unwatched = [0] * len(groups)
         self._change = [0.0] * len(groups)
         self._hardened = [0.0] * len(groups)
-        most = MOST_PUSHED_STEPS if scene.forces else MOST_UNWATCHED_STEPS
+        most = MOST_PUSHED_STEPS if scene.pushes else MOST_UNWATCHED_STEPS
         self.longest = most if on_cpu else MOST_BLIND_STEPS
         share = UNWATCHED_SHARE if on_cpu else BLIND_SHARE
         # A step of safety times the limit is stable until the stiffness has grown to safety^-2 of what it was.

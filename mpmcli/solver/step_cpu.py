@@ -13,7 +13,7 @@ from mpmcli.boundaries.wall_friction import find_friction
 from mpmcli.solver.cpu_loops import average_pencils, clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid
-from mpmcli.solver.lanes import advance_range
+from mpmcli.solver.lanes import advance_range, scatter_range
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.ordering import CHUNK, TileOrder, share_start
 from mpmcli.solver.particle_update import NOT_LOST, ParticleUpdate
@@ -27,6 +27,7 @@ from mpmcli.solver.state_bounds import (
     widen_motion,
     widen_state,
 )
+from mpmcli.solver.volume_average import average_range
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,8 @@ def build_cpu_step(
         one, as if they shared cache lines.
         """
         own = ti.Vector([NOTHING] * ti.static(max(len(maxima[g]), 1)))
-        first, last = share_start(group.count, t, threads), share_start(group.count, t + 1, threads)
+        count = group.present()
+        first, last = share_start(count, t, threads), share_start(count, t + 1, threads)
         sharpest = advance_range(particles, g, group, first, last, dt)
         if ti.static(hardens[g]):
             for p in range(first, last):
@@ -112,14 +114,20 @@ def build_cpu_step(
                         t = q // CHUNK
                         first, last = order.work[part, t], order.work[part, t + 1]
                         average_pencils(grid, g, group, order, part, first, last)
+                # What has come in since the sort follows.
+                if ti.static(group.comes_and_goes):
+                    ti.loop_config(serialize=True)
+                    for _ in range(1):
+                        if part == ti.static(orders[0].colours - 1):
+                            average_range(grid, g, group, order.start[order.tiles], group.present())
 
     @ti.kernel
-    def p2g(part: int, kick: float, relaxed: float):
-        """Scatter some colours, after clearing the grid for the first ones."""
+    def p2g(which: int, part: int, kick: float, relaxed: float):
+        """Scatter some colours of one group, after clearing the grid for the first ones of the first."""
         ti.loop_config(serialize=alone)
         for q in range(CHUNK * threads):
             if q % CHUNK == 0:
-                rows = grid.row_count() if part == ti.static(-1 if averages else 0) else 0
+                rows = grid.row_count() if which + part == ti.static(-1 if averages else 0) else 0
                 t = q // CHUNK
                 clear_rows(grid, share_start(rows, t, threads), share_start(rows, t + 1, threads))
         for g, group, order in ti.static(pairs):
@@ -129,7 +137,14 @@ def build_cpu_step(
                     if q % CHUNK == 0:
                         t, colour = q // CHUNK, parity + together * part
                         first, last = order.work[colour, t], order.work[colour, t + 1]
+                        if which != g:
+                            last = first
                         scatter_pencils(particles, g, group, order, colour, first, last, kick, relaxed)
+            if ti.static(group.comes_and_goes):
+                ti.loop_config(serialize=True)
+                for _ in range(1):
+                    if which == g and part == ti.static(orders[0].colours // together - 1):
+                        scatter_range(particles, g, group, order.start[order.tiles], group.present(), kick, relaxed)
 
     # A kernel of its own: as a loop or a branch beside G2P it took 5 to 25 % of every step's time.
     @ti.kernel
@@ -142,7 +157,8 @@ def build_cpu_step(
                 for q in range(CHUNK * threads):
                     if q % CHUNK == 0:
                         t, change = q // CHUNK, 0.0
-                        for p in range(share_start(group.count, t, threads), share_start(group.count, t + 1, threads)):
+                        count = group.present()
+                        for p in range(share_start(count, t, threads), share_start(count, t + 1, threads)):
                             change = ti.max(change, particles.relax(group, p, relaxed))
                         ti.atomic_max(largest_change[g][None], change)
         result = changes(0.0)
@@ -189,8 +205,10 @@ def build_cpu_step(
     def step(dt: float, kick: float, relaxed: float) -> StepResult:
         for part in range(orders[0].colours if averages else 0):
             average(part)
-        for part in range(orders[0].colours // together):
-            p2g(part, kick, relaxed)
+        # One group after the other, as the kernel of a batch does: sums at a node depend on the order.
+        for which in range(len(groups)):
+            for part in range(orders[0].colours // together):
+                p2g(which, part, kick, relaxed)
         changed = relax(relaxed).to_list() if relaxes and relaxed > 0 else [0.0] * len(groups)
         speed, *values = update_and_g2p(dt, kick).to_list()
         bounds, first = [], len(groups)
@@ -198,7 +216,8 @@ def build_cpu_step(
             own = values[first : first + len(fields)]
             bounds.append(state_bounds_of(group, own) if own else None)
             first += len(fields)
-        rates = [rate + change / dt for rate, change in zip(values[: len(groups)], changed, strict=True)]
+        # A law may have no particle yet.
+        rates = [max(rate, 0.0) + change / dt for rate, change in zip(values[: len(groups)], changed, strict=True)]
         return StepResult(speed, rates, bounds)
 
     return step

@@ -25,14 +25,14 @@ def build_gpu_step(
             grid.clear(grid.linear_index(grid.box_node(q)))
         for g, group in ti.static(numbered):
             if ti.static(group.averaged):
-                for p in range(group.count):
+                for p in range(group.present()):
                     add_volume(grid, g, group, p)
         for g, group in ti.static(numbered):
-            for p in range(group.count):
+            for p in range(group.present()):
                 particles.scatter(g, group, p, kick, relaxed)
         for g, group in ti.static(numbered):
             if ti.static(group.law.relaxes):
-                for p in range(group.count):
+                for p in range(group.present()):
                     if relaxed > 0.0:
                         particles.relax(group, p, relaxed)
         if ti.static(nodes.needs_contact):
@@ -45,7 +45,7 @@ def build_gpu_step(
             node = grid.box_node(q)
             nodes.update(node, grid.linear_index(node), gravity.in_step(kick, 0))
         for g, group in ti.static(numbered):
-            for p in range(group.count):
+            for p in range(group.present()):
                 particles.advance(g, group, p, dt)
 
     return step

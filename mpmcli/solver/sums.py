@@ -101,6 +101,9 @@ def ledger_rows(sums: dict[str, np.ndarray], times: Sequence[float], taken: Sequ
     columns = {name: values.tolist() for name, values in sums.items()}
     for name in ("linear_momentum", "angular_momentum"):
         columns[name] = list(map(tuple, columns[name]))
+    for name in ("collider_force", "collider_torque"):
+        if name in columns:
+            columns[name] = [tuple(map(tuple, rows)) for rows in columns[name]]
     return [
         LedgerRow(
             time=time,

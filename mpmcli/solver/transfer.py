@@ -115,6 +115,8 @@ def scatter_before(
         for a in ti.static(range(d)):
             change[a, c] = (mass * grid.spacing) * C[c, a]
             middle[c] -= change[a, c] * (distance[a] - 1.0)
+    if ti.static(grid.weighs_before):
+        middle[grid.dimension] = mass
     add_linear(grid.before, grid, grid.linear_index(base), w, middle, change, atomic)
 
 

@@ -31,7 +31,11 @@ def cell_of(grid: ti.template(), x: ti.template()):
     """Return the linear index of the first node of the cell of a point."""
     cell = ti.Vector.zero(int, ti.static(grid.dimension))
     for a in ti.static(range(grid.dimension)):
-        cell[a] = ti.cast(x[a] * grid.inverse_spacing, int) + PAD
+        if ti.static(a in grid.period.axes):
+            # Of a particle beyond the lower face the coordinate is negative.
+            cell[a] = ti.cast(ti.floor(x[a] * grid.inverse_spacing), int) + PAD
+        else:
+            cell[a] = ti.cast(x[a] * grid.inverse_spacing, int) + PAD
     return grid.linear_index(cell)
 
 
@@ -82,9 +86,28 @@ def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: i
 
 
 @ti.func
+def clear_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
+    """Set the sums of the cell of particle p, and of its images, to zero."""
+    cell = cell_of(grid, group.on_grid(p))
+    grid.means[g][cell] = ti.Vector.zero(float, 2)
+    if ti.static(len(grid.period.axes) > 0):
+        for images in range(1, ti.static(2**grid.dimension)):
+            image, exists = grid.period.image(grid.place_of(cell), images)
+            if exists:
+                grid.means[g][grid.linear_index(image)] = ti.Vector.zero(float, 2)
+
+
+@ti.func
 def missing_to_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
     """Return the mean of ln J over the cell of particle p less its own, once all were added."""
     sums = grid.means[g][group.cell[p]]
+    if ti.static(len(grid.period.axes) > 0):
+        for images in range(1, ti.static(2**grid.dimension)):
+            image, exists = grid.period.image(grid.place_of(group.cell[p]), images)
+            if exists:
+                more = grid.means[g][grid.linear_index(image)]
+                for k in ti.static(range(2)):
+                    sums[k] += more[k]
     return sums[0] / sums[1] - group.to_mean[p]
 
 
@@ -98,7 +121,7 @@ def stretch_to(missing: float, d: ti.template()):
 def average_for_frame(grid: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int):
     """Leave in `to_mean` of all particles of a run what `missing_to_mean` returns; on one thread."""
     for p in range(first, last):
-        grid.means[g][cell_of(grid, group.on_grid(p))] = ti.Vector.zero(float, 2)
+        clear_mean(grid, g, group, p)
     average_range(grid, g, group, first, last)
     for p in range(first, last):
         group.to_mean[p] = missing_to_mean(grid, g, group, p)
@@ -106,23 +129,24 @@ def average_for_frame(grid: ti.template(), g: ti.template(), group: ti.template(
 
 def build_averaging(grid: Grid, groups: Sequence[ParticleArrays], *, on_cpu: bool) -> Callable[[], None]:
     """Return what does so for groups of one run, before a frame is read."""
-    members = tuple((g, group, group.x.shape[0]) for g, group in enumerate(groups) if group.averaged)
+    members = tuple((g, group) for g, group in enumerate(groups) if group.averaged)
 
     @ti.kernel
     def average_serially():
         ti.loop_config(serialize=True)
         for _ in range(1):
-            for g, group, count in ti.static(members):
+            for g, group in ti.static(members):
+                count = group.present()
                 average_for_frame(grid, g, group, 0, count)
 
     @ti.kernel
     def average_at_once():
-        for g, group, count in ti.static(members):
-            for p in range(count):
-                grid.means[g][cell_of(grid, group.on_grid(p))] = ti.Vector.zero(float, 2)
-            for p in range(count):
+        for g, group in ti.static(members):
+            for p in range(group.present()):
+                clear_mean(grid, g, group, p)
+            for p in range(group.present()):
                 add_volume(grid, g, group, p)
-            for p in range(count):
+            for p in range(group.present()):
                 group.to_mean[p] = missing_to_mean(grid, g, group, p)
 
     return average_serially if on_cpu else average_at_once

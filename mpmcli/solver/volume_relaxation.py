@@ -20,7 +20,7 @@ INTERVAL = 50
 
 def needs_filling(scene: Scene, laws: Sequence[Law]) -> bool:
     """Return whether nodes keep the volume scattered to them: with one density alone it follows from their mass."""
-    return any(law.relaxes for law in laws) and len({body.material.density for body in scene.bodies}) > 1
+    return any(law.relaxes for law in laws) and len({body.material.density for body in scene.sources}) > 1
 
 
 @ti.func
@@ -68,7 +68,13 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
     first = grid.linear_index(base)
     near_wall = False
     for a in ti.static(range(d)):
-        near_wall = near_wall or base[a] <= PAD + reach or base[a] + 1 + 2 * reach >= last[a]
+        if ti.static(a in grid.period.axes):
+            near_wall = near_wall or base[a] <= 2 * PAD or base[a] + 1 + reach >= last[a] - PAD
+        else:
+            if ti.static((a, 0) not in grid.opens):
+                near_wall = near_wall or base[a] <= PAD + reach
+            if ti.static((a, 1) not in grid.opens):
+                near_wall = near_wall or base[a] + 1 + 2 * reach >= last[a]
     mean = 0.0
     least = 1e30
     if near_wall:
@@ -118,17 +124,32 @@ def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
         used = True
         for b in ti.static(range(d)):
             node[b] += ti.select(side // 2 == b, offset, 1)
-            if node[b] < PAD:
-                node[b] = 2 * PAD - node[b]
-            elif node[b] > last[b]:
-                node[b] = 2 * last[b] - node[b]
-            if node[b] == PAD or node[b] == last[b]:
-                share *= 2.0
+            if ti.static(b in grid.period.axes):
+                # The grid may end here, but not at its image.
+                if node[b] < PAD:
+                    node[b] += last[b] - PAD
+                elif node[b] >= last[b]:
+                    node[b] -= last[b] - PAD
+            if ti.static(b not in grid.period.axes and (b, 0) not in grid.opens):
+                if node[b] < PAD:
+                    node[b] = 2 * PAD - node[b]
+                if node[b] == PAD:
+                    share *= 2.0
+            if ti.static(b not in grid.period.axes and (b, 1) not in grid.opens):
+                if node[b] > last[b]:
+                    node[b] = 2 * last[b] - node[b]
+                if node[b] == last[b]:
+                    share *= 2.0
             # Nodes that are not in use hold what was there before.
             used = used and node[b] >= grid.box[0, b] and node[b] < grid.box[0, b] + grid.box[1, b]
         held = 0.0
         if used:
             held = grid.holding[grid.linear_index(node)][d] * share
+            if ti.static(len(grid.period.axes) > 0):
+                for images in range(1, ti.static(2**d)):
+                    image, exists = grid.period.image(node, images)
+                    if exists:
+                        held += grid.holding[grid.linear_index(image)][d] * share
         least = ti.min(least, held)
     return least
 
@@ -137,7 +158,8 @@ def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
 def mirrored_sum(node: ti.template(), grid: ti.template(), last: ti.template(), reach: ti.template()):
     """Return what a node and its mirror images behind walls hold; one on a wall, half of whose cell is inside, twice.
 
-    It is a matter of geometry: a wall that has let go mirrors, too, as do those that set velocities to zero.
+    Beyond a periodic face the image is the node as far inside of the other. It is a matter of geometry: a wall that has
+    let go mirrors, too, as do those that set velocities to zero.
     """
     d = ti.static(grid.dimension)
     total = 0.0
@@ -146,10 +168,21 @@ def mirrored_sum(node: ti.template(), grid: ti.template(), last: ti.template(), 
         exists = True
         for a in ti.static(range(d)):
             if images >> a & 1 == 1:
-                if node[a] <= PAD + reach:
+                if ti.static(a in grid.period.axes):
+                    if node[a] <= 2 * PAD:
+                        place[a] = node[a] + last[a] - PAD
+                    elif node[a] >= last[a] - PAD:
+                        place[a] = node[a] - last[a] + PAD
+                    else:
+                        exists = False
+                elif node[a] <= PAD + reach:
                     place[a] = 2 * PAD - node[a]
+                    if ti.static((a, 0) in grid.opens):
+                        exists = False
                 elif node[a] >= last[a] - reach:
                     place[a] = 2 * last[a] - node[a]
+                    if ti.static((a, 1) in grid.opens):
+                        exists = False
                 else:
                     exists = False
         if exists:

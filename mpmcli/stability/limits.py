@@ -18,6 +18,7 @@ WHY = {
     "viscosity": "momentum must not diffuse across more than a quarter of a cell's square in a step",
     "speed": "a particle must not move more than half a cell in a step",
     "deformation": "a particle must not be compressed by more than half in a step",
+    "collider": "a collider must not move more than half a cell in a step",
     "force": "a force must not change by itself within a step, as the particle that it pushes moves on",
     "maximum": "time.step in the scene sets it",
     "forced": "time.step in the scene sets it, above what is stable, as --force allows",
@@ -27,6 +28,7 @@ FIX = {
     "viscosity": "a thinner fluid or a coarser grid allows a larger step",
     "speed": "a coarser grid or a slower scene allows a larger step",
     "deformation": "a coarser grid or a stiffer material deforms less in a step",
+    "collider": "a coarser grid or a slower collider allows a larger step",
     "force": "a force that changes less from place to place allows a larger step",
     "maximum": 'a larger time.step, or "auto", allows a larger step',
     "forced": 'time.step = "auto" takes the largest stable step',
@@ -38,7 +40,7 @@ class Limit(NamedTuple):
 
     Attributes:
         value: the largest step that it allows, s.
-        name: "wave", "viscosity", "speed", "deformation", "force", "maximum" or "forced".
+        name: "wave", "viscosity", "speed", "deformation", "force", "collider", "maximum" or "forced".
         body: name of the body that sets it, "" where no single one does.
     """
 
@@ -103,6 +105,11 @@ def speed_limit(spacing: float, speed: float, gravity: float) -> float:
 def deformation_limit(gradient: float) -> float:
     """Return the step in which the largest velocity gradient (1/s) deforms by DEFORMATION, s."""
     return DEFORMATION / gradient if gradient > 0 else math.inf
+
+
+def collider_limit(spacing: float, speed: float) -> float:
+    """Return the step in which a collider with a speed (m/s) moves COURANT cells, s."""
+    return COURANT * spacing / speed if speed > 0 else math.inf
 
 
 def force_limit(slope: float) -> float:

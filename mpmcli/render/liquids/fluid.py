@@ -73,9 +73,9 @@ class FluidPainter:
         """Return the picture of a frame, (h, w, 3) uint8; particles without a place (NaN) are left out."""
         groups = groups_of(self._scene, frame)
         solids = [group for group in groups if not group.appearance.liquid]
-        picture, depth = self._background.things(solids, [_colors(group) for group in solids])
-        image = self._background.base(groups)
-        samples = self._samples(picture, depth, max((group.distance for group in solids), default=None))
+        picture, depth, dots = self._background.things(solids, [_colors(group) for group in solids], frame)
+        image = self._background.base(groups, frame.time)
+        samples = self._samples(picture, depth, dots, max((group.distance for group in solids), default=None))
         liquids = [self._liquid(group, frame) for group in groups if group.appearance.liquid]
         liquids = [liquid for liquid in liquids if len(liquid.pixels)]
         window = window_of(liquids, self._view)
@@ -100,17 +100,20 @@ class FluidPainter:
         volume = np.array(self._scene.distances)[body] ** 3
         return Liquid(group.appearance, group.distance, group.position[seen], pixels[seen], scale, volume)
 
-    def _samples(self, picture: np.ndarray, depth: np.ndarray, distance: float | None) -> list[Sample]:
+    def _samples(
+        self, picture: np.ndarray, depth: np.ndarray, dots: np.ndarray, distance: float | None
+    ) -> list[Sample]:
         """Part a picture with several samples to a pixel, leaving out what shows nothing.
 
         Args:
-            distance: between the dots, m; None where there are only lines.
+            dots: the depth without colliders.
+            distance: between the dots, m; None where there are none.
         """
         width, height = self._view.size
         shade = None
         if distance is not None:
             white = np.full((height, width, 3), 255, np.uint8)
-            shade = depth_shaded(white, depth, OVERLAP * distance, self._view, SAMPLES)[..., 0] / np.float32(255)
+            shade = depth_shaded(white, depth, OVERLAP * distance, self._view, SAMPLES, dots)[..., 0] / np.float32(255)
         samples = []
         for i in range(SAMPLES):
             for j in range(SAMPLES):

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mpmcli.frames.frame import Frame
+from mpmcli.render.collider_actors import ColliderActors
 from mpmcli.render.dots import OVERLAP, SMALLEST
 from mpmcli.render.liquids.fluid_shading import linear
 from mpmcli.render.offscreen import OffscreenRenderer
@@ -30,13 +32,20 @@ class FluidBackground:
         self._background = Background(scene, view, theme)
         self._offscreen = OffscreenRenderer(replace(view, size=(view.size[0] * SAMPLES, view.size[1] * SAMPLES)), theme)
         self._offscreen.add_box(scene.lower, scene.upper, theme.wall, width=1.6 * SAMPLES)
+        self._colliders = ColliderActors(scene, theme, self._offscreen)
+        if scene.colliders:
+            self._offscreen.add_light()
         # The background without shadows (h, w, 3), in amounts of light.
         self.bare = linear(self._background.image(None) / np.float32(255))
         self._actors: dict[tuple[int, int], pv.Actor] = {}
-        self._empty: tuple[np.ndarray, np.ndarray] | None = None
+        self._empty: tuple[np.ndarray, ...] | None = None
 
-    def things(self, groups: list[Group], colors: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Draw lines and dots; return their picture (2h, 2w, 3) uint8 and depth (2h, 2w), inf where there is nothing.
+    def things(self, groups: list[Group], colors: list[np.ndarray], frame: Frame) -> tuple[np.ndarray, ...]:
+        """Draw lines, colliders and dots of a frame.
+
+        Returns:
+            Their picture (2h, 2w, 3) uint8, their depth (2h, 2w), inf where there is nothing, and that without
+            colliders.
 
         Args:
             groups: what is drawn as dots.
@@ -48,15 +57,18 @@ class FluidBackground:
             actor.SetVisibility(False)
         for group, color in zip(groups, colors, strict=True):
             self._show(group, color)
+        self._colliders.pose(frame)
         self._offscreen.render()
-        seen = self._offscreen.picture(), self._offscreen.depth()
-        if not groups:
+        seen = self._offscreen.picture(), *[self._offscreen.depth()] * 2
+        if groups and self._colliders.meshes:
+            seen = *seen[:2], self._colliders.depth_without(self._offscreen)
+        if not groups and not self._scene.colliders:
             self._empty = seen
         return seen
 
-    def base(self, groups: list[Group]) -> np.ndarray:
-        """Return the background (h, w, 3) in amounts of light, with the shadows that particles throw on the floor."""
-        occlusion = occlusion_by(self._scene, groups, self._lamp)
+    def base(self, groups: list[Group], time: float) -> np.ndarray:
+        """Return the background (h, w, 3) in amounts of light, with the shadows of `things` on the floor."""
+        occlusion = occlusion_by(self._scene, groups, self._lamp, self._colliders.shades(time))
         return linear(self._background.image(occlusion) / np.float32(255))
 
     def _show(self, group: Group, colors: np.ndarray) -> None:
@@ -66,7 +78,7 @@ class FluidBackground:
         cloud = pv.PolyData(group.position.astype(np.float32))
         cloud["color"] = colors
         if group.key not in self._actors:
-            if not self._actors:
+            if not self._actors and not self._scene.colliders:
                 self._offscreen.add_light()
             self._actors[group.key] = self._offscreen.plotter.add_points(
                 cloud,

@@ -46,14 +46,25 @@ class Lights:
     ground: np.ndarray
 
 
-def occlusion_by(scene: RenderScene, groups: Sequence[Group], lamp: np.ndarray) -> Occlusion | None:
-    """Return what the particles of some groups take of the light of a lamp in direction (3,), None without any."""
-    if not groups:
+def occlusion_by(
+    scene: RenderScene,
+    groups: Sequence[Group],
+    lamp: np.ndarray,
+    shades: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+) -> Occlusion | None:
+    """Return what the particles of some groups take of the light of a lamp in direction (3,), None without any.
+
+    Args:
+        shades: places (n, 3) and volumes (n,) of what is opaque besides.
+    """
+    if not groups and not shades:
         return None
-    counts = [len(group.position) for group in groups]
-    volumes = np.repeat([group.distance**3 for group in groups], counts)
-    opacity = np.repeat([OPACITY.get(group.appearance.finish, 1.0) for group in groups], counts)
-    return occlusion_of(scene, np.concatenate([group.position for group in groups]), volumes, opacity, lamp)
+    counts = [len(group.position) for group in groups] + [len(places) for places, _ in shades]
+    opacities = [OPACITY.get(group.appearance.finish, 1.0) for group in groups] + [1.0] * len(shades)
+    cells = [np.full(len(group.position), group.distance**3) for group in groups]
+    volumes = np.concatenate([*cells, *(volumes for _, volumes in shades)])
+    places = np.concatenate([*(group.position for group in groups), *(places for places, _ in shades)])
+    return occlusion_of(scene, places, volumes, np.repeat(opacities, counts), lamp)
 
 
 def lights_of(scene: RenderScene, view: View, theme: Theme) -> Lights:
@@ -85,13 +96,21 @@ def vertex_code() -> tuple[str, str]:
 
 
 def fragment_code(
-    scene: RenderScene, view: View, lights: Lights, appearance: Appearance, finer: int, *, by_field: bool
+    scene: RenderScene,
+    view: View,
+    lights: Lights,
+    appearance: Appearance,
+    finer: int,
+    *,
+    by_field: bool,
+    walled: bool = True,
 ) -> tuple[str, str]:
     """Return what the fragment shader declares and does for one material.
 
     Args:
         finer: pixels of the window to one of the view, along each axis.
         by_field: the tints mean something, so that light must not change them much.
+        walled: what lies at the walls of the domain leans on them, and is flat there.
     """
     side = max(np.subtract(scene.upper, scene.lower))
     volume_length = float(np.prod(np.maximum(np.subtract(scene.upper, scene.lower), 1e-12))) ** (1 / 3)
@@ -123,7 +142,8 @@ def fragment_code(
     if appearance.name.startswith("lava") and kind == "syrup":
         kind = "lava"
     towards = "toCamera" if view.parallel else "normalize(cameraAt - worldPoint)"
-    return declared, _COMMON.replace("TOWARDS", towards) + _FINISHES.get(kind, _FINISHES["matte"]) + _TONE
+    common = _COMMON.replace("TOWARDS", towards).replace("WALLED", "true" if walled else "false")
+    return declared, common + _FINISHES.get(kind, _FINISHES["matte"]) + _TONE
 
 
 def _carried(direction: str) -> str:
@@ -163,7 +183,7 @@ _COMMON = """
 vec3 n = normalize(worldNormal);
 vec3 v = TOWARDS;
 vec3 flat_ = step(upperWall - wallGap, worldPoint) - step(worldPoint, lowerWall + wallGap);
-bool atWall = dot(flat_, flat_) > 0.5;
+bool atWall = WALLED && dot(flat_, flat_) > 0.5;
 if (atWall) { n = normalize(flat_); }
 float facing = dot(n, v);
 if (facing < 0.02) { n = normalize(n + (0.02 - facing) * v); facing = dot(n, v); }

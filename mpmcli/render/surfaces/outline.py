@@ -7,9 +7,11 @@ import numpy as np
 from mpmcli.frames.frame import Frame
 from mpmcli.render.appearance import Appearance
 from mpmcli.render.coloring import Coloring
+from mpmcli.render.flat_colliders import flat_colliders
 from mpmcli.render.particle_grid import with_images
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.shading.material_groups import Group, groups_of
+from mpmcli.render.surfaces.collider_images import with_collider_images
 from mpmcli.render.surfaces.coverage import SPREAD, Grid, cover_of, disk_nodes, gaussian, spread
 from mpmcli.render.theme import Theme, rgb
 from mpmcli.render.view import View
@@ -44,6 +46,7 @@ class OutlinePainter:
         self.scene, self.view, self.theme, self.colors = scene, view, theme, colors
         self.fields = () if colors is None else colors.fields
         width, height = view.size
+        self.solid = flat_colliders(scene, view, theme)
         # Each pixel is a node; rows of the grid run upwards.
         edge = 1.0 / view.pixels_per_metre
         middle = np.array(view.focus)[:2]
@@ -61,7 +64,7 @@ class OutlinePainter:
         picture = np.empty((height, width, 3), dtype=np.float32)
         picture[:] = rgb(self.theme.ground)
         groups = groups_of(self.scene, frame)
-        covers = [self._cover(group) for group in groups]
+        covers = [self._cover(group, frame) for group in groups]
         if groups:
             finest = min(group.distance for group in groups)
             alpha = np.clip(self._inwards(sum(covers), finest) + 0.5, 0.0, 1.0) * self.inside
@@ -73,13 +76,16 @@ class OutlinePainter:
                 weight += own
             drawn /= weight[..., None]
             picture += alpha[..., None] * (drawn - picture)
-        return (255.0 * np.clip(picture, 0.0, 1.0) + 0.5).astype(np.uint8)[::-1]
+        picture = np.clip(picture, 0.0, 1.0)[::-1]
+        self.solid.draw(picture, frame)
+        return (255.0 * picture + 0.5).astype(np.uint8)
 
-    def _cover(self, group: Group) -> np.ndarray:
+    def _cover(self, group: Group, frame: Frame) -> np.ndarray:
         """Return the share of each pixel's surroundings that a group covers, (h, w); its edge is where it is 1/2."""
         step = _coarseness(group.distance, self.grid)
         grid = _coarser(self.grid, step)
-        cover = cover_of(group.position, group.distance, self.scene.lower, self.scene.upper, grid)
+        position = with_collider_images(group.position, group.distance, self.scene, frame)
+        cover = cover_of(position, group.distance, self.scene.lower, self.scene.upper, grid)
         if group.appearance.finish == "crumbly" and self.colors is None:
             cover = cover + ROUGHNESS * self._crumbs(group, grid) * np.clip(4.0 * cover * (1.0 - cover), 0.0, 1.0)
         return _finer(cover, step, self.grid.shape)

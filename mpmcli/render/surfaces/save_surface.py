@@ -104,7 +104,7 @@ class SurfaceJob:
         scene = render_scene_of(result)
 
         def save(k: int) -> None:
-            save_surface(scene, result.frame(k, ()), self.directory)
+            save_surface(scene, result.present_frame(k, ()), self.directory)
 
         return save
 

@@ -1,11 +1,15 @@
 """Draws 3D surfaces in one off-screen window, its meshes replaced with every frame."""
 
 import math
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
 from mpmcli.frames.frame import Frame
+from mpmcli.render.appearance import Appearance
+from mpmcli.render.collider_actors import edge_actors
+from mpmcli.render.collider_mesh import ColliderMesh, collider_meshes
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.offscreen import averaged, window_pixels
 from mpmcli.render.particle_grid import blurred_along, deposited, sampled
@@ -52,19 +56,25 @@ class SurfaceRenderer:
         self.plotter.renderer.TexturedBackgroundOn()
         self.actors: dict[Any, Any] = {}
         self._add_walls()
+        self.rims: dict[int, list[Any]] = {}
+        self.solids = [(mesh, mesh.shown(fine=True)) for mesh in collider_meshes(scene)]
         view.place(self.plotter)
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return the picture of a frame, (h, w, 3) uint8."""
         groups = groups_of(self.scene, frame)
-        occlusion = lighting.occlusion_by(self.scene, groups, self.lights.lamp)
+        solids = [(mesh, shown) for mesh, shown in self.solids if self.scene.shows(mesh.number, frame)]
+        shades = [mesh.shade(frame.time) for mesh, _ in solids if mesh.casts]
+        occlusion = lighting.occlusion_by(self.scene, groups, self.lights.lamp, shades)
         clear = []
-        for actor in self.actors.values():
+        for actor in (*self.actors.values(), *chain(*self.rims.values())):
             actor.SetVisibility(False)
         for group in groups:
             actor = self._posed(group, frame, occlusion)
             if group.appearance.finish in lighting.CLEAR and self.colors is None:
                 clear.append(actor)
+        for mesh, shown in solids:
+            self._pose_solid(mesh, shown, frame.time, occlusion)
         _put(self.background_texture, self.background.image(occlusion))
         if clear:
             # What is clear shows the picture of all the rest.
@@ -102,7 +112,7 @@ class SurfaceRenderer:
         )
         actor = self.actors.get(group.key)
         if actor is None:
-            actor = self.actors[group.key] = self._new_actor(group)
+            actor = self.actors[group.key] = self._new_actor(group.appearance, by_field=self.colors is not None)
         self._fill(actor, mesh, group, occlusion)
         actor.SetVisibility(bool(len(mesh.triangles)))
         return actor
@@ -128,10 +138,35 @@ class SurfaceRenderer:
         actor.SetVisibility(True)
         return actor
 
-    def _fill(self, actor: Any, mesh: Mesh, group: Group, occlusion: Occlusion | None) -> None:
-        import pyvista as pv
+    def _pose_solid(self, mesh: ColliderMesh, shown: Any, time: float, occlusion: Occlusion | None) -> None:
+        """Put a collider where it is at a time, s, in the light there."""
+        color = self.theme.solid
+        number = mesh.number
+        key = ("collider", number)
+        actor = self.actors.get(key)
+        matrix = mesh.transform(time)
+        if actor is None:
+            look = Appearance("collider", color, color, "matte")
+            actor = self.actors[key] = self._new_actor(look, by_field=False, walled=False)
+            if self.scene.clear and mesh.casts:
+                actor.GetProperty().BackfaceCullingOff()
+                actor.GetProperty().FrontfaceCullingOn()
+            # The rims of a container stand for its near side, which is not seen.
+            inside = mesh.collider.side == "inside"
+            self.rims[number] = edge_actors(mesh, self.theme, self.plotter, self.finer) if inside else []
+        for rim in self.rims[number]:
+            rim.user_matrix = matrix
+            rim.SetVisibility(True)
+        normals = shown.point_data["Normals"] @ matrix[:3, :3].T
+        points = shown.points @ matrix[:3, :3].T + matrix[:3, 3]
+        light = np.ones((len(points), 4), dtype=np.float32)
+        if occlusion is not None:
+            light[:, 0], light[:, 1] = occlusion.at(points, normals)
+        tint = np.broadcast_to(lighting.linear(color), points.shape)
+        _carry(actor, points, shown.regular_faces, (light, tint, np.zeros_like(points), normals))
+        actor.SetVisibility(True)
 
-        data = pv.PolyData.from_regular_faces(mesh.points, mesh.triangles) if len(mesh.points) else pv.PolyData()
+    def _fill(self, actor: Any, mesh: Mesh, group: Group, occlusion: Occlusion | None) -> None:
         count = len(mesh.points)
         light = np.ones((count, 4), dtype=np.float32)
         if occlusion is not None and count:
@@ -145,15 +180,9 @@ class SurfaceRenderer:
             mean = np.divide(value, known, out=np.full_like(value, np.nan), where=known > 0.5)
             tint = self.colors.shades(mean) ** np.float32(2.2)
         rough = mesh.attributes.get("rough", np.zeros((count, 3), dtype=np.float32))
-        carried = (light, tint, rough, mesh.normals)
-        for name, values in zip(lighting.CARRIED, carried, strict=True):
-            data.point_data[name] = np.ascontiguousarray(values, dtype=np.float32)
-        # Only because the window declares textures of meshes that have these.
-        data.point_data["places"] = np.zeros((count, 2), dtype=np.float32)
-        data.GetPointData().SetActiveTCoords("places")
-        actor.GetMapper().SetInputData(data)
+        _carry(actor, mesh.points, mesh.triangles, (light, tint, rough, mesh.normals))
 
-    def _new_actor(self, group: Group) -> Any:
+    def _new_actor(self, appearance: Appearance, *, by_field: bool, walled: bool = True) -> Any:
         import vtk
 
         mapper = vtk.vtkPolyDataMapper()
@@ -171,7 +200,7 @@ class SurfaceRenderer:
         shader.AddVertexShaderReplacement("//VTK::Normal::Dec", True, f"//VTK::Normal::Dec\n{declared}", False)
         shader.AddVertexShaderReplacement("//VTK::Normal::Impl", True, f"//VTK::Normal::Impl\n{done}", False)
         declared, done = lighting.fragment_code(
-            self.scene, self.view, self.lights, group.appearance, self.finer, by_field=self.colors is not None
+            self.scene, self.view, self.lights, appearance, self.finer, by_field=by_field, walled=walled
         )
         # After all that the window does itself; its own lights and textures are left out.
         shader.AddFragmentShaderReplacement("//VTK::TCoord::Dec", True, f"//VTK::TCoord::Dec\n{declared}", False)
@@ -193,6 +222,19 @@ class SurfaceRenderer:
             lighting=False,
         )
         walls.SetPickable(False)
+
+
+def _carry(actor: Any, points: np.ndarray, triangles: np.ndarray, carried: tuple[np.ndarray, ...]) -> None:
+    """Give an actor a mesh whose vertices hand the values of `lighting.CARRIED` to the shader."""
+    import pyvista as pv
+
+    data = pv.PolyData.from_regular_faces(points, triangles) if len(points) else pv.PolyData()
+    for name, values in zip(lighting.CARRIED, carried, strict=True):
+        data.point_data[name] = np.ascontiguousarray(values, dtype=np.float32)
+    # Only because the window declares textures of meshes that have these.
+    data.point_data["places"] = np.zeros((len(points), 2), dtype=np.float32)
+    data.GetPointData().SetActiveTCoords("places")
+    actor.GetMapper().SetInputData(data)
 
 
 def _thickness_at(view: View, position: np.ndarray, distance: float, points: np.ndarray) -> np.ndarray:

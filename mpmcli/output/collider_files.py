@@ -1,0 +1,194 @@
+"""The surfaces of colliders beside the particles, for ParaView: those at rest once, those that move at every frame.
+
+VTKHDF PolyData as of the particles (see `vtkhdf`), of triangles in 3D and lines in 2D. All frames share one list of
+cells, and those of colliders at rest one set of points.
+"""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from mpmcli.errors import RunError
+from mpmcli.output.durable import require_free_space, sealed, write_text
+from mpmcli.output.stored_colliders import triangles_of
+from mpmcli.output.vtkhdf import LIBVER
+from mpmcli.scene.collider_surface import collider_surface
+from mpmcli.scene.colliders import Collider
+from mpmcli.scene.surface import Surface, joined
+from mpmcli.scene.triangles import Surface as Triangles
+
+RESTING, MOVING = "colliders.vtkhdf", "colliders_moving.vtkhdf"
+SERIES = "colliders.pvd"
+RESTING_PIECE, MOVING_PIECE = "colliders.vtu", "colliders_{:06d}.vtu"
+COLLIDER_FILES = (RESTING, MOVING, SERIES, RESTING_PIECE)
+MOVING_FRAME = re.compile(r"colliders_\d{6,}\.vtu")
+# Groups of cells in the order of VTK; those for 2D and 3D.
+CELLS = ("Vertices", "Lines", "Polygons", "Strips")
+
+
+@dataclass(frozen=True, eq=False)
+class Things:
+    """Some colliders of a run as one surface.
+
+    Attributes:
+        colliders: k of them.
+        surfaces: of each, where its shape stands.
+        numbers: of each, in the scene.
+    """
+
+    colliders: tuple[Collider, ...]
+    surfaces: tuple[Surface, ...]
+    numbers: tuple[int, ...]
+
+    @property
+    def whole(self) -> Surface:
+        """All surfaces as one."""
+        return joined(list(self.surfaces), self.surfaces[0].points.shape[1])
+
+    @property
+    def meshes(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """Vertices and triangles of those that are read from files, which may be gone later, by number."""
+        pairs = zip(self.numbers, map(triangles_of, self.colliders), strict=True)
+        return {number: triangles for number, triangles in pairs if triangles is not None}
+
+    @property
+    def labels(self) -> np.ndarray:
+        """The number of the collider of each cell, (m,) int32."""
+        return np.repeat(np.array(self.numbers, np.int32), [len(surface.cells) for surface in self.surfaces])
+
+    def points(self, time: float) -> np.ndarray:
+        """Return the points (n, 3) at a time, s; z = 0 in 2D."""
+        pairs = zip(self.colliders, self.surfaces, strict=True)
+        moved = np.concatenate([collider.motion.placed(surface.points, time) for collider, surface in pairs])
+        return np.pad(moved, ((0, 0), (0, 3 - moved.shape[1])))
+
+
+def write_collider_files(
+    directory: Path, header: Mapping[str, Any], times: Sequence[float], colliders: Sequence[Collider]
+) -> None:
+    """Write the colliders of a run, if it has any, at the times of its frames, s.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    for name, moves in ((RESTING, False), (MOVING, True)):
+        things = _things(header, colliders, moving=moves)
+        if things is None:
+            continue
+        frames = len(times) if moves else 1
+        size = 24 * sum(len(s.points) for s in things.surfaces) * frames + 32 * len(things.labels) + 2**16
+        size += 200 * len(times) + sum(vertices.nbytes + cells.nbytes for vertices, cells in things.meshes.values())
+        _written(directory, name, size, lambda path, things=things: _write_vtkhdf(path, things, times))
+
+
+def write_collider_series(
+    directory: Path, header: Mapping[str, Any], times: Sequence[float], colliders: Sequence[Collider]
+) -> None:
+    """Write the colliders of a run, if it has any, as .vtu files and the .pvd that lists them.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    entries: list[tuple[float, int, str]] = []
+    for part, moves in enumerate((False, True)):
+        things = _things(header, colliders, moving=moves)
+        if things is None:
+            continue
+        size = 64 * (3 * sum(len(s.points) for s in things.surfaces) + 3 * len(things.labels)) + 2**12
+        for k, time in enumerate(times):
+            name = MOVING_PIECE.format(k) if moves else RESTING_PIECE
+            entries.append((time, part, name))
+            if moves or k == 0:
+                _written(directory, name, size, lambda path, things=things, time=time: _write_vtu(path, things, time))
+    if entries:
+        lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "<Collection>"]
+        lines += [f'<DataSet timestep="{t!r}" group="" part="{p}" file="{name}"/>' for t, p, name in sorted(entries)]
+        write_text(directory / SERIES, "\n".join([*lines, "</Collection>", "</VTKFile>", ""]))
+
+
+def read_stored_surfaces(directory: Path) -> dict[int, Triangles]:
+    """Return the surfaces of colliders that were read from files, by number, as a packed result keeps them."""
+    found = {}
+    for name in (RESTING, MOVING):
+        with suppress(OSError, KeyError, ValueError), h5py.File(directory / name, "r", locking=False) as file:
+            for number, group in file["mpmcli/surfaces"].items():
+                found[int(number)] = Triangles(group["vertices"][...], group["triangles"][...])
+    return found
+
+
+def _things(header: Mapping[str, Any], colliders: Sequence[Collider], *, moving: bool) -> Things | None:
+    """Return the colliders that move, or those that do not; None where there are none."""
+    found = []
+    for number, collider in enumerate(colliders):
+        if collider.motion.moves == moving:
+            lower = np.array(header["origin"], float)
+            surface = collider_surface(collider, lower, lower + np.array(header["size"], float))
+            if len(surface.cells):
+                found.append((collider, surface, number))
+    return Things(*zip(*found, strict=True)) if found else None
+
+
+def _written(directory: Path, name: str, size: int, write: Any) -> None:
+    path = directory / name
+    kept = "the frames of the run are kept"
+    try:
+        require_free_space(directory, size, f"writing {name}", kept)
+        with sealed(path, size) as temporary:
+            write(temporary)
+    except (OSError, RuntimeError) as error:
+        if isinstance(error, RunError):
+            raise
+        reason = getattr(error, "strerror", None) or error
+        raise RunError(f"{path} could not be written ({reason}); {kept}.") from error
+
+
+def _write_vtkhdf(path: Path, things: Things, times: Sequence[float]) -> None:
+    whole, labels = things.whole, things.labels
+    count, cells, corners = len(whole.points), len(whole.cells), whole.cells.shape[1]
+    moving = any(collider.motion.moves for collider in things.colliders)
+    with h5py.File(path, "w", libver=LIBVER, locking="best-effort") as file:
+        root = file.create_group("VTKHDF")
+        root.attrs["Version"] = [2, 0]
+        root.attrs["Type"] = np.bytes_("PolyData")
+        sets = len(times) if moving else 1
+        points = root.create_dataset("Points", (sets * count, 3), "f8")
+        for k in range(sets):
+            points[k * count : (k + 1) * count] = things.points(times[k])
+        root["NumberOfPoints"] = np.array([count])
+        for kind in CELLS:
+            ours = kind == ("Lines" if corners == 2 else "Polygons")
+            group = root.create_group(kind)
+            group["NumberOfCells"] = np.array([cells * ours])
+            group["NumberOfConnectivityIds"] = np.array([cells * corners * ours])
+            group["Connectivity"] = whole.cells.ravel() if ours else np.empty(0, np.int64)
+            group["Offsets"] = np.arange(0, cells * corners * ours + 1, corners)
+        root["CellData/collider"] = labels
+        steps, zeros = root.create_group("Steps"), np.zeros(len(times), np.int64)
+        steps["PartOffsets"] = zeros
+        steps["NumberOfParts"] = zeros + 1
+        steps["PointOffsets"] = count * np.arange(len(times)) if moving else zeros
+        steps["CellOffsets"] = steps["ConnectivityIdOffsets"] = np.zeros((len(times), 4), np.int64)
+        steps["CellDataOffsets/collider"] = zeros
+        steps["Values"] = np.asarray(times, float)
+        steps.attrs["NSteps"] = len(times)
+        names = {number: c.name for number, c in zip(things.numbers, things.colliders, strict=True)}
+        file.create_group("mpmcli").attrs["colliders"] = json.dumps(names)
+        for number, (vertices, triangles) in things.meshes.items():
+            group = file.create_group(f"mpmcli/surfaces/{number}")
+            group["vertices"], group["triangles"] = vertices, triangles
+
+
+def _write_vtu(path: Path, things: Things, time: float) -> None:
+    from meshio import Mesh, vtu
+
+    whole = things.whole
+    kind = "line" if whole.cells.shape[1] == 2 else "triangle"
+    mesh = Mesh(things.points(time), [(kind, whole.cells)], cell_data={"collider": [things.labels]})
+    vtu.write(path, mesh, compression=None, header_type="UInt64")

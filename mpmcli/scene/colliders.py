@@ -1,0 +1,200 @@
+"""Colliders: rigid things that the material meets, at rest or moving as the scene says."""
+
+import math
+from itertools import pairwise
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+
+from mpmcli.scene.derivative import derivative
+from mpmcli.scene.domain import Domain
+from mpmcli.scene.entry import Entry, OfTime, TimeVector, tree_of
+from mpmcli.scene.expression import Expression, Tree, evaluate
+from mpmcli.scene.expression import Number as Constant
+from mpmcli.scene.motion import Motion, between_keys
+from mpmcli.scene.primitives import unit
+from mpmcli.scene.quantity import NAME, NotNegative, Number, Table, Vector, flaw, list_of_axes, scene_dimension
+from mpmcli.scene.shapes import Form, Shape, exactly_one_form
+
+# What a surface does, as walls of the domain.
+SurfaceWord = Literal["slip", "stick", "separate"]
+ZERO = Constant(0.0)
+
+
+class Plane(Table):
+    """A half space: all that lies behind a plane."""
+
+    point: Annotated[Vector, Field(description="A point of the plane, m.")]
+    normal: Annotated[Vector, Field(description="Direction out of the collider, into the material, of any length.")]
+
+    @model_validator(mode="after")
+    def _normal_has_a_direction(self) -> "Plane":
+        if not any(self.normal):
+            raise flaw("must have a direction, as [0, 1] has in 2D; found zeros", "normal")
+        return self
+
+    @property
+    def direction(self) -> np.ndarray:
+        """The normal as a unit vector, (d,)."""
+        return unit(self.normal)
+
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each point (n, d) from the plane, (n,), m; negative behind it."""
+        return (points - np.array(self.point)) @ self.direction
+
+
+class ColliderShape(Shape):
+    """The shape of a collider: one of the forms of bodies, or a plane."""
+
+    plane: Annotated[Plane | None, Field(description="A half space: all that lies behind a plane.")] = None
+
+
+OneColliderShape = Annotated[
+    ColliderShape,
+    AfterValidator(exactly_one_form),
+    Field(json_schema_extra={"minProperties": 1}),
+]
+
+
+class Keyframe(Table):
+    """Where a collider is at a time."""
+
+    time: Annotated[NotNegative, Field(description="s.")]
+    offset: Annotated[
+        Vector, Field(validate_default=True, description="Offset from where its shape stands, m. Default: zeros.")
+    ] = None  # type: ignore[assignment]
+    angle: Annotated[Number, Field(description="Angle that it is turned by, rad.")] = 0.0
+
+
+class Collider(Table):
+    """A rigid thing that the material meets."""
+
+    name: Annotated[str, Field(pattern=NAME, description="Name of the collider, for messages and --set.")]
+    shape: Annotated[OneColliderShape, Field(description="What it is made of: a form as bodies have, or a plane.")]
+    side: Annotated[
+        Literal["outside", "inside"],
+        Field(description="Where the material is: outside of the shape, or inside, as in a container."),
+    ] = "outside"
+    wall: Annotated[SurfaceWord, Field(description="What its surface does: slip, stick or separate.")] = "separate"
+    friction: Annotated[NotNegative, Field(description="Coefficient of friction, unless it sticks.")] = 0.0
+    velocity: Annotated[
+        TimeVector,
+        Field(
+            validate_default=True,
+            description="Velocity, m/s; numbers, or expressions of the time t (s). Default: at rest.",
+        ),
+    ] = None  # type: ignore[assignment]
+    angular_velocity: Annotated[OfTime, Field(description="Rate at which it turns about its axis, rad/s.")] = 0.0
+    offset: Annotated[
+        list_of_axes(OfTime) | None,
+        Field(description="Offset from where its shape stands, m, in place of the velocity. Default: none."),
+    ] = None
+    angle: Annotated[
+        OfTime | None, Field(description="Angle that it is turned by, rad, in place of the rate. Default: none.")
+    ] = None
+    keyframes: Annotated[
+        tuple[Keyframe, ...],
+        Field(description="Offsets and angles at some times, in place of all these; linear between them."),
+    ] = ()
+    axis: Annotated[
+        tuple[Number, Number, Number] | None,
+        Field(description="Direction of the axis that it turns about; 3D only. Default: [0, 0, 1]."),
+    ] = None
+    pivot: Annotated[
+        Vector | None,
+        Field(description="Point of the axis, m; it moves along. Default: the centre of the shape."),
+    ] = None
+
+    @field_validator("axis", mode="before")
+    @classmethod
+    def _axis_has_a_direction(cls, axis: Any, info: ValidationInfo) -> Any:
+        if axis is not None and scene_dimension(info) == 2:
+            raise flaw("is for 3D scenes and this one is 2D, where colliders turn in their plane; leave it out")
+        if isinstance(axis, list | tuple) and not any(axis):
+            raise flaw("must have a direction, as [0, 0, 1] has; found zeros")
+        return axis
+
+    @model_validator(mode="after")
+    def _one_way_to_move(self) -> "Collider":
+        for key, other in (("offset", "velocity"), ("angle", "angular_velocity")):
+            if getattr(self, key) is not None and self._gives(other):
+                raise flaw(f'"{other}" is given as well; leave one of them out', key)
+        others = [key for key in ("velocity", "angular_velocity", "offset", "angle") if self._gives(key)]
+        if self.keyframes and others:
+            raise flaw(f'"{others[0]}" is given as well; leave one of them out', "keyframes")
+        times = [key.time for key in self.keyframes]
+        if any(b <= a for a, b in pairwise(times)):
+            raise flaw("must have times that rise from each to the next", "keyframes")
+        if self.wall == "stick" and self.friction > 0:
+            raise flaw('is for a surface that slips or separates, and wall is "stick"; leave it out', "friction")
+        return self
+
+    def _gives(self, key: str) -> bool:
+        """Return whether a motion is given; zeros, as defaults are written out, are none."""
+        value = getattr(self, key)
+        return bool(any(value) if isinstance(value, tuple) else value)
+
+    @property
+    def form(self) -> Form | Plane:
+        """The form of its shape."""
+        return self.shape.form
+
+    @property
+    def center(self) -> tuple[float, ...]:
+        """The pivot: as it is given, or the centre of the bounding box, or the point of a plane."""
+        if self.pivot is not None:
+            return self.pivot
+        if isinstance(self.form, Plane):
+            return self.form.point
+        return tuple(float(x) for x in np.mean(self.form.bounds(), axis=0))
+
+    @property
+    def radius(self) -> float:
+        """The distance from the pivot that no point of it exceeds, m; infinite for a plane."""
+        if isinstance(self.form, Plane):
+            return math.inf
+        return float(np.linalg.norm(np.abs(np.array(self.form.bounds()) - self.center).max(axis=0)))
+
+    @property
+    def motion(self) -> Motion:
+        """How it moves."""
+        d = len(self.velocity)
+        axis = tuple(unit(self.axis or (0.0, 0.0, 1.0)).tolist())
+        if self.keyframes:
+            times = [key.time for key in self.keyframes]
+            offsets = [between_keys(times, [key.offset[a] for key in self.keyframes]) for a in range(d)]
+            spin = between_keys(times, [key.angle for key in self.keyframes])
+            first = self.keyframes[0]
+            return Motion(self.center, axis, first.offset, first.angle, tuple(offsets), spin)
+        velocity, start = tuple(map(tree_of, self.velocity)), (0.0,) * d
+        if self.offset is not None:
+            velocity = tuple(slope_of(entry) for entry in self.offset)
+            start = tuple(start_of(entry) for entry in self.offset)
+        spin, angle = tree_of(self.angular_velocity), 0.0
+        if self.angle is not None:
+            spin, angle = slope_of(self.angle), start_of(self.angle)
+        return Motion(self.center, axis, start, angle, velocity, spin)
+
+    def fastest(self, domain: Domain, end: float) -> float:
+        """Return a bound on the speed of its points in a domain between time 0 and `end` (s), m/s."""
+        motion = self.motion
+        # What lies outside of the domain meets nothing; the pivot goes this far at most.
+        gone = float(np.linalg.norm(motion.offset)) + end * motion.fastest(0.0, end)
+        far = np.linalg.norm(np.abs(np.array([domain.origin, domain.upper]) - self.center).max(axis=0)) + gone
+        return motion.fastest(min(self.radius, float(far)), end)
+
+    def signed_distance(self, points: np.ndarray, time: float = 0.0) -> np.ndarray:
+        """Return the distance of points (n, d) from its surface at a time, s: (n,), m; positive where material is."""
+        found = self.form.signed_distance(self.motion.taken_back(points, time))
+        return -found if self.side == "inside" else found
+
+
+def slope_of(entry: Entry) -> Tree:
+    """Return the derivative of an entry by t, a tree."""
+    return derivative(entry.tree, "t") if isinstance(entry, Expression) else ZERO
+
+
+def start_of(entry: Entry) -> float:
+    """Return the value of an entry at time 0."""
+    return float(evaluate(tree_of(entry), {"t": 0.0}))

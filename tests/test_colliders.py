@@ -1,0 +1,357 @@
+"""Colliders in the solver: distances, what a step takes, slopes, weight, buoyancy, and nothing that passes them."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import taichi as ti
+from solver_state import scene_of, with_colliders
+
+from mpmcli.boundaries.collider_kind import ColliderKind
+from mpmcli.boundaries.colliders import Colliders
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.scene import Scene
+from mpmcli.solver.engine import build_engine
+from mpmcli.solver.solver import Solver
+
+G = 10.0
+JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e6, "poissons_ratio": 0.3}
+SHAPES_2D = [
+    {"plane": {"point": [0.3, 0.4], "normal": [1.0, 2.0]}},
+    {"box": {"min": [0.3, 0.4], "max": [0.6, 0.5]}},
+    {"ball": {"center": [0.5, 0.4], "radius": 0.2}},
+    {"capsule": {"start": [0.3, 0.3], "end": [0.5, 0.6], "radius": 0.1}},
+    {"polygon": {"vertices": [[0.2, 0.2], [0.8, 0.3], [0.5, 0.4], [0.4, 0.8]]}},
+    {"polygon": {"vertices": [[0.4, 0.8], [0.5, 0.4], [0.8, 0.3], [0.2, 0.2]]}},
+]
+SHAPES_3D = [
+    {"plane": {"point": [0.3, 0.4, 0.5], "normal": [1.0, 2.0, -1.0]}},
+    {"box": {"min": [0.3, 0.4, 0.2], "max": [0.6, 0.5, 0.7]}},
+    {"ball": {"center": [0.5, 0.4, 0.6], "radius": 0.2}},
+    {"capsule": {"start": [0.3, 0.3, 0.3], "end": [0.5, 0.6, 0.7], "radius": 0.1}},
+    {"cylinder": {"base": [0.4, 0.4, 0.4], "axis": [1.0, 1.0, 0.3], "radius": 0.15, "height": 0.3}},
+]
+
+
+def run(scene: Scene, backend: object) -> list[tuple[Frame, LedgerRow]]:
+    """Return the frames of a scene, run as `mpmcli simulate` does on the CPU."""
+    return list(build_engine(scene, backend, batched=True).frames(lambda: False))
+
+
+@ti.kernel
+def evaluate(colliders: ti.template(), points: ti.types.ndarray(), found: ti.types.ndarray()):
+    """Fill found (n, k, d + 1) with distances and normals of all colliders at the points (n, d)."""
+    for p in range(points.shape[0]):
+        for k in range(found.shape[1]):
+            x = ti.Vector.zero(float, ti.static(colliders.dimension))
+            for a in ti.static(range(colliders.dimension)):
+                x[a] = points[p, a]
+            phi, normal = colliders.distance(k, x - colliders.place[k], 0)
+            found[p, k, 0] = phi
+            for a in ti.static(range(colliders.dimension)):
+                found[p, k, 1 + a] = normal[a]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_distances_are_those_of_the_shapes(backend_of: Callable, dimension: int) -> None:
+    """As numpy computes them, also turned and as containers; normals are their gradients. f64, to 1e-12 and 1e-6.
+
+    Unions and differences are read from a grid: to h^2 / 8 of it where the surface is curved.
+    """
+    backend_of("f64", 1)
+    shapes = SHAPES_2D if dimension == 2 else SHAPES_3D
+    outer, inner = ({"ball": {"center": [0.5] * dimension, "radius": radius}} for radius in (0.4, 0.2))
+    ring = outer | {"subtract": [inner]}
+    colliders = [{"name": f"c{k}", "shape": shape, "angle": 0.3 * k} for k, shape in enumerate([*shapes, ring])]
+    colliders[2]["side"] = "inside"
+    scene = scene_of(
+        domain={"size": [1.0] * dimension, "origin": [0.0] * dimension, "spacing": 0.05},
+        time={"end": 1.0, "frames": 1},
+        bodies=[
+            {
+                "name": "b",
+                "material": "jelly",
+                "shape": {"box": {"min": [0.9] * dimension, "max": [0.95] * dimension}},
+            }
+        ],
+    )
+    scene = with_colliders(scene, colliders)
+    device = Colliders(ColliderKind.of(scene), dimension, (27,) * dimension, 3, 1, on_cpu=True)
+    device.spacing = 0.05
+    device.write(scene)
+    points = np.random.default_rng(0).uniform(0.02, 0.98, (400, dimension))
+    found = np.zeros((len(points), len(colliders), 1 + dimension))
+    evaluate(device, points, found)
+    step = 1e-6
+    for k, collider in enumerate(scene.colliders):
+        expected = collider.signed_distance(points)
+        around = np.stack(
+            [
+                (collider.signed_distance(points + step * e) - collider.signed_distance(points - step * e)) / (2 * step)
+                for e in np.eye(dimension)
+            ],
+            axis=1,
+        )
+        # Where the gradient is that of an edge or a middle plane, no direction is right.
+        smooth = np.abs(np.linalg.norm(around, axis=1) - 1) < 1e-4
+        assert smooth.sum() > 300
+        if k < len(shapes):
+            assert found[:, k, 0] == pytest.approx(expected, abs=1e-12)
+            assert np.abs(found[smooth, k, 1:] - around[smooth]).max() < 1e-4
+        else:
+            near = np.abs(expected) < 0.02
+            assert np.abs(found[near, k, 0] - expected[near]).max() < 0.025**2 / 0.15
+            assert np.abs(found[near & smooth, k, 1:] - around[near & smooth]).max() < 0.2
+
+
+def block_on_plane(
+    slope: float, tilt: float, friction: float, end: float, *, offset: float, speed: float = 0.0, cells: int = 4
+) -> tuple[Scene, np.ndarray, np.ndarray]:
+    """Return a flat block on a plane tilted against the grid, with its direction down the slope and its normal.
+
+    Gravity is turned so that the plane has a slope, degrees; it sets in over 0.4 s where the block begins at rest.
+    The plane begins `offset` cells from a node. Angles in degrees.
+    """
+    length, height = 1.0, 0.25
+    h, turn, angle = height / cells, math.radians(tilt), math.radians(slope)
+    down, normal = np.array([math.cos(turn), math.sin(turn)]), np.array([-math.sin(turn), math.cos(turn)])
+    pull = G * (math.sin(angle) * down - math.cos(angle) * normal)
+    point = np.array([0.5 + 6 * h * bool(tilt), 6 * h + offset * h])
+    corner = point + 0.1 * down
+    corners = [corner, corner + length * down, corner + length * down + height * normal, corner + height * normal]
+    high = 48 if tilt else 16
+    slowly = "*(0.5 - 0.5*cos(pi*min(t/0.4, 1)))"
+    # What it begins in: the stress of its weight, along the normal.
+    strain = [
+        [f"{int(i == j)} - {normal[i] * normal[j] * 1000 * G / 1e6} * ({height} - s)" for j in (0, 1)] for i in (0, 1)
+    ]
+    place = f"({normal[0]}*(X - {corner[0]}) + {normal[1]}*(Y - {corner[1]}))"
+    weight = {"deformation": [[entry.replace("s)", f"{place})") for entry in row] for row in strain]}
+    scene = scene_of(
+        domain={
+            "size": [64 * h, high * h],
+            "spacing": h,
+            "gravity": list(pull) if speed else [f"{x}{slowly}" for x in pull],
+        },
+        time={"end": end, "frames": 40},
+        solver={"precision": "f64"},
+        bodies=[
+            {
+                "name": "block",
+                "material": JELLY | ({"poissons_ratio": 0.0} if speed else {}),
+                "shape": {"polygon": {"vertices": [list(c) for c in corners]}},
+                "velocity": list(speed * down),
+                **(weight if speed else {}),
+            }
+        ],
+        colliders=[
+            {
+                "name": "slope",
+                "shape": {"plane": {"point": list(point), "normal": list(normal)}},
+                "friction": friction,
+            }
+        ],
+    )
+    return scene, down, normal
+
+
+def slid(scene: Scene, down: np.ndarray, backend: object) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return times, mean places and mean velocities of the block down the slope."""
+    frames = [frame for frame, _ in run(scene, backend)]
+    return (
+        np.array([frame.time for frame in frames]),
+        np.array([(frame.position.astype(float) @ down).mean() for frame in frames]),
+        np.array([(frame.velocity.astype(float) @ down).mean() for frame in frames]),
+    )
+
+
+SLOW = [pytest.param(tilt, offset, marks=pytest.mark.slow) for tilt in (0.0, 45.0) for offset in (0.3, 0.5)]
+PLACES = [(0.0, 0.0), (17.0, 0.3), *SLOW]
+
+
+@pytest.mark.parametrize(("tilt", "offset"), PLACES)
+def test_a_block_slides_down_a_slope(
+    backend_of: Callable, tilt: float, offset: float, record_property: Callable
+) -> None:
+    """a = g (sin - mu cos), to 1 %, along the grid and across it (asked 5 % there)."""
+    scene, down, _ = block_on_plane(30.0, tilt, 0.3, 0.9, offset=offset)
+    t, _, v = slid(scene, down, backend_of("f64", 1))
+    late = t > 0.45
+    found = np.polyfit(t[late], v[late], 1)[0]
+    expected = G * (math.sin(math.radians(30)) - 0.3 * math.cos(math.radians(30)))
+    record_property("error", found / expected - 1)
+    assert found == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(("tilt", "offset"), PLACES)
+def test_a_block_stays_on_a_slope(backend_of: Callable, tilt: float, offset: float, record_property: Callable) -> None:
+    """mu = 0.7 > tan(30 degrees): it drifts by less than 1e-4 of its length in a second."""
+    scene, down, _ = block_on_plane(30.0, tilt, 0.7, 1.6, offset=offset)
+    t, x, _ = slid(scene, down, backend_of("f64", 1))
+    late = t > 0.8
+    drift = np.polyfit(t[late], x[late], 1)[0]
+    record_property("drift / L", drift)
+    assert abs(drift) < 1e-4
+    assert abs(x[-1] - x[0]) < 1e-3
+
+
+@pytest.mark.parametrize(("tilt", "offset"), [PLACES[0], pytest.param(17.0, 0.3, marks=pytest.mark.slow)])
+def test_a_block_comes_to_rest(backend_of: Callable, tilt: float, offset: float, record_property: Callable) -> None:
+    """Thrown along a floor it stops after v^2 / (2 mu g), to 1 %."""
+    scene, down, _ = block_on_plane(0.0, tilt, 0.4, 0.7, offset=offset, speed=2.0)
+    _, x, v = slid(scene, down, backend_of("f64", 1))
+    expected = 2.0**2 / (2 * 0.4 * G)
+    record_property("error", (x[-4:].mean() - x[0]) / expected - 1)
+    assert x[-4:].mean() - x[0] == pytest.approx(expected, rel=0.01)
+    assert abs(v[-4:].mean()) < 4e-3 * 2.0
+
+
+def test_momentum_goes_to_the_colliders(backend_of: Callable) -> None:
+    """Momentum and angular momentum of the particles and what colliders took are constant, to round-off in f64."""
+    centers = np.array([[1.0, 0.6], [1.35, 0.95]])
+    scene = scene_of(
+        domain={"size": [2.0, 2.0], "spacing": 0.05},
+        time={"end": 0.5, "frames": 5},
+        solver={"precision": "f64"},
+        bodies=[
+            {
+                "name": "b",
+                "material": JELLY,
+                "velocity": [1.0, -1.0],
+                "shape": {"box": {"min": [0.8, 0.9], "max": [1.2, 1.2]}},
+            }
+        ],
+        colliders=[
+            {"name": "ball", "shape": {"ball": {"center": list(centers[0]), "radius": 0.25}}, "friction": 0.3},
+            {
+                "name": "paddle",
+                "shape": {"box": {"min": [1.3, 0.6], "max": [1.4, 1.3]}},
+                "angular_velocity": 2.0,
+                "wall": "stick",
+            },
+        ],
+    )
+    rows = [row for _, row in run(scene, backend_of("f64", 1))]
+    momentum = np.array([row.linear_momentum for row in rows])
+    turning = np.array([row.angular_momentum[0] for row in rows])
+    force, torque = (np.array([getattr(row, f"collider_{name}") for row in rows]) for name in ("force", "torque"))
+    assert (np.abs(force[1:]).max(axis=(0, 2)) > 100).all()
+    taken = np.cumsum(0.1 * force.sum(axis=1), axis=0)
+    assert np.abs(momentum + taken - momentum[0]).max() < 1e-12 * np.abs(momentum[0]).max()
+    arms = centers[None, :, 0] * force[:, :, 1] - centers[None, :, 1] * force[:, :, 0]
+    turned = np.cumsum(0.1 * (torque[:, :, 0] + arms).sum(axis=1))
+    assert np.abs(turning + turned - turning[0]).max() < 1e-12 * abs(turning[0])
+
+
+def still_water(n: int, colliders: list[dict], shape: dict, *, side: str = "slip") -> Scene:
+    """Return water in the state of its own weight, in a box of n cells."""
+    return scene_of(
+        domain={"size": [1.0, 1.0], "cells": [n, n], "gravity": [0.0, -9.81], "walls": side},
+        time={"end": 1.0, "frames": 20},
+        bodies=[{"name": "water", "material": "water", "initial_pressure": "hydrostatic", "shape": shape}],
+        colliders=colliders,
+    )
+
+
+@pytest.mark.parametrize("offset", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
+def test_a_floor_carries_the_weight(backend_of: Callable, offset: float, record_property: Callable) -> None:
+    """The force on a plane under water at rest, to 1 %."""
+    low = (8 + offset) / 32
+    floor = {"name": "floor", "shape": {"plane": {"point": [0.0, low], "normal": [0.0, 1.0]}}}
+    rows = [
+        row
+        for _, row in run(
+            still_water(32, [floor], {"box": {"min": [0.0, low], "max": [1.0, low + 0.4]}}), backend_of("f32", 1)
+        )
+    ]
+    force = np.mean([row.collider_force[0] for row in rows[10:]], axis=0)
+    weight = rows[0].mass * 9.81
+    record_property("error", float(-force[1] / weight - 1))
+    assert force[1] == pytest.approx(-weight, rel=0.01)
+    assert abs(force[0]) < 1e-3 * weight
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("offset", [0.0, 0.5])
+def test_archimedes(backend_of: Callable, offset: float, record_property: Callable) -> None:
+    """Water at rest lifts a fixed disk of 10 cells with the weight of what it displaces, to 2 %."""
+    n, radius = 64, 0.16
+    center = [0.5 + offset / n, 0.3 + offset / n]
+    disk = {"ball": {"center": center, "radius": radius}}
+    shape = {"box": {"min": [0.0, 0.0], "max": [1.0, 0.6]}, "subtract": [disk]}
+    rows = [row for _, row in run(still_water(n, [{"name": "disk", "shape": disk}], shape), backend_of("f32", 1))]
+    force = np.mean([row.collider_force[0] for row in rows[5:]], axis=0)
+    weight = 1000 * math.pi * radius**2 * 9.81
+    record_property("error", float(force[1] / weight - 1))
+    assert force[1] == pytest.approx(weight, rel=0.02)
+
+
+@pytest.mark.parametrize("speed", [4.0, pytest.param(40.0, marks=pytest.mark.slow)])
+def test_nothing_passes_a_collider_that_moves(backend_of: Callable, speed: float) -> None:
+    """A slab sweeps a tank: all water stays before it, whatever its speed; steps are at most half a cell of it."""
+    h = 1 / 32
+    slab = {
+        "name": "slab",
+        "shape": {"box": {"min": [0.0, -0.5], "max": [0.15, 2.0]}},
+        "velocity": [f"{speed} if t < {0.6 / speed} else 0", 0.0],
+    }
+    end = 0.65 / speed
+    scene = scene_of(
+        domain={"size": [1.0, 1.0], "spacing": h, "gravity": [0.0, -9.81]},
+        time={"end": end, "frames": 6},
+        bodies=[{"name": "w", "material": "water", "shape": {"box": {"min": [0.15 + h, 0.0], "max": [0.5, 0.3]}}}],
+        colliders=[slab],
+    )
+    frames = run(scene, backend_of("f32", 1))
+    for frame, row in frames:
+        face = 0.15 + min(frame.time * speed, 0.6)
+        assert frame.position[:, 0].min() > face - 0.5 * h
+        assert row.step_max <= 0.8 * 0.5 * h / speed * (1 + 1e-6)
+    assert frames[-1][0].position[:, 0].min() > 0.7
+
+
+def test_a_collider_at_speed_limits_the_step(backend_of: Callable) -> None:
+    """Half a cell of the fastest point of a blade at most, though nothing is near it; the ledger says what binds."""
+    blade = {
+        "name": "blade",
+        "shape": {"box": {"min": [0.5, 0.7], "max": [0.9, 0.75]}},
+        "angular_velocity": 500.0,
+        "pivot": [0.5, 0.7],
+    }
+    scene = scene_of(
+        domain={"size": [1.0, 1.0], "spacing": 0.05},
+        time={"end": 0.002, "frames": 1},
+        bodies=[{"name": "b", "material": JELLY, "shape": {"box": {"min": [0.1, 0.1], "max": [0.2, 0.2]}}}],
+        colliders=[blade],
+    )
+    solver = Solver(scene, backend_of("f64", 1))
+    limit = {one.name: one for one in solver.limits()}["collider"]
+    assert limit.value == pytest.approx(0.5 * 0.05 / (500 * math.hypot(0.4, 0.05)))
+    assert run(scene, solver.backend)[-1][1].limit == "collider"
+    assert "collider" in limit.why
+
+
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_turning_colliders_are_where_their_motion_says(backend_of: Callable, dimension: int) -> None:
+    """A body that sticks in a container that turns and moves goes with it: each particle to 1e-3 of a cell in f64."""
+    h, d = 0.1, dimension
+    turn = {"angular_velocity": "3 + 4*t", "velocity": ["0.2*cos(5*t)", *[0.1] * (d - 1)], "pivot": [0.9] * d}
+    if d == 3:
+        turn["axis"] = [1.0, -2.0, 0.5]
+    ball = {"ball": {"center": [1.0] * d, "radius": 2.6 * h}}
+    held = {"name": "c", "shape": {"ball": {"center": [1.0] * d, "radius": 5 * h}}, "wall": "stick"} | turn
+    scene = scene_of(
+        domain={"size": [2.0] * d, "spacing": h},
+        time={"end": 0.5, "frames": 1},
+        solver={"precision": "f64"},
+        bodies=[{"name": "b", "material": JELLY, "shape": ball}],
+    )
+    # All nodes of the body are held, which the checks of a scene refuse.
+    scene = with_colliders(scene, [held])
+    frames = run(scene, backend_of("f64", 1))
+    start, end = (frame.position.astype(float) for frame, _ in (frames[0], frames[-1]))
+    expected = scene.colliders[0].motion.placed(start, 0.5)
+    assert np.abs(end - start).max() > 3 * h
+    assert np.abs(end - expected).max() < 0.02 * h

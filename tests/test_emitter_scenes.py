@@ -1,0 +1,143 @@
+"""Emitters, open faces and impulses in a scene: mouths against closed forms, and a sentence for each bad one."""
+
+import math
+
+import numpy as np
+import pytest
+from good_scene import GOOD, load, refusal
+from solver_state import scene_of
+
+from mpmcli.errors import InputError
+from mpmcli.scene import Scene, estimate_particles, sample_bodies, scene_to_toml
+from mpmcli.scene.sheets import mouth_of, sheets_of
+
+WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}
+JET = {"name": "jet", "material": WATER, "shape": {"box": {"min": [0.1, 0.2], "max": [0.3, 0.5]}}}
+GOOD_JET = """\
+[[emitters]]
+name = "jet"
+material = { law = "fluid", density = 1000.0, bulk_modulus = "auto" }
+shape = { box = { min = [2.0, 1.5], max = [2.2, 1.6] } }
+velocity = [0.0, -2.0]
+"""
+GOOD_PUSH = """\
+[[impulses]]
+start = 0.5
+center = [3.0, 1.0]
+radius = 0.3
+strength = 2.0
+"""
+
+
+def jet_scene(d: int = 2, **more: object) -> Scene:
+    size = [1.0, 1.0, 1.0][:d]
+    box = {"min": [0.6, 0.0, 0.0][:d], "max": [0.7, 0.1, 0.1][:d]}
+    return scene_of(
+        domain={"size": size, "spacing": 0.05},
+        time={"end": 1.0, "frames": 2},
+        bodies=[{"name": "pool", "material": WATER, "shape": {"box": box}}],
+        emitters=[{**JET, "velocity": [2.0, 0.0, 0.0][:d], **more}],
+    )
+
+
+@pytest.mark.parametrize(
+    ("shape", "velocity", "area"),
+    [
+        ({"box": {"min": [0.1, 0.2], "max": [0.3, 0.5]}}, [2.0, 0.0], 0.3),
+        ({"box": {"min": [0.1, 0.2], "max": [0.3, 0.5]}}, [0.0, -1.0], 0.2),
+        # Through the centre at 45 degrees, from one long side to the other.
+        ({"box": {"min": [0.1, 0.2], "max": [0.3, 0.5]}}, [1.0, 1.0], 0.2 * math.sqrt(2)),
+        ({"ball": {"center": [0.4, 0.4], "radius": 0.13}}, [1.0, 3.0], 0.26),
+        ({"box": {"min": [0.1, 0.2, 0.3], "max": [0.3, 0.5, 0.7]}}, [0.0, 0.0, 3.0], 0.06),
+        ({"ball": {"center": [0.4, 0.4, 0.4], "radius": 0.2}}, [1.0, 1.0, 1.0], math.pi * 0.04),
+        (
+            {"cylinder": {"base": [0.4, 0.2, 0.4], "axis": [0, 1, 0], "radius": 0.2, "height": 0.1}},
+            [0.0, -1.0, 0.0],
+            math.pi * 0.04,
+        ),
+    ],
+)
+def test_the_mouth_is_the_section_and_the_flow_its_area_times_the_speed(shape, velocity, area):
+    """The area to 2e-3, of which the flow is a multiple: the issue asks for 1 %."""
+    scene = jet_scene(len(velocity), shape=shape, velocity=velocity)
+    emitter = scene.emitters[0]
+    mouth, sheets = mouth_of(emitter, scene.domain.spacing), sheets_of(emitter, scene)
+    assert mouth.area == pytest.approx(area, rel=2e-3)
+    flow = len(sheets.places) * sheets.volume / sheets.period
+    assert flow == pytest.approx(area * np.linalg.norm(velocity), rel=2e-3)
+    assert ((sheets.places - mouth.centre) @ mouth.direction) == pytest.approx(0.0, abs=1e-12)
+    assert sheets.count == math.ceil(1.0 / sheets.period - 1e-9)
+    # Each particle fills about as much as one of a body.
+    assert sheets.volume == pytest.approx(scene.domain.spacing**scene.dimension / 2**scene.dimension, rel=0.15)
+
+
+def test_all_particles_are_sampled_and_counted():
+    scene = jet_scene(start=0.25, end=0.75)
+    pool, jet = sample_bodies(scene)
+    assert jet.waits and not pool.waits and not jet.velocity.any()
+    assert len(jet.position) == sheets_of(scene.emitters[0], scene).particles == 40 * 12
+    assert estimate_particles(scene) == len(pool.position) + len(jet.position)
+    # What has come out is all that flows through the mouth in this time.
+    assert jet.volume * len(jet.position) == pytest.approx(0.3 * 2.0 * 0.5, rel=1e-6)
+
+
+@pytest.mark.parametrize(("key", "value", "count"), [("particles", 100, 8), ("volume", 0.0725, 10)])
+def test_a_total_is_kept_as_far_as_whole_sheets_allow(key, value, count):
+    scene = jet_scene(**{key: value})
+    assert sheets_of(scene.emitters[0], scene).count == count
+
+
+def test_the_effective_scene_has_them_all(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = GOOD.replace("[time]", 'walls = { x_max = "open" }\n[time]') + GOOD_JET + GOOD_PUSH
+    loaded = load(text)
+    again = load(scene_to_toml(loaded.scene)).scene
+    assert again == loaded.scene and again.comes_and_goes
+    assert any(note.startswith("jet: bulk_modulus") for note in loaded.notes)
+
+
+BAD = [
+    ("velocity = [0.0, -2.0]", "velocity = [0, 0]",
+     "emitters[0].velocity: must not be zero, as nothing would flow; give the velocity of the material in m/s"),
+    ("velocity = [0.0, -2.0]", "velocity = [0.0, -2.0]\nstart = 2.0",
+     "emitters[0].start: must be before the end of the scene, 1.5 s; found 2"),
+    ("velocity = [0.0, -2.0]", "velocity = [0.0, -2.0]\nstart = 1.0\nend = 0.5",
+     "emitters[0].end: must be after start, 1 s; found 0.5"),
+    ("velocity = [0.0, -2.0]", "velocity = [0.0, -2.0]\nparticles = 100000",
+     'emitters[0].particles: takes 25 s to flow out of "jet", which has 1.5 s until time.end; 6000 particles at most '
+     "come out by then"),
+    ("velocity = [0.0, -2.0]", "velocity = [0.0, -2.0]\nvolume = 1.0\nend = 1.0",
+     'emitters[0].volume: takes 2.5 s to flow out of "jet", which has 1 s until end; 0.4 m^2 at most come out by then'),
+    ("velocity = [0.0, -2.0]", "velocity = [0.0, -2.0]\nvolume = 0.1\nparticles = 10",
+     "emitters[0].volume: particles is given as well; leave one of them out"),
+    ("[2.0, 1.5], max = [2.2, 1.6]", "[3.9, 1.5], max = [4.5, 1.6]",
+     'emitters[0].shape: the mouth of "jet" reaches out of the domain along x by 0.495 m; move it or enlarge the '
+     "domain"),
+    ('name = "jet"', 'name = "column"',
+     'emitters[0].name: "column" is the name of bodies[0] already; every emitter needs its own'),
+    ("radius = 0.3", "radius = 0.3\ndirection = [0, 0]",
+     "impulses[0].direction: must not be zero; leave it out for a push away from the centre"),
+    ("start = 0.5", "start = 0.5\nend = 0.4", "impulses[0].end: must be after start, 0.5 s; found 0.4"),
+    ("start = 0.5", 'start = 0.5\nbody = "colum"',
+     'impulses[0].body: no body has the name "colum"; did you mean "column"?'),
+    ("[time]", 'walls = "open"\n[solver]\nwalls = "zeroed"\n[time]',
+     'domain.walls: solver.walls = "zeroed" knows no open faces: give walls = "folded"'),
+    ("[time]", 'walls = { y_max = "open" }\nfriction = { y_max = 0.5 }\n[time]',
+     'domain.friction.y_max: is for a wall that can slip, and domain.walls has "open" for y_max; leave it out, or give '
+     '"slip" or "separate" there'),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("good", "bad", "line"), BAD, ids=[line.split(":", 1)[0] for *_, line in BAD])
+def test_each_bad_one_has_its_sentence(tmp_path, monkeypatch, good, bad, line):
+    monkeypatch.chdir(tmp_path)
+    text = GOOD + GOOD_JET + GOOD_PUSH
+    assert good in text
+    found = refusal(text.replace(good, bad))
+    assert [one.split(": ", 1)[1] for one in found] == [line]
+
+
+def test_solids_on_grids_of_their_own_know_neither():
+    tables = jet_scene().model_dump(exclude_none=True, exclude={"domain": {"cells"}})
+    with pytest.raises(InputError, match='solids = "total" knows no emitters'):
+        scene_of(**tables | {"solver": {"solids": "total"}})

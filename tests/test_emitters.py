@@ -1,0 +1,223 @@
+"""Particles that come and go: a jet against its closed form, runs of a batch against a solver's, what a file says."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import run_here
+from solver_state import scene_of
+from state_run import MATERIALS
+from test_batch import Output, batch_of, outputs_of, same
+
+from mpmcli.check.result_check import check_result
+from mpmcli.errors import InputError
+from mpmcli.output import open_result
+from mpmcli.scene import Scene, sample_bodies, scene_to_toml
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.batch import Batch, Kind
+from mpmcli.solver.solver import Solver
+
+WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}
+SPEED, SPACING = 2.0, 0.0125
+
+
+def box(low: Sequence[float], high: Sequence[float]) -> dict:
+    return {"box": {"min": list(low), "max": list(high)}}
+
+
+def jet_scene(**more: object) -> Scene:
+    """Return a jet through empty space, from x = 0.125 to an open face at 1.0, beside a pool at rest."""
+    tables = {
+        "domain": {"size": [1.0, 0.5], "spacing": 2 * SPACING, "walls": {"default": "separate", "x_max": "open"}},
+        "time": {"end": 0.6, "frames": 6},
+        "bodies": [{"name": "pool", "material": WATER, "shape": box([0.3, 0.0], [0.4, 0.05])}],
+        "emitters": [
+            {"name": "jet", "material": WATER, "shape": box([0.1, 0.2], [0.15, 0.3]), "velocity": [SPEED, 0.0]}
+        ],
+        "output": {"fields": ["velocity", "density", "pressure", "volume_ratio", "mass"]},
+    }
+    return scene_of(**tables | more)
+
+
+def mixed_scene(other: bool = False) -> Scene:
+    """Return a jet of water, two laws, a mouth that is blocked at once, and two open faces; all numbers can differ."""
+    speed = 2.0 + other
+    return jet_scene(
+        domain={
+            "size": [1.0, 0.5],
+            "spacing": 2 * SPACING,
+            "gravity": [0.0, -9.81],
+            "origin": [-0.1 * other, 0.0],
+            "walls": {"default": "separate", "x_max": "open", "y_min": "open"},
+        },
+        time={"end": 0.4 + 0.1 * other, "frames": 4},
+        bodies=[{"name": "block", "material": MATERIALS["snow"], "shape": box([0.5, 0.1], [0.8, 0.2])}],
+        emitters=[
+            {
+                "name": "jet",
+                "material": MATERIALS["fluid"],
+                "shape": box([0.1, 0.2], [0.15, 0.3]),
+                "velocity": [speed, 0.5],
+                "end": 0.3,
+            },
+            {
+                "name": "hail",
+                "material": MATERIALS["snow"],
+                "shape": {"ball": {"center": [0.6, 0.4], "radius": 0.06 - 0.02 * other}},
+                "velocity": [0.0, -1.0],
+                "start": 0.1,
+                "volume": 0.015,
+            },
+            # In the middle of the jet.
+            {
+                "name": "blocked",
+                "material": MATERIALS["fluid"],
+                "shape": {"ball": {"center": [0.2, 0.25], "radius": 0.05}},
+                "velocity": [0.0, -1.0],
+                "start": 0.1,
+            },
+        ],
+        output={"fields": ["velocity", "volume_ratio", "stress"]},
+    )
+
+
+@pytest.fixture(scope="module")
+def jet(backend_of: Callable[..., Backend]) -> Output:
+    scene = jet_scene()
+    return outputs_of(batch_of([scene], backend_of("f32", 1)), [scene])[0]
+
+
+def test_the_jet_flows_as_its_velocity_says(jet: Output) -> None:
+    """8 particles a sheet, one each SPACING / SPEED: emitted mass to 1e-6, and every particle at x0 + v (t - due)."""
+    waiting = sample_bodies(jet_scene())[1]
+    first = len(jet[0][0].position) - len(waiting.position)
+    sheet = np.arange(len(waiting.position)) // 8
+    for frame, row in jet:
+        status = frame.fields["status"]
+        assert status.dtype == np.int8 and status[:first].min() != 0
+        due = sheet * SPACING / SPEED
+        # A sheet that is due at a frame enters in the next step.
+        assert row.emitted == 8 * np.count_nonzero(due[::8] < frame.time - 1e-9)
+        assert row.emitted_mass == pytest.approx(1000.0 * 0.1 * SPACING * row.emitted / 8, rel=1e-6)
+        # Beyond the face a particle stays when it has gone two cells.
+        mine = (status[first:] == 1) & (frame.position[first:, 0] < 1.0)
+        x = waiting.position[mine, 0] + SPEED * (frame.time - due[mine])
+        assert frame.position[first:][mine, 0] == pytest.approx(x, abs=2e-6)
+        assert frame.position[first:][mine, 1] == pytest.approx(waiting.position[mine, 1], abs=2e-6)
+        # Those that wait lie still where they will enter.
+        waits = status[first:] == 0
+        assert (frame.position[first:][waits] == waiting.position[waits].astype(np.float32)).all()
+        assert not frame.velocity[status == 0].any()
+
+
+def test_the_jet_leaves_as_if_nothing_were_there(jet: Output) -> None:
+    """No pressure comes back from the open face: J stays 1, and the velocity what it was, to rounding."""
+    frame, row = jet[-1]
+    assert row.retired > 100
+    there = (frame.fields["status"] == 1) & (frame.body == 1)
+    assert np.abs(frame.fields["volume_ratio"][there] - 1).max() < 2e-5
+    assert np.abs(frame.velocity[there] - [SPEED, 0.0]).max() < 2e-5
+    gone = frame.fields["status"] == 2
+    assert row.retired == gone.sum() and (frame.position[gone, 0] == 1.0).all()
+    # At most two cells beyond, until the next sort.
+    assert frame.position[there, 0].max() < 1.0 + 4 * SPACING
+    assert row.mass == pytest.approx(jet[0][1].mass + row.emitted_mass - row.retired_mass, rel=1e-9)
+    assert row.linear_momentum[0] == pytest.approx(SPEED * (row.emitted_mass - row.retired_mass), rel=1e-5)
+
+
+def test_runs_of_a_batch_have_the_bytes_of_a_solver(backend_of: Callable[..., Backend]) -> None:
+    """Of two laws and three emitters, one of them blocked, beside a run in which all numbers differ."""
+    scenes = [mixed_scene(), mixed_scene(other=True)]
+    backend = backend_of("f32", 1)
+    found = outputs_of(batch_of(scenes, backend), scenes)
+    solver = Solver(scenes[0], backend)
+    assert list(same(found[0], list(solver.frames()))) == []
+    last = found[0][-1][1]
+    assert last.blocked >= 1 and last.emitted > 300 and last.retired > 100
+    # Saved in the middle, loaded and continued.
+    kept = Solver(scenes[1], backend)
+    for _ in range(60):
+        kept.step(kept.stable_step()[0])
+    saved = kept.state.save()
+    for _ in range(40):
+        kept.step(kept.stable_step()[0])
+    expected = kept.frame()
+    kept.state.load(saved)
+    for _ in range(40):
+        kept.step(kept.stable_step()[0])
+    again = kept.frame()
+    assert expected[1].emitted > 0 and list(same([again], [expected])) == []
+
+
+@pytest.mark.slow
+def test_all_runs_of_a_batch_do(backend_of: Callable[..., Backend]) -> None:
+    scenes = [mixed_scene(other=True), mixed_scene(), mixed_scene(other=True)]
+    backend = backend_of("f32", 1)
+    found = outputs_of(batch_of(scenes, backend), scenes)
+    for output, scene in zip(found, scenes, strict=True):
+        assert list(same(output, list(Solver(scene, backend).frames()))) == []
+    shared = backend_of("f32", 3)
+    (together,) = outputs_of(batch_of(scenes[1:2], shared), scenes[1:2])
+    assert list(same(together, found[1])) == []
+
+
+@pytest.mark.slow
+@pytest.mark.gpu
+def test_a_gpu_does_the_same(backend_of: Callable[..., Backend], jet: Output) -> None:
+    """The same particles inside the domain, where they are on the CPU; a batch there says that it cannot."""
+    scene = jet_scene()
+    backend = backend_of("f32", 1, "vulkan")
+    with pytest.raises(InputError, match="no emitters and no open faces"):
+        Batch(Kind.of(scene, sample_bodies(scene)), backend)
+    for (frame, row), (other, other_row) in zip(Solver(scene, backend).frames(), jet, strict=True):
+        assert (row.emitted, row.blocked) == (other_row.emitted, other_row.blocked)
+        # When a sort retires what is beyond the face differs.
+        inside, other_inside = ((one.fields["status"] == 1) & (one.position[:, 0] <= 1.0) for one in (frame, other))
+        assert (inside == other_inside).all()
+        assert np.abs(frame.position - other.position)[inside].max() < 2e-6
+        assert np.abs(frame.velocity - other.velocity)[inside].max() < 2e-5
+        there = (frame.fields["status"] == 1).sum() * row.emitted_mass / max(row.emitted, 1)
+        assert row.emitted == 0 or row.mass == pytest.approx(there, rel=1e-5)
+
+
+def test_a_result_says_who_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It passes its check; render, info and plot take it; learners' formats do not."""
+    monkeypatch.chdir(tmp_path)
+    scene = jet_scene(output={"fields": ["velocity", "density", "volume_ratio"]})
+    Path("jet.toml").write_text(scene_to_toml(scene), encoding="utf-8")
+    assert run_here("simulate", "jet.toml", "-o", "out").status == 0
+    check = check_result(Path("out"))
+    assert check.passes(strict=True), check.text()
+    result = open_result(Path("out"))
+    assert result.field_names[-1] == "status" and result.ledger[-1].emitted == 768
+    frame = result.present_frame(3, ())
+    assert len(frame.position) == np.count_nonzero(result.frame(3).fields["status"] == 1)
+    refused = run_here("export", "out", "--to", "gns", "-o", "gns")
+    assert refused.status == 2 and "has particles that come or go, and GNS cannot say which are there" in refused.stderr
+    assert run_here("export", "out", "--to", "npz", "-o", "npz").status == 0
+
+
+@pytest.mark.slow
+def test_a_file_may_hold_only_those_that_are_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jet: Output
+) -> None:
+    """Its frames are those of the whole file without the others, and the ids say which."""
+    monkeypatch.chdir(tmp_path)
+    scene = jet_scene(
+        output={"fields": ["velocity", "density", "pressure", "volume_ratio", "mass"], "drop_retired": True}
+    )
+    Path("jet.toml").write_text(scene_to_toml(scene), encoding="utf-8")
+    assert run_here("simulate", "jet.toml", "-o", "out").status == 0
+    assert check_result(Path("out")).passes(strict=True), check_result(Path("out")).text()
+    result = open_result(Path("out"))
+    for k, (whole, row) in enumerate(jet):
+        frame, ids = result.numbered_frame(k)
+        there = np.flatnonzero(whole.fields["status"] == 1)
+        assert ids.tolist() == there.tolist() and len(there) == result.particle_counts[k]
+        assert frame.position.tobytes() == whole.position[there].tobytes()
+        assert result.ledger[k].mass == row.mass
+    refused = run_here("export", "out", "--to", "npz", "-o", "npz")
+    assert refused.status == 2 and "holds only the particles that are there" in refused.stderr
+    drawn = run_here("render", "out", "--mode", "density", "-o", "picture.png")
+    assert drawn.status == 2 and "density needs all of them" in drawn.stderr

@@ -1,0 +1,290 @@
+"""Meshes: against an analytic ball, a box, VTK's own distance, and files that make no closed surface."""
+
+import copy
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvista as pv
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mpmcli.check.distance import distance_between
+from mpmcli.check.extent import thickness
+from mpmcli.dataset.draw import draw
+from mpmcli.dataset.sweep_file import load_sweep
+from mpmcli.errors import InputError
+from mpmcli.materials.registry import laws, parameter_models
+from mpmcli.output.header import RunHeader
+from mpmcli.scene import Ball, Scene, Shape, parse_scene, sample_bodies, scene_to_toml
+from mpmcli.scene.distance_grid import distance_grid
+from mpmcli.scene.mesh import Mesh, _surface_of
+from mpmcli.scene.mesh_file import MeshFileError, read_mesh
+from mpmcli.scene.triangles import Surface
+
+R = 0.4
+
+
+def saved(directory: Path, surface: pv.PolyData, name: str = "mesh.stl") -> str:
+    """Write a surface, and return its path."""
+    # PyVista would turn triangles that face inwards.
+    surface.save(directory / name, recompute_normals=False)
+    return str(directory / name)
+
+
+def ball(steps: int = 60) -> pv.PolyData:
+    """Return a ball of radius R about the origin, of 2 steps^2 triangles."""
+    return pv.Sphere(radius=R, theta_resolution=steps, phi_resolution=steps)
+
+
+def mesh(path: str, **keys: object) -> Mesh:
+    """Return the form that a scene has."""
+    return Mesh.model_validate({"file": path, **keys}, context={"dimension": 3})
+
+
+def scene_of(shape: dict, size: tuple[float, ...] = (1.0, 1.0, 1.0), directory: Path = Path()) -> Scene:
+    """Return a scene of water in a shape."""
+    data = {
+        "domain": {"size": list(size), "spacing": 0.05},
+        "time": {"end": 1.0, "frames": 1},
+        "bodies": [{"name": "b", "material": {"law": "fluid", "density": 800.0, "bulk_modulus": 1e5}, "shape": shape}],
+    }
+    return parse_scene(copy.deepcopy(data), laws=parameter_models(), directory=directory).scene
+
+
+def test_the_inside_of_a_ball(tmp_path: Path) -> None:
+    """The facets of 2 k^2 triangles lie R (1 - cos(pi / k)) under the sphere at most; volume 4/3 pi R^3 (1 - O(1/k^2)).
+
+    Points are on the lines through vertices and along edges, too, where a triangle could be counted twice or missed.
+    """
+    form = mesh(saved(tmp_path, ball(60)))
+    assert form.volume == pytest.approx(4 / 3 * math.pi * R**3, rel=2 * (math.pi / 60) ** 2)
+    random = np.random.default_rng(0).uniform(-0.5, 0.5, (50_000, 3))
+    vertices = form.surface.vertices
+    lines = np.concatenate([vertices * [1, 1, s] for s in (-2.0, -0.5, 0.0, 0.5, 2.0)])
+    for points in (random, lines, (vertices + np.roll(vertices, 1, axis=0)) / 2 * [1, 1, 0.3]):
+        away = np.linalg.norm(points, axis=1)
+        depth = R * (1 - math.cos(math.pi / 60) ** 2)
+        assert form.contains(points)[away < R - depth].all() and not form.contains(points)[away > R].any()
+
+
+def test_distances_are_those_of_vtk(tmp_path: Path) -> None:
+    """Near the surface of a body with edges and a hole: to round-off; the sign everywhere; never too small."""
+    torus = pv.ParametricTorus(ringradius=0.3, crosssectionradius=0.1, u_res=40, v_res=20, w_res=4)
+    torus = torus.triangulate().clean(tolerance=1e-6)
+    path = saved(tmp_path, torus, "torus.ply")
+    form = mesh(path)
+    points = np.random.default_rng(1).uniform(-0.5, 0.5, (4000, 3)) * [1, 1, 0.5]
+    surface = pv.PolyData.from_regular_faces(form.surface.vertices, form.surface.triangles)
+    right = np.array(pv.PolyData(points).compute_implicit_distance(surface)["implicit_distance"])
+    found = form.signed_distance(points)
+    assert np.array_equal(found < 0, right < 0) and np.array_equal(form.contains(points), right < 0)
+    near = np.abs(right) < 0.05
+    assert np.allclose(found[near], right[near], rtol=0, atol=1e-9)
+    assert np.all(np.abs(found) >= np.abs(right) - 1e-9) and np.all(np.abs(found - right) < 0.02)
+    assert np.array_equal(form.contains(points, inset=0.03), right < -0.03)
+
+
+def test_the_grid_of_distances_of_a_box_is_that_of_the_form(tmp_path: Path) -> None:
+    """Twelve triangles give the distances of the analytic box: exact within four cells, signs everywhere."""
+    low, high = np.array([0.1, 0.2, 0.3]), np.array([0.9, 0.7, 0.6])
+    form = mesh(saved(tmp_path, pv.Box(bounds=np.stack([low, high], axis=1).ravel()).triangulate()))
+    box = scene_of({"box": {"min": low.tolist(), "max": high.tolist()}}).bodies[0].shape.form
+    assert form.volume == pytest.approx(box.volume, rel=1e-6)
+    found, origin, h = distance_grid(form, 0.02, 0.11)
+    assert found.dtype == np.float32 and h == 0.02
+    last = origin + h * (np.array(found.shape) - 1)
+    nodes = np.stack(
+        np.meshgrid(*(o + h * np.arange(n) for o, n in zip(origin, found.shape, strict=True)), indexing="ij")
+    )
+    exact = box.signed_distance(nodes.reshape(3, -1).T).reshape(found.shape)
+    assert np.allclose(distance_grid(box, 0.02, 0.11)[0][1, 1, 1], math.sqrt(3) * 0.09, rtol=0.1)
+    assert np.all(origin <= low - 0.11 + 1e-6) and np.all(last >= high + 0.11 - 1e-6)
+    near = np.abs(exact) < 4 * h
+    assert np.allclose(found[near], exact[near], rtol=0, atol=1e-6)
+    off = np.abs(exact) > 1e-6  # nodes on the surface, of the file's single precision, have either sign
+    assert np.array_equal((found < 0)[off], (exact < 0)[off])
+    assert np.all(np.abs(found) >= np.abs(exact) - 1e-6) and np.all(np.abs(found - exact) < 3 * h)
+
+
+@given(
+    scale=st.floats(0.01, 100),
+    axis=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1),
+    angle=st.floats(-360, 360),
+    shift=st.tuples(*[st.floats(-10, 10)] * 3),
+)
+@settings(max_examples=15)
+def test_a_mesh_is_scaled_then_turned_then_moved(tmp_path_factory, scale, axis, angle, shift) -> None:
+    """Volume as scale^3; a turned vertex keeps its part along the axis and turns by the angle about it."""
+    path = tmp_path_factory.getbasetemp() / "cone.ply"
+    if not path.exists():
+        pv.Cone(resolution=7).triangulate().save(path)
+    plain, triangles = read_mesh(path)
+    moved, _ = read_mesh(path, scale, axis, angle, shift)
+    assert Surface(moved, triangles).volume == pytest.approx(scale**3 * Surface(plain, triangles).volume, rel=1e-6)
+    n = np.array(axis) / np.linalg.norm(axis)
+    before, after = scale * plain, moved - shift
+    assert np.allclose(before @ n, after @ n, rtol=0, atol=1e-9 * (scale + 10))
+    across = [v - (v @ n)[:, None] * n for v in (before, after)]
+    turned = np.cos(np.radians(angle)) * across[0] + np.sin(np.radians(angle)) * np.cross(n, across[0])
+    assert np.allclose(turned, across[1], rtol=0, atol=1e-8 * (scale + 10))
+
+
+@pytest.mark.parametrize("name", ["m.stl", "m.ply", "m.vtp", "m.obj", "m.vtu", "m.off"])
+def test_every_format_gives_the_same_surface(tmp_path: Path, name: str) -> None:
+    """One surface in several files; the VTU holds cells, whose surface it is. Single precision: 1e-6."""
+    cells = pv.ImageData(dimensions=(4, 3, 2)).cast_to_unstructured_grid()
+    surface = pv.Box(bounds=(0, 3, 0, 2, 0, 1)).triangulate()
+    if name == "m.vtu":
+        cells.save(tmp_path / name)
+    elif name in ("m.obj", "m.off"):
+        pv.save_meshio(tmp_path / name, surface)
+    else:
+        surface.save(tmp_path / name)
+    form = mesh(str(tmp_path / name))
+    assert form.volume == pytest.approx(6.0, rel=1e-6)
+    assert np.allclose(form.bounds(), [[0, 0, 0], [3, 2, 1]], atol=1e-6)
+
+
+def test_particles_fill_a_mesh(tmp_path: Path) -> None:
+    """The mass is that of the enclosed volume; the path is relative to the scene; inverted triangles are turned."""
+    saved(tmp_path, ball().flip_faces(), "ball.ply")
+    scene = scene_of({"mesh": {"file": "ball.ply", "translate": [0.5, 0.5, 0.5]}}, directory=tmp_path)
+    (particles,) = sample_bodies(scene)
+    form = scene.bodies[0].shape.form
+    assert particles.count * particles.mass == pytest.approx(800 * form.volume, rel=1e-12)
+    assert particles.count == pytest.approx(form.volume / 0.025**3, rel=0.02)
+    assert np.linalg.norm(particles.position - 0.5, axis=1).max() < R
+
+
+def two_balls(apart: float) -> pv.PolyData:
+    """Return two balls in one file."""
+    return pv.merge([ball(12), ball(12).translate((apart, 0, 0))])
+
+
+BAD = {
+    "open": (
+        lambda: pv.Box().triangulate().extract_cells(range(10)).extract_surface(algorithm=None),
+        "its surface is open: 4 of 17",
+    ),
+    "turned": (
+        lambda: pv.PolyData(BOX.points, np.concatenate([BOX.faces[:4][[0, 2, 1, 3]], BOX.faces[4:]])),
+        "its triangles face different sides across 3 of 18 edges",
+    ),
+    "overlap": (lambda: two_balls(0.3), "its parts overlap, for example at ["),
+    "points": (lambda: pv.PolyData(np.eye(3)), "it holds no triangle"),
+}
+BOX = pv.Box().triangulate()
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_file_that_makes_no_closed_surface_is_named(tmp_path: Path, name: str) -> None:
+    """One sentence each, with the file in it."""
+    made, said = BAD[name]
+    path = saved(tmp_path, made(), "bad.vtp")
+    with pytest.raises(MeshFileError, match=said.replace("[", r"\[")):
+        read_mesh(path)
+    with pytest.raises(InputError, match=r"bodies\[0\].shape.mesh.file: .*bad.vtp: " + said.replace("[", r"\[")):
+        scene_of({"mesh": {"file": path}})
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("m.stl", b"hello"),
+        ("m.obj", b"v 1 2 x\n"),
+        ("m.ply", b"ply\n"),
+        ("m.vtu", b"<VTK"),
+        ("m.csv", b"1,2,3"),
+        ("m.stl", b""),
+    ],
+)
+def test_a_damaged_file_is_one_sentence_and_nothing_else(
+    tmp_path: Path, capfd: pytest.CaptureFixture, name: str, content: bytes
+) -> None:
+    """VTK writes to the terminal what it thinks of it, unless it is kept from it."""
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(MeshFileError, match=r"it is no mesh that can be read|it holds no triangle"):
+        read_mesh(tmp_path / name)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_sentences_of_a_mesh_in_a_scene(tmp_path: Path) -> None:
+    """A missing file, two dimensions, millimetres, a mesh beside the domain."""
+    saved(tmp_path, ball(), "ball.stl")
+
+    def said(size: tuple[float, ...] = (1.0, 1.0, 1.0), **keys: object) -> str:
+        with pytest.raises(InputError) as caught:
+            scene_of({"mesh": {"file": "ball.stl", **keys}}, size, tmp_path)
+        return str(caught.value)
+
+    assert f"bodies[0].shape.mesh.file: {tmp_path / 'bal.stl'}: there is no such file" in said(file="bal.stl")
+    assert "shape.mesh: is a shape of 3D scenes and this one is 2D; use box" in said((1.0, 1.0))
+    much = 'body "b" leaves the domain: the mesh is 799.7 x 799.7 x 800 m, the domain 1 x 1 x 1 m'
+    assert said(scale=1000).endswith(f"shape: {much}; it would fit with scale = 1")
+    assert said(translate=[0.5, 0.5, 0.2]).endswith("; give translate = [0.5, 0.5, 0.4] or enlarge the domain")
+    saved(tmp_path, ball().scale(1000), "large.stl")
+    assert said(file="large.stl").endswith(f"{much}; if it is in millimetres, give scale = 0.001")
+    assert "mesh.rotate.axis: must have a direction" in said(rotate={"axis": [0, 0, 0], "angle": 3})
+
+
+def test_a_result_is_read_after_its_mesh_is_gone(tmp_path: Path) -> None:
+    """The header keeps the volumes of a scene with files, and only of such a scene."""
+    path = Path(saved(tmp_path, ball(), "ball.stl"))
+    table = {"file": "ball.stl", "translate": [0.5, 0.5, 0.5]}
+    scene = scene_of({"mesh": table}, directory=tmp_path)
+    facts = {"arch": "cpu", "threads": 1, "precision": "f32"}
+    stored = RunHeader.of(scene, scene_to_toml(scene), [laws()["fluid"]], facts).stored
+    path.unlink()
+    _surface_of.cache_clear()
+    (body,) = RunHeader.read(stored).bodies
+    assert body.volume == pytest.approx(4 / 3 * math.pi * R**3, rel=0.01)
+    plain = scene_of({"ball": {"center": [0.5] * 3, "radius": R}})
+    assert "volumes" not in RunHeader.of(plain, scene_to_toml(plain), [laws()["fluid"]], facts).stored
+
+
+def test_what_check_says_of_a_mesh_is_what_it_says_of_the_ball(tmp_path: Path) -> None:
+    """Thickness to a cell of 48; the distance of two balls to a thousandth of them."""
+    form = mesh(saved(tmp_path, ball()))
+    assert thickness(form) == pytest.approx(2 * R, abs=4 * 2 * R / 48)
+    other = Ball.model_validate({"center": [1.0, 0.2, 0.1], "radius": 0.3}, context={"dimension": 3})
+    gap = math.dist((1.0, 0.2, 0.1), (0, 0, 0)) - R - 0.3
+    assert distance_between(form, other) == pytest.approx(gap, abs=2e-3)
+
+
+def test_a_sweep_varies_a_mesh_beside_its_base_scene(tmp_path: Path) -> None:
+    """Paths are relative to the base scene; scales are drawn, and a body sampled at random gets a seed of its own."""
+    (tmp_path / "scenes").mkdir()
+    saved(tmp_path / "scenes", ball(12), "ball.stl")
+    (tmp_path / "scenes" / "base.toml").write_text(
+        "[domain]\nsize = [1.0, 1.0, 1.0]\nspacing = 0.1\n[time]\nend = 1.0\nframes = 1\n"
+        '[[bodies]]\nname = "b"\nmaterial = "jelly"\nsampling = "poisson"\n'
+        'shape = { mesh = { file = "ball.stl", translate = [0.5, 0.5, 0.5] } }\n',
+        encoding="utf-8",
+    )
+    lines = 'base = "scenes/base.toml"\ncount = 2\n[vary]\n"bodies.b.shape.mesh.scale" = { uniform = [0.5, 1.1] }\n'
+    (tmp_path / "sweep.toml").write_text(lines, encoding="utf-8")
+    sweep = load_sweep(tmp_path / "sweep.toml", laws=parameter_models())
+    bodies = [draw(sweep, number).scene(parameter_models()).scene.bodies[0] for number in range(2)]
+    assert bodies[0].seed != bodies[1].seed
+    for body in bodies:
+        scale = body.shape.mesh.scale
+        assert body.shape.form.volume == pytest.approx(
+            scale**3 * mesh(str(tmp_path / "scenes/ball.stl")).volume, rel=1e-6
+        )
+    (tmp_path / "sweep.toml").write_text(lines.replace("1.1", "2.0"), encoding="utf-8")
+    with pytest.raises(InputError, match=r'with 2.0: .*"b" leaves the domain: the mesh is 1\.58'):
+        load_sweep(tmp_path / "sweep.toml", laws=parameter_models())
+
+
+@pytest.mark.slow
+def test_what_is_left_of_a_mesh_has_its_volume(tmp_path: Path) -> None:
+    """Half of a mesh, and a mesh with a hollow: by quadrature, to 1e-4."""
+    table = {"mesh": {"file": saved(tmp_path, ball())}}
+    whole = mesh(table["mesh"]["file"]).volume
+    half = {"box": {"min": [-1, -1, 0], "max": [1, 1, 1]}}
+    hollow = {"ball": {"center": [0, 0, 0], "radius": 0.3}}
+    for removed, left in ((half, whole / 2), (hollow, whole - 4 / 3 * math.pi * 0.3**3)):
+        form = Shape.model_validate({**table, "subtract": [removed]}, context={"dimension": 3}).form
+        assert form.volume == pytest.approx(left, rel=1e-4)

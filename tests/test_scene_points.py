@@ -1,0 +1,124 @@
+"""Bodies from point files: positions and velocities as they stand there, volumes as asked, faults in one sentence."""
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import pyvista as pv
+
+from mpmcli.errors import InputError
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import Scene, estimate_particles, highest_speed, parse_scene, sample_bodies
+
+RANDOM = np.random.default_rng(3)
+POINTS = {d: RANDOM.uniform(0.1, 0.9, (50, d)) for d in (2, 3)}
+SPEEDS = {d: RANDOM.normal(size=(50, d)) for d in (2, 3)}
+COLUMNS = {2: ["x", "y", "vx", "vy"], 3: ["x", "y", "z", "vx", "vy", "vz"]}
+
+
+def write(path: Path, d: int) -> dict[str, Any]:
+    """Write points with velocities, and return the table that reads them."""
+    both = np.concatenate([POINTS[d], SPEEDS[d]], axis=1)
+    if path.suffix == ".csv":
+        # The order of columns is that of the file, and others may stand between.
+        rows = np.concatenate([both[:, ::-1], np.ones((50, 1))], axis=1)
+        np.savetxt(path, rows, delimiter=",", header=",".join([*COLUMNS[d][::-1], "id"]), comments="", fmt="%.17g")
+        return {"file": path.name, "velocity": COLUMNS[d][d:]}
+    if path.suffix == ".npy":
+        if "named" in path.name:
+            both = np.array(list(map(tuple, both)), dtype=[(name, "f8") for name in COLUMNS[d]])
+        np.save(path, both)
+        return {"file": path.name, "velocity": COLUMNS[d][d:]}
+    cloud = pv.PolyData(np.pad(POINTS[d], ((0, 0), (0, 3 - d))))
+    cloud.point_data["motion"] = np.pad(SPEEDS[d], ((0, 0), (0, 3 - d)))
+    (cloud.cast_to_unstructured_grid() if path.suffix == ".vtu" else cloud).save(path)
+    return {"file": path.name, "velocity": "motion"}
+
+
+def scene_of(directory: Path, table: dict[str, Any], d: int = 2, **body: Any) -> Scene:
+    """Return a scene of water in points."""
+    data = {
+        "domain": {"size": [1.0] * d, "spacing": 0.1},
+        "time": {"end": 1.0, "frames": 1},
+        "bodies": [
+            {
+                "name": "b",
+                "material": {"law": "fluid", "density": 800.0, "bulk_modulus": 1e5},
+                "shape": {"points": table},
+                **body,
+            }
+        ],
+    }
+    return parse_scene(copy.deepcopy(data), laws=parameter_models(), directory=directory).scene
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("name", ["p.csv", "p.npy", "named.npy", "p.vtu", "p.vtp"])
+def test_particles_are_where_and_as_fast_as_the_file_says(tmp_path: Path, name: str, d: int) -> None:
+    """Positions, velocities on top of that of the body, and spacing^d of volume each, whatever the grid."""
+    table = write(tmp_path / name, d)
+    scene = scene_of(tmp_path, {**table, "spacing": 0.02}, d, velocity=[1.0] * d)
+    (particles,) = sample_bodies(scene)
+    error = 1e-6 if name.endswith(("vtu", "vtp")) else 0.0  # VTK writes single precision as it is given
+    assert np.allclose(particles.position, POINTS[d], rtol=0, atol=error)
+    assert np.allclose(particles.velocity, SPEEDS[d] + 1.0, rtol=0, atol=4 * error)
+    assert particles.volume == pytest.approx(0.02**d, rel=1e-12)
+    assert particles.count == estimate_particles(scene) == 50
+    assert highest_speed(scene.bodies[0]) >= np.linalg.norm(particles.velocity, axis=1).max()
+    assert scene.bodies[0].particles_per_cell == 5**d
+
+
+def test_the_volume_of_the_whole_scale_and_translate(tmp_path: Path) -> None:
+    """A PLY in millimetres; the mass is density times the volume asked; velocities stay out unless asked for."""
+    pv.PolyData(np.pad(1000 * POINTS[2], ((0, 0), (0, 1)))).save(tmp_path / "p.ply")
+    table = {"file": "p.ply", "total_volume": 0.3, "scale": 1e-3, "translate": [0.0, 0.05]}
+    (particles,) = sample_bodies(scene_of(tmp_path, table))
+    assert np.allclose(particles.position, POINTS[2] + [0, 0.05], rtol=0, atol=1e-6)
+    assert particles.count * particles.mass == pytest.approx(800 * 0.3, rel=1e-12)
+    assert not particles.velocity.any()
+
+
+BAD = [
+    ("none.csv", None, {}, "none.csv: there is no such file"),
+    ("p.csv", "x,y\n1,2\n3\n", {}, "p.csv: line 3 must hold 2 numbers, one for each column"),
+    ("p.csv", "x,y\n1,2\n3,nan\n", {}, "point 2 is not finite"),
+    ("p.csv", "0.1,0.2\n", {}, "its first line must name the columns, such as x,y"),
+    ("p.csv", "x,y\n", {}, "it holds no point"),
+    ("p.csv", "x,Y\n1,2\n", {}, 'it has no column "y"; its columns are "x" and "Y"'),
+    ("p.csv", "x,y,u\n1,2,3\n", {"velocity": ["u", "w"]}, 'it has no column "w"; its columns are "x", "y" and "u"'),
+    ("p.csv", "x,y\n1,2\n", {"velocity": "v"}, 'velocity must name 2 columns, such as ["vx", "vy"]'),
+    ("p.csv", "x,y\n1,2\n", {"velocity": ["v"]}, 'velocity must name 2 columns, such as ["vx", "vy"]'),
+    ("p.npy", "hello", {}, "p.npy: it is no array of numpy"),
+    ("p.vtu", "hello", {}, "p.vtu: it is no file of points that can be read|it holds no point"),
+    ("p.csv", "x,y\n.1,.2\n.1,.5\n", {"spacing": None}, "needs either spacing or total_volume, which the mass"),
+    ("p.csv", "x,y\n.1,.2\n.1,.5\n", {"spacing": None}, "its points are some 0.3 m apart"),
+    ("p.csv", "x,y\n.1,.2\n.1,1.5\n", {}, 'body "b" leaves the domain through y_max by 0.5 m'),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "keys", "said"), BAD)
+def test_a_bad_file_is_one_sentence(tmp_path: Path, name: str, text: str | None, keys: dict, said: str) -> None:
+    """Which file, what is wrong, and what would be right."""
+    if text is not None:
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    table = {key: value for key, value in {"file": name, "spacing": 0.1, **keys}.items() if value is not None}
+    with pytest.raises(InputError) as caught:
+        scene_of(tmp_path, table)
+    assert any(one in str(caught.value) for one in said.split("|")), caught.value
+    assert "\n" not in str(caught.value)
+
+
+def test_points_are_not_combined_and_lie_in_their_plane(tmp_path: Path) -> None:
+    """What an array must be, and where points make no sense."""
+    table = write(tmp_path / "p.vtp", 3)
+    with pytest.raises(InputError, match="its points lie in space, and the scene is 2D"):
+        scene_of(tmp_path, {**table, "spacing": 0.1})
+    with pytest.raises(InputError, match='its points have no array "speed"; they have "motion"'):
+        scene_of(tmp_path, {**table, "spacing": 0.1, "velocity": "speed"}, 3)
+    np.save(tmp_path / "p.npy", np.zeros((4, 5)))
+    with pytest.raises(
+        InputError, match=r"it must be of numbers, \(n, 2\), or \(n, 4\) with velocities; it is \(4, 5\)"
+    ):
+        scene_of(tmp_path, {"file": "p.npy", "spacing": 0.1})
