@@ -84,7 +84,7 @@ def _of_result(path: Path) -> dict:
         "materials": [law.name for law in result.header.laws],
         "fields": ["velocity", *result.field_names],
         "precision": result.header.precision,
-        "backend": dict(result.header.backend) or None,
+        "backend": record.get("backend") or dict(result.header.backend) or None,
         "steps": record.get("steps"),
         "step_s": [
             min((row.step_min for row in result.ledger[1:]), default=0.0),

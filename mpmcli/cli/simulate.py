@@ -40,6 +40,14 @@ from mpmcli.cli.streams import print_json, print_text
 )
 @click.option("--compress", is_flag=True, help="Compress the stored file with gzip.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier result in the output directory.")
+@click.option("--resume", is_flag=True, help="Go on with the run in the output directory, from its newest checkpoint.")
+@click.option(
+    "--checkpoint",
+    "checkpoint_every",
+    type=click.FloatRange(min=0),
+    metavar="SECONDS",
+    help="Wall time between two checkpoints; by default as often as takes less than 1 % of it.",
+)
 @click.option(
     "--force", is_flag=True, help="Run although `mpmcli check` finds errors, and take time.step above the stable step."
 )
@@ -56,16 +64,21 @@ def command(
     form: str,
     compress: bool,
     overwrite: bool,
+    resume: bool,
+    checkpoint_every: float | None,
     force: bool,
     quiet: bool,
     as_json: bool,
 ) -> int:
     """Run SCENE, a TOML file, and store its particles for ParaView, h5py and learners."""
     from mpmcli.cli.simulate_progress import SimulateProgress
+    from mpmcli.errors import InputError
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
     from mpmcli.simulation.simulate import RunSettings, simulate
 
+    if resume and overwrite:
+        raise InputError("--resume keeps an earlier result, and --overwrite removes it: give one of them.")
     overrides += (f'solver.precision="{precision}"',) if precision else ()
     overrides += ("output.compress=true",) if compress else ()
     loaded = load_scene(scene, overrides, laws=load_plugins(plugins))
@@ -75,6 +88,8 @@ def command(
         threads=threads,
         form=form,
         overwrite=overwrite,
+        resume=resume,
+        checkpoint_every=checkpoint_every,
         force=force,
         command=["mpmcli", *sys.argv[1:]],
     )

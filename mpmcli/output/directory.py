@@ -4,6 +4,7 @@ import tempfile
 from pathlib import Path
 
 from mpmcli.errors import InputError
+from mpmcli.output.checkpoints import remove_checkpoints
 from mpmcli.output.collider_files import COLLIDER_FILES, MOVING_FRAME
 from mpmcli.output.durable import TEMPORARY_SUFFIX
 from mpmcli.output.run_record import RECORD, read_record
@@ -18,7 +19,7 @@ def prepare_directory(directory: Path, overwrite: bool) -> Path:
     """Make sure that `directory` exists, is writable and holds no earlier result.
 
     With `overwrite` the files that mpmcli writes are removed: the packed file, segments, series,
-    scene.toml and run.json. Anything else in the directory stays.
+    checkpoints, scene.toml and run.json. Anything else in the directory stays.
 
     Returns:
         The directory.
@@ -36,10 +37,11 @@ def prepare_directory(directory: Path, overwrite: bool) -> Path:
     return directory
 
 
-def check_directory(directory: Path, overwrite: bool) -> None:
-    """Refuse a directory that holds something or cannot be written; nothing is made or removed.
+def check_directory(directory: Path, overwrite: bool, *, resume: bool = False) -> None:
+    """Refuse a directory that holds something, unless a run is resumed there, or cannot be written.
 
-    Cheap, so that a long preparation need not come first; `prepare_directory` has the last word.
+    Nothing is made or removed. Cheap, so that a long preparation need not come first; `prepare_directory` has the last
+    word.
 
     Raises:
         InputError: as `prepare_directory`.
@@ -54,10 +56,10 @@ def check_directory(directory: Path, overwrite: bool) -> None:
         raise InputError(f"{directory} cannot be made ({reason}): give another place with -o.") from error
     if directory.is_dir():
         _refuse_unwritable(directory)
-        if not overwrite and any(directory.iterdir()):
+        if not (overwrite or resume) and any(directory.iterdir()):
             raise InputError(
                 f"{directory} exists and is not empty: give another directory with -o, or --overwrite to "
-                "replace the result in it."
+                "replace the result in it, or --resume to go on with it."
             )
     elif directory.exists() or directory.is_symlink():
         raise InputError(f"{directory} is a file, not a directory: give another place with -o.")
@@ -105,6 +107,7 @@ def _remove_result(directory: Path) -> None:
         raise InputError(f"{directory / SCENE} was not written by mpmcli: give another directory with -o.")
     try:
         remove_segments(directory)
+        remove_checkpoints(directory)
         # The record is removed last: while it exists, the remaining files are known to be mpmcli's.
         for path in sorted(ours, key=lambda path: path.name == RECORD):
             path.unlink(missing_ok=True)

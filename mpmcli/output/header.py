@@ -71,7 +71,7 @@ class RunHeader(ColliderFacts):
         bodies: in the order of their labels in the frames.
         laws: in the order of the labels in the frames.
         end: s; frames: expected, the initial one included.
-        precision: "f32" or "f64"; backend: "arch", "threads" and "precision".
+        precision: "f32" or "f64"; backend: "arch" and "precision", in older files "threads" too.
     """
 
     stored: dict[str, Any]
@@ -122,7 +122,8 @@ class RunHeader(ColliderFacts):
                     {"deformation": law.deformation, "coherent": law.coherent, "projects": law.projects} for law in laws
                 ],
                 "precision": backend["precision"],
-                "backend": dict(backend),
+                # The bytes of a result do not depend on threads; run.json has their number.
+                "backend": {name: value for name, value in backend.items() if name != "threads"},
                 "scene": text,
             }
             | ({"emitter_volumes": emitted_volumes(scene)} if scene.emitters else {})

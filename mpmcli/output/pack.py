@@ -1,8 +1,10 @@
 """Packing: many sealed files become one file, proved equal before it takes its name."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +14,9 @@ from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, part_tables, read_array, read_index
 
 
-def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = False) -> None:
+def pack_segments(
+    segments: Sequence[Path], target: Path, *, compress: bool = False, header: Mapping[str, Any] | None = None
+) -> None:
     """Write all frames of `segments` into `target`, compare every number, then give it its name.
 
     Memory is that of one array of one segment. The segments are left as they are.
@@ -21,6 +25,7 @@ def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = Fa
         segments: sealed VTKHDF files of one run, in order.
         target: file to make; an existing one is replaced at the very end.
         compress: gzip-1 with shuffle.
+        header: of the packed file, that of the segments by default; "scene" may differ, as a resumed run may end later.
 
     Raises:
         RunError: the disk cannot hold the packed file, the segments do not belong together, or the
@@ -31,10 +36,11 @@ def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = Fa
     except InputError as error:
         raise RunError(f"{error} The frames in {segments[0].parent} were left unpacked.") from error
     first = indices[0]
+    facts = first.header if header is None else dict(header)
     for segment, index in zip(segments, indices, strict=True):
-        if index.layout != first.layout or index.header != first.header:
+        if index.layout != first.layout or any(index.header.get(key) != facts[key] for key in facts if key != "scene"):
             raise RunError(f"{segment} is of another run than {segments[0]}: the frames were left unpacked.")
-    expected = FrameIndex.joined(indices)
+    expected = replace(FrameIndex.joined(indices), header=facts)
     counts = expected.counts.tolist()
     kept = f"the {len(counts)} frames written are kept in {segments[0].parent} and stay readable there"
     purpose = f"packing the frames into {target.name}"

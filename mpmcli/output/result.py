@@ -44,6 +44,7 @@ class Result(ABC):
         dimension: 2 or 3.
         field_names: the fields of each Frame, without position, velocity, body and material.
         record: content of run.json, None where there is none.
+        index: tables of all frames, as the files hold them.
         collider_frames: for each collider the number of the only frame that it is in; None where all are in all.
     """
 
@@ -52,7 +53,7 @@ class Result(ABC):
 
     def __init__(self, path: Path, index: FrameIndex) -> None:
         self.path = path
-        self._index = index
+        self.index = index
         self.times = index.times
         self.numbers = index.frames
         self.particle_counts = index.counts
@@ -89,11 +90,11 @@ class Result(ABC):
             raise InputError(f"{self.path} has no frame {k}: it holds frames 0 to {self.frame_count - 1}.")
         names = [POSITION, *STANDARD[1:], *(self.field_names if fields is None else fields)]
         for name in names:
-            if name not in self._index.layout.arrays:
+            if name not in self.index.layout.arrays:
                 known = ", ".join(self.field_names) or "none"
                 raise InputError(f'{self.path} holds no field "{name}": its fields are {known}.')
         stored = self._read(k, names)
-        index = self._index
+        index = self.index
         return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
 
     def present_frame(self, k: int, fields: Sequence[str] | None = None) -> Frame:
@@ -108,7 +109,7 @@ class Result(ABC):
         The numbers are 0, 1, 2, ... unless something has changed the file.
         """
         stored = self._read(k, [POSITION, *STANDARD, *self.field_names])
-        index = self._index
+        index = self.index
         frame = index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
         return frame, stored["id"]
 
@@ -129,7 +130,7 @@ class _PackedResult(Result):
         super().__init__(path, _index_of(path))
 
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
-        return _read_arrays(self.path, names, int(self._index.offsets[k]), int(self.particle_counts[k]))
+        return _read_arrays(self.path, names, int(self.index.offsets[k]), int(self.particle_counts[k]))
 
 
 class _SegmentsResult(Result):
@@ -152,7 +153,7 @@ class _SegmentsResult(Result):
             if segment.exists() or not packed.exists():
                 raise
             # The run has ended since, and its frames were packed: the same ones, and perhaps more.
-            return _read_arrays(packed, names, int(self._index.offsets[k]), int(self.particle_counts[k]))
+            return _read_arrays(packed, names, int(self.index.offsets[k]), int(self.particle_counts[k]))
 
 
 class _SeriesResult(Result):
@@ -184,7 +185,7 @@ class _SeriesResult(Result):
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
         if self.particle_counts[k] == 0:
             # meshio cannot read back the empty arrays that it wrote.
-            arrays = self._index.layout.arrays
+            arrays = self.index.layout.arrays
             return {name: np.empty(arrays[name].stored_shape(0), arrays[name].dtype) for name in names}
         stored = read_vtu(self._files[k])
         return {name: stored[name] for name in names}

@@ -4,7 +4,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -29,6 +29,8 @@ class RunRecord:
         directory: where run.json goes; not part of it.
         command: command line, the program's name first and without its path.
         backend: arch, threads, precision, and device name where known, of the backend that really came.
+        files: SHA-256 of each file that the scene reads, by name.
+        resumed: for each time that the run went on: when (at), frames kept, and the step it went on from.
         seeds: seed of each body by name, for those that have one.
         frames_expected, particles: as planned.
         notes: sentences about what was chosen for the user ("auto" values).
@@ -44,6 +46,7 @@ class RunRecord:
     command: Sequence[str] = ()
     backend: dict[str, Any] = field(default_factory=dict)
     seeds: dict[str, int] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
     frames_expected: int = 0
     particles: int = 0
     notes: Sequence[str] = ()
@@ -55,6 +58,7 @@ class RunRecord:
     limits: dict[str, int] = field(default_factory=dict)
     energy: dict[str, float] = field(default_factory=dict)
     failure: dict[str, Any] | None = None
+    resumed: list[dict[str, Any]] = field(default_factory=list)
     started: str = field(default_factory=lambda: _now())
     ended: str | None = None
 
@@ -70,6 +74,17 @@ class RunRecord:
         self.energy["last"] = energy
         self.energy["smallest"] = min(energy, self.energy.get("smallest", energy))
         self.energy["largest"] = max(energy, self.energy.get("largest", energy))
+
+    def go_on_from(self, earlier: Mapping[str, Any], rows: Sequence[LedgerRow], step: int) -> None:
+        """Go on with the record of a run that is resumed.
+
+        Args:
+            earlier: content of its run.json; rows: of the frames that are there; step: that it goes on from.
+        """
+        for row in rows:
+            self.observe(row)
+        self.started = str(earlier.get("started", self.started))
+        self.resumed = [*earlier.get("resumed", ()), {"at": _now(), "frames": len(rows), "step": step}]
 
     def close(self, status: Status, message: str = "", **facts: Any) -> None:
         """Set how the run ended and write.

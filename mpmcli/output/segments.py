@@ -12,6 +12,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.collider_files import write_collider_files
 from mpmcli.output.durable import TEMPORARY_SUFFIX, sealed, sync_directory
+from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.pack import pack_segments
 from mpmcli.output.store import Store
@@ -72,11 +73,11 @@ class SegmentStore(Store):
         if not segments:
             return None
         packed = self._directory / PACKED
-        if len(segments) == 1 and not self._compress:
+        if len(segments) == 1 and not self._compress and not self._kept:
             os.replace(segments[0], packed)
             sync_directory(self._directory)
         else:
-            pack_segments(segments, packed, compress=self._compress)
+            pack_segments(segments, packed, compress=self._compress, header=self._header)
         if self._colliders:
             with closing(open_vtkhdf(packed)) as file:
                 times = read_index(file).times.tolist()
@@ -85,6 +86,10 @@ class SegmentStore(Store):
         with suppress(OSError):
             remove_segments(self._directory)
         return packed
+
+    def go_on_after(self, index: FrameIndex) -> None:
+        super().go_on_after(index)
+        self._sealed = {path.name for path in sealed_segments(self._directory)}
 
     def _holds_result(self) -> bool:
         return (self._directory / PACKED).exists() or bool(sealed_segments(self._directory))

@@ -18,6 +18,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.collider_files import write_collider_series
 from mpmcli.output.durable import sealed, write_text
+from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.layout import POSITION, FrameLayout
 from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_csv
 from mpmcli.output.store import Store
@@ -48,6 +49,14 @@ class VtkSeriesStore(Store):
         self._frames: dict[str, list[int]] = {name: [] for name in FRAME_COLUMNS}
         self._rows: list[LedgerRow] = []
 
+    def go_on_after(self, index: FrameIndex) -> None:
+        super().go_on_after(index)
+        self._times, self._rows = index.times.tolist(), list(index.ledger)
+        for name, column in zip(FRAME_COLUMNS, (index.frames, index.steps, index.counts), strict=True):
+            self._frames[name] = column.tolist()
+        # The scene may end later than it did.
+        self._write_header(index.layout)
+
     def finish(self) -> Path | None:
         """Write the colliders, and return the .pvd, complete after every frame; None where no frame was written."""
         if self.frames_written:
@@ -69,8 +78,7 @@ class VtkSeriesStore(Store):
             with sealed(self._directory / series_frame_name(frame.index)) as temporary:
                 _write_vtu(temporary, dict(layout.stored(frame)), compress=self._compress)
         if frames[0].index == 0:
-            facts = {"format": FORMAT, "version": __version__, "header": self._header, "layout": layout.to_dict()}
-            write_text(self._directory / SERIES_HEADER, json.dumps(facts, indent=1) + "\n")
+            self._write_header(layout)
         self._rows += rows
         for frame in frames:
             self._times.append(float(frame.time))
@@ -79,6 +87,10 @@ class VtkSeriesStore(Store):
         write_text(self._directory / SERIES_LEDGER, ledger_csv(self._rows, self._frames))
         # The .pvd comes last: what it lists is there.
         write_text(self._directory / SERIES, _pvd_text(self._times))
+
+    def _write_header(self, layout: FrameLayout) -> None:
+        facts = {"format": FORMAT, "version": __version__, "header": self._header, "layout": layout.to_dict()}
+        write_text(self._directory / SERIES_HEADER, json.dumps(facts, indent=1) + "\n")
 
 
 def read_vtu(path: Path) -> dict[str, np.ndarray]:

@@ -10,6 +10,7 @@ from mpmcli.errors import InputError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import require_free_space
+from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
 from mpmcli.scene.colliders import Collider
@@ -56,17 +57,27 @@ class Store(ABC):
         self._waiting: list[tuple[Frame, LedgerRow]] = []
         self._waiting_since = 0.0
         self.frames_written = 0
+        # Frames that an earlier process has written.
+        self._kept = 0
+
+    def go_on_after(self, index: FrameIndex) -> None:
+        """Go on after frames that an earlier process has written here; they are not written again."""
+        self._layout = index.layout
+        self.frames_written = self._kept = len(index.times)
+        self._start()
 
     def write(self, frame: Frame, row: LedgerRow) -> None:
         """Take the next frame; seal the waiting frames if they fill MOST_WAITING bytes or one has waited for `hold`.
 
-        The arrays of the frame must not change afterwards.
+        The arrays of the frame must not change afterwards. One that an earlier process has written is left as it is.
 
         Raises:
             RunError: the disk is full or refuses; all frames before this one are kept.
             InputError: the directory holds an earlier result.
             ValueError: the frame is out of order or has other arrays than the first one.
         """
+        if frame.index < self._kept:
+            return
         following = self.frames_written + len(self._waiting)
         if frame.index != following:
             raise ValueError(f"frame {frame.index} was given where frame {following} comes next")

@@ -1,55 +1,36 @@
 """One run from a loaded scene to a stored result: check, refuse or go on, run, store."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
 
 from mpmcli.check.finding import Finding, passes
 from mpmcli.check.scene_check import check_scene
 from mpmcli.errors import InputError, MpmcliError, RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
-from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, check_directory, prepare_directory
-from mpmcli.output.durable import write_text
+from mpmcli.output import (
+    RunRecord,
+    check_directory,
+    open_result,
+    prepare_directory,
+)
+from mpmcli.output.directory import SCENE
 from mpmcli.output.header import RunHeader
-from mpmcli.output.store import HOLD, Store
-from mpmcli.scene import LoadedScene, Scene, scene_to_toml
+from mpmcli.output.segments import sealed_segments
+from mpmcli.output.store import Store
+from mpmcli.scene import LoadedScene, scene_to_toml
+from mpmcli.simulation.checkpointing import Checkpointer
 from mpmcli.simulation.engine import choose_engine
+from mpmcli.simulation.resume import Resumption, find_resumption, go_on, take_over
+from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.stopwatch import Stopwatch
+from mpmcli.simulation.stored_run import finish, new_record, new_store, new_summary, write_scene
 from mpmcli.simulation.summary import RunSummary
-from mpmcli.solver.backend import Arch, start
+from mpmcli.solver.backend import Backend, start
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.engine import Engine, build_engine
-from mpmcli.solver.plan import make_plan, require_room
-
-SCENE = "scene.toml"
-
-
-@dataclass(frozen=True)
-class RunSettings:
-    """Settings of a run that are not part of its scene.
-
-    Attributes:
-        directory: where the result goes.
-        arch: backend to use; threads: CPU threads, where None one for few particles and otherwise all.
-        form: "vtkhdf" for one packed file, "vtk" for a .vtu series.
-        overwrite: whether an earlier result in the directory may be replaced.
-        force: whether to run although the check finds errors, and to take time.step above the stable step too.
-        compile_cache: whether compiled kernels are kept for the next start.
-        command: the command line, for the record.
-    """
-
-    directory: Path
-    arch: Arch = "auto"
-    threads: int | None = None
-    form: Literal["vtkhdf", "vtk"] = "vtkhdf"
-    overwrite: bool = False
-    force: bool = False
-    compile_cache: bool = True
-    command: Sequence[str] = ()
+from mpmcli.solver.plan import Plan, make_plan, require_room
 
 
 def simulate(
@@ -75,38 +56,49 @@ def simulate(
     """
     began = time.perf_counter()
     scene = loaded.scene
-    check_directory(settings.directory, settings.overwrite)
+    check_directory(settings.directory, settings.overwrite, resume=settings.resume)
+    earlier = find_resumption(loaded, settings.directory, settings.form) if settings.resume else None
     backend, batched = choose_engine(scene, settings.arch, settings.threads, compile_cache=settings.compile_cache)
     plan = make_plan(scene, backend)
     findings = check_scene(loaded, plan=plan, directory=settings.directory).findings
     if not (settings.force or passes(findings)):
         raise InputError(_refusal(loaded.source, findings))
+    if earlier is not None and earlier.complete:
+        return _complete(loaded, settings, earlier, plan, backend, on_start)
     require_room(plan)
     start(backend)
     solver = build_engine(scene, backend, batched=batched, force=settings.force)
-    # Last, since it removes an earlier result.
-    prepare_directory(settings.directory, settings.overwrite)
+    forced = settings.force and scene.time.step != "auto"
+    if earlier is None:
+        # Last, since it removes an earlier result.
+        prepare_directory(settings.directory, settings.overwrite or settings.resume)
+    else:
+        go_on(solver, earlier, backend, forced=forced)
+        take_over(settings.directory, earlier)
 
     notes = (*loaded.notes, *(finding.line for finding in findings if finding.severity != "note"))
-    facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
-    summary = RunSummary(settings.directory, solver.particle_count, scene.time.frames + 1, facts, notes, plan)
+    summary = new_summary(loaded, settings, plan, backend, earlier, notes)
     on_start(summary)
-    record = _new_record(scene, settings, summary)
+    record = new_record(loaded, settings, summary, earlier)
     text = scene_to_toml(scene)
-    try:
-        write_text(settings.directory / SCENE, text)
-    except OSError as error:
-        raise RunError(f"{settings.directory / SCENE} could not be written ({error.strerror or error}).") from error
     record.write()
+    write_scene(settings.directory, text)
     header = RunHeader.of(scene, text, [laws()[name] for name in solver.laws], summary.backend)
-    kind = VtkSeriesStore if settings.form == "vtk" else SegmentStore
-    options = {"compress": scene.output.compress, "hold": HOLD, "colliders": scene.colliders}
-    store = kind(settings.directory, header.stored, **options)
+    store = new_store(loaded, settings, header.stored, earlier)
+    checkpoints = Checkpointer(
+        settings.directory,
+        solver,
+        store,
+        summary.backend,
+        size=plan.particles * plan.bytes_per_particle,
+        forced=forced,
+        every=settings.checkpoint_every,
+    )
 
     clock = Stopwatch(summary.timings, began)
     failure: dict = {}
     try:
-        _run(solver, store, record, summary, clock, on_frame, stop)
+        _run(solver, store, checkpoints, record, summary, clock, on_frame, stop)
         summary.status = "finished"
     except KeyboardInterrupt:
         summary.status, summary.message = "interrupted", "the run was interrupted"
@@ -122,16 +114,49 @@ def simulate(
     summary.steps = solver.step_count
     clock.book(solver.first_step_seconds, "compile_s")
     with clock.adding("output_s"):
-        _finish(store, summary)
+        finish(store, summary)
     clock.stop()
     record.timings = summary.timings
     record.close(summary.status, summary.message, **failure)
     return summary
 
 
+def _complete(
+    loaded: LoadedScene,
+    settings: RunSettings,
+    earlier: Resumption,
+    plan: Plan,
+    backend: Backend,
+    on_start: Callable[[RunSummary], None],
+) -> RunSummary:
+    """Pack the frames of a run that had stored all of them; nothing is done where they are packed."""
+    began = time.perf_counter()
+    summary = new_summary(loaded, settings, plan, backend, earlier, loaded.notes)
+    on_start(summary)
+    clock = Stopwatch(summary.timings, began)
+    text = scene_to_toml(loaded.scene)
+    packed = settings.form == "vtk" or not sealed_segments(settings.directory)
+    same = (settings.directory / SCENE).read_text(encoding="utf-8") == text
+    if packed and same and earlier.record["status"] == "finished":
+        summary.status, summary.path = "finished", open_result(settings.directory).path
+        return summary
+    record = new_record(loaded, settings, summary, earlier)
+    take_over(settings.directory, earlier)
+    write_scene(settings.directory, text)
+    store = new_store(loaded, settings, {**earlier.index.header, "scene": text}, earlier)
+    summary.status = "finished"
+    with clock.adding("output_s"):
+        finish(store, summary)
+    clock.stop()
+    record.timings = summary.timings
+    record.close(summary.status, summary.message)
+    return summary
+
+
 def _run(
     solver: Engine,
     store: Store,
+    checkpoints: Checkpointer,
     record: RunRecord,
     summary: RunSummary,
     clock: Stopwatch,
@@ -140,16 +165,20 @@ def _run(
 ) -> None:
     """Compute and store frame after frame; the record and the summary follow the frames that are sealed."""
     rows: list[LedgerRow] = []
+    kept = store.frames_written
 
     def after_step() -> bool:
         store.seal_due()
-        return stop()
+        ends = stop()
+        if ends or checkpoints.due():
+            checkpoints.take()
+        return ends
 
     def report() -> None:
-        sealed = rows[summary.frames : store.frames_written]
+        sealed = rows[summary.frames - kept : store.frames_written - kept]
         with clock.adding("output_s"):
             clock.book(solver.first_step_seconds, "compile_s")
-            clock.book(solver.frame_seconds, "output_s")
+            clock.book(solver.frame_seconds + checkpoints.seconds, "output_s")
             summary.steps = solver.step_count
             summary.timings["watch_s"] = solver.measure_seconds
             record.timings = summary.timings
@@ -169,12 +198,11 @@ def _run(
                 frame, row = next(frames, (None, None))
             if frame is None:
                 break
-            rows.append(row)
+            if frame.index >= kept:
+                rows.append(row)
             with clock.adding("output_s"):
                 store.write(frame, row)
             report()
-            if stop():
-                raise KeyboardInterrupt
     except BaseException:
         # The first error is the one to be told.
         with suppress(RunError):
@@ -183,32 +211,10 @@ def _run(
         raise
     with clock.adding("output_s"):
         store.seal()
+        if checkpoints.taken:
+            # So that the run can go on where its end is put off.
+            checkpoints.take()
     report()
-
-
-def _finish(store: Store, summary: RunSummary) -> None:
-    """Pack what was stored; until then, the result is the directory with its sealed frames."""
-    summary.path = summary.directory
-    try:
-        summary.path = store.finish()
-    except KeyboardInterrupt:
-        summary.status, summary.message = "interrupted", "the run was interrupted while its frames were packed"
-    except RunError as error:
-        if summary.status == "finished":
-            summary.status = "failed"
-        summary.message = f"{summary.message} {error}".strip()
-
-
-def _new_record(scene: Scene, settings: RunSettings, summary: RunSummary) -> RunRecord:
-    return RunRecord(
-        settings.directory,
-        command=settings.command,
-        backend=summary.backend,
-        seeds={body.name: body.seed for body in scene.bodies if body.sampling == "jittered"},
-        frames_expected=summary.frames_expected,
-        particles=summary.particles,
-        notes=summary.notes,
-    )
 
 
 def _refusal(source: str, findings: Iterable[Finding]) -> str:

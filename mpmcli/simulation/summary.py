@@ -15,7 +15,8 @@ class RunSummary:
         directory: where the result is; path: the file to open, None where no frame was written.
         status: "finished", "unstable", "interrupted" or "failed".
         message: why it ended early, "" where it did not.
-        frames, steps, particles: counts; frames_expected: of the whole run.
+        frames, steps, particles: counts; frames_expected: of the whole run; steps_before:
+            those of earlier processes, where the run was resumed.
         backend: "arch", "threads" and "precision"; plan: memory and passes.
         notes: what was chosen for the user, and warnings of the check.
         timings: seconds by name: start_s (load and allocate), compile_s (first step, compilation
@@ -35,6 +36,7 @@ class RunSummary:
     path: Path | None = None
     frames: int = 0
     steps: int = 0
+    steps_before: int = 0
     timings: dict[str, float] = field(default_factory=dict)
     first: LedgerRow | None = None
     last: LedgerRow | None = None
@@ -43,7 +45,7 @@ class RunSummary:
     def rate(self) -> float:
         """Particle-steps per second, compilation and output not counted."""
         seconds = self.timings.get("solve_s", 0.0)
-        return self.particles * max(self.steps - 1, 0) / seconds if seconds > 0 else 0.0
+        return self.particles * max(self.steps - self.steps_before - 1, 0) / seconds if seconds > 0 else 0.0
 
     def as_dict(self) -> dict:
         """Return all of it as JSON can hold it."""

@@ -136,6 +136,7 @@ class Batch:
         values: numbers that expressions read.
         observations: per law, on a GPU.
         pushes: measurements of the forces on each law, None where there are none.
+        share_work: (counts), divides particles among threads anew after they were loaded; on the CPU.
         seconds: wall time of all launches; first_seconds: of the first, which compiles the kernel.
     """
 
@@ -224,6 +225,7 @@ class Batch:
             colliders,
             motion,
             Emission(kind.comings, d, runs) if kind.comings.groups else None,
+            ti.field(int, shape=(2 * runs, d)) if on_cpu else None,
         )
         self.layout = Layout(d, [len(law.internal) for law in kind.members], len(kind.comings.groups))
         self.numbers = np.zeros((runs, self.layout.reals))
@@ -238,8 +240,10 @@ class Batch:
         if on_cpu:
             loads = kind.colliders.count * colliders.loads if colliders else 0
             self.notes = np.zeros((runs, MOST_FRAMES, len(NOTES) + len(groups) * sum_entries(d) + loads))
-        build = build_batch_kernel if on_cpu else build_gpu_launch
-        self._launch = build(self.device, self.layout)
+        if on_cpu:
+            self._launch, self.share_work = build_batch_kernel(self.device, self.layout)
+        else:
+            self._launch = build_gpu_launch(self.device, self.layout)
 
     def make_room(self, rows: int, columns: int) -> None:
         """Let each run have so many rows of `shown` from the next launch on."""

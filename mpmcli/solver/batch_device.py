@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
+import taichi as ti
+
 from mpmcli.boundaries.collider_motion import ColliderMotion
 from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.moving_faces import MovingFaces
@@ -31,6 +33,8 @@ class Device:
         colliders, motion: those of each run, and how they move; None where there are none.
         values, gravity: numbers that expressions read, and gravity where it varies.
         emission: the mouths of emitters, None where there are none.
+        stencils: (2 runs, d) int, of each run the first and the last node per axis at which a stencil began when
+            particles were sorted; None on a GPU.
     """
 
     runs: int
@@ -49,6 +53,7 @@ class Device:
     colliders: Colliders | None = None
     motion: ColliderMotion | None = None
     emission: Emission | None = None
+    stencils: ti.Field | None = None
 
     @property
     def comes_and_goes(self) -> bool:

@@ -1,11 +1,16 @@
 """The particles of one law of one run of a batch."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
 from mpmcli.materials.law import Law
+from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.batch import Batch
+from mpmcli.solver.particle_update import NOT_LOST
+from mpmcli.solver.particles import initial_states, table_of
+from mpmcli.solver.plan import members_of
+from mpmcli.solver.state_bounds import floor_of
 
 
 class BatchGroup:
@@ -40,3 +45,22 @@ class BatchGroup:
             self.arrays.write(self.first + first, found, self.row + row)
         for i, row in enumerate(self.rows):
             self.arrays.table[self.row + i] = row.tolist()
+
+
+def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyParticles]) -> list[BatchGroup]:
+    """Put the particles of a run, one entry per source, on the device; return its groups, one for each law."""
+    first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
+    lost, groups = batch.device.particles.lost, []
+    for g, shared in enumerate(batch.kind.members):
+        bodies = members_of(scene, shared.name)
+        own = [particles[i] for i in bodies]
+        law = type(shared)([scene.sources[i].material for i in bodies], scene.dimension)
+        count = sum(len(b.position) for b in own)
+        active = sum(len(b.position) for b in own if not b.waits)
+        group = BatchGroup(batch, g, slot, law, bodies, table_of(law, own), count, active)
+        group.floor = floor_of(scene, law, bodies)
+        group.write(initial_states(law, own, [int(first_ids[i]) for i in bodies], np.array(scene.domain.origin)))
+        groups.append(group)
+        if lost[slot * len(batch.kind.members) + g] != NOT_LOST:
+            lost[slot * len(batch.kind.members) + g] = NOT_LOST
+    return groups

@@ -24,8 +24,13 @@ from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
 
 
-def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, ...], None]:
-    """Compile-ready kernel: (numbers, counts, shown, notes) of all runs, see `Batch`; it advances and changes all."""
+def build_batch_kernel(device: Device, layout: Layout) -> tuple[Callable[..., None], Callable[[np.ndarray], None]]:
+    """Return compile-ready kernels.
+
+    Returns:
+        (numbers, counts, shown, notes) of all runs, see `Batch`, which advances and changes all; and (counts), which
+        divides the particles among threads.
+    """
     d = device.grid.dimension
     groups, room, threads = tuple(device.groups), tuple(device.room), device.threads
     members = tuple(enumerate(groups))
@@ -38,8 +43,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
     counted = tuple((k, getattr(count, name)) for k, name in enumerate(NOTES) if hasattr(count, name))
     alone, collides = threads == 1, device.colliders is not None
     next_run = ti.field(int, shape=())
-    # Of each run and axis the first and the last node at which a stencil began when particles were sorted.
-    stencils = ti.field(int, shape=(2 * device.runs, d))
+    stencils = device.stencils
     emission = BatchEmission(device, layout, stencils)
 
     @ti.func
@@ -224,4 +228,12 @@ def build_batch_kernel(device: Device, layout: Layout) -> Callable[[np.ndarray, 
                         attend(w, 0, numbers, counts, shown, notes)
                         w = ti.atomic_add(next_run[None], 1)
 
-    return launch
+    @ti.kernel
+    def share_work(counts: ti.types.ndarray(ti.i32, 2)):
+        ti.loop_config(serialize=True)
+        for w in range(device.runs):
+            if ti.static(phases.shared):
+                for g in ti.static(range(len(groups))):
+                    phases.places.divide(g, counts[w, count.particles[g]])
+
+    return launch, share_work

@@ -22,15 +22,18 @@ def steps_of(row: Row, count: int) -> StepsTaken:
 
 
 class BatchRecorder:
-    """The place of a run in `Batch.shown` and `Batch.notes`."""
+    """The place of a run in `Batch.shown` and `Batch.notes`.
+
+    Attributes:
+        index: the next frame to be read; steps: those of the run up to the last one.
+    """
 
     def __init__(self, batch: Batch, slot: int, particles: int, frames: int) -> None:
         self._batch, self._slot, self._particles, self._frames = batch, slot, particles, frames
         self._row = Row(batch.layout, batch.numbers[slot], batch.counts[slot])
         self._room = 0
         self._columns: FrameColumns | None = None
-        # The next frame to be read, and steps of the run up to the last one.
-        self._index = self._steps = 0
+        self.index = self.steps = 0
 
     def begin(self, columns: FrameColumns) -> None:
         """Let the kernel record frame 0 in the next launch, and then all others."""
@@ -38,7 +41,7 @@ class BatchRecorder:
         size = self._particles * columns.count * self._batch.shown.itemsize
         self._room = min(max(1, ROOM // size), MOST_FRAMES, self._frames)
         self._row.set_counts(records=1, arrived=1, frame=0, frames=self._frames)
-        self._index = self._steps = 0
+        self.index = self.steps = 0
         self.make_room()
 
     def make_room(self) -> None:
@@ -59,13 +62,11 @@ class BatchRecorder:
             now, last_step, smallest, courant, largest, largest_courant, limit, steps, blocked = note
             step = before + int(steps)
             taken = NO_STEPS
-            if step > self._steps:
-                taken = StepsTaken(
-                    step - self._steps, (smallest, courant, LIMITS[int(limit)]), largest, largest_courant
-                )
+            if step > self.steps:
+                taken = StepsTaken(step - self.steps, (smallest, courant, LIMITS[int(limit)]), largest, largest_courant)
             own = None if loads is None else loads[n]
-            moments.append(Moment(self._index, now, step, last_step, taken, own, int(blocked)))
-            self._index, self._steps = self._index + 1, step
+            moments.append(Moment(self.index, now, step, last_step, taken, own, int(blocked)))
+            self.index, self.steps = self.index + 1, step
         rows = self._batch.shown[self._batch.first_row(self._slot) :][: count * self._particles]
         arrays = FrameArrays(builder.columns, rows.reshape(count, self._particles, -1))
         return builder.build(moments, arrays, self._sums(count)[0])

@@ -11,23 +11,22 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.batch import Batch
-from mpmcli.solver.batch_emission import begin_emission
+from mpmcli.solver.batch_constants import write_constants
 from mpmcli.solver.batch_exchange import Exchange
-from mpmcli.solver.batch_group import BatchGroup
+from mpmcli.solver.batch_group import groups_of
 from mpmcli.solver.batch_layout import ATTEND, BEYOND, COLLAPSED, GOING, IDLE, LOST, MEASURE, Row
 from mpmcli.solver.batch_recorder import BatchRecorder, steps_of
+from mpmcli.solver.batch_state import aim_on, read_batch, write_batch
 from mpmcli.solver.batch_values import Drives
 from mpmcli.solver.collider_steps import read_loads
 from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.groups import require_inside
 from mpmcli.solver.particle_update import NOT_LOST
-from mpmcli.solver.particles import initial_states, table_of
-from mpmcli.solver.plan import members_of
 from mpmcli.solver.run import COLLAPSE, Run
 from mpmcli.solver.run_values import RunValues
-from mpmcli.solver.state import Progress
-from mpmcli.solver.state_bounds import Measurement, entries, floor_of, state_bounds_of
+from mpmcli.solver.state import Progress, SavedState
+from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
 from mpmcli.solver.step_control import StepControl
 from mpmcli.solver.sums import Sums
 
@@ -68,56 +67,15 @@ class BatchRun(Run):
         self._row.set(time=0.0, last_step=0.0)
         self._row.set_counts(records=0, arrived=0, steps=0)
         self._exchange = Exchange(batch.layout, self._numbers, self._counts)
-        first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in self._particles])])
-        self.groups = []
-        for g, shared in enumerate(batch.kind.members):
-            bodies = members_of(scene, shared.name)
-            own = [self._particles[i] for i in bodies]
-            law = type(shared)([scene.sources[i].material for i in bodies], scene.dimension)
-            count = sum(len(b.position) for b in own)
-            active = sum(len(b.position) for b in own if not b.waits)
-            group = BatchGroup(batch, g, slot, law, bodies, table_of(law, own), count, active)
-            group.floor = floor_of(scene, law, bodies)
-            group.write(initial_states(law, own, [int(first_ids[i]) for i in bodies], self._origin))
-            self.groups.append(group)
-            lost = batch.device.particles.lost
-            if lost[slot * len(batch.kind.members) + g] != NOT_LOST:
-                lost[slot * len(batch.kind.members) + g] = NOT_LOST
+        self.groups = groups_of(batch, slot, scene, self._particles)
         self._recorder = BatchRecorder(batch, slot, self.particle_count, scene.time.frames)
         entries = Drives.of(scene, [group.bodies for group in self.groups])[1]
         self._values = RunValues(batch.values.device, slot, entries, scene.time.end)
         self._tables, self._means = batch.values.tables, list(self._values.means.values())
-        self._filled_since = -math.inf
-        self._set_constants()
-        self._row.set_counts(status=MEASURE)
-
-    def _set_constants(self) -> None:
-        """Store what does not change during the run."""
-        scene, h = self.scene, self.spacing
-        device = self.batch.device
-        for data in (device.friction, device.moving, device.grid.period, device.colliders, device.motion):
-            if data is not None:
-                data.write(scene, self.slot)
-        gravity = scene.domain.gravity_at(0.0)
-        for a, n in enumerate(scene.domain.cells):
-            self._numbers[self._real.gravity[a]] = gravity[a]
-            self._numbers[self._real.extent[a]] = n * h
-            self._counts[self._count.cells[a]] = n
-        maximum = math.inf if scene.time.step == "auto" else scene.time.step
-        self._row.set(
-            spacing=h,
-            inverse_spacing=1 / h,
-            gradient_scale=device.grid.scheme.spline.inverse_moment / h,
-            safety=scene.time.safety,
-            maximum=maximum,
-            end=scene.time.end,
-            horizon=-math.inf if self._means else math.inf,
-            force=math.inf,
-            wall_speed=scene.domain.wall_speed,
-            collider=self._collider_bound,
-        )
-        begin_emission(self.batch, self.slot, scene, self._particles)
-        self._row.set_counts(forced=self._forced)
+        self._filled_since, self._coarse = -math.inf, False
+        write_constants(batch, slot, scene, self._particles)
+        self._row.set(horizon=-math.inf if self._means else math.inf, collider=self._collider_bound)
+        self._row.set_counts(status=MEASURE, forced=self._forced)
 
     def _measurement(self, g: int) -> Measurement:
         first = self._real.maxima[g]
@@ -132,6 +90,9 @@ class BatchRun(Run):
         Raises:
             UnstableRunError: a particle left the domain, was inverted or became non-finite.
         """
+        if self._begun:
+            yield from self._advance()
+            return
         if self.backend.on_cpu:
             self._recorder.begin(self._builder.columns)
         yield None
@@ -172,19 +133,38 @@ class BatchRun(Run):
     def wait(self) -> None:
         """Wait until the device has taken every step; each launch waits."""
 
+    def save(self) -> SavedState:
+        """Copy the state of the only run of a batch to the host, between two launches."""
+        numbers = {name: getattr(self.state, name) for name in Progress.NUMBERS}
+        numbers["step_control"] = self.state.step_control.save()
+        numbers["external_forces"] = self.state.external_forces.save()
+        numbers["tables"] = [self._filled_since, self._coarse]
+        numbers["frames"] = [self._recorder.index, self._recorder.steps, self._builder.before]
+        return SavedState(numbers, read_batch(self.batch))
+
+    def load(self, saved: SavedState) -> None:
+        """Go on from a saved state of the same scene, or of one that ends earlier, as the only run of a batch.
+
+        Raises:
+            InputError: it is of another scene.
+        """
+        self._recorder.begin(self._builder.columns)
+        write_batch(self.batch, saved.arrays)
+        self._prepare()
+        for name in Progress.NUMBERS:
+            setattr(self.state, name, saved.numbers[name])
+        self.state.step_control.load(saved.numbers["step_control"])
+        self.state.external_forces.load(saved.numbers["external_forces"])
+        self._filled_since, self._coarse = saved.numbers["tables"]
+        if math.isfinite(self._filled_since):
+            self._tables.fill(self.slot, self._means, self._filled_since, coarse=self._coarse)
+        self._recorder.index, self._recorder.steps, self._builder.before = saved.numbers["frames"]
+        aim_on(self._row)
+
     def _start(self) -> None:
         """Take the bounds of time 0 from the measurement of the first launch."""
         self.first_step_seconds = self.batch.first_seconds
-        control = StepControl(
-            self.scene, self.groups, [self._measurement(g) for g in range(len(self.groups))], on_cpu=True
-        )
-        measures = [
-            partial(push, group.first, group.count, self.slot)
-            for push, group in zip(self.batch.pushes, self.groups, strict=True)
-            if push is not None
-        ]
-        self.state = Progress(control, ExternalForces(self.scene, self._values, measures))
-        self._begun = True
+        control = self._prepare()
         self._begin()
         self._row.set(
             growth_allowed=control.growth_allowed,
@@ -195,6 +175,20 @@ class BatchRun(Run):
             self._numbers[self._real.sensitivity[g]] = group.law.sensitivity
             self._numbers[self._real.hardening[g]] = group.law.hardening
         self._exchange.push(self.state)
+
+    def _prepare(self) -> StepControl:
+        """Begin to follow the state from the measurement that the kernel made last."""
+        control = StepControl(
+            self.scene, self.groups, [self._measurement(g) for g in range(len(self.groups))], on_cpu=True
+        )
+        measures = [
+            partial(push, group.first, group.count, self.slot)
+            for push, group in zip(self.batch.pushes, self.groups, strict=True)
+            if push is not None
+        ]
+        self.state = Progress(control, ExternalForces(self.scene, self._values, measures))
+        self._begun = True
+        return control
 
     def _reach(self, target: float) -> Iterator[None]:
         """Let the batch launch until the run has reached a time, s."""
@@ -261,8 +255,8 @@ class BatchRun(Run):
         """Let the kernel go on from the time that velocities have."""
         since = self.state.velocity_time
         # The same time again: the next kick takes more windows than found room.
-        self._row.set(horizon=self._tables.fill(self.slot, self._means, since, coarse=since == self._filled_since))
-        self._filled_since = since
+        self._coarse, self._filled_since = since == self._filled_since, since
+        self._row.set(horizon=self._tables.fill(self.slot, self._means, since, coarse=self._coarse))
 
     def _lost(self) -> list[int | None]:
         """Return a lost particle of each group, in solver order, None where none is known."""
@@ -295,3 +289,4 @@ class BatchRun(Run):
             if self.step_count and stop():
                 raise KeyboardInterrupt
             self.batch.launch()
+            self.first_step_seconds = self.first_step_seconds or self.batch.first_seconds

@@ -11,6 +11,7 @@ from mpmcli.solver.backend import Arch, Backend, choose_backend
 from mpmcli.solver.batch import Batch, Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.solver import Solver
+from mpmcli.solver.state import SavedState
 
 # Particles that are worth a thread.
 WORTH_A_THREAD = 2_500
@@ -59,6 +60,16 @@ class Engine(Protocol):
 
         Raises:
             UnstableRunError: see `advance`.
+        """
+
+    def save(self) -> SavedState:
+        """Return the state, where `stop` of `frames` is called."""
+
+    def load(self, saved: SavedState) -> None:
+        """Go on from a saved state of the same scene, or of one that ends earlier, with the frames that follow.
+
+        Raises:
+            InputError: it is of another scene, or of another kind of backend.
         """
 
     def frame(self) -> tuple[Frame, LedgerRow]:

@@ -42,6 +42,7 @@ class FrameBuilder:
 
     Attributes:
         columns: that the frames need.
+        before: time of the last frame, s.
     """
 
     def __init__(self, scene: Scene, particles: Sequence[BodyParticles], groups: Sequence) -> None:
@@ -62,7 +63,7 @@ class FrameBuilder:
         farthest = float(np.abs([self._origin, scene.domain.upper]).max())
         coarse = farthest * np.finfo(np.float32).eps > POSITION_ERROR * scene.domain.spacing
         self._position_type = np.float64 if coarse or groups[0].real == np.float64 else np.float32
-        self._before = 0.0
+        self.before = 0.0
         self._initial = None
         if "initial_position" in scene.output.fields:
             initial = [b.position if b.initial is None else b.initial for b in particles]
@@ -125,7 +126,7 @@ class FrameBuilder:
         d = self._scene.dimension
         found = []
         for moment in moments:
-            duration, self._before = moment.time - self._before, moment.time
+            duration, self.before = moment.time - self.before, moment.time
             found.append(moment.loads / duration if duration > 0 else np.zeros_like(moment.loads))
         loads = np.array(found)
         return loads[..., :d], loads[..., d:]

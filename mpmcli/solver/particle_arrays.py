@@ -138,6 +138,13 @@ class ParticleArrays(ParticleExchange):
         """Every field that moves with a particle from place to place."""
         return (*self.state, *self.labels)
 
+    def fields(self) -> dict[str, ti.Field]:
+        """Return every field of the particles that changes during a run or is sorted, by name."""
+        names = ["position", "velocity", "velocity_gradient", "deformation", *(v.name for v in self.law.internal)]
+        initial = ["initial_position"] * self.keeps_initial + ["slip"] * self.slips
+        labels = ["id"] + ["body"] * (self.body is not None) + ["activity"] * self.comes_and_goes
+        return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
+
     @ti.func
     def stored(self, p: int):
         """Return J, or F as a d x d matrix, of particle p."""

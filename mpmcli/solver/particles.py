@@ -123,13 +123,6 @@ class ParticleGroup(ParticleArrays):
         self.active = count
         self.live[None] = count
 
-    def fields(self) -> dict[str, ti.Field]:
-        """Return every field of the particles that changes during a run or is sorted, by name."""
-        names = ["position", "velocity", "velocity_gradient", "deformation", *(v.name for v in self.law.internal)]
-        initial = ["initial_position"] * self.keeps_initial + ["slip"] * self.slips
-        labels = ["id"] + ["body"] * (self.body is not None) + ["activity"] * self.comes_and_goes
-        return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
-
     def set_motion(self, velocity: np.ndarray, C: np.ndarray) -> None:
         """Set the velocity, (n, d), and the affine velocity C, (n, d, d), of all particles."""
         d, width = self.dimension, self.v.n

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from mpmcli.solver.kernels import Kernels
 from mpmcli.solver.observe import build_observation
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.run import COLLAPSE, Run
-from mpmcli.solver.state import State
+from mpmcli.solver.state import SavedState, State
 from mpmcli.solver.state_bounds import build_measurement
 from mpmcli.solver.step_control import StepControl
 from mpmcli.solver.sums import NO_STEPS, StepsTaken, Sums
@@ -67,10 +68,28 @@ class Solver(Run):
         self._slowest = 0.0 if self._emission is None else self._emission.slowest
         schedule = None if self._emission is None else self._emission.schedule
         self.state = State(self.groups, self._kernels, step_control, forces, schedule)
+        # The next frame, the steps since the last one, and whether frames go on from there.
+        self._next, self._taken, self._goes_on = 0, NO_STEPS, False
         self._begin()
 
     def begin(self) -> None:
         """Take the bounds of time 0; done when the device was filled."""
+
+    def save(self) -> SavedState:
+        """Copy the state, and the place among the frames, to the host; between steps."""
+        saved = self.state.save()
+        saved.numbers["frames"] = [self._next, asdict(self._taken), self._builder.before]
+        return saved
+
+    def load(self, saved: SavedState) -> None:
+        """Go on from a saved state of the same scene, or of one that ends earlier.
+
+        Raises:
+            InputError: it is of another scene.
+        """
+        self.state.load(saved)
+        self._next, taken, self._builder.before = saved.numbers["frames"]
+        self._taken, self._goes_on = StepsTaken(**taken | {"smallest": tuple(taken["smallest"])}), True
 
     def restart(self) -> None:
         """Begin a new run at time 0 with the particles as they are on the device, set from outside."""
@@ -202,20 +221,25 @@ class Solver(Run):
         The time left to the next frame is split into equal steps, so that frames land on their times.
 
         Args:
-            stop: called after each step; True ends the run there.
+            stop: called between steps, where `save` may be called; True ends the run there.
 
         Raises:
             UnstableRunError: see `step`.
             KeyboardInterrupt: `stop` returned True.
         """
         count = self.scene.time.frames
-        yield self.frame()
-        for index in range(1, count + 1):
-            target = self.scene.time.end * index / count
-            if target <= self.time:
-                continue
-            taken = NO_STEPS
+        if not self._goes_on:
+            first = self.frame()
+            self._next, self._taken = 1, NO_STEPS
+            while self._next <= count and self.scene.time.end * self._next / count <= self.time:
+                self._next += 1
+            yield first
+        self._goes_on = False
+        while self._next <= count:
+            target = self.scene.time.end * self._next / count
             while True:
+                if self.step_count and stop():
+                    raise KeyboardInterrupt
                 largest, limit = self.stable_step()
                 if largest < COLLAPSE * self.state.first_stable_step:
                     self._stop_collapsed(largest)
@@ -223,12 +247,12 @@ class Solver(Run):
                 splits = max(1, math.ceil(left / largest - 1e-6))
                 dt = left / splits
                 self.step(dt, target if splits == 1 else None)
-                taken = taken.and_one(dt, self.courant, limit.name)
+                self._taken = self._taken.and_one(dt, self.courant, limit.name)
                 if splits == 1:
                     break
-                if stop():
-                    raise KeyboardInterrupt
             if not self.backend.on_cpu:
                 # Nothing else detects lost particles there.
                 self.measure_state(dt)
-            yield self.frame(index, taken)
+            reached = self.frame(self._next, self._taken)
+            self._next, self._taken = self._next + 1, NO_STEPS
+            yield reached

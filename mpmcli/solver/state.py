@@ -126,7 +126,7 @@ class State(Progress):
             InputError: the saved state has other fields or other numbers of particles or nodes.
         """
         fields = self._fields()
-        shapes = {name: _shape(field) for name, field in fields.items()}
+        shapes = {name: shape_of(field) for name, field in fields.items()}
         if shapes != {name: array.shape for name, array in saved.arrays.items()}:
             raise InputError("the saved state belongs to another scene or to another kind of backend.")
         for name, field in fields.items():
@@ -153,7 +153,7 @@ class State(Progress):
         return fields | ({} if self._kernels.contact is None else self._kernels.contact.fields())
 
 
-def _shape(field: ti.Field) -> tuple[int, ...]:
+def shape_of(field: ti.Field) -> tuple[int, ...]:
     """Return the shape of a field as a numpy array."""
     if isinstance(field, ti.lang.matrix.MatrixField):
         return (*field.shape, field.n) if field.m == 1 else (*field.shape, field.n, field.m)

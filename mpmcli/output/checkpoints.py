@@ -1,0 +1,102 @@
+"""Checkpoints: complete states of a run that goes on, from which it can be resumed. The two newest ones are kept."""
+
+import json
+import re
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpmcli import __version__
+from mpmcli.output.durable import TEMPORARY_SUFFIX, require_free_space, sealed
+
+CHECKPOINTS = "checkpoints"
+CHECKPOINT_NAME = re.compile(r"step_\d{9,}\.npz")
+FORMAT = 1
+KEPT = 2
+# Member with the facts, as JSON.
+FACTS = "facts"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A state of a run at rest.
+
+    Attributes:
+        frame: number of the first frame that it had not stored; step: steps taken; time: s.
+        backend: "arch" and "precision"; forced: whether time.step was taken as it was.
+        numbers: of the state, as JSON can hold them; arrays: by name.
+        version: of mpmcli that wrote it.
+    """
+
+    frame: int
+    step: int
+    time: float
+    backend: Mapping[str, str]
+    forced: bool
+    numbers: Mapping[str, Any]
+    arrays: Mapping[str, np.ndarray]
+    version: str = __version__
+
+
+def write_checkpoint(directory: Path, checkpoint: Checkpoint) -> Path:
+    """Seal a checkpoint of the run in `directory`, and remove those before the last one.
+
+    Raises:
+        RunError, OSError: the disk cannot hold it; earlier ones are kept.
+    """
+    folder = directory / CHECKPOINTS
+    facts = {name: value for name, value in vars(checkpoint).items() if name != "arrays"}
+    text = np.frombuffer(json.dumps({"format": FORMAT, **facts}).encode("utf-8"), np.uint8)
+    size = sum(array.nbytes for array in checkpoint.arrays.values()) + text.nbytes + 1024 * (1 + len(checkpoint.arrays))
+    require_free_space(directory, size, "a checkpoint", "the frames are kept")
+    folder.mkdir(exist_ok=True)
+    path = folder / f"step_{checkpoint.step:09d}.npz"
+    with sealed(path, size) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **{FACTS: text, **{f"state/{name}": array for name, array in checkpoint.arrays.items()}})
+    for older in _paths(directory)[KEPT:]:
+        older.unlink(missing_ok=True)
+    return path
+
+
+def read_checkpoints(directory: Path) -> Iterator[Checkpoint]:
+    """Yield the sound checkpoints of a directory that this version can read, the newest first."""
+    for path in _paths(directory):
+        # Every member carries a CRC-32, which reading it compares.
+        with suppress(OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+            yield _read(path)
+
+
+def remove_checkpoints(directory: Path, *, but: int = 0) -> None:
+    """Remove all checkpoints except for the newest `but`, and their folder where it becomes empty."""
+    folder = directory / CHECKPOINTS
+    if not folder.is_dir():
+        return
+    for path in _paths(directory)[but:]:
+        path.unlink(missing_ok=True)
+    for path in folder.glob(f"*{TEMPORARY_SUFFIX}"):
+        if CHECKPOINT_NAME.fullmatch(path.name.removesuffix(TEMPORARY_SUFFIX)):
+            path.unlink(missing_ok=True)
+    with suppress(OSError):
+        folder.rmdir()
+
+
+def _paths(directory: Path) -> list[Path]:
+    """Return the files of checkpoints, the newest first."""
+    folder = directory / CHECKPOINTS
+    found = [path for path in folder.iterdir() if CHECKPOINT_NAME.fullmatch(path.name)] if folder.is_dir() else []
+    return sorted(found, key=lambda path: int(path.stem.split("_")[1]), reverse=True)
+
+
+def _read(path: Path) -> Checkpoint:
+    with np.load(path, allow_pickle=False) as file:
+        facts = json.loads(file[FACTS].tobytes().decode("utf-8"))
+        if facts.pop("format") != FORMAT or facts["version"] != __version__:
+            raise ValueError(f"{path} is of another version")
+        names = [name for name in file.files if name != FACTS]
+        arrays = {name.removeprefix("state/"): file[name] for name in names}
+    return Checkpoint(**facts, arrays=arrays)

@@ -1,0 +1,227 @@
+"""What an earlier run left in a directory, and whether a scene can go on from it."""
+
+import math
+import os
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Literal
+
+from mpmcli.errors import InputError
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output import read_record
+from mpmcli.output.checkpoints import Checkpoint, read_checkpoints
+from mpmcli.output.directory import SCENE
+from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory
+from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.result import open_result
+from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments, segment_name
+from mpmcli.output.series import SERIES
+from mpmcli.output.vtkhdf import open_vtkhdf, read_index
+from mpmcli.plain_text import counted
+from mpmcli.scene import LoadedScene, scene_to_toml
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.engine import Engine
+from mpmcli.solver.state import SavedState
+
+# What may change between two parts of a run: it may end later, with frames as far apart, and its file be compressed.
+MAY_CHANGE = ("time.end", "time.frames", "output.compress")
+_NONE = object()
+# What h5py, numpy and JSON raise on a file whose content contradicts itself.
+DAMAGE = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError)
+
+
+@dataclass(frozen=True)
+class Resumption:
+    """The start of a run that goes on.
+
+    Attributes:
+        index: of the sound frames from the first one on, None where there are none.
+        checkpoint: the newest one whose frames are all there; None where the run is computed from its start again.
+        complete: whether all frames are there, and no step is left to be taken.
+        record: content of run.json.
+    """
+
+    index: FrameIndex | None
+    checkpoint: Checkpoint | None
+    complete: bool
+    record: Mapping[str, Any]
+
+    @property
+    def step(self) -> int:
+        """Steps taken where it goes on."""
+        return 0 if self.checkpoint is None else self.checkpoint.step
+
+    @property
+    def note(self) -> str:
+        """Where the run goes on, a sentence."""
+        point = self.checkpoint
+        place = "the start" if point is None else f"step {point.step} at {point.time:.6g} s"
+        return f"resumed: {counted(self.frames, 'frame')} kept, computed again from {place}"
+
+    @property
+    def frames(self) -> int:
+        """Frames that are there."""
+        return 0 if self.index is None else len(self.index.times)
+
+    @property
+    def rows(self) -> list[LedgerRow]:
+        """Their ledger."""
+        return [] if self.index is None else self.index.ledger
+
+
+def find_resumption(loaded: LoadedScene, directory: Path, form: Literal["vtkhdf", "vtk"]) -> Resumption | None:
+    """Return how a scene goes on from what a directory holds; None where it holds nothing. Nothing is changed.
+
+    Raises:
+        InputError: the directory holds something else, or the result of another scene.
+    """
+    record = read_record(directory) if directory.is_dir() else None
+    if not (_has_frames(directory) or (directory / SERIES).exists()):
+        # Killed before it had written anything, or not begun.
+        names = [path.name for path in directory.iterdir()] if directory.is_dir() else []
+        if record is not None or all(name.endswith(TEMPORARY_SUFFIX) for name in names):
+            return None
+    if record is None or not (directory / SCENE).is_file():
+        raise InputError(f"{directory} holds no run that could be resumed: give its directory with -o.")
+    other = (directory / SERIES).exists() if form == "vtkhdf" else _has_frames(directory)
+    if other:
+        raise InputError(f"{directory} holds a run with another --format: leave --format as it was.")
+    _require_same_scene(loaded, directory)
+    _require_same_files(loaded, record, directory)
+    index = _series_index(directory) if form == "vtk" else _sound_index(directory)
+    frames = 0 if index is None else len(index.times)
+    found = (point for point in read_checkpoints(directory) if point.frame <= frames)
+    return Resumption(index, next(found, None), frames == loaded.scene.time.frames + 1, record)
+
+
+def go_on(engine: Engine, resumption: Resumption, backend: Backend, *, forced: bool) -> None:
+    """Put the state of the checkpoint, if there is one, in place of the start of the run.
+
+    Args:
+        forced: whether time.step is taken as it is.
+
+    Raises:
+        InputError: the checkpoint is of another kind of backend, or of a scene whose particles differ.
+    """
+    point = resumption.checkpoint
+    if point is None:
+        return
+    if point.backend != {"arch": backend.arch, "precision": backend.precision}:
+        raise InputError(
+            f"The run was computed with --arch {point.backend['arch']}: give that to resume it; found {backend.arch}."
+        )
+    if point.forced != forced:
+        raise InputError(f"The run was begun with{'' if point.forced else 'out'} --force: resume it in the same way.")
+    engine.load(SavedState(dict(point.numbers), dict(point.arrays)))
+
+
+def take_over(directory: Path, resumption: Resumption) -> None:
+    """Make the frames that are there the first segments of the run, and remove what follows a damaged one."""
+    packed, folder = directory / PACKED, directory / SEGMENTS
+    if packed.exists():
+        with closing(open_vtkhdf(packed)) as file:
+            count = len(read_index(file).times)
+        folder.mkdir(exist_ok=True)
+        os.replace(packed, folder / segment_name(0))
+        sync_directory(folder)
+        sync_directory(directory)
+        own = range(1, count)
+    else:
+        own = range(0)
+    for path in sealed_segments(directory):
+        first = int(path.stem.split("_")[1])
+        if first in own or first >= resumption.frames:
+            path.unlink()
+
+
+def file_digests(loaded: LoadedScene) -> dict[str, str]:
+    """Return SHA-256 of each file that a scene reads, by its name in the scene."""
+    scene, found = loaded.scene, {}
+    for entry in (*scene.sources, *scene.colliders):
+        for name in entry.shape.files:
+            with suppress(OSError):
+                found[name] = sha256((Path(loaded.source).parent / name).read_bytes()).hexdigest()
+    return found
+
+
+def _has_frames(directory: Path) -> bool:
+    return (directory / PACKED).exists() or bool(sealed_segments(directory))
+
+
+def _series_index(directory: Path) -> FrameIndex | None:
+    return open_result(directory / SERIES).index if (directory / SERIES).exists() else None
+
+
+def _sound_index(directory: Path) -> FrameIndex | None:
+    """Return the index of the sound frames from the first one on."""
+    found: list[FrameIndex] = []
+    count = 0
+    for path in [*([directory / PACKED] if (directory / PACKED).exists() else []), *sealed_segments(directory)]:
+        try:
+            with closing(open_vtkhdf(path)) as file:
+                index = read_index(file)
+        except (InputError, *DAMAGE) as error:
+            if path.name == PACKED:
+                raise InputError(f"{path} is damaged: take it away to resume the run without its frames.") from error
+            break
+        first = int(index.frames[0])
+        if first < count:
+            # The packed file has it.
+            continue
+        if first > count or index.frames.tolist() != list(range(first, first + len(index.frames))):
+            break
+        found.append(index)
+        count += len(index.frames)
+    return FrameIndex.joined(found) if found else None
+
+
+def _require_same_scene(loaded: LoadedScene, directory: Path) -> None:
+    try:
+        before = tomllib.loads((directory / SCENE).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{directory / SCENE} cannot be read, so that the run cannot be resumed.") from error
+    now = tomllib.loads(scene_to_toml(loaded.scene))
+    changes = list(_changes("", before, now))
+    texts = [f"{key} was {_text(old)} and is {_text(new)}" for key, old, new in changes if key not in MAY_CHANGE]
+    if texts:
+        raise InputError(
+            f"{directory} holds a run of another scene and cannot be resumed with {loaded.source}: "
+            + "; ".join(texts[:8])
+            + (f"; and {len(texts) - 8} more" if len(texts) > 8 else "")
+            + "."
+        )
+    old, new = before["time"], now["time"]
+    same_spacing = math.isclose(old["end"] * new["frames"], new["end"] * old["frames"], rel_tol=1e-12)
+    if new["frames"] < old["frames"] or not same_spacing:
+        raise InputError(
+            f"{directory} holds frames {old['end'] / old['frames']:.6g} s apart up to {old['end']:.6g} s: to resume, "
+            "time.end and time.frames may only grow, both by the same factor."
+        )
+
+
+def _require_same_files(loaded: LoadedScene, record: Mapping[str, Any], directory: Path) -> None:
+    before = record.get("files") or {}
+    for name, digest in file_digests(loaded).items():
+        if before.get(name, digest) != digest:
+            raise InputError(f"{name} has changed since the run in {directory} began, which cannot be resumed with it.")
+
+
+def _changes(place: str, old: object, new: object) -> Iterator[tuple[str, object, object]]:
+    """Yield the key path, the old and the new value of what differs."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in sorted({*old, *new}):
+            yield from _changes(f"{place}.{key}".lstrip("."), old.get(key, _NONE), new.get(key, _NONE))
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for k, pair in enumerate(zip(old, new, strict=True)):
+            yield from _changes(f"{place}[{k}]", *pair)
+    elif old != new:
+        yield place, old, new
+
+
+def _text(value: object) -> str:
+    text = "absent" if value is _NONE else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

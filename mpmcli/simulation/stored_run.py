@@ -1,0 +1,91 @@
+"""What a run writes, and what is told of it: summary, record, scene and store, at its start and at its end."""
+
+from pathlib import Path
+from typing import Any
+
+from mpmcli.errors import RunError
+from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore
+from mpmcli.output.directory import SCENE
+from mpmcli.output.durable import write_text
+from mpmcli.output.store import HOLD, Store
+from mpmcli.scene import LoadedScene
+from mpmcli.simulation.resume import Resumption, file_digests
+from mpmcli.simulation.settings import RunSettings
+from mpmcli.simulation.summary import RunSummary
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.plan import Plan
+
+
+def new_summary(
+    loaded: LoadedScene,
+    settings: RunSettings,
+    plan: Plan,
+    backend: Backend,
+    earlier: Resumption | None,
+    notes: tuple[str, ...],
+) -> RunSummary:
+    """Return the summary of a run that begins, or goes on from an earlier part."""
+    facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
+    summary = RunSummary(settings.directory, plan.particles, loaded.scene.time.frames + 1, facts, notes, plan)
+    if earlier is not None:
+        summary.notes += (earlier.note,)
+        summary.frames = earlier.frames
+        if earlier.rows:
+            summary.first, summary.last = earlier.rows[0], earlier.rows[-1]
+            summary.steps = int(earlier.index.steps[-1])
+        summary.steps_before = earlier.step
+    return summary
+
+
+def new_store(loaded: LoadedScene, settings: RunSettings, header: dict[str, Any], earlier: Resumption | None) -> Store:
+    """Return the store of a run, which goes on after the frames that are there."""
+    kind = VtkSeriesStore if settings.form == "vtk" else SegmentStore
+    scene = loaded.scene
+    store = kind(settings.directory, header, compress=scene.output.compress, hold=HOLD, colliders=scene.colliders)
+    if earlier is not None and earlier.index is not None:
+        store.go_on_after(earlier.index)
+    return store
+
+
+def write_scene(directory: Path, text: str) -> None:
+    """Write the effective scene beside the frames.
+
+    Raises:
+        RunError: the disk is full or refuses.
+    """
+    try:
+        write_text(directory / SCENE, text)
+    except OSError as error:
+        raise RunError(f"{directory / SCENE} could not be written ({error.strerror or error}).") from error
+
+
+def finish(store: Store, summary: RunSummary) -> None:
+    """Pack what was stored; until then, the result is the directory with its sealed frames."""
+    summary.path = summary.directory
+    try:
+        summary.path = store.finish()
+    except KeyboardInterrupt:
+        summary.status, summary.message = "interrupted", "the run was interrupted while its frames were packed"
+    except RunError as error:
+        if summary.status == "finished":
+            summary.status = "failed"
+        summary.message = f"{summary.message} {error}".strip()
+
+
+def new_record(
+    loaded: LoadedScene, settings: RunSettings, summary: RunSummary, earlier: Resumption | None
+) -> RunRecord:
+    """Return the record of a run, which goes on from that of an earlier part."""
+    record = RunRecord(
+        settings.directory,
+        command=settings.command,
+        backend=summary.backend,
+        seeds={body.name: body.seed for body in loaded.scene.bodies if body.sampling == "jittered"},
+        files=file_digests(loaded),
+        frames_expected=summary.frames_expected,
+        particles=summary.particles,
+        notes=summary.notes,
+    )
+    if earlier is not None:
+        record.go_on_from(earlier.record, earlier.rows, earlier.step)
+    return record
