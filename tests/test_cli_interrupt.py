@@ -46,7 +46,8 @@ def test_an_interrupt_packs_what_is_done(tmp_path, number, ctrl_c_off):
     assert parts == ["interrupted", "seconds", "energy", "volume ratio J at the end", "result"]
     assert stdout.splitlines()[-1] == f"result: {Path('result/particles.vtkhdf')}"
     directory = tmp_path / "result"
-    assert sorted(path.name for path in directory.iterdir()) == ["particles.vtkhdf", "run.json", "scene.toml"]
+    expected = ["checkpoints", "particles.vtkhdf", "run.json", "scene.toml"]
+    assert sorted(path.name for path in directory.iterdir()) == expected
     record = json.loads((directory / "run.json").read_text(encoding="utf-8"))
     assert record["status"] == "interrupted" and record["ended"]
     check_readable(directory, "packed", record["frames_written"])

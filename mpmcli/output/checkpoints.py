@@ -1,8 +1,11 @@
 """Checkpoints: complete states of a run that goes on, from which it can be resumed. The two newest ones are kept."""
 
+import io
 import json
 import re
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,6 +23,18 @@ FORMAT = 1
 KEPT = 2
 # Member with the facts, as JSON.
 FACTS = "facts"
+# What a damaged archive raises.
+DAMAGE = (
+    OSError,
+    RuntimeError,
+    ValueError,
+    KeyError,
+    TypeError,
+    EOFError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 @dataclass(frozen=True)
@@ -66,8 +81,7 @@ def write_checkpoint(directory: Path, checkpoint: Checkpoint) -> Path:
 def read_checkpoints(directory: Path) -> Iterator[Checkpoint]:
     """Yield the sound checkpoints of a directory that this version can read, the newest first."""
     for path in _paths(directory):
-        # Every member carries a CRC-32, which reading it compares.
-        with suppress(OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+        with suppress(*DAMAGE):
             yield _read(path)
 
 
@@ -93,10 +107,13 @@ def _paths(directory: Path) -> list[Path]:
 
 
 def _read(path: Path) -> Checkpoint:
-    with np.load(path, allow_pickle=False) as file:
-        facts = json.loads(file[FACTS].tobytes().decode("utf-8"))
-        if facts.pop("format") != FORMAT or facts["version"] != __version__:
-            raise ValueError(f"{path} is of another version")
-        names = [name for name in file.files if name != FACTS]
-        arrays = {name.removeprefix("state/"): file[name] for name in names}
-    return Checkpoint(**facts, arrays=arrays)
+    with zipfile.ZipFile(path) as file:
+        # Each member has a CRC-32, which is compared when all of it is read, before anything is made of it.
+        arrays = {
+            name: np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False) for name in file.namelist()
+        }
+    facts = json.loads(arrays.pop(f"{FACTS}.npy").tobytes().decode("utf-8"))
+    if facts.pop("format") != FORMAT or facts["version"] != __version__:
+        raise ValueError(f"{path} is of another version")
+    names = {name: name.removeprefix("state/").removesuffix(".npy") for name in arrays}
+    return Checkpoint(**facts, arrays={own: arrays[name] for name, own in names.items()})

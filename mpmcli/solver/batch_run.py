@@ -286,7 +286,7 @@ class BatchRun(Run):
                 yield event
                 continue
             # Frame 0 is always there, and what a launch has recorded is yielded before.
-            if self.step_count and stop():
+            if self._begun and stop():
                 raise KeyboardInterrupt
             self.batch.launch()
             self.first_step_seconds = self.first_step_seconds or self.batch.first_seconds
