@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import click
 
 from mpmcli import __version__
-from mpmcli.cli.interrupt import catch_interrupts, interrupt_came
+from mpmcli.cli.interrupt import catch_interrupts, interrupt_came, interrupted_code
 from mpmcli.cli.streams import flush_streams
 from mpmcli.errors import MpmcliError
 
@@ -30,8 +30,6 @@ COMMANDS = {
     "doctor": "Say whether everything that mpmcli needs works here.",
     "completion": "Print the script that completes commands in a shell.",
 }
-
-INTERRUPTED = 130
 
 
 class LazyGroup(click.Group):
@@ -67,7 +65,7 @@ def program(context: click.Context, debug: bool) -> None:
     """Turn a TOML scene into a reproducible particle dataset with the Material Point Method.
 
     What a command was asked for goes to stdout; progress, warnings and errors go to stderr. Exit codes: 0 done;
-    1 done, with a finding; 2 bad input or usage; 130 interrupted.
+    1 done, with a finding; 2 bad input or usage; 130 interrupted; 143 ended by SIGTERM or SIGHUP.
     """
     context.obj = debug
     if context.invoked_subcommand is None:
@@ -96,7 +94,7 @@ def run(arguments: list[str]) -> int:
         return 2
     except (click.Abort, KeyboardInterrupt):
         _print_error("interrupted")
-        return INTERRUPTED
+        return interrupted_code()
     except MpmcliError as error:
         if debug:
             traceback.print_exc()
@@ -108,7 +106,7 @@ def run(arguments: list[str]) -> int:
     except Exception as error:
         if interrupt_came():
             _print_error("interrupted")
-            return INTERRUPTED
+            return interrupted_code()
         if debug:
             traceback.print_exc()
         kind = type(error).__name__

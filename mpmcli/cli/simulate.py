@@ -5,7 +5,8 @@ from pathlib import Path
 
 import click
 
-from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
+from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
+from mpmcli.cli.limit_types import Duration, Size
 from mpmcli.cli.options import json_option, plugin_option, quiet_option, set_option
 from mpmcli.cli.streams import print_json, print_text
 
@@ -43,6 +44,16 @@ from mpmcli.cli.streams import print_json, print_text
 @click.option(
     "--force", is_flag=True, help="Run although `mpmcli check` finds errors, and take time.step above the stable step."
 )
+@click.option(
+    "--max-time",
+    type=Duration(),
+    help="End the run, with the result packed, before this wall time: 2h, 90m, 45s, 1h30m or 1:30:00.",
+)
+@click.option(
+    "--max-memory",
+    type=Size(),
+    help="End the run before it takes more memory of this machine: 8GB, 500MB or 8GiB.",
+)
 @quiet_option
 @json_option
 def command(
@@ -57,6 +68,8 @@ def command(
     compress: bool,
     overwrite: bool,
     force: bool,
+    max_time: float | None,
+    max_memory: int | None,
     quiet: bool,
     as_json: bool,
 ) -> int:
@@ -64,6 +77,7 @@ def command(
     from mpmcli.cli.simulate_progress import SimulateProgress
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
+    from mpmcli.simulation.limits import Limits
     from mpmcli.simulation.simulate import RunSettings, simulate
 
     overrides += (f'solver.precision="{precision}"',) if precision else ()
@@ -76,6 +90,7 @@ def command(
         form=form,
         overwrite=overwrite,
         force=force,
+        limits=Limits(max_time, max_memory),
         command=["mpmcli", *sys.argv[1:]],
     )
     progress = SimulateProgress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
@@ -86,4 +101,4 @@ def command(
         print_json(summary.as_dict())
     elif not quiet:
         print_text(summary.text())
-    return {"finished": 0, "interrupted": 130}.get(summary.status, 1)
+    return {"finished": 0, "interrupted": interrupted_code()}.get(summary.status, 1)

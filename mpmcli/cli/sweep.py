@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
+from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
 from mpmcli.cli.options import json_option, plugin_option, quiet_option
 from mpmcli.cli.streams import print_json, print_text
 
@@ -103,5 +103,5 @@ def command(
         rate = f", {state.per_hour:,.0f} per hour" if state.done > state.kept else ""
         print_text(f"{state.status}: {state.done} of {state.expected} trajectories{rate}\n{status.text()}")
     if state.status == "interrupted":
-        return 130
+        return interrupted_code()
     return 0 if state.accepted == state.done else 1

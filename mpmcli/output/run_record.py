@@ -6,7 +6,6 @@ import os
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
@@ -15,10 +14,11 @@ from mpmcli import __version__
 from mpmcli.errors import RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import write_text
+from mpmcli.output.owner import Owner, time_now
 
 RECORD = "run.json"
 PROGRAM = "mpmcli"
-Status = Literal["running", "finished", "unstable", "interrupted", "failed"]
+Status = Literal["running", "finished", "unstable", "interrupted", "stopped", "failed"]
 
 
 @dataclass
@@ -55,7 +55,7 @@ class RunRecord:
     limits: dict[str, int] = field(default_factory=dict)
     energy: dict[str, float] = field(default_factory=dict)
     failure: dict[str, Any] | None = None
-    started: str = field(default_factory=lambda: _now())
+    started: str = field(default_factory=time_now)
     ended: str | None = None
 
     def observe(self, row: LedgerRow) -> None:
@@ -80,7 +80,7 @@ class RunRecord:
             facts: where it failed: step, time, particle, body, position, limit, ...
         """
         self.status = status
-        self.ended = _now()
+        self.ended = time_now()
         if message or facts:
             self.failure = {"message": message, **facts}
         self.write()
@@ -94,7 +94,13 @@ class RunRecord:
         content = asdict(self)
         del content["directory"]
         content["command"] = [Path(word).name if i == 0 else word for i, word in enumerate(self.command)]
-        content = {"program": PROGRAM, "version": __version__, **content, "host": host_facts()}
+        content = {
+            "program": PROGRAM,
+            "version": __version__,
+            **content,
+            "process": Owner.here().as_dict(),
+            "host": host_facts(),
+        }
         text = json.dumps(_plain(content), indent=2, ensure_ascii=False)
         try:
             write_text(Path(self.directory) / RECORD, text + "\n")
@@ -104,7 +110,10 @@ class RunRecord:
 
 
 def host_facts() -> dict[str, Any]:
-    """What a figure depends on and a name does not: versions, system, processors; no path, no host name."""
+    """What a figure depends on and a name does not: versions, system, processors; no path, no host name.
+
+    Machines are told apart by a hash in "process", see `Owner`.
+    """
     try:
         taichi = version("taichi")
     except PackageNotFoundError:
@@ -125,10 +134,6 @@ def read_record(directory: Path) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     return record if isinstance(record, dict) and record.get("program") == PROGRAM else None
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _plain(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,7 @@ class SegmentStore(Store):
         self.place = self._directory / SEGMENTS
         self._sealed: set[str] = set()
 
-    def finish(self) -> Path | None:
+    def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
         """Seal the waiting frames, pack all segments, verify the packed file, and remove the segments.
 
         A single segment becomes the packed file as it is, unless that is compressed. The surfaces of colliders go
@@ -59,6 +59,7 @@ class SegmentStore(Store):
             The packed file; None when no frame was written.
 
         Raises:
+            KeyboardInterrupt: `stop` returned True; the segments stay.
             RunError: the disk cannot hold the packed file or it does not read back; the segments stay.
         """
         self.seal()
@@ -76,7 +77,7 @@ class SegmentStore(Store):
             os.replace(segments[0], packed)
             sync_directory(self._directory)
         else:
-            pack_segments(segments, packed, compress=self._compress)
+            pack_segments(segments, packed, compress=self._compress, stop=stop)
         if self._colliders:
             with closing(open_vtkhdf(packed)) as file:
                 times = read_index(file).times.tolist()

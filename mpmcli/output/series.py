@@ -5,7 +5,7 @@ Every ParaView and VTK reads it, at the price of more and larger files; VTKHDF i
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -48,7 +48,7 @@ class VtkSeriesStore(Store):
         self._frames: dict[str, list[int]] = {name: [] for name in FRAME_COLUMNS}
         self._rows: list[LedgerRow] = []
 
-    def finish(self) -> Path | None:
+    def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
         """Write the colliders, and return the .pvd, complete after every frame; None where no frame was written."""
         if self.frames_written:
             write_collider_series(self._directory, self._header, self._times, self._colliders)

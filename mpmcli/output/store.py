@@ -2,7 +2,7 @@
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ class Store(ABC):
     Attributes:
         place: where frames are written.
         frames_written: number of frames that a crash can no longer harm.
+        bytes_written: their size; seconds: wall time that sealing them took.
     """
 
     def __init__(
@@ -55,7 +56,8 @@ class Store(ABC):
         self._layout: FrameLayout | None = None
         self._waiting: list[tuple[Frame, LedgerRow]] = []
         self._waiting_since = 0.0
-        self.frames_written = 0
+        self.frames_written = self.bytes_written = 0
+        self.seconds = 0.0
 
     def write(self, frame: Frame, row: LedgerRow) -> None:
         """Take the next frame; seal the waiting frames if they fill MOST_WAITING bytes or one has waited for `hold`.
@@ -105,6 +107,7 @@ class Store(ABC):
             return
         frames, rows = zip(*self._waiting, strict=True)
         size = self._size(self._layout, [len(frame.position) for frame in frames])
+        began = time.perf_counter()
         purpose, kept = f"frame {frames[0].index}", _frames_kept(self.frames_written)
         try:
             require_free_space(self._directory, size, purpose, kept)
@@ -116,13 +119,19 @@ class Store(ABC):
             reason = getattr(error, "strerror", None) or error
             raise RunError(f"{purpose} could not be written to {self.place} ({reason}); {kept}.") from error
         self.frames_written += len(frames)
+        self.bytes_written += size
+        self.seconds += time.perf_counter() - began
         self._waiting.clear()
 
     @abstractmethod
-    def finish(self) -> Path | None:
+    def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
         """Complete the result and return the file to open; None where no frame was written.
 
+        Args:
+            stop: called often; True ends it, and what was written stays as it is.
+
         Raises:
+            KeyboardInterrupt: `stop` returned True.
             RunError: it could not be completed; what was written stays.
         """
 

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -12,18 +12,20 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.errors import InputError, MpmcliError, RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
-from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, check_directory, prepare_directory
+from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, check_directory
+from mpmcli.output.directory import TakenDirectory, take_directory
 from mpmcli.output.durable import write_text
 from mpmcli.output.header import RunHeader
 from mpmcli.output.store import HOLD, Store
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.engine import choose_engine
+from mpmcli.simulation.limits import Halt, Limits
 from mpmcli.simulation.stopwatch import Stopwatch
 from mpmcli.simulation.summary import RunSummary
-from mpmcli.solver.backend import Arch, start
+from mpmcli.solver.backend import Arch, Backend, start
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.engine import Engine, build_engine
-from mpmcli.solver.plan import make_plan, require_room
+from mpmcli.solver.plan import Plan, make_plan, require_room
 
 SCENE = "scene.toml"
 
@@ -39,6 +41,7 @@ class RunSettings:
         overwrite: whether an earlier result in the directory may be replaced.
         force: whether to run although the check finds errors, and to take time.step above the stable step too.
         compile_cache: whether compiled kernels are kept for the next start.
+        limits: on time and memory.
         command: the command line, for the record.
     """
 
@@ -49,6 +52,7 @@ class RunSettings:
     overwrite: bool = False
     force: bool = False
     compile_cache: bool = True
+    limits: Limits = field(default_factory=Limits)
     command: Sequence[str] = ()
 
 
@@ -57,21 +61,24 @@ def simulate(
     settings: RunSettings,
     on_start: Callable[[RunSummary], None] = lambda summary: None,
     on_frame: Callable[[LedgerRow, RunSummary], None] = lambda row, summary: None,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Callable[[], bool | str] = lambda: False,
 ) -> RunSummary:
     """Check a scene, run it to its end or to where it stops, and store it.
 
     Everything that can be refused is refused before anything is written. A run that becomes unstable, is
-    interrupted (`stop`, or KeyboardInterrupt) or cannot write keeps its sealed frames; its summary says so.
+    interrupted (`stop`, or KeyboardInterrupt), comes near a limit or cannot write keeps its sealed frames; its summary
+    says so. One that is interrupted before its first frame leaves nothing.
 
     Args:
         on_start: called before the first step, with the notes and warnings of the check in the summary.
         on_frame: called after each stored frame with its ledger row and the summary so far.
-        stop: called after every step and every stored frame; returns whether to interrupt the run.
+        stop: called after every step and every stored frame; returns whether to interrupt the run, or the name of the
+            signal that asks for it.
 
     Raises:
-        InputError: the check finds errors, or the scene, the backend or the directory cannot be used; nothing was
-            written.
+        InputError: the check finds errors, or the scene, the backend or the directory cannot be used, as when another
+            process writes it; nothing was written.
+        KeyboardInterrupt: the run was interrupted before it began; nothing was written.
     """
     began = time.perf_counter()
     scene = loaded.scene
@@ -82,11 +89,31 @@ def simulate(
     if not (settings.force or passes(findings)):
         raise InputError(_refusal(loaded.source, findings))
     require_room(plan)
+    settings.limits.require_room(plan)
     start(backend)
     solver = build_engine(scene, backend, batched=batched, force=settings.force)
+    if stop():
+        raise KeyboardInterrupt
     # Last, since it removes an earlier result.
-    prepare_directory(settings.directory, settings.overwrite)
+    with take_directory(settings.directory, settings.overwrite) as taken:
+        return _store_run(loaded, settings, findings, plan, backend, solver, taken, began, on_start, on_frame, stop)
 
+
+def _store_run(
+    loaded: LoadedScene,
+    settings: RunSettings,
+    findings: Sequence[Finding],
+    plan: Plan,
+    backend: Backend,
+    solver: Engine,
+    taken: TakenDirectory,
+    began: float,
+    on_start: Callable[[RunSummary], None],
+    on_frame: Callable[[LedgerRow, RunSummary], None],
+    stop: Callable[[], bool | str],
+) -> RunSummary:
+    """Run a scene and store it in a directory that is this process's to write; see `simulate`."""
+    scene = loaded.scene
     notes = (*loaded.notes, *(finding.line for finding in findings if finding.severity != "note"))
     facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
     summary = RunSummary(settings.directory, solver.particle_count, scene.time.frames + 1, facts, notes, plan)
@@ -104,12 +131,15 @@ def simulate(
     store = kind(settings.directory, header.stored, **options)
 
     clock = Stopwatch(summary.timings, began)
+    halt = Halt(stop, settings.limits, compress=scene.output.compress)
     failure: dict = {}
     try:
-        _run(solver, store, record, summary, clock, on_frame, stop)
+        _run(solver, store, record, summary, clock, on_frame, halt)
         summary.status = "finished"
     except KeyboardInterrupt:
-        summary.status, summary.message = "interrupted", "the run was interrupted"
+        halt.interrupted()
+        summary.status, summary.message = halt.status, halt.message
+        failure = {"signal": halt.signal} if halt.signal else {}
     except UnstableRunError as error:
         summary.status, summary.message = "unstable", str(error)
         failure = vars(error.diagnosis)
@@ -122,8 +152,11 @@ def simulate(
     summary.steps = solver.step_count
     clock.book(solver.first_step_seconds, "compile_s")
     with clock.adding("output_s"):
-        _finish(store, summary)
+        _finish(store, summary, halt)
     clock.stop()
+    if summary.status == "interrupted" and not summary.frames:
+        taken.undo()
+        return summary
     record.timings = summary.timings
     record.close(summary.status, summary.message, **failure)
     return summary
@@ -136,14 +169,14 @@ def _run(
     summary: RunSummary,
     clock: Stopwatch,
     on_frame: Callable[[LedgerRow, RunSummary], None],
-    stop: Callable[[], bool],
+    halt: Halt,
 ) -> None:
     """Compute and store frame after frame; the record and the summary follow the frames that are sealed."""
     rows: list[LedgerRow] = []
 
     def after_step() -> bool:
         store.seal_due()
-        return stop()
+        return halt()
 
     def report() -> None:
         sealed = rows[summary.frames : store.frames_written]
@@ -173,7 +206,8 @@ def _run(
             with clock.adding("output_s"):
                 store.write(frame, row)
             report()
-            if stop():
+            halt.wrote(store.bytes_written, store.seconds)
+            if halt():
                 raise KeyboardInterrupt
     except BaseException:
         # The first error is the one to be told.
@@ -186,13 +220,16 @@ def _run(
     report()
 
 
-def _finish(store: Store, summary: RunSummary) -> None:
+def _finish(store: Store, summary: RunSummary, halt: Halt) -> None:
     """Pack what was stored; until then, the result is the directory with its sealed frames."""
     summary.path = summary.directory
     try:
-        summary.path = store.finish()
+        summary.path = store.finish(halt.packing)
     except KeyboardInterrupt:
-        summary.status, summary.message = "interrupted", "the run was interrupted while its frames were packed"
+        if not halt.status:
+            halt.interrupted()
+        where = f"its frames were left unpacked, and stay readable in {store.place}"
+        summary.status, summary.message = halt.status, f"{halt.message}; {where}"
     except RunError as error:
         if summary.status == "finished":
             summary.status = "failed"

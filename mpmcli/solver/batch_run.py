@@ -21,6 +21,7 @@ from mpmcli.solver.collider_steps import read_loads
 from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.groups import require_inside
+from mpmcli.solver.launch_budget import LaunchBudget
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.particles import initial_states, table_of
 from mpmcli.solver.plan import members_of
@@ -30,9 +31,6 @@ from mpmcli.solver.state import Progress
 from mpmcli.solver.state_bounds import Measurement, entries, floor_of, state_bounds_of
 from mpmcli.solver.step_control import StepControl
 from mpmcli.solver.sums import Sums
-
-# Particle-steps of a run in one launch: some tenths of a second, after which the host may stop the run.
-BUDGET = 5_000_000
 
 
 class BatchRun(Run):
@@ -83,6 +81,7 @@ class BatchRun(Run):
             lost = batch.device.particles.lost
             if lost[slot * len(batch.kind.members) + g] != NOT_LOST:
                 lost[slot * len(batch.kind.members) + g] = NOT_LOST
+        self._budget = LaunchBudget(self.particle_count)
         self._recorder = BatchRecorder(batch, slot, self.particle_count, scene.time.frames)
         entries = Drives.of(scene, [group.bodies for group in self.groups])[1]
         self._values = RunValues(batch.values.device, slot, entries, scene.time.end)
@@ -210,12 +209,14 @@ class BatchRun(Run):
             None where the batch must launch; and the frames that it has recorded.
         """
         while self._row.count("arrived") == 0:
-            self._row.set_counts(status=GOING, budget=max(1, BUDGET // self.particle_count), steps=0)
+            self._row.set_counts(status=GOING, budget=self._budget.steps, steps=0)
             if self._row.count("records"):
                 self._recorder.make_room()
+            since = self.batch.seconds
             yield None
             before = self.step_count
             self._exchange.pull(self.state)
+            self._budget.took(self._row.count("steps"), self.batch.seconds - since)
             status = self._row.count("status")
             if self._row.count("records"):
                 yield from self._recorded(before)
