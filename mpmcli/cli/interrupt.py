@@ -1,6 +1,6 @@
 """Ctrl-C, and the requests of a batch system or a closing terminal to end: what is written is sealed.
 
-SIGTERM and SIGHUP are treated like Ctrl-C (SIGINT); the exit code tells which came: 130 for SIGINT, and 143 for the others.
+SIGTERM and SIGHUP are treated like Ctrl-C (SIGINT). The exit code is 130 after SIGINT, and 143 after the others.
 """
 
 import signal

@@ -36,7 +36,7 @@ class TakenDirectory:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None and issubclass(kind, KeyboardInterrupt) and not sealed_segments(self.path):
+        if kind is not None and not _has_frames(self.path):
             self.undo()
         self.release()
 
@@ -191,6 +191,9 @@ def _is_ours(name: str) -> bool:
 
 
 def _holds_result(directory: Path) -> bool:
-    if (directory / PACKED).exists() or (directory / SERIES_HEADER).exists() or sealed_segments(directory):
-        return True
-    return read_record(directory) is not None
+    return _has_frames(directory) or read_record(directory) is not None
+
+
+def _has_frames(directory: Path) -> bool:
+    files = (PACKED, SERIES_HEADER)
+    return any((directory / name).exists() for name in files) or bool(sealed_segments(directory))

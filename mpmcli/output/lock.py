@@ -70,9 +70,7 @@ def take_lock(directory: Path) -> DirectoryLock:
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o644)
         except OSError as error:
-            raise InputError(
-                f"{directory} cannot be locked ({error.strerror or error}): give another place with -o."
-            ) from error
+            raise _cannot(directory, error) from error
         try:
             got = _lock(descriptor, exclusive=True)
             content = _content(path)
@@ -90,9 +88,11 @@ def take_lock(directory: Path) -> DirectoryLock:
                 continue
             _refuse_foreign(directory, content, locks_work=got is True)
             _write(descriptor)
-        except BaseException:
+        except BaseException as error:
             if descriptor >= 0:
                 os.close(descriptor)
+            if isinstance(error, OSError):
+                raise _cannot(directory, error) from error
             raise
         return DirectoryLock(path, descriptor)
 
@@ -180,6 +180,10 @@ def _refuse_foreign(directory: Path, content: dict[str, Any], *, locks_work: boo
         f"{directory} was locked by {_named(content)}, and whether that process has ended cannot be seen from here: "
         f"if it has, remove {Path(directory) / LOCK}; or give another directory with -o."
     )
+
+
+def _cannot(directory: Path, error: OSError) -> InputError:
+    return InputError(f"{directory} cannot be locked ({error.strerror or error}): give another place with -o.")
 
 
 def _held(directory: Path, content: dict[str, Any]) -> str:

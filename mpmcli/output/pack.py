@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mpmcli.errors import InputError, RunError
-from mpmcli.output.durable import require_free_space, sealed, sync_file
+from mpmcli.errors import InputError, NoRoomError, RunError
+from mpmcli.output.durable import is_full, require_free_space, sealed, sync_file
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, part_tables, read_array, read_index
 
@@ -63,7 +63,8 @@ def pack_segments(
                 raise RunError(f"{target.name} does not read back as it was written ({difference}); {kept}.")
     except (OSError, RuntimeError, InputError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise RunError(f"{target} could not be written ({reason}); {kept}.") from error
+        fault = NoRoomError if is_full(error) else RunError
+        raise fault(f"{target} could not be written ({reason}); {kept}.") from error
 
 
 def find_difference(

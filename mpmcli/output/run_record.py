@@ -32,7 +32,7 @@ class RunRecord:
         seeds: seed of each body by name, for those that have one.
         frames_expected, particles: as planned.
         notes: sentences about what was chosen for the user ("auto" values).
-        status: "running" until `close`.
+        status: "running" until `close`; "interrupted" by a signal, "stopped" at a limit or for want of room.
         frames_written, steps, time: how far the run came; time in s.
         timings: seconds by name: compile_s, solve_s, output_s, wall_s.
         limits: number of frames in which each bound on the step was the nearest.

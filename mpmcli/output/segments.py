@@ -48,6 +48,7 @@ class SegmentStore(Store):
         super().__init__(directory, header, **options)
         self.place = self._directory / SEGMENTS
         self._sealed: set[str] = set()
+        self._counts: list[int] = []
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
         """Seal the waiting frames, pack all segments, verify the packed file, and remove the segments.
@@ -100,6 +101,9 @@ class SegmentStore(Store):
     def _size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
         return file_size(layout, counts)
 
+    def _joined_size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
+        return file_size(layout, [*self._counts, *counts])
+
     def _write(self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int) -> None:
         with (
             sealed(self.place / segment_name(frames[0].index), size) as temporary,
@@ -110,6 +114,7 @@ class SegmentStore(Store):
             tables = zip(*((frame.time, frame.index, frame.step) for frame in frames), strict=True)
             writer.finish(*tables, rows, self._header)
         self._sealed.add(segment_name(frames[0].index))
+        self._counts += [len(frame.position) for frame in frames]
 
 
 def remove_segments(directory: Path) -> None:

@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mpmcli.errors import InputError, RunError
+from mpmcli.errors import InputError, NoRoomError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.durable import require_free_space
+from mpmcli.output.durable import is_full, require_free_space
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
 from mpmcli.scene.colliders import Collider
@@ -106,18 +106,21 @@ class Store(ABC):
         if not self._waiting:
             return
         frames, rows = zip(*self._waiting, strict=True)
-        size = self._size(self._layout, [len(frame.position) for frame in frames])
+        counts = [len(frame.position) for frame in frames]
+        size = self._size(self._layout, counts)
         began = time.perf_counter()
         purpose, kept = f"frame {frames[0].index}", _frames_kept(self.frames_written)
         try:
-            require_free_space(self._directory, size, purpose, kept)
+            joined = self._joined_size(self._layout, counts)
+            require_free_space(self._directory, size, purpose, kept, joined=joined)
             self._write(self._layout, frames, rows, size)
         except (OSError, RuntimeError, RunError) as error:
             self._waiting.clear()
             if isinstance(error, RunError):
                 raise
             reason = getattr(error, "strerror", None) or error
-            raise RunError(f"{purpose} could not be written to {self.place} ({reason}); {kept}.") from error
+            kind = NoRoomError if is_full(error) else RunError
+            raise kind(f"{purpose} could not be written to {self.place} ({reason}); {kept}.") from error
         self.frames_written += len(frames)
         self.bytes_written += size
         self.seconds += time.perf_counter() - began
@@ -146,6 +149,10 @@ class Store(ABC):
     @abstractmethod
     def _size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
         """Return the bytes of frames of `counts` particles."""
+
+    def _joined_size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
+        """Return the bytes that `finish` needs beside the sealed frames, if frames of `counts` particles follow."""
+        return 0
 
     @abstractmethod
     def _write(self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int) -> None:

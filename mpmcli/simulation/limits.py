@@ -11,7 +11,8 @@ from mpmcli.errors import InputError
 from mpmcli.plain_text import size_text
 from mpmcli.solver.plan import Plan
 
-# Time kept for the last records and the end of the process, s; times of the longest pause between two questions that are kept for the next one.
+# Time kept for the last records and the end of the process, s, and multiple of the longest pause between two questions
+# that is kept for the next one.
 RESERVE, PAUSES = 2.0, 1.5
 # Packing reads, writes and compares what was written once; bytes/s of compression.
 PACKING, COMPRESSION = 3.0, 30e6

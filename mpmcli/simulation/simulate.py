@@ -9,7 +9,7 @@ from typing import Literal
 
 from mpmcli.check.finding import Finding, passes
 from mpmcli.check.scene_check import check_scene
-from mpmcli.errors import InputError, MpmcliError, RunError
+from mpmcli.errors import InputError, MpmcliError, NoRoomError, RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
 from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, check_directory
@@ -143,6 +143,8 @@ def _store_run(
     except UnstableRunError as error:
         summary.status, summary.message = "unstable", str(error)
         failure = vars(error.diagnosis)
+    except NoRoomError as error:
+        summary.status, summary.message = "stopped", str(error)
     except MpmcliError as error:
         summary.status, summary.message = "failed", str(error)
     finally:
@@ -232,7 +234,7 @@ def _finish(store: Store, summary: RunSummary, halt: Halt) -> None:
         summary.status, summary.message = halt.status, f"{halt.message}; {where}"
     except RunError as error:
         if summary.status == "finished":
-            summary.status = "failed"
+            summary.status = "stopped" if isinstance(error, NoRoomError) else "failed"
         summary.message = f"{summary.message} {error}".strip()
 
 
