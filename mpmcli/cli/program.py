@@ -11,6 +11,7 @@ import click
 from mpmcli import __version__
 from mpmcli.cli.interrupt import catch_interrupts, interrupt_came, interrupted_code
 from mpmcli.cli.streams import flush_streams
+from mpmcli.cli.supervisor import may_supervise, supervise
 from mpmcli.errors import MpmcliError
 
 # Name of each command, the module that holds it, and its line in the help: so that help loads no module.
@@ -75,7 +76,8 @@ def program(context: click.Context, debug: bool) -> None:
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line, `sys.argv` where no arguments are given, and exit with its code."""
-    code = run(sys.argv[1:] if arguments is None else arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    code = supervise(lambda: run(words)) if may_supervise(words) else run(words)
     flush_streams()
     sys.exit(code)
 

@@ -9,6 +9,7 @@ from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wa
 from mpmcli.cli.limit_types import Duration, Size
 from mpmcli.cli.options import json_option, plugin_option, quiet_option, set_option
 from mpmcli.cli.streams import print_json, print_text
+from mpmcli.cli.supervisor import announce
 
 
 @click.command("simulate")
@@ -93,6 +94,7 @@ def command(
         limits=Limits(max_time, max_memory),
         command=["mpmcli", *sys.argv[1:]],
     )
+    announce(settings.directory)
     progress = SimulateProgress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
     with progress, interrupts_wait():
         summary = simulate(loaded, settings, progress.start, progress.advance, interrupt_came)

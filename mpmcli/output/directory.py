@@ -36,7 +36,7 @@ class TakenDirectory:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None and not _has_frames(self.path):
+        if kind is not None and not has_frames(self.path):
             self.undo()
         self.release()
 
@@ -191,9 +191,10 @@ def _is_ours(name: str) -> bool:
 
 
 def _holds_result(directory: Path) -> bool:
-    return _has_frames(directory) or read_record(directory) is not None
+    return has_frames(directory) or read_record(directory) is not None
 
 
-def _has_frames(directory: Path) -> bool:
+def has_frames(directory: Path) -> bool:
+    """Return whether a directory holds a frame of a run."""
     files = (PACKED, SERIES_HEADER)
     return any((directory / name).exists() for name in files) or bool(sealed_segments(directory))

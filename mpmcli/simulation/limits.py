@@ -16,6 +16,8 @@ from mpmcli.solver.plan import Plan
 RESERVE, PAUSES = 2.0, 1.5
 # Packing reads, writes and compares what was written once; bytes/s of compression.
 PACKING, COMPRESSION = 3.0, 30e6
+# Wall time that packing may take after a signal, s.
+PACKING_LEFT = 2.0
 # Time between two looks at the memory, s.
 MEMORY_LOOKS = 0.1
 
@@ -94,7 +96,7 @@ class Halt:
         if self.status != "interrupted" and self._ask_signal():
             return True
         if self.status == "interrupted":
-            return time.monotonic() > self._asked + PACKING
+            return time.monotonic() > self._asked + PACKING_LEFT
         return self._end is not None and time.monotonic() > self._end - RESERVE
 
     def interrupted(self) -> None:
