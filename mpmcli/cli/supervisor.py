@@ -20,7 +20,7 @@ from mpmcli.cli.interrupt import INTERRUPTED, TERMINATED
 # Commands that may take long.
 LONG = ("simulate", "sweep", "render", "validate", "export", "dataset", "plot")
 # Time from the first and from a second signal to the end by force, s.
-PATIENCE, LITTLE = 4.0, 0.5
+PATIENCE, LITTLE = 3.5, 0.5
 REQUESTS = ("SIGINT", "SIGTERM", "SIGHUP")
 # Linux: the signal that a process gets when its parent is gone (prctl).
 DEATH_SIGNAL = 1

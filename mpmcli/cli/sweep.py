@@ -1,12 +1,19 @@
 """`mpmcli sweep`."""
 
+import math
+import time
 from pathlib import Path
 
 import click
 
 from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
+from mpmcli.cli.limit_types import Duration
 from mpmcli.cli.options import json_option, plugin_option, quiet_option
 from mpmcli.cli.streams import print_json, print_text
+
+
+# Time in which the workers end, and this process, s.
+RESERVE = 5.0
 
 
 class Part(click.ParamType):
@@ -47,6 +54,11 @@ class Part(click.ParamType):
     show_default=True,
     help="Where each worker computes; auto takes CUDA or Metal where they are, and else the CPU.",
 )
+@click.option(
+    "--max-time",
+    type=Duration(),
+    help="End the sweep before this wall time, to go on with --resume: 2h, 90m, 45s, 1h30m or 1:30:00.",
+)
 @plugin_option
 @quiet_option
 @json_option
@@ -60,6 +72,7 @@ def command(
     resume: bool,
     dry_run: bool,
     arch: str,
+    max_time: float | None,
     plugins: tuple[Path, ...],
     quiet: bool,
     as_json: bool,
@@ -78,6 +91,7 @@ def command(
     from mpmcli.materials.registry import load_plugins
     from mpmcli.plain_text import duration_text
 
+    end = math.inf if max_time is None else time.monotonic() + max_time - RESERVE
     loaded = load_sweep(sweep, laws=load_plugins(plugins), count=count)
     directory = output or Path("datasets") / sweep.stem
     settings = SweepSettings(directory, workers, scheduler, part, resume, arch, plugins=plugins)
@@ -95,7 +109,11 @@ def command(
                 f", {duration_text(left)} left",
             )
 
-        state = run_sweep(loaded, settings, show, interrupt_came)
+        state = run_sweep(loaded, settings, show, lambda: interrupt_came() or time.monotonic() > end)
+    stopped = state.status == "interrupted" and not interrupt_came()
+    if stopped:
+        state.status = "stopped"
+        click.echo("error: the sweep stopped before its --max-time; --resume goes on with it", err=True)
     status = status_of(directory)
     if as_json:
         print_json({**state.as_dict(), "dataset": status.as_dict()})
@@ -104,4 +122,4 @@ def command(
         print_text(f"{state.status}: {state.done} of {state.expected} trajectories{rate}\n{status.text()}")
     if state.status == "interrupted":
         return interrupted_code()
-    return 0 if state.accepted == state.done else 1
+    return 0 if state.accepted == state.done and not stopped else 1

@@ -17,7 +17,7 @@ RESERVE, PAUSES = 2.0, 1.5
 # Packing reads, writes and compares what was written once; bytes/s of compression.
 PACKING, COMPRESSION = 3.0, 30e6
 # Wall time that packing may take after a signal, s.
-PACKING_LEFT = 2.0
+PACKING_LEFT = 1.5
 # Time between two looks at the memory, s.
 MEMORY_LOOKS = 0.1
 
