@@ -11,7 +11,6 @@ from mpmcli.cli.limit_types import Duration
 from mpmcli.cli.options import json_option, plugin_option, quiet_option
 from mpmcli.cli.streams import print_json, print_text
 
-
 # Time in which the workers end, and this process, s.
 RESERVE = 5.0
 
