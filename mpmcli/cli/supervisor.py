@@ -100,12 +100,10 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
         else:
             came = signal.sigtimedwait(watched, max(0.0, deadline - time.monotonic()))
         if came is None:
-            with suppress(ProcessLookupError):
-                os.kill(child, signal.SIGKILL)
+            _kill_tree(child)
             os.waitpid(child, 0)
             _close_result(child, told, first)
-            _say("interrupted")
-            return INTERRUPTED if first == signal.SIGINT else TERMINATED
+            return _interrupted(first)
         number = signal.Signals(came.si_signo)
         if number in requests:
             with suppress(ProcessLookupError):
@@ -117,8 +115,29 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
             _pause(child)
         else:
             ended, status = os.waitpid(child, os.WNOHANG)
+            if ended and first is not None and os.WIFSIGNALED(status):
+                # It came where Python is not ready for it, as at its end.
+                return _interrupted(first)
             if ended:
                 return _code(status)
+
+
+def _interrupted(first: signal.Signals) -> int:
+    _say("interrupted")
+    return INTERRUPTED if first == signal.SIGINT else TERMINATED
+
+
+def _kill_tree(child: int) -> None:
+    """Kill a child and all processes that it has started."""
+    import psutil
+
+    with suppress(psutil.Error):
+        process = psutil.Process(child)
+        # Stopped, it starts no more.
+        process.suspend()
+        for one in [*process.children(recursive=True), process]:
+            with suppress(psutil.Error):
+                one.kill()
 
 
 def _pause(child: int) -> None:
@@ -145,7 +164,7 @@ def _code(status: int) -> int:
     return 1
 
 
-def _close_result(child: int, told: int, first: signal.Signals | None) -> None:
+def _close_result(child: int, told: int, first: signal.Signals) -> None:
     """Write into run.json how the run ended that the child was writing, or remove it where it has no frame."""
     os.set_blocking(told, False)
     try:
@@ -159,9 +178,7 @@ def _close_result(child: int, told: int, first: signal.Signals | None) -> None:
 
     facts = json.loads(lines[-1])
     with suppress(MpmcliError, OSError):
-        close_abandoned(
-            Path(facts["directory"]), [Path(path) for path in facts["made"]], child, first.name if first else ""
-        )
+        close_abandoned(Path(facts["directory"]), [Path(path) for path in facts["made"]], child, first.name)
 
 
 def _say(line: str) -> None:

@@ -85,6 +85,7 @@ def command(
     from mpmcli.dataset.rehearsal import rehearse
     from mpmcli.dataset.report import status_of
     from mpmcli.dataset.sweep_file import load_sweep
+    from mpmcli.dataset.sweep_folder import discard_beginning
     from mpmcli.dataset.sweep_run import run_sweep
     from mpmcli.dataset.sweep_state import SweepSettings, SweepState
     from mpmcli.materials.registry import load_plugins
@@ -98,6 +99,7 @@ def command(
         rehearsal = rehearse(loaded, settings)
         print_json(rehearsal.as_dict()) if as_json else print_text(rehearsal.text())
         return 0 if rehearsal.passes else 1
+    made = [path for path in (directory, *directory.parents) if not path.exists()][::-1]
     with ProgressBar(loaded.count, "trajectories", quiet=quiet) as bar, interrupts_wait():
 
         def show(state: SweepState) -> None:
@@ -109,6 +111,9 @@ def command(
             )
 
         state = run_sweep(loaded, settings, show, lambda: interrupt_came() or time.monotonic() > end)
+    if interrupt_came() and not state.done and not resume:
+        discard_beginning(directory, made)
+        raise KeyboardInterrupt
     stopped = state.status == "interrupted" and not interrupt_came()
     if stopped:
         state.status = "stopped"

@@ -2,8 +2,8 @@
 
 import math
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +115,26 @@ def open_folder(
         }
     )
     return folder, manifest
+
+
+def discard_beginning(directory: Path, made: Sequence[Path]) -> None:
+    """Remove a dataset in which no trajectory has been done.
+
+    Args:
+        made: the directories that were made for it, outermost first.
+
+    Raises:
+        InputError: another process writes it.
+    """
+    if not (directory / MANIFEST).exists() or Manifest(directory).rows():
+        return
+    with take_lock(directory):
+        Folder(directory, 0, 1, (1, 1)).close()
+        for name in (SWEEP, BASE, MANIFEST):
+            (directory / name).unlink(missing_ok=True)
+    for path in reversed(made):
+        with suppress(OSError):
+            path.rmdir()
 
 
 def _is_beginning(directory: Path) -> bool:
