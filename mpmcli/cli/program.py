@@ -1,5 +1,6 @@
 """The group of all commands, loaded when named, and what every one of them does with an error."""
 
+import errno
 import importlib
 import sys
 import traceback
@@ -31,6 +32,9 @@ COMMANDS = {
     "doctor": "Say whether everything that mpmcli needs works here.",
     "completion": "Print the script that completes commands in a shell.",
 }
+
+# Faults of the disk, which any file may meet.
+DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
 class LazyGroup(click.Group):
@@ -111,6 +115,10 @@ def run(arguments: list[str]) -> int:
             return interrupted_code()
         if debug:
             traceback.print_exc()
+        if isinstance(error, OSError) and error.errno in DISK_FAULTS:
+            place = f"{error.filename} could not be written" if error.filename else "a file could not be written"
+            _print_error(f"error: {place} ({error.strerror}); what was written before it is kept.")
+            return 1
         kind = type(error).__name__
         # On a bare machine a library of the system may be missing, which a package of ours loads.
         of_system = isinstance(error, ImportError) and not (error.name or "").startswith("mpmcli")

@@ -50,7 +50,7 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
 def _join(parts: Sequence[Path], target: Path, files: Sequence[Path], facts: Mapping[str, Any]) -> None:
     """Copy files of the parts, and write what belongs to the whole; see `merge`."""
     size = sum(file.stat().st_size for file in files)
-    require_free_space(target, size, "the merged dataset", "the parts are kept")
+    require_free_space(target, size, "the merged dataset", "the parts are kept", several=True)
     try:
         for file in files:
             copy = target / file.parent.name / file.name

@@ -109,7 +109,9 @@ def largest_file() -> int | None:
     return None if limit == resource.RLIM_INFINITY else limit
 
 
-def require_free_space(directory: Path, size: int, purpose: str, kept: str, *, joined: int = 0) -> None:
+def require_free_space(
+    directory: Path, size: int, purpose: str, kept: str, *, joined: int = 0, several: bool = False
+) -> None:
     """Refuse to start writing what the disk cannot hold.
 
     Args:
@@ -118,6 +120,7 @@ def require_free_space(directory: Path, size: int, purpose: str, kept: str, *, j
         purpose: what is to be written, the subject of the error's sentence ("frame 7").
         kept: what stays usable, closing the sentence ("the 7 frames before it are kept").
         joined: bytes of one more file, of this and of what was written before, that is to follow.
+        several: whether the bytes go to several files.
 
     Raises:
         NoRoomError: fewer than `size` + `joined` + `SPACE_MARGIN` bytes are free, or files may not be so large.
@@ -130,7 +133,7 @@ def require_free_space(directory: Path, size: int, purpose: str, kept: str, *, j
             f"{(size + joined + SPACE_MARGIN) / 1e6:.1f} MB ({included} included): free some space or write to another "
             f"disk with -o; {kept}."
         )
-    need = max(size, joined)
+    need = max(0 if several else size, joined)
     if largest is not None and largest < need:
         what = "the packing of all frames up to it needs" if joined > size else "that needs"
         raise NoRoomError(

@@ -87,7 +87,12 @@ def take_lock(directory: Path) -> DirectoryLock:
                 descriptor = -1
                 continue
             _refuse_foreign(directory, content, locks_work=got is True)
-            _write(descriptor)
+            try:
+                _write(descriptor)
+            except OSError:
+                # The disk is full.
+                path.unlink(missing_ok=True)
+                raise
         except BaseException as error:
             if descriptor >= 0:
                 os.close(descriptor)

@@ -42,6 +42,8 @@ class VtkSeriesStore(Store):
     zlib in the .vtu files.
     """
 
+    several = True
+
     def __init__(self, directory: Path, header: dict[str, Any], **options: Any) -> None:
         super().__init__(directory, header, **options)
         self._times: list[float] = []

@@ -39,6 +39,9 @@ class Store(ABC):
         bytes_written: their size; seconds: wall time that sealing them took.
     """
 
+    # Whether frames that are sealed together have a file each.
+    several = False
+
     def __init__(
         self,
         directory: Path,
@@ -112,7 +115,7 @@ class Store(ABC):
         purpose, kept = f"frame {frames[0].index}", _frames_kept(self.frames_written)
         try:
             joined = self._joined_size(self._layout, counts)
-            require_free_space(self._directory, size, purpose, kept, joined=joined)
+            require_free_space(self._directory, size, purpose, kept, joined=joined, several=self.several)
             self._write(self._layout, frames, rows, size)
         except (OSError, RuntimeError, RunError) as error:
             self._waiting.clear()
