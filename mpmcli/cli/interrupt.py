@@ -3,6 +3,7 @@
 SIGTERM and SIGHUP are treated like Ctrl-C (SIGINT). The exit code is 130 after SIGINT, and 143 after the others.
 """
 
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,14 @@ _came: int = 0
 _waits = False
 
 
+def leave_at_once() -> None:
+    """Let the signals end the process, with its exit codes: until there is anything to keep."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            signal.signal(number, _leave)
+
+
 def catch_interrupts() -> None:
     """Let the signals raise KeyboardInterrupt.
 
@@ -21,9 +30,9 @@ def catch_interrupts() -> None:
     global _came
     _came = 0
     signal.signal(signal.SIGTERM, _interrupt)
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if signal.getsignal(signal.SIGINT) in (signal.default_int_handler, _leave):
         signal.signal(signal.SIGINT, _interrupt)
-    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) in (signal.SIG_DFL, _leave):
         signal.signal(signal.SIGHUP, _interrupt)
 
 
@@ -53,6 +62,10 @@ def interrupts_wait() -> Iterator[None]:
         yield
     finally:
         _waits = False
+
+
+def _leave(number: int, _: object) -> None:
+    os._exit(INTERRUPTED if number == signal.SIGINT else TERMINATED)
 
 
 def _interrupt(number: int, _: object) -> None:

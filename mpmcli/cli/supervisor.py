@@ -39,7 +39,7 @@ def supervise(work: Callable[[], int]) -> int:
     """Do work in a child process; return its exit code, or that of an interrupt where it had to be ended.
 
     A child that was killed by a signal takes this process with it, by the same signal; one that crashed makes exit
-    code 1, with a sentence.
+    code 1, with a sentence. The signals are blocked when this returns, as the process is about to end.
     """
     # Ignored ones, as in `mpmcli ... &` or under nohup, stay ignored.
     requests = {
@@ -61,11 +61,8 @@ def supervise(work: Callable[[], int]) -> int:
     os.close(tells)
     with suppress(OSError):
         os.setpgid(child, child)
-    try:
-        return _attend(child, requests, watched, told)
-    finally:
-        os.close(told)
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    # The signals stay blocked: what comes now is too late.
+    return _attend(child, requests, watched, told)
 
 
 def announce(directory: Path) -> None:
