@@ -114,6 +114,7 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
             ended, status = os.waitpid(child, os.WNOHANG)
             if ended and first is not None and os.WIFSIGNALED(status):
                 # It came where Python is not ready for it, as at its end.
+                _close_result(child, told, first)
                 return _interrupted(first)
             if ended:
                 return _code(status)
