@@ -111,6 +111,7 @@ def files_in(place: Path) -> list[str]:
     return sorted(path.name for path in place.rglob("*") if path.is_file() and path.name != "filling")
 
 
+@pytest.mark.slow
 def test_a_small_disk_stops_a_run(whole: Path, small_disk: Callable[[int], Path]) -> None:
     place = small_disk(17_000_000)
     outcome = run_limited(whole, None, "simulate", "scene.toml", "-o", place / "result", "-q")

@@ -12,6 +12,7 @@ from mpmcli.cli.limit_types import Duration, Size
 from mpmcli.output import open_result
 from mpmcli.simulation import limits
 from mpmcli.simulation.limits import Halt, Limits
+from mpmcli.solver.device_memory import is_out_of_memory
 
 pytestmark = pytest.mark.usefixtures("few_optimisations")
 LONG = SCENE.replace("end = 0.05", "end = 5000.0").replace("frames = 4", "frames = 20000")
@@ -99,6 +100,7 @@ def start(tmp_path: Path) -> Callable:
     return lambda *words: run_here("simulate", tmp_path / "scene.toml", "-o", tmp_path / "result", "--json", *words)
 
 
+@pytest.mark.slow
 def test_a_run_ends_packed_before_its_time(start: Callable, tmp_path: Path, monkeypatch) -> None:
     # The time of this process, not that of the tests, counts.
     began = limits.time.monotonic()
@@ -126,3 +128,32 @@ def test_a_plan_above_the_memory_is_refused(start: Callable, tmp_path: Path) -> 
     outcome = start("--max-memory", "1MB")
     assert outcome.status == 2 and "--max-memory is 1 MB" in outcome.stderr
     assert not (tmp_path / "result").exists()
+
+
+CUDA = (
+    "[cuda_driver.h:operator()@92] CUDA Error CUDA_ERROR_OUT_OF_MEMORY: out of memory while calling malloc (cuMemAlloc)"
+)
+
+
+@pytest.mark.parametrize("error", [RuntimeError(CUDA), MemoryError()])
+def test_a_device_without_memory_is_a_sentence(start: Callable, tmp_path: Path, monkeypatch, error: Exception) -> None:
+    """Before the run, where nothing is written yet, and in it, where no frame has come."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise error
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mpmcli.simulation.simulate.build_engine", refuse)
+        outcome = start()
+    assert outcome.status == 2 and outcome.stderr.splitlines()[-1].startswith("error: The memory of this machine does")
+    assert not (tmp_path / "result").exists()
+    monkeypatch.setattr("mpmcli.solver.batch_run.BatchRun.frames", refuse)
+    outcome = start()
+    assert outcome.status == 1 and json.loads(outcome.stdout)["status"] == "failed"
+    assert "does not suffice" in outcome.stderr and "a fault of mpmcli" not in outcome.stderr
+
+
+def test_other_errors_are_no_want_of_memory() -> None:
+    assert not is_out_of_memory(RuntimeError("a kernel is broken")) and not is_out_of_memory(
+        ValueError("out of memory")
+    )

@@ -23,6 +23,7 @@ from mpmcli.simulation.limits import Halt, Limits
 from mpmcli.simulation.stopwatch import Stopwatch
 from mpmcli.simulation.summary import RunSummary
 from mpmcli.solver.backend import Arch, Backend, start
+from mpmcli.solver.device_memory import is_out_of_memory, out_of_memory_sentence
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.engine import Engine, build_engine
 from mpmcli.solver.plan import Plan, make_plan, require_room
@@ -91,7 +92,12 @@ def simulate(
     require_room(plan)
     settings.limits.require_room(plan)
     start(backend)
-    solver = build_engine(scene, backend, batched=batched, force=settings.force)
+    try:
+        solver = build_engine(scene, backend, batched=batched, force=settings.force)
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error):
+            raise
+        raise InputError(out_of_memory_sentence(backend.arch, error)) from error
     if stop():
         raise KeyboardInterrupt
     # Last, since it removes an earlier result.
@@ -147,6 +153,10 @@ def _store_run(
         summary.status, summary.message = "stopped", str(error)
     except MpmcliError as error:
         summary.status, summary.message = "failed", str(error)
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error):
+            raise
+        summary.status, summary.message = "failed", out_of_memory_sentence(backend.arch, error)
     finally:
         if summary.status == "running":
             # A fault of mpmcli: the record must not state that the run is going on.
