@@ -21,3 +21,7 @@ class RunError(MpmcliError):
     """A run that started and could not go on: everything written before stays."""
 
     exit_code = 1
+
+
+class NoRoomError(RunError):
+    """What is to be written does not fit onto the disk: everything written before stays."""

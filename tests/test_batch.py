@@ -12,7 +12,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene, sample_bodies
-from mpmcli.solver import batch_run
+from mpmcli.solver import launch_budget
 from mpmcli.solver.batch import Batch, Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.diagnosis import UnstableRunError
@@ -295,7 +295,8 @@ def test_kinds_are_equal_where_flags_are() -> None:
 
 def test_frames_stop_on_request(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between two launches, after the frames that were recorded until then."""
-    monkeypatch.setattr(batch_run, "BUDGET", 1)
+    monkeypatch.setattr(launch_budget, "FIRST", 1)
+    monkeypatch.setattr(launch_budget, "LAUNCH", 0.0)
     scene = scene_named("sand")
     run = BatchRun(batch_of([scene, scene_named("sand", other=True)], backend_of("f32", 1)), 0, scene)
     frames = run.frames(stop=lambda: run.step_count > 0)

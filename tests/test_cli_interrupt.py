@@ -1,5 +1,6 @@
 """A run that is ended from outside: every sealed frame stays, packed where there was time for it."""
 
+import itertools
 import json
 import signal
 import time
@@ -34,14 +35,14 @@ def end_with(number: signal.Signals, directory: Path, *, ctrl_c_off: bool = Fals
 
 
 @pytest.mark.parametrize(
-    ("number", "ctrl_c_off"),
-    [(signal.SIGINT, False), (signal.SIGTERM, True)],
-    ids=["Ctrl-C", "SIGTERM of a run in the background"],
+    ("number", "ctrl_c_off", "code"),
+    [(signal.SIGINT, False, 130), (signal.SIGTERM, True, 143), (signal.SIGHUP, False, 143)],
+    ids=["Ctrl-C", "SIGTERM of a run in the background", "the end of the terminal"],
 )
-def test_an_interrupt_packs_what_is_done(tmp_path, number, ctrl_c_off):
+def test_an_interrupt_packs_what_is_done(tmp_path, number, ctrl_c_off, code):
     status, stdout, stderr = end_with(number, tmp_path, ctrl_c_off=ctrl_c_off)
-    assert status == 130 and "Traceback" not in stderr
-    assert "error: the run was interrupted" in stderr.splitlines()
+    assert status == code and "Traceback" not in stderr
+    assert f"error: the run was interrupted ({number.name})" in stderr.splitlines()
     parts = [line.split(":")[0] for line in stdout.splitlines()]
     assert parts == ["interrupted", "seconds", "energy", "volume ratio J at the end", "result"]
     assert stdout.splitlines()[-1] == f"result: {Path('result/particles.vtkhdf')}"
@@ -49,7 +50,7 @@ def test_an_interrupt_packs_what_is_done(tmp_path, number, ctrl_c_off):
     expected = ["checkpoints", "particles.vtkhdf", "run.json", "scene.toml"]
     assert sorted(path.name for path in directory.iterdir()) == expected
     record = json.loads((directory / "run.json").read_text(encoding="utf-8"))
-    assert record["status"] == "interrupted" and record["ended"]
+    assert record["status"] == "interrupted" and record["ended"] and record["failure"]["signal"] == number.name
     check_readable(directory, "packed", record["frames_written"])
 
 
@@ -59,7 +60,7 @@ def test_sealed_frames_survive_a_kill(tmp_path):
     # The record is written after the seal, so it may be one seal behind.
     directory = tmp_path / "result"
     record = json.loads((directory / "run.json").read_text(encoding="utf-8"))
-    assert record["status"] == "running"
+    assert record["status"] == "running" and open_result(directory).status == "died"
     check_readable(directory, "segments", record["frames_written"])
 
 
@@ -76,7 +77,9 @@ def check_readable(directory: Path, kind: str, count: int) -> None:
 def test_an_interrupt_ends_the_run_at_its_next_frame(tmp_path, monkeypatch):
     """It waits for the end of a step: an exception in the middle of one may fall into a callback and be lost."""
     (tmp_path / "scene.toml").write_text(SCENE, encoding="utf-8")
-    monkeypatch.setattr("mpmcli.cli.simulate.interrupt_came", lambda: True)
+    asked = itertools.count()
+    # The first question comes before anything is written.
+    monkeypatch.setattr("mpmcli.cli.simulate.interrupt_came", lambda: next(asked) > 0)
     outcome = run_here("simulate", tmp_path / "scene.toml", "-o", tmp_path / "result")
     assert outcome.status == 130 and "error: the run was interrupted" in outcome.stderr
     assert open_result(tmp_path / "result").frame_count == 1
@@ -91,7 +94,7 @@ def test_an_interrupt_that_became_another_error_is_still_one(tmp_path, monkeypat
 
     monkeypatch.setattr("mpmcli.output.open_result", interrupted_import)
     outcome = run_here("info", tmp_path)
-    assert (outcome.status, outcome.stdout, outcome.stderr) == (130, "", "interrupted\n")
+    assert (outcome.status, outcome.stdout, outcome.stderr) == (143, "", "interrupted\n")
 
 
 def test_the_first_interrupt_waits_where_a_run_asks_for_it_and_the_second_does_not():

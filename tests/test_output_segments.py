@@ -286,7 +286,8 @@ import sys
 sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 from test_output_frames import make_frame, make_row
-from mpmcli.output import SegmentStore
+from mpmcli.output import SegmentStore, durable
+durable.largest_file = lambda: None
 store = SegmentStore(Path({str(tmp_path)!r}), {{}}, hold={hold})
 k = 0
 while True:
@@ -334,7 +335,8 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 from pathlib import Path
 from test_output_frames import make_frame, make_row
 from mpmcli.errors import RunError
-from mpmcli.output import SegmentStore
+from mpmcli.output import SegmentStore, durable
+durable.largest_file = lambda: None
 store = SegmentStore(Path({str(tmp_path)!r}), {{}})
 store.write(make_frame(0, 100, 2), make_row(0, 2))
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

@@ -15,7 +15,7 @@ bounds = st.one_of(st.none(), st.integers(-30, 30))
 
 
 def result(count: int, status: str = "finished") -> SimpleNamespace:
-    return SimpleNamespace(path="results/run", frame_count=count, numbers=np.arange(count), record={"status": status})
+    return SimpleNamespace(path="results/run", frame_count=count, numbers=np.arange(count), status=status)
 
 
 def test_names_and_numbers() -> None:

@@ -21,7 +21,7 @@ from mpmcli.output.checkpoints import CHECKPOINTS, Checkpoint, read_checkpoints,
 from mpmcli.scene import Scene, load_scene, parse_scene
 from mpmcli.simulation.resume import find_resumption
 from mpmcli.simulation.simulate import RunSettings, simulate
-from mpmcli.solver import batch_run
+from mpmcli.solver import launch_budget
 from mpmcli.solver.backend import choose_backend, start, stop_backend
 from mpmcli.solver.engine import Engine, build_engine
 from mpmcli.solver.state import SavedState
@@ -91,9 +91,10 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import load_scene
 from mpmcli.simulation import stored_run
 from mpmcli.simulation.simulate import RunSettings, simulate
-from mpmcli.solver import batch_run
+from mpmcli.solver import launch_budget
 scene, directory, form = sys.argv[1:]
-batch_run.BUDGET, stored_run.HOLD = 2000, 0.0
+launch_budget.FIRST, stored_run.HOLD = 2000, 0.0
+launch_budget.LaunchBudget.took = lambda *_: None
 def told(row, summary):
     if summary.frames == 3:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -113,7 +114,8 @@ def engine_of(scene: Scene) -> Engine:
 @pytest.fixture
 def short_launches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a run stop every few steps."""
-    monkeypatch.setattr(batch_run, "BUDGET", 2000)
+    monkeypatch.setattr(launch_budget, "FIRST", 2000)
+    monkeypatch.setattr(launch_budget.LaunchBudget, "took", lambda *_: None)
 
 
 @pytest.mark.parametrize("data", [CHANGING, TOTAL], ids=["all that changes", "total"])

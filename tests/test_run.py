@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -171,7 +172,7 @@ def test_a_fault_of_ours_leaves_no_run_that_seems_to_go_on(run, tmp_path):
 
 
 def test_ctrl_c_while_packing_leaves_the_segments(run, tmp_path, monkeypatch):
-    def interrupted(self: SegmentStore) -> None:
+    def interrupted(self: SegmentStore, stop: Callable[[], bool]) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(SegmentStore, "finish", interrupted)
@@ -182,7 +183,7 @@ def test_ctrl_c_while_packing_leaves_the_segments(run, tmp_path, monkeypatch):
 
 
 def test_a_run_that_cannot_be_packed_says_so(run, tmp_path, monkeypatch):
-    def full(self: SegmentStore) -> None:
+    def full(self: SegmentStore, stop: Callable[[], bool]) -> None:
         raise RunError("The disk has no room for the packed file.")
 
     monkeypatch.setattr(SegmentStore, "finish", full)

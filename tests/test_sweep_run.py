@@ -9,6 +9,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,6 +27,7 @@ from mpmcli.dataset.compute import Task, compute
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import status_of, verify
+from mpmcli.dataset.sweep_folder import taken_folder
 from mpmcli.dataset.sweep_run import run_sweep
 from mpmcli.dataset.sweep_state import SweepSettings, SweepState
 from mpmcli.errors import InputError
@@ -101,6 +103,17 @@ def test_parts_and_another_number_of_workers_make_the_same_dataset(
     with pytest.raises(InputError, match="a part is given twice"):
         merge([parts[0], parts[0], parts[1]], tmp_path / "half")
     assert not (tmp_path / "half").exists()
+
+
+def test_a_dataset_that_is_being_written_is_refused(tmp_path: Path) -> None:
+    sweep, settings = tiny_sweep(tmp_path), SweepSettings(tmp_path / "dataset")
+    with taken_folder(sweep, settings):
+        before = {path.name: path.read_bytes() for path in settings.directory.iterdir()}
+        for resume in (False, True):
+            with pytest.raises(InputError, match=rf"is being written by process {os.getpid()} on"):
+                run_sweep(sweep, replace(settings, resume=resume))
+        assert {path.name: path.read_bytes() for path in settings.directory.iterdir()} == before
+    assert "run.lock" in before and not (settings.directory / "run.lock").exists()
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import Forecast
 from mpmcli.errors import InputError
+from mpmcli.output.durable import largest_file
 from mpmcli.plain_text import size_text
 from mpmcli.solver.plan import Plan, require_room
 
@@ -48,6 +49,15 @@ def output_findings(facts: SceneFacts, plan: Plan, forecast: Forecast, directory
             f"The result takes {size_text(forecast.file_bytes)}, twice that while it is packed, and the disk has "
             f"{size_text(disk.free)} left.",
             "Store fewer frames or output.fields, or write to another disk with -o.",
+            forecast.file_bytes,
+        )
+    largest = largest_file()
+    if largest is not None and forecast.file_bytes > largest:
+        yield Finding(
+            "warning",
+            "disk",
+            f"The result takes {size_text(forecast.file_bytes)}, and a file may have {size_text(largest)} here.",
+            "Raise the limit on the size of a file (ulimit -f), or store fewer frames or output.fields.",
             forecast.file_bytes,
         )
     try:

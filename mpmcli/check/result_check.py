@@ -159,7 +159,7 @@ def _check(opened: OpenedResult, findings: FrameFindings) -> ResultCheck:
     return ResultCheck(
         path=opened.path,
         kind=opened.kind,
-        status=(opened.record or {}).get("status", "unknown"),
+        status=opened.status,
         findings=found,
         first_bad_frame=first_bad,
         limit="" if first_bad is None else _limit_at(opened, first_bad),

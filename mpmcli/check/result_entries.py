@@ -14,6 +14,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.header import RunHeader
 from mpmcli.output.result import Result, open_result
 from mpmcli.output.run_record import read_record
+from mpmcli.output.run_status import run_status
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_HEADER
 
@@ -95,6 +96,12 @@ class OpenedResult:
     header: RunHeader
     record: dict[str, Any] | None
     entries: list[Entry]
+
+    @property
+    def status(self) -> str:
+        """How the run stands, see `run_status`."""
+        directory = self.path if self.path.is_dir() else self.path.parent
+        return run_status(directory, self.record)
 
 
 def arrays_of(frame: Frame, ids: np.ndarray) -> dict[str, np.ndarray]:

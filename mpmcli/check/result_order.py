@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_entries import RUN_AGAIN, Entry, OpenedResult
 from mpmcli.output.header import RunHeader
+from mpmcli.output.run_status import DIED, ELSEWHERE
 
 # Tolerance of times, relative to the duration of the run.
 TIME_ERROR = 1e-9
@@ -87,7 +88,7 @@ def _status(opened: OpenedResult, expected: int | None, findings: FrameFindings)
         what = "No run.json lies beside the frames, so how the run ended is not known"
         findings.add("note", "no-record", None, what, "Keep run.json together with the frames.")
         return
-    status = record.get("status")
+    status = opened.status
     message = ((record.get("failure") or {}).get("message") or "").rstrip(".")
     said = f": {message}" if message else ""
     if status == "unstable":
@@ -98,6 +99,12 @@ def _status(opened: OpenedResult, expected: int | None, findings: FrameFindings)
     elif status == "interrupted":
         what = f"The run was interrupted after {far}"
         findings.add("warning", "interrupted-run", count, what, "Run it again to have all frames.")
-    elif status == "running":
-        what = f"The run has not ended; there are {far}, and it is under way still or was killed"
+    elif status == "stopped":
+        findings.add("warning", "stopped-run", count, f"The run stopped after {far}{said}", "Run it again.")
+    elif status == DIED:
+        what = f"The run died after {far}: its process has ended and left no word"
+        findings.add("warning", "died-run", count, what, "Run it again to have all frames.")
+    elif status in ("running", ELSEWHERE):
+        still = "and it goes on" if status == "running" else "and whether it goes on cannot be seen from here"
+        what = f"The run has not ended; there are {far}, {still}"
         findings.add("warning", "running", count, what, "Wait for it, or run it again.")

@@ -1,5 +1,15 @@
 """The command line: `mpmcli COMMAND ...`."""
 
-from mpmcli.cli.program import main
+from typing import NoReturn
+
+from mpmcli.cli.interrupt import leave_at_once
 
 __all__ = ["main"]
+
+
+def main(arguments: list[str] | None = None) -> NoReturn:
+    """Run the command line, see `program.main`; an interrupt while it is loaded is one too."""
+    leave_at_once()
+    from mpmcli.cli import program
+
+    program.main(arguments)

@@ -73,7 +73,7 @@ def _of_result(path: Path) -> dict:
     return {
         "title": result.header.title,
         "kind": result.kind,
-        "status": record.get("status", "unknown"),
+        "status": result.status,
         "frames": result.frame_count,
         "frames_expected": record.get("frames_expected"),
         "time_s": [float(result.times[0]), float(result.times[-1])],

@@ -1,28 +1,52 @@
-"""Ctrl-C, and a batch system's request to end (SIGTERM), which is treated alike: what is written is sealed."""
+"""Ctrl-C, and the requests of a batch system or a closing terminal to end: what is written is sealed.
 
+SIGTERM and SIGHUP are treated like Ctrl-C (SIGINT). The exit code is 130 after SIGINT, and 143 after the others.
+"""
+
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-_came = False
+INTERRUPTED, TERMINATED = 130, 143
+
+_came: int = 0
 _waits = False
 
 
+def leave_at_once() -> None:
+    """Let the signals end the process, with its exit codes: until there is anything to keep."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            signal.signal(number, _leave)
+
+
 def catch_interrupts() -> None:
-    """Let both signals raise KeyboardInterrupt, SIGTERM also where a shell has switched Ctrl-C off (`mpmcli ... &`)."""
+    """Let the signals raise KeyboardInterrupt.
+
+    SIGTERM does also where a shell has switched Ctrl-C off (`mpmcli ... &`), and SIGHUP unless nohup was there first.
+    """
     global _came
-    _came = False
+    _came = 0
     signal.signal(signal.SIGTERM, _interrupt)
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if signal.getsignal(signal.SIGINT) in (signal.default_int_handler, _leave):
         signal.signal(signal.SIGINT, _interrupt)
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) in (signal.SIG_DFL, _leave):
+        signal.signal(signal.SIGHUP, _interrupt)
 
 
-def interrupt_came() -> bool:
-    """Say whether one of the signals came.
+def interrupt_came() -> str:
+    """Return the name of the first of the signals that came, "" where none did.
 
     Modules written in C may lose a KeyboardInterrupt, or make another error of it, while they are imported.
     """
-    return _came
+    return signal.Signals(_came).name if _came else ""
+
+
+def interrupted_code() -> int:
+    """Return the exit code of a command that was interrupted."""
+    return INTERRUPTED if _came in (0, signal.SIGINT) else TERMINATED
 
 
 @contextmanager
@@ -40,9 +64,13 @@ def interrupts_wait() -> Iterator[None]:
         _waits = False
 
 
-def _interrupt(*_: object) -> None:
+def _leave(number: int, _: object) -> None:
+    os._exit(INTERRUPTED if number == signal.SIGINT else TERMINATED)
+
+
+def _interrupt(number: int, _: object) -> None:
     global _came
     first = not _came
-    _came = True
+    _came = _came or number
     if not (_waits and first):
         raise KeyboardInterrupt

@@ -1,5 +1,6 @@
 """The group of all commands, loaded when named, and what every one of them does with an error."""
 
+import errno
 import importlib
 import sys
 import traceback
@@ -9,8 +10,9 @@ from typing import Any, NoReturn
 import click
 
 from mpmcli import __version__
-from mpmcli.cli.interrupt import catch_interrupts, interrupt_came
+from mpmcli.cli.interrupt import catch_interrupts, interrupt_came, interrupted_code
 from mpmcli.cli.streams import flush_streams
+from mpmcli.cli.supervisor import may_supervise, supervise
 from mpmcli.errors import MpmcliError
 
 # Name of each command, the module that holds it, and its line in the help: so that help loads no module.
@@ -31,7 +33,8 @@ COMMANDS = {
     "completion": "Print the script that completes commands in a shell.",
 }
 
-INTERRUPTED = 130
+# Faults of the disk, which any file may meet.
+DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
 class LazyGroup(click.Group):
@@ -67,7 +70,7 @@ def program(context: click.Context, debug: bool) -> None:
     """Turn a TOML scene into a reproducible particle dataset with the Material Point Method.
 
     What a command was asked for goes to stdout; progress, warnings and errors go to stderr. Exit codes: 0 done;
-    1 done, with a finding; 2 bad input or usage; 130 interrupted.
+    1 done, with a finding; 2 bad input or usage; 130 interrupted; 143 ended by SIGTERM or SIGHUP.
     """
     context.obj = debug
     if context.invoked_subcommand is None:
@@ -77,7 +80,8 @@ def program(context: click.Context, debug: bool) -> None:
 
 def main(arguments: list[str] | None = None) -> NoReturn:
     """Run the command line, `sys.argv` where no arguments are given, and exit with its code."""
-    code = run(sys.argv[1:] if arguments is None else arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    code = supervise(lambda: run(words)) if may_supervise(words) else run(words)
     flush_streams()
     sys.exit(code)
 
@@ -96,7 +100,7 @@ def run(arguments: list[str]) -> int:
         return 2
     except (click.Abort, KeyboardInterrupt):
         _print_error("interrupted")
-        return INTERRUPTED
+        return interrupted_code()
     except MpmcliError as error:
         if debug:
             traceback.print_exc()
@@ -108,9 +112,13 @@ def run(arguments: list[str]) -> int:
     except Exception as error:
         if interrupt_came():
             _print_error("interrupted")
-            return INTERRUPTED
+            return interrupted_code()
         if debug:
             traceback.print_exc()
+        if isinstance(error, OSError) and error.errno in DISK_FAULTS:
+            place = f"{error.filename} could not be written" if error.filename else "a file could not be written"
+            _print_error(f"error: {place} ({error.strerror}); what was written before it is kept.")
+            return 1
         kind = type(error).__name__
         # On a bare machine a library of the system may be missing, which a package of ours loads.
         of_system = isinstance(error, ImportError) and not (error.name or "").startswith("mpmcli")

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import click
 
-from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
+from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
+from mpmcli.cli.limit_types import Duration, Size
 from mpmcli.cli.options import json_option, plugin_option, quiet_option, set_option
 from mpmcli.cli.streams import print_json, print_text
+from mpmcli.cli.supervisor import announce
 
 
 @click.command("simulate")
@@ -51,6 +53,16 @@ from mpmcli.cli.streams import print_json, print_text
 @click.option(
     "--force", is_flag=True, help="Run although `mpmcli check` finds errors, and take time.step above the stable step."
 )
+@click.option(
+    "--max-time",
+    type=Duration(),
+    help="End the run, with the result packed, before this wall time: 2h, 90m, 45s, 1h30m or 1:30:00.",
+)
+@click.option(
+    "--max-memory",
+    type=Size(),
+    help="End the run before it takes more memory of this machine: 8GB, 500MB or 8GiB.",
+)
 @quiet_option
 @json_option
 def command(
@@ -67,6 +79,8 @@ def command(
     resume: bool,
     checkpoint_every: float | None,
     force: bool,
+    max_time: float | None,
+    max_memory: int | None,
     quiet: bool,
     as_json: bool,
 ) -> int:
@@ -75,6 +89,7 @@ def command(
     from mpmcli.errors import InputError
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
+    from mpmcli.simulation.limits import Limits
     from mpmcli.simulation.simulate import RunSettings, simulate
 
     if resume and overwrite:
@@ -91,8 +106,10 @@ def command(
         resume=resume,
         checkpoint_every=checkpoint_every,
         force=force,
+        limits=Limits(max_time, max_memory),
         command=["mpmcli", *sys.argv[1:]],
     )
+    announce(settings.directory)
     progress = SimulateProgress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
     with progress, interrupts_wait():
         summary = simulate(loaded, settings, progress.start, progress.advance, interrupt_came)
@@ -101,4 +118,4 @@ def command(
         print_json(summary.as_dict())
     elif not quiet:
         print_text(summary.text())
-    return {"finished": 0, "interrupted": 130}.get(summary.status, 1)
+    return {"finished": 0, "interrupted": interrupted_code()}.get(summary.status, 1)

@@ -1,12 +1,18 @@
 """`mpmcli sweep`."""
 
+import math
+import time
 from pathlib import Path
 
 import click
 
-from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
+from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
+from mpmcli.cli.limit_types import Duration
 from mpmcli.cli.options import json_option, plugin_option, quiet_option
 from mpmcli.cli.streams import print_json, print_text
+
+# Time in which the workers end, and this process, s.
+RESERVE = 5.0
 
 
 class Part(click.ParamType):
@@ -47,6 +53,11 @@ class Part(click.ParamType):
     show_default=True,
     help="Where each worker computes; auto takes CUDA or Metal where they are, and else the CPU.",
 )
+@click.option(
+    "--max-time",
+    type=Duration(),
+    help="End the sweep before this wall time, to go on with --resume: 2h, 90m, 45s, 1h30m or 1:30:00.",
+)
 @plugin_option
 @quiet_option
 @json_option
@@ -60,6 +71,7 @@ def command(
     resume: bool,
     dry_run: bool,
     arch: str,
+    max_time: float | None,
     plugins: tuple[Path, ...],
     quiet: bool,
     as_json: bool,
@@ -73,11 +85,13 @@ def command(
     from mpmcli.dataset.rehearsal import rehearse
     from mpmcli.dataset.report import status_of
     from mpmcli.dataset.sweep_file import load_sweep
+    from mpmcli.dataset.sweep_folder import discard_beginning
     from mpmcli.dataset.sweep_run import run_sweep
     from mpmcli.dataset.sweep_state import SweepSettings, SweepState
     from mpmcli.materials.registry import load_plugins
     from mpmcli.plain_text import duration_text
 
+    end = math.inf if max_time is None else time.monotonic() + max_time - RESERVE
     loaded = load_sweep(sweep, laws=load_plugins(plugins), count=count)
     directory = output or Path("datasets") / sweep.stem
     settings = SweepSettings(directory, workers, scheduler, part, resume, arch, plugins=plugins)
@@ -85,6 +99,7 @@ def command(
         rehearsal = rehearse(loaded, settings)
         print_json(rehearsal.as_dict()) if as_json else print_text(rehearsal.text())
         return 0 if rehearsal.passes else 1
+    made = [path for path in (directory, *directory.parents) if not path.exists()][::-1]
     with ProgressBar(loaded.count, "trajectories", quiet=quiet) as bar, interrupts_wait():
 
         def show(state: SweepState) -> None:
@@ -95,7 +110,14 @@ def command(
                 f", {duration_text(left)} left",
             )
 
-        state = run_sweep(loaded, settings, show, interrupt_came)
+        state = run_sweep(loaded, settings, show, lambda: interrupt_came() or time.monotonic() > end)
+    if interrupt_came() and not state.done and not resume:
+        discard_beginning(directory, made)
+        raise KeyboardInterrupt
+    stopped = state.status == "interrupted" and not interrupt_came()
+    if stopped:
+        state.status = "stopped"
+        click.echo("error: the sweep stopped before its --max-time; --resume goes on with it", err=True)
     status = status_of(directory)
     if as_json:
         print_json({**state.as_dict(), "dataset": status.as_dict()})
@@ -103,5 +125,5 @@ def command(
         rate = f", {state.per_hour:,.0f} per hour" if state.done > state.kept else ""
         print_text(f"{state.status}: {state.done} of {state.expected} trajectories{rate}\n{status.text()}")
     if state.status == "interrupted":
-        return 130
-    return 0 if state.accepted == state.done else 1
+        return interrupted_code()
+    return 0 if state.accepted == state.done and not stopped else 1

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
+from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
 from mpmcli.cli.options import json_option, quiet_option
 from mpmcli.cli.streams import print_json, print_text
 
@@ -184,7 +184,7 @@ def _run(
     except KeyboardInterrupt:
         if output is not None:
             click.echo(f"interrupted; the runs that are done are kept: --resume -o {output} goes on", err=True)
-            return 130
+            return interrupted_code()
         raise
     if output is not None:
         write_report(report, output)

@@ -1,9 +1,10 @@
 """Sends tasks to the workers of a Dask cluster, its own or one that runs already."""
 
+import os
 import queue
 import signal
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING
@@ -100,7 +101,12 @@ def local_workers(count: int) -> Iterator[Workers]:
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(_SETTINGS))
         cluster = stack.enter_context(_local_cluster(count))
-        yield Workers(stack.enter_context(Client(cluster)))
+        workers = Workers(stack.enter_context(Client(cluster)))
+        try:
+            yield workers
+        except BaseException:
+            _kill(cluster)
+            raise
 
 
 def _local_cluster(count: int) -> "LocalCluster":
@@ -122,6 +128,14 @@ def _local_cluster(count: int) -> "LocalCluster":
             if not left:
                 raise RunError(f"the workers do not start ({error}); --resume goes on with what is done.") from error
     raise AssertionError
+
+
+def _kill(cluster: "LocalCluster") -> None:
+    """End the worker processes, which hear of nothing while a kernel runs; what they write is whole or absent."""
+    for nanny in cluster.workers.values():
+        nanny.auto_restart = False
+        with suppress(OSError, AttributeError, TypeError):
+            os.kill(nanny.pid, signal.SIGKILL)
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.dataset.draw import Draw, draw
 from mpmcli.dataset.manifest import Row
 from mpmcli.dataset.paths import PENDING, QUARANTINE, file_name
-from mpmcli.dataset.shard import TrajectoryData, checksum_of, write_trajectory
+from mpmcli.dataset.shard import TrajectoryData, checksum_of, stored_bytes, write_trajectory
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.materials.registry import load_plugins
@@ -183,7 +183,7 @@ def _stored(task: Task, row: Row, drawn: Draw, scene: Scene, run: Recording, ret
         path.parent.mkdir(parents=True, exist_ok=True)
         data = trajectory_data(drawn, run)
         try:
-            with sealed(path, data.position.nbytes) as temporary, h5py.File(temporary, "w") as opened:
+            with sealed(path, stored_bytes(data)) as temporary, h5py.File(temporary, "w") as opened:
                 write_trajectory(opened, data, compress=scene.output.compress)
         except (OSError, RuntimeError) as error:
             reason = getattr(error, "strerror", None) or error

@@ -118,7 +118,8 @@ def export(
     for each in chosen:
         _require_sound_walls(each)
     there = next(parent for parent in directory.resolve().parents if parent.exists())
-    require_free_space(there, form.size(chosen), f"the export to {directory}", "nothing was written")
+    what, kept = f"the export to {directory}", "nothing was written"
+    require_free_space(there, form.size(chosen), what, kept, several=True)
     if settings.walls != "none":
         metadata["wall_spacing"] = max(each.walls.spacing for each in chosen)
     done = 0

@@ -22,6 +22,7 @@ from mpmcli.dataset.facts import (
     wall_types,
 )
 from mpmcli.dataset.thinned import ThinnedTrajectory
+from mpmcli.output.durable import ask_for
 
 FORM = "LagrangeBench"
 # Its own types are 0 fluid, 1 solid wall, 2 moving wall, 3 rigid body, -1 padding, out of 9.
@@ -53,6 +54,7 @@ def write(
     statistics, notes = learning_facts(trajectories)
     splits, left_out = by_split(trajectories, ".h5")
     for name, chosen in splits.items():
+        ask_for(directory / name, size(chosen))
         with h5py.File(directory / name, "w") as file:
             for k, each in enumerate(chosen):
                 _write_trajectory(file.create_group(f"{k:05d}"), each, types)

@@ -9,6 +9,7 @@ import numpy as np
 from mpmcli.dataset.shard import LABELS, group_name
 from mpmcli.dataset.thinned import ThinnedTrajectory
 from mpmcli.errors import InputError
+from mpmcli.output.durable import ask_for
 from mpmcli.output.layout import POSITION
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
 
@@ -46,6 +47,7 @@ def _write_trajectory(path: Path, trajectory: ThinnedTrajectory) -> None:
     n, frames, layout = trajectory.particle_count, trajectory.frame_count, trajectory.layout
     # The same for all frames.
     fixed = {name: trajectory.label(name) for name in LABELS} | {"id": np.arange(n, dtype=layout.arrays["id"].dtype)}
+    ask_for(path, file_size(layout, [n] * frames))
     with VtkhdfWriter(path, layout, [n] * frames) as writer:
         for name, array in layout.arrays.items():
             if name in fixed:

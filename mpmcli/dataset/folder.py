@@ -13,20 +13,24 @@ from mpmcli.dataset.shard import FORMAT, VERSION, checksum, group_name
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.directory import check_directory
 from mpmcli.output.durable import require_free_space, sealed
+from mpmcli.output.lock import LOCK
 
 # Bytes of a shard, about: large enough for a file system and for copies over a network, small enough to lose.
 SHARD_BYTES = 256e6
 
 
-def require_empty(directory: Path) -> None:
-    """Refuse a directory that holds something or cannot be written.
+def require_empty(directory: Path, *, locked: bool = False) -> None:
+    """Refuse a directory that holds something, is being written or cannot be.
+
+    Args:
+        locked: whether this process has the lock of the directory.
 
     Raises:
         InputError: it does; nothing was made.
     """
-    if directory.is_dir() and any(directory.iterdir()):
+    if directory.is_dir() and any(path.name != LOCK for path in directory.iterdir()):
         raise InputError(f"{directory} exists and is not empty: give another directory with -o.")
-    check_directory(directory, overwrite=False)
+    check_directory(directory, overwrite=False, locked=locked)
 
 
 class Folder:

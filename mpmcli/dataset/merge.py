@@ -1,8 +1,9 @@
 """Joins the parts of a dataset that `mpmcli sweep --shard` has computed."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from mpmcli.dataset.card import write_card
 from mpmcli.dataset.folder import require_empty
@@ -10,7 +11,8 @@ from mpmcli.dataset.manifest import Manifest
 from mpmcli.dataset.paths import BASE, QUARANTINE, SHARDS, SWEEP
 from mpmcli.dataset.report import Status, status_of, verify
 from mpmcli.errors import InputError, RunError
-from mpmcli.output.durable import require_free_space, sync_directory, sync_file, write_text
+from mpmcli.output.durable import require_free_space, sealed, write_text
+from mpmcli.output.lock import take_lock
 
 
 def merge(parts: Sequence[Path], target: Path) -> Status:
@@ -39,21 +41,27 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
             raise InputError(f"{part} cannot be merged: {faults[0]}")
     files = [file for part in parts for folder in (SHARDS, QUARANTINE) for file in sorted((part / folder).glob("*.h5"))]
     target.mkdir(parents=True, exist_ok=True)
+    with take_lock(target):
+        require_empty(target, locked=True)
+        _join(parts, target, files, facts[0])
+    return status_of(target)
+
+
+def _join(parts: Sequence[Path], target: Path, files: Sequence[Path], facts: Mapping[str, Any]) -> None:
+    """Copy files of the parts, and write what belongs to the whole; see `merge`."""
     size = sum(file.stat().st_size for file in files)
-    require_free_space(target, size, "the merged dataset", "the parts are kept")
+    require_free_space(target, size, "the merged dataset", "the parts are kept", several=True)
     try:
         for file in files:
             copy = target / file.parent.name / file.name
             copy.parent.mkdir(exist_ok=True)
-            shutil.copyfile(file, copy)
-            sync_file(copy)
-            sync_directory(copy.parent)
+            with sealed(copy, file.stat().st_size) as temporary:
+                shutil.copyfile(file, temporary)
         for name in (SWEEP, BASE):
             write_text(target / name, (parts[0] / name).read_text(encoding="utf-8"))
     except OSError as error:
         raise RunError(f"{target} could not be written ({error.strerror}); the parts are kept.") from error
     manifest = Manifest(target)
-    manifest.create({**facts[0], "part": [1, 1]})
+    manifest.create({**facts, "part": [1, 1]})
     manifest.put(row for part in parts for row in Manifest(part).rows())
     write_card(target)
-    return status_of(target)

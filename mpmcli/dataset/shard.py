@@ -27,6 +27,8 @@ FORMAT, VERSION = "mpmcli-dataset", 1
 SPLITS = ("train", "valid", "test")
 MOVING, LABELS, TABLES = ("position", "velocity"), ("body", "material"), ("time", "step", "frame")
 LEDGER = "ledger"
+# Of HDF5 for a data set and for a group, at most.
+TABLE_BYTES, GROUP_BYTES = 1024, 16 * 1024
 # Of a compressed chunk: as much as HDF5 caches of a dataset.
 CHUNK_BYTES = 2**20
 
@@ -104,6 +106,12 @@ def _arrays(data: TrajectoryData) -> dict[str, np.ndarray]:
     for name, dtype in (("time", np.float64), ("step", np.int64), ("frame", np.int64)):
         arrays[name] = np.asarray(getattr(data, name), dtype)
     return arrays | {f"{LEDGER}/{name}": column for name, column in ledger_columns(data.ledger).items()}
+
+
+def stored_bytes(data: TrajectoryData) -> int:
+    """Return the bytes of a shard that holds this trajectory alone, without compression, rounded up."""
+    attributes = sum(len(str(value)) for value in _attributes(data).values())
+    return sum(array.nbytes + TABLE_BYTES for array in _arrays(data).values()) + attributes + GROUP_BYTES
 
 
 def checksum_of(data: TrajectoryData) -> str:

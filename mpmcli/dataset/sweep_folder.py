@@ -2,6 +2,8 @@
 
 import math
 import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from mpmcli.dataset.sweep_state import SweepSettings
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import load_plugins
 from mpmcli.output.durable import SPACE_MARGIN, TEMPORARY_SUFFIX, write_text
+from mpmcli.output.lock import LOCK, refuse_locked, take_lock
 from mpmcli.plain_text import counted, size_text
 from mpmcli.scene import Scene, estimate_particles
 
@@ -27,8 +30,34 @@ SAMPLE = 16
 HEADER_BYTES, FRAME_BYTES = 11_000, 200
 
 
-def open_folder(sweep: Sweep, settings: SweepSettings) -> tuple[Folder, Manifest]:
+@contextmanager
+def taken_folder(sweep: Sweep, settings: SweepSettings) -> Iterator[tuple[Folder, Manifest]]:
+    """Make the directory of a dataset, or open the one that is to be resumed, and keep other sweeps out of it.
+
+    One process writes the manifest and the shards of a directory; workers, of this machine or others, write the
+    trajectories that it asks them for, and parts of a sweep have directories of their own.
+
+    Raises:
+        InputError: as `open_folder`, or another process writes the directory.
+    """
+    directory = settings.directory
+    if directory.is_dir():
+        refuse_locked(directory)
+        if settings.resume:
+            with take_lock(directory):
+                yield open_folder(sweep, settings)
+            return
+    with ExitStack() as held:
+        yield open_folder(sweep, settings, lambda: held.enter_context(take_lock(directory)))
+
+
+def open_folder(
+    sweep: Sweep, settings: SweepSettings, take: Callable[[], object] = lambda: None
+) -> tuple[Folder, Manifest]:
     """Make the directory of a dataset, or open the one that is to be resumed.
+
+    Args:
+        take: called before the first file is written into the directory.
 
     Raises:
         InputError: it holds something else, or the dataset of another sweep; the disk or the part is too small; no
@@ -68,6 +97,10 @@ def open_folder(sweep: Sweep, settings: SweepSettings) -> tuple[Folder, Manifest
             "give another place with -o, or a smaller --count."
         )
     directory.mkdir(parents=True, exist_ok=True)
+    take()
+    if not settings.resume:
+        # Another sweep may have come and gone meanwhile.
+        require_empty(directory, locked=True)
     write_text(directory / SWEEP, sweep.text)
     write_text(directory / BASE, sweep.base_text)
     manifest.create(
@@ -84,9 +117,29 @@ def open_folder(sweep: Sweep, settings: SweepSettings) -> tuple[Folder, Manifest
     return folder, manifest
 
 
+def discard_beginning(directory: Path, made: Sequence[Path]) -> None:
+    """Remove a dataset in which no trajectory has been done.
+
+    Args:
+        made: the directories that were made for it, outermost first.
+
+    Raises:
+        InputError: another process writes it.
+    """
+    if not (directory / MANIFEST).exists() or Manifest(directory).rows():
+        return
+    with take_lock(directory):
+        Folder(directory, 0, 1, (1, 1)).close()
+        for name in (SWEEP, BASE, MANIFEST):
+            (directory / name).unlink(missing_ok=True)
+    for path in reversed(made):
+        with suppress(OSError):
+            path.rmdir()
+
+
 def _is_beginning(directory: Path) -> bool:
     """Return whether a sweep was killed here before it had a manifest."""
-    texts = {SWEEP, BASE, MANIFEST}
+    texts = {SWEEP, BASE, MANIFEST, LOCK}
     return directory.is_dir() and all(
         path.name.removesuffix(TEMPORARY_SUFFIX).removesuffix("-journal") in texts for path in directory.iterdir()
     )

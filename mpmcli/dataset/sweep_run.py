@@ -11,7 +11,7 @@ from mpmcli.dataset.compute import Task
 from mpmcli.dataset.folder import Folder
 from mpmcli.dataset.manifest import Manifest, Row
 from mpmcli.dataset.sweep import Sweep
-from mpmcli.dataset.sweep_folder import open_folder
+from mpmcli.dataset.sweep_folder import taken_folder
 from mpmcli.dataset.sweep_state import SweepSettings, SweepState
 
 # Most trajectories of a task, and tasks per worker below which they become shorter.
@@ -42,7 +42,7 @@ def run_sweep(
     with ExitStack() as stack:
         # Nothing is written where there is no scheduler.
         joined = stack.enter_context(joined_workers(settings.scheduler)) if settings.scheduler else None
-        folder, manifest = open_folder(sweep, settings)
+        folder, manifest = stack.enter_context(taken_folder(sweep, settings))
         return _run(sweep, settings, folder, manifest, joined, began, on_progress, stop)
 
 

@@ -1,12 +1,16 @@
 """The output directory: made, refused, or cleared of an earlier result, and of nothing else."""
 
 import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from mpmcli.errors import InputError
 from mpmcli.output.checkpoints import remove_checkpoints
 from mpmcli.output.collider_files import COLLIDER_FILES, MOVING_FRAME
 from mpmcli.output.durable import TEMPORARY_SUFFIX
+from mpmcli.output.lock import LOCK, DirectoryLock, refuse_locked, take_lock
 from mpmcli.output.run_record import RECORD, read_record
 from mpmcli.output.segments import PACKED, remove_segments, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_FRAME, SERIES_HEADER, SERIES_LEDGER
@@ -15,36 +19,102 @@ SCENE = "scene.toml"
 NAMES = (PACKED, SCENE, SERIES, SERIES_HEADER, SERIES_LEDGER, RECORD, *COLLIDER_FILES)
 
 
-def prepare_directory(directory: Path, overwrite: bool) -> Path:
-    """Make sure that `directory` exists, is writable and holds no earlier result.
+@dataclass(frozen=True)
+class TakenDirectory:
+    """A directory that is this process's to write.
+
+    Attributes:
+        path: of the directory.
+        lock: held until `release`.
+        made: the directories that were made for it, outermost first.
+    """
+
+    path: Path
+    lock: DirectoryLock
+    made: tuple[Path, ...]
+
+    def __enter__(self) -> "TakenDirectory":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and not has_frames(self.path):
+            self.undo()
+        self.release()
+
+    def release(self) -> None:
+        """Let others write; a second call does nothing."""
+        self.lock.release()
+
+    def clear(self) -> None:
+        """Remove an earlier result.
+
+        Raises:
+            InputError: it cannot be removed.
+        """
+        _remove_result(self.path)
+
+    def undo(self) -> None:
+        """Remove what a run has written that computed nothing, and the directories made for it."""
+        with suppress(OSError, InputError):
+            _remove_result(self.path)
+        self.release()
+        _unmake(self.made)
+
+
+def take_directory(directory: Path, overwrite: bool, *, resume: bool = False) -> TakenDirectory:
+    """Make sure that `directory` exists, is writable, holds no earlier result and is written by nobody else.
 
     With `overwrite` the files that mpmcli writes are removed: the packed file, segments, series,
-    checkpoints, scene.toml and run.json. Anything else in the directory stays.
+    checkpoints, scene.toml and run.json. Anything else in the directory stays. With `resume` all of it stays.
+
+    Raises:
+        InputError: something is in the way, another process writes the directory, or it cannot be written. Nothing was
+            made or removed then.
+    """
+    directory = Path(directory)
+    check_directory(directory, overwrite, resume=resume)
+    made = [] if directory.is_dir() else _make(directory)
+    lock = None
+    try:
+        lock = take_lock(directory)
+        # Another run may have come and gone meanwhile.
+        check_directory(directory, overwrite, resume=resume, locked=True)
+        if not resume:
+            _remove_result(directory)
+    except BaseException:
+        if lock is not None:
+            lock.release()
+        _unmake(made)
+        raise
+    return TakenDirectory(directory, lock, tuple(made))
+
+
+def prepare_directory(directory: Path, overwrite: bool) -> Path:
+    """Do what `take_directory` does, and leave the directory to others at once.
 
     Returns:
         The directory.
 
     Raises:
-        InputError: something is in the way, or the directory cannot be written. Nothing was made
-            or removed then.
+        InputError: as `take_directory`.
     """
-    directory = Path(directory)
-    check_directory(directory, overwrite)
-    if directory.is_dir():
-        _remove_result(directory)
-    else:
-        _make(directory)
-    return directory
+    taken = take_directory(directory, overwrite)
+    taken.release()
+    return taken.path
 
 
-def check_directory(directory: Path, overwrite: bool, *, resume: bool = False) -> None:
-    """Refuse a directory that holds something, unless a run is resumed there, or cannot be written.
+def check_directory(directory: Path, overwrite: bool, *, resume: bool = False, locked: bool = False) -> None:
+    """Refuse a directory that holds something, unless a run is resumed there, is being written, or cannot be.
 
-    Nothing is made or removed. Cheap, so that a long preparation need not come first; `prepare_directory` has the last
+    Nothing is made or removed. Cheap, so that a long preparation need not come first; `take_directory` has the last
     word.
 
+    Args:
+        resume: whether what it holds goes on.
+        locked: whether this process has the lock of the directory.
+
     Raises:
-        InputError: as `prepare_directory`.
+        InputError: as `take_directory`.
     """
     directory = Path(directory)
     try:
@@ -56,7 +126,9 @@ def check_directory(directory: Path, overwrite: bool, *, resume: bool = False) -
         raise InputError(f"{directory} cannot be made ({reason}): give another place with -o.") from error
     if directory.is_dir():
         _refuse_unwritable(directory)
-        if not (overwrite or resume) and any(directory.iterdir()):
+        if not locked:
+            refuse_locked(directory)
+        if not (overwrite or resume) and any(path.name != LOCK for path in directory.iterdir()):
             raise InputError(
                 f"{directory} exists and is not empty: give another directory with -o, or --overwrite to "
                 "replace the result in it, or --resume to go on with it."
@@ -65,7 +137,8 @@ def check_directory(directory: Path, overwrite: bool, *, resume: bool = False) -
         raise InputError(f"{directory} is a file, not a directory: give another place with -o.")
 
 
-def _make(directory: Path) -> None:
+def _make(directory: Path) -> list[Path]:
+    """Make a directory; return all that were made, outermost first."""
     # Every missing parent is made too, and taken away again if the whole does not succeed.
     missing = [directory]
     for parent in directory.parents:
@@ -75,16 +148,25 @@ def _make(directory: Path) -> None:
     made: list[Path] = []
     try:
         for path in reversed(missing):
-            path.mkdir()
-            made.append(path)
+            # Another process may make it at this moment.
+            with suppress(FileExistsError):
+                path.mkdir()
+                made.append(path)
         _refuse_unwritable(directory)
     except (OSError, InputError) as error:
-        for path in reversed(made):
-            path.rmdir()
+        _unmake(made)
         if isinstance(error, InputError):
             raise
         reason = error.strerror or error
         raise InputError(f"{directory} cannot be made ({reason}): give another place with -o.") from error
+    return made
+
+
+def _unmake(made: Sequence[Path]) -> None:
+    """Remove directories, given outermost first, that are empty."""
+    for path in reversed(made):
+        with suppress(OSError):
+            path.rmdir()
 
 
 def _refuse_unwritable(directory: Path) -> None:
@@ -122,6 +204,10 @@ def _is_ours(name: str) -> bool:
 
 
 def _holds_result(directory: Path) -> bool:
-    if (directory / PACKED).exists() or (directory / SERIES_HEADER).exists() or sealed_segments(directory):
-        return True
-    return read_record(directory) is not None
+    return has_frames(directory) or read_record(directory) is not None
+
+
+def has_frames(directory: Path) -> bool:
+    """Return whether a directory holds a frame of a run."""
+    files = (PACKED, SERIES_HEADER)
+    return any((directory / name).exists() for name in files) or bool(sealed_segments(directory))

@@ -7,11 +7,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from mpmcli.errors import RunError
+from mpmcli.errors import NoRoomError
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
 
 TEMPORARY_SUFFIX = ".tmp"
 # Bytes left free on top of what is about to be written: file system metadata and other programs.
 SPACE_MARGIN = 16 * 1024 * 1024
+# Answers of the system where there is no room.
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def sync_file(path: Path) -> None:
@@ -53,7 +60,7 @@ def sealed(path: Path, size: int = 0) -> Iterator[Path]:
     temporary = path.with_name(path.name + TEMPORARY_SUFFIX)
     try:
         if size:
-            _ask_for(temporary, size)
+            ask_for(temporary, size)
         yield temporary
         sync_file(temporary)
         os.replace(temporary, path)
@@ -65,7 +72,7 @@ def sealed(path: Path, size: int = 0) -> Iterator[Path]:
     sync_directory(path.parent)
 
 
-def _ask_for(path: Path, size: int) -> None:
+def ask_for(path: Path, size: int) -> None:
     """Reserve and release `size` bytes, so that a full disk is found here and not inside HDF5.
 
     HDF5 that is refused space raises, and then crashes the interpreter at exit. Free space alone does
@@ -78,7 +85,7 @@ def _ask_for(path: Path, size: int) -> None:
             os.posix_fallocate(file.fileno(), 0, size)
         except OSError as error:
             # Some file systems cannot reserve; then nothing is learned.
-            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            if is_full(error):
                 raise
         file.truncate(0)
 
@@ -89,7 +96,22 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
-def require_free_space(directory: Path, size: int, purpose: str, kept: str) -> None:
+def is_full(error: BaseException) -> bool:
+    """Return whether an error says that the disk is full, or a quota or a limit on the size of a file reached."""
+    return isinstance(error, OSError) and error.errno in FULL
+
+
+def largest_file() -> int | None:
+    """Return the limit of this process on the size of a file (`ulimit -f`), bytes; None where there is none."""
+    if resource is None:
+        return None
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def require_free_space(
+    directory: Path, size: int, purpose: str, kept: str, *, joined: int = 0, several: bool = False
+) -> None:
     """Refuse to start writing what the disk cannot hold.
 
     Args:
@@ -97,14 +119,24 @@ def require_free_space(directory: Path, size: int, purpose: str, kept: str) -> N
         size: bytes to be written.
         purpose: what is to be written, the subject of the error's sentence ("frame 7").
         kept: what stays usable, closing the sentence ("the 7 frames before it are kept").
+        joined: bytes of one more file, of this and of what was written before, that is to follow.
+        several: whether the bytes go to several files.
 
     Raises:
-        RunError: fewer than `size` + `SPACE_MARGIN` bytes are free.
+        NoRoomError: fewer than `size` + `joined` + `SPACE_MARGIN` bytes are free, or files may not be so large.
     """
-    free = shutil.disk_usage(directory).free
-    if free < size + SPACE_MARGIN:
-        raise RunError(
+    included = "a margin and the packing of all frames up to it" if joined else "a margin"
+    free, largest = shutil.disk_usage(directory).free, largest_file()
+    if free < size + joined + SPACE_MARGIN:
+        raise NoRoomError(
             f"The disk of {directory} has {free / 1e6:.1f} MB left, but {purpose} needs "
-            f"{(size + SPACE_MARGIN) / 1e6:.1f} MB (a margin included): free some space or write to another "
+            f"{(size + joined + SPACE_MARGIN) / 1e6:.1f} MB ({included} included): free some space or write to another "
             f"disk with -o; {kept}."
+        )
+    need = max(0 if several else size, joined)
+    if largest is not None and largest < need:
+        what = "the packing of all frames up to it needs" if joined > size else "that needs"
+        raise NoRoomError(
+            f"{purpose} cannot be written, since {what} a file of {need / 1e6:.3g} MB, and files may have "
+            f"{largest / 1e6:.3g} MB here: raise that limit (ulimit -f); {kept}."
         )

@@ -1,6 +1,6 @@
 """Packing: many sealed files become one file, proved equal before it takes its name."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -8,14 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli.errors import InputError, RunError
-from mpmcli.output.durable import require_free_space, sealed, sync_file
+from mpmcli.errors import InputError, NoRoomError, RunError
+from mpmcli.output.durable import is_full, require_free_space, sealed, sync_file
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, part_tables, read_array, read_index
 
 
 def pack_segments(
-    segments: Sequence[Path], target: Path, *, compress: bool = False, header: Mapping[str, Any] | None = None
+    segments: Sequence[Path],
+    target: Path,
+    *,
+    compress: bool = False,
+    header: Mapping[str, Any] | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> None:
     """Write all frames of `segments` into `target`, compare every number, then give it its name.
 
@@ -26,8 +31,10 @@ def pack_segments(
         target: file to make; an existing one is replaced at the very end.
         compress: gzip-1 with shuffle.
         header: of the packed file, that of the segments by default; "scene" may differ, as a resumed run may end later.
+        stop: called for each array; True ends the packing.
 
     Raises:
+        KeyboardInterrupt: `stop` returned True; no `target` is made then.
         RunError: the disk cannot hold the packed file, the segments do not belong together, or the
             packed file does not read back bit for bit. No `target` is made then.
     """
@@ -54,23 +61,31 @@ def pack_segments(
                     frames, rows = len(index.counts), int(index.counts.sum())
                     with closing(open_vtkhdf(segment)) as source:
                         for name in first.layout.arrays:
+                            if stop():
+                                raise KeyboardInterrupt
                             writer.write_array(k, name, read_array(source, name, 0, rows), frames=frames)
                     k += frames
                 writer.finish(expected.times, expected.frames, expected.steps, expected.ledger, header=expected.header)
             sync_file(temporary)
-            difference = find_difference(temporary, segments, expected)
+            difference = find_difference(temporary, segments, expected, stop)
             if difference:
                 raise RunError(f"{target.name} does not read back as it was written ({difference}); {kept}.")
     except (OSError, RuntimeError, InputError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise RunError(f"{target} could not be written ({reason}); {kept}.") from error
+        fault = NoRoomError if is_full(error) else RunError
+        raise fault(f"{target} could not be written ({reason}); {kept}.") from error
 
 
-def find_difference(packed: Path, segments: Sequence[Path], expected: FrameIndex) -> str:
+def find_difference(
+    packed: Path, segments: Sequence[Path], expected: FrameIndex, stop: Callable[[], bool] = lambda: False
+) -> str:
     """Compare a packed file with its segments, bit for bit.
 
     Returns:
         What differs first, in words; "" when nothing does.
+
+    Raises:
+        KeyboardInterrupt: `stop` returned True.
     """
     with closing(open_vtkhdf(packed)) as file:
         index = read_index(file)
@@ -93,6 +108,8 @@ def find_difference(packed: Path, segments: Sequence[Path], expected: FrameIndex
             with closing(open_vtkhdf(segment)) as source:
                 rows = int(source["VTKHDF/NumberOfPoints"][:].sum())
                 for name in expected.layout.arrays:
+                    if stop():
+                        raise KeyboardInterrupt
                     written, stored = read_array(file, name, first, rows), read_array(source, name, 0, rows)
                     if not _same(written, stored):
                         return f"{name} of the frames of {segment.name}"

@@ -20,6 +20,7 @@ from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import POSITION, STANDARD, FrameLayout
 from mpmcli.output.ledger_table import FRAME_COLUMNS, parse_ledger_csv
 from mpmcli.output.run_record import read_record
+from mpmcli.output.run_status import run_status
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_HEADER, SERIES_LEDGER, read_vtu
 from mpmcli.output.vtkhdf import FORMAT, open_vtkhdf, read_array, read_index
@@ -45,6 +46,7 @@ class Result(ABC):
         field_names: the fields of each Frame, without position, velocity, body and material.
         record: content of run.json, None where there is none.
         index: tables of all frames, as the files hold them.
+        status: how the run stands, see `run_status`.
         collider_frames: for each collider the number of the only frame that it is in; None where all are in all.
     """
 
@@ -62,7 +64,9 @@ class Result(ABC):
         self.dimension = index.layout.dimension
         names = [name for name in index.layout.arrays if name not in (POSITION, *STANDARD)]
         self.field_names: tuple[str, ...] = tuple(names)
-        self.record = read_record(path if path.is_dir() else path.parent)
+        directory = path if path.is_dir() else path.parent
+        self.record = read_record(directory)
+        self.status = run_status(directory, self.record)
 
     @cached_property
     def colliders(self) -> tuple[Collider, ...]:
@@ -232,7 +236,8 @@ def _open_directory(directory: Path) -> Result:
     record = read_record(directory)
     if record is None:
         raise InputError(f"{directory} holds no result of mpmcli: no {PACKED}, {SEGMENTS} or {SERIES}.")
-    raise InputError(f'{directory} holds no frame yet: its run is "{record["status"]}" and has written none.')
+    status = run_status(directory, record)
+    raise InputError(f'{directory} holds no frame yet: its run is "{status}" and has written none.')
 
 
 def _index_of(path: Path) -> FrameIndex:

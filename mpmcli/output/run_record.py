@@ -6,7 +6,6 @@ import os
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
@@ -15,10 +14,11 @@ from mpmcli import __version__
 from mpmcli.errors import RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import write_text
+from mpmcli.output.owner import Owner, time_now
 
 RECORD = "run.json"
 PROGRAM = "mpmcli"
-Status = Literal["running", "finished", "unstable", "interrupted", "failed"]
+Status = Literal["running", "finished", "unstable", "interrupted", "stopped", "failed"]
 
 
 @dataclass
@@ -34,7 +34,7 @@ class RunRecord:
         seeds: seed of each body by name, for those that have one.
         frames_expected, particles: as planned.
         notes: sentences about what was chosen for the user ("auto" values).
-        status: "running" until `close`.
+        status: "running" until `close`; "interrupted" by a signal, "stopped" at a limit or for want of room.
         frames_written, steps, time: how far the run came; time in s.
         timings: seconds by name: compile_s, solve_s, output_s, wall_s.
         limits: number of frames in which each bound on the step was the nearest.
@@ -59,7 +59,7 @@ class RunRecord:
     energy: dict[str, float] = field(default_factory=dict)
     failure: dict[str, Any] | None = None
     resumed: list[dict[str, Any]] = field(default_factory=list)
-    started: str = field(default_factory=lambda: _now())
+    started: str = field(default_factory=time_now)
     ended: str | None = None
 
     def observe(self, row: LedgerRow) -> None:
@@ -84,7 +84,7 @@ class RunRecord:
         for row in rows:
             self.observe(row)
         self.started = str(earlier.get("started", self.started))
-        self.resumed = [*earlier.get("resumed", ()), {"at": _now(), "frames": len(rows), "step": step}]
+        self.resumed = [*earlier.get("resumed", ()), {"at": time_now(), "frames": len(rows), "step": step}]
 
     def close(self, status: Status, message: str = "", **facts: Any) -> None:
         """Set how the run ended and write.
@@ -95,7 +95,7 @@ class RunRecord:
             facts: where it failed: step, time, particle, body, position, limit, ...
         """
         self.status = status
-        self.ended = _now()
+        self.ended = time_now()
         if message or facts:
             self.failure = {"message": message, **facts}
         self.write()
@@ -109,7 +109,13 @@ class RunRecord:
         content = asdict(self)
         del content["directory"]
         content["command"] = [Path(word).name if i == 0 else word for i, word in enumerate(self.command)]
-        content = {"program": PROGRAM, "version": __version__, **content, "host": host_facts()}
+        content = {
+            "program": PROGRAM,
+            "version": __version__,
+            **content,
+            "process": Owner.here().as_dict(),
+            "host": host_facts(),
+        }
         text = json.dumps(_plain(content), indent=2, ensure_ascii=False)
         try:
             write_text(Path(self.directory) / RECORD, text + "\n")
@@ -119,7 +125,10 @@ class RunRecord:
 
 
 def host_facts() -> dict[str, Any]:
-    """What a figure depends on and a name does not: versions, system, processors; no path, no host name."""
+    """What a figure depends on and a name does not: versions, system, processors; no path, no host name.
+
+    Machines are told apart by a hash in "process", see `Owner`.
+    """
     try:
         taichi = version("taichi")
     except PackageNotFoundError:
@@ -140,10 +149,6 @@ def read_record(directory: Path) -> dict[str, Any] | None:
     except (OSError, ValueError):
         return None
     return record if isinstance(record, dict) and record.get("program") == PROGRAM else None
-
-
-def _now() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 def _plain(value: Any) -> Any:

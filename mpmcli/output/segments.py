@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -49,8 +49,9 @@ class SegmentStore(Store):
         super().__init__(directory, header, **options)
         self.place = self._directory / SEGMENTS
         self._sealed: set[str] = set()
+        self._counts: list[int] = []
 
-    def finish(self) -> Path | None:
+    def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
         """Seal the waiting frames, pack all segments, verify the packed file, and remove the segments.
 
         A single segment becomes the packed file as it is, unless that is compressed. The surfaces of colliders go
@@ -60,6 +61,7 @@ class SegmentStore(Store):
             The packed file; None when no frame was written.
 
         Raises:
+            KeyboardInterrupt: `stop` returned True; the segments stay.
             RunError: the disk cannot hold the packed file or it does not read back; the segments stay.
         """
         self.seal()
@@ -77,7 +79,7 @@ class SegmentStore(Store):
             os.replace(segments[0], packed)
             sync_directory(self._directory)
         else:
-            pack_segments(segments, packed, compress=self._compress, header=self._header)
+            pack_segments(segments, packed, compress=self._compress, header=self._header, stop=stop)
         if self._colliders:
             with closing(open_vtkhdf(packed)) as file:
                 times = read_index(file).times.tolist()
@@ -90,6 +92,7 @@ class SegmentStore(Store):
     def go_on_after(self, index: FrameIndex) -> None:
         super().go_on_after(index)
         self._sealed = {path.name for path in sealed_segments(self._directory)}
+        self._counts = index.counts.tolist()
 
     def _holds_result(self) -> bool:
         return (self._directory / PACKED).exists() or bool(sealed_segments(self._directory))
@@ -104,6 +107,9 @@ class SegmentStore(Store):
     def _size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
         return file_size(layout, counts)
 
+    def _joined_size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
+        return file_size(layout, [*self._counts, *counts])
+
     def _write(self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int) -> None:
         with (
             sealed(self.place / segment_name(frames[0].index), size) as temporary,
@@ -114,6 +120,7 @@ class SegmentStore(Store):
             tables = zip(*((frame.time, frame.index, frame.step) for frame in frames), strict=True)
             writer.finish(*tables, rows, self._header)
         self._sealed.add(segment_name(frames[0].index))
+        self._counts += [len(frame.position) for frame in frames]
 
 
 def remove_segments(directory: Path) -> None:

@@ -5,7 +5,7 @@ Every ParaView and VTK reads it, at the price of more and larger files; VTKHDF i
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -43,6 +43,8 @@ class VtkSeriesStore(Store):
     zlib in the .vtu files.
     """
 
+    several = True
+
     def __init__(self, directory: Path, header: dict[str, Any], **options: Any) -> None:
         super().__init__(directory, header, **options)
         self._times: list[float] = []
@@ -57,7 +59,7 @@ class VtkSeriesStore(Store):
         # The scene may end later than it did.
         self._write_header(index.layout)
 
-    def finish(self) -> Path | None:
+    def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
         """Write the colliders, and return the .pvd, complete after every frame; None where no frame was written."""
         if self.frames_written:
             write_collider_series(self._directory, self._header, self._times, self._colliders)

@@ -2,14 +2,14 @@
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from mpmcli.errors import InputError, RunError
+from mpmcli.errors import InputError, NoRoomError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.durable import require_free_space
+from mpmcli.output.durable import is_full, require_free_space
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
@@ -37,7 +37,11 @@ class Store(ABC):
     Attributes:
         place: where frames are written.
         frames_written: number of frames that a crash can no longer harm.
+        bytes_written: their size; seconds: wall time that sealing them took.
     """
+
+    # Whether frames that are sealed together have a file each.
+    several = False
 
     def __init__(
         self,
@@ -56,7 +60,8 @@ class Store(ABC):
         self._layout: FrameLayout | None = None
         self._waiting: list[tuple[Frame, LedgerRow]] = []
         self._waiting_since = 0.0
-        self.frames_written = 0
+        self.frames_written = self.bytes_written = 0
+        self.seconds = 0.0
         # Frames that an earlier process has written.
         self._kept = 0
 
@@ -115,25 +120,35 @@ class Store(ABC):
         if not self._waiting:
             return
         frames, rows = zip(*self._waiting, strict=True)
-        size = self._size(self._layout, [len(frame.position) for frame in frames])
+        counts = [len(frame.position) for frame in frames]
+        size = self._size(self._layout, counts)
+        began = time.perf_counter()
         purpose, kept = f"frame {frames[0].index}", _frames_kept(self.frames_written)
         try:
-            require_free_space(self._directory, size, purpose, kept)
+            joined = self._joined_size(self._layout, counts)
+            require_free_space(self._directory, size, purpose, kept, joined=joined, several=self.several)
             self._write(self._layout, frames, rows, size)
         except (OSError, RuntimeError, RunError) as error:
             self._waiting.clear()
             if isinstance(error, RunError):
                 raise
             reason = getattr(error, "strerror", None) or error
-            raise RunError(f"{purpose} could not be written to {self.place} ({reason}); {kept}.") from error
+            kind = NoRoomError if is_full(error) else RunError
+            raise kind(f"{purpose} could not be written to {self.place} ({reason}); {kept}.") from error
         self.frames_written += len(frames)
+        self.bytes_written += size
+        self.seconds += time.perf_counter() - began
         self._waiting.clear()
 
     @abstractmethod
-    def finish(self) -> Path | None:
+    def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
         """Complete the result and return the file to open; None where no frame was written.
 
+        Args:
+            stop: called often; True ends it, and what was written stays as it is.
+
         Raises:
+            KeyboardInterrupt: `stop` returned True.
             RunError: it could not be completed; what was written stays.
         """
 
@@ -148,6 +163,10 @@ class Store(ABC):
     @abstractmethod
     def _size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
         """Return the bytes of frames of `counts` particles."""
+
+    def _joined_size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
+        """Return the bytes that `finish` needs beside the sealed frames, if frames of `counts` particles follow."""
+        return 0
 
     @abstractmethod
     def _write(self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int) -> None:

@@ -83,7 +83,6 @@ def read_history(result: Result) -> History:
         values = np.array([getattr(row, name) for row in rows], dtype=np.float64)
         columns[name] = np.where(np.isfinite(values), values, np.nan)
         broken.append(~np.isfinite(values).reshape(len(rows), -1).all(1))
-    record = result.record or {}
     notes = _gaps(np.flatnonzero(np.any(broken, 0)), result.numbers)
     chosen = evenly_spaced(range(result.frame_count), FRAMES_MAX)
     if len(chosen) < result.frame_count:
@@ -92,7 +91,7 @@ def read_history(result: Result) -> History:
         title=one_line(result.header.title) or result.path.stem,
         header=result.header,
         particles=int(result.particle_counts[-1]),
-        status=str(record.get("status", "")),
+        status="" if result.record is None else result.status,
         columns=columns,
         limits=tuple(row.limit for row in rows),
         reach=_reach(result, chosen),

@@ -53,8 +53,7 @@ def evenly_spaced(ks: Sequence[int], count: int) -> list[int]:
 
 def _holds(result: Result) -> str:
     first, last = int(result.numbers[0]), int(result.numbers[-1])
-    running = (result.record or {}).get("status") == "running"
-    so_far = " so far, as its run goes on" if running else ""
+    so_far = " so far, as its run goes on" if result.status == "running" else ""
     return (
         f"{result.path} holds frame {first} only{so_far}"
         if first == last

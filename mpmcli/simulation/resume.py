@@ -17,6 +17,7 @@ from mpmcli.output.checkpoints import Checkpoint, read_checkpoints
 from mpmcli.output.directory import SCENE
 from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory
 from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.lock import LOCK
 from mpmcli.output.result import open_result
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments, segment_name
 from mpmcli.output.series import SERIES
@@ -83,7 +84,7 @@ def find_resumption(loaded: LoadedScene, directory: Path, form: Literal["vtkhdf"
     if not (_has_frames(directory) or (directory / SERIES).exists()):
         # Killed before it had written anything, or not begun.
         names = [path.name for path in directory.iterdir()] if directory.is_dir() else []
-        if record is not None or all(name.endswith(TEMPORARY_SUFFIX) for name in names):
+        if record is not None or all(name == LOCK or name.endswith(TEMPORARY_SUFFIX) for name in names):
             return None
     if record is None or not (directory / SCENE).is_file():
         raise InputError(f"{directory} holds no run that could be resumed: give its directory with -o.")

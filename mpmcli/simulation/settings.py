@@ -1,10 +1,11 @@
 """Settings of a run that are not part of its scene."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from mpmcli.simulation.limits import Limits
 from mpmcli.solver.backend import Arch
 
 
@@ -21,6 +22,7 @@ class RunSettings:
         checkpoint_every: s between two checkpoints; None for as often as costs less than 1 %.
         force: whether to run although the check finds errors, and to take time.step above the stable step too.
         compile_cache: whether compiled kernels are kept for the next start.
+        limits: on time and memory.
         command: the command line, for the record.
     """
 
@@ -33,4 +35,5 @@ class RunSettings:
     checkpoint_every: float | None = None
     force: bool = False
     compile_cache: bool = True
+    limits: Limits = field(default_factory=Limits)
     command: Sequence[str] = ()

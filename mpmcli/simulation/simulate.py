@@ -3,31 +3,29 @@
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from typing import NamedTuple
 
 from mpmcli.check.finding import Finding, passes
 from mpmcli.check.scene_check import check_scene
-from mpmcli.errors import InputError, MpmcliError, RunError
+from mpmcli.errors import InputError, MpmcliError, NoRoomError, RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
-from mpmcli.output import (
-    RunRecord,
-    check_directory,
-    open_result,
-    prepare_directory,
-)
-from mpmcli.output.directory import SCENE
+from mpmcli.output import RunRecord, check_directory, open_result
+from mpmcli.output.directory import SCENE, TakenDirectory, take_directory
 from mpmcli.output.header import RunHeader
 from mpmcli.output.segments import sealed_segments
 from mpmcli.output.store import Store
-from mpmcli.scene import LoadedScene, scene_to_toml
+from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.checkpointing import Checkpointer
 from mpmcli.simulation.engine import choose_engine
+from mpmcli.simulation.limits import Halt
 from mpmcli.simulation.resume import Resumption, find_resumption, go_on, take_over
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.stopwatch import Stopwatch
 from mpmcli.simulation.stored_run import finish, new_record, new_store, new_summary, write_scene
 from mpmcli.simulation.summary import RunSummary
 from mpmcli.solver.backend import Backend, start
+from mpmcli.solver.device_memory import is_out_of_memory, out_of_memory_sentence
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.engine import Engine, build_engine
 from mpmcli.solver.plan import Plan, make_plan, require_room
@@ -38,21 +36,24 @@ def simulate(
     settings: RunSettings,
     on_start: Callable[[RunSummary], None] = lambda summary: None,
     on_frame: Callable[[LedgerRow, RunSummary], None] = lambda row, summary: None,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Callable[[], bool | str] = lambda: False,
 ) -> RunSummary:
     """Check a scene, run it to its end or to where it stops, and store it.
 
     Everything that can be refused is refused before anything is written. A run that becomes unstable, is
-    interrupted (`stop`, or KeyboardInterrupt) or cannot write keeps its sealed frames; its summary says so.
+    interrupted (`stop`, or KeyboardInterrupt), comes near a limit or cannot write keeps its sealed frames; its summary
+    says so. One that is interrupted before its first frame leaves nothing.
 
     Args:
         on_start: called before the first step, with the notes and warnings of the check in the summary.
         on_frame: called after each stored frame with its ledger row and the summary so far.
-        stop: called after every step and every stored frame; returns whether to interrupt the run.
+        stop: called after every step and every stored frame; returns whether to interrupt the run, or the name of the
+            signal that asks for it.
 
     Raises:
-        InputError: the check finds errors, or the scene, the backend or the directory cannot be used; nothing was
-            written.
+        InputError: the check finds errors, or the scene, the backend or the directory cannot be used, as when another
+            process writes it; nothing was written.
+        KeyboardInterrupt: the run was interrupted before it began; nothing was written.
     """
     began = time.perf_counter()
     scene = loaded.scene
@@ -63,20 +64,68 @@ def simulate(
     findings = check_scene(loaded, plan=plan, directory=settings.directory).findings
     if not (settings.force or passes(findings)):
         raise InputError(_refusal(loaded.source, findings))
-    if earlier is not None and earlier.complete:
-        return _complete(loaded, settings, earlier, plan, backend, on_start)
+    complete = earlier is not None and earlier.complete
+    solver = None if complete else _build(scene, settings, plan, backend, batched=batched)
+    if stop():
+        raise KeyboardInterrupt
+    # Last, since it removes an earlier result.
+    with take_directory(settings.directory, settings.overwrite, resume=settings.resume) as taken:
+        if settings.resume:
+            # Once more, as nobody else can write now.
+            earlier = find_resumption(loaded, settings.directory, settings.form)
+            if earlier is None:
+                taken.clear()
+        notes = (*loaded.notes, *(finding.line for finding in findings if finding.severity != "note"))
+        begun = _Begun(loaded, settings, plan, backend, earlier, notes, began, taken)
+        if solver is None:
+            return _complete(begun, on_start, stop)
+        return _store_run(begun, solver, on_start, on_frame, stop)
+
+
+class _Begun(NamedTuple):
+    """A run whose directory is this process's to write."""
+
+    loaded: LoadedScene
+    settings: RunSettings
+    plan: Plan
+    backend: Backend
+    earlier: Resumption | None
+    notes: tuple[str, ...]
+    began: float
+    taken: TakenDirectory
+
+
+def _build(scene: Scene, settings: RunSettings, plan: Plan, backend: Backend, *, batched: bool) -> Engine:
+    """Put a scene on the device.
+
+    Raises:
+        InputError: there is too little memory, or a particle is not in the domain.
+    """
     require_room(plan)
+    settings.limits.require_room(plan)
     start(backend)
-    solver = build_engine(scene, backend, batched=batched, force=settings.force)
+    try:
+        return build_engine(scene, backend, batched=batched, force=settings.force)
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error):
+            raise
+        raise InputError(out_of_memory_sentence(backend.arch, error)) from error
+
+
+def _store_run(
+    begun: _Begun,
+    solver: Engine,
+    on_start: Callable[[RunSummary], None],
+    on_frame: Callable[[LedgerRow, RunSummary], None],
+    stop: Callable[[], bool | str],
+) -> RunSummary:
+    """Run a scene and store it; see `simulate`."""
+    loaded, settings, plan, backend, earlier, notes, began, taken = begun
+    scene = loaded.scene
     forced = settings.force and scene.time.step != "auto"
-    if earlier is None:
-        # Last, since it removes an earlier result.
-        prepare_directory(settings.directory, settings.overwrite or settings.resume)
-    else:
+    if earlier is not None:
         go_on(solver, earlier, backend, forced=forced)
         take_over(settings.directory, earlier)
-
-    notes = (*loaded.notes, *(finding.line for finding in findings if finding.severity != "note"))
     summary = new_summary(loaded, settings, plan, backend, earlier, notes)
     on_start(summary)
     record = new_record(loaded, settings, summary, earlier)
@@ -96,17 +145,26 @@ def simulate(
     )
 
     clock = Stopwatch(summary.timings, began)
+    halt = Halt(stop, settings.limits, compress=scene.output.compress)
     failure: dict = {}
     try:
-        _run(solver, store, checkpoints, record, summary, clock, on_frame, stop)
+        _run(solver, store, checkpoints, record, summary, clock, on_frame, halt)
         summary.status = "finished"
     except KeyboardInterrupt:
-        summary.status, summary.message = "interrupted", "the run was interrupted"
+        halt.interrupted()
+        summary.status, summary.message = halt.status, halt.message
+        failure = {"signal": halt.signal} if halt.signal else {}
     except UnstableRunError as error:
         summary.status, summary.message = "unstable", str(error)
         failure = vars(error.diagnosis)
+    except NoRoomError as error:
+        summary.status, summary.message = "stopped", str(error)
     except MpmcliError as error:
         summary.status, summary.message = "failed", str(error)
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error):
+            raise
+        summary.status, summary.message = "failed", out_of_memory_sentence(backend.arch, error)
     finally:
         if summary.status == "running":
             # A fault of mpmcli: the record must not state that the run is going on.
@@ -114,24 +172,20 @@ def simulate(
     summary.steps = solver.step_count
     clock.book(solver.first_step_seconds, "compile_s")
     with clock.adding("output_s"):
-        finish(store, summary)
+        finish(store, summary, halt)
     clock.stop()
+    if summary.status == "interrupted" and not summary.frames:
+        taken.undo()
+        return summary
     record.timings = summary.timings
     record.close(summary.status, summary.message, **failure)
     return summary
 
 
-def _complete(
-    loaded: LoadedScene,
-    settings: RunSettings,
-    earlier: Resumption,
-    plan: Plan,
-    backend: Backend,
-    on_start: Callable[[RunSummary], None],
-) -> RunSummary:
+def _complete(begun: _Begun, on_start: Callable[[RunSummary], None], stop: Callable[[], bool | str]) -> RunSummary:
     """Pack the frames of a run that had stored all of them; nothing is done where they are packed."""
-    began = time.perf_counter()
-    summary = new_summary(loaded, settings, plan, backend, earlier, loaded.notes)
+    loaded, settings, plan, backend, earlier, notes, began, _ = begun
+    summary = new_summary(loaded, settings, plan, backend, earlier, notes)
     on_start(summary)
     clock = Stopwatch(summary.timings, began)
     text = scene_to_toml(loaded.scene)
@@ -146,7 +200,7 @@ def _complete(
     store = new_store(loaded, settings, {**earlier.index.header, "scene": text}, earlier)
     summary.status = "finished"
     with clock.adding("output_s"):
-        finish(store, summary)
+        finish(store, summary, Halt(stop, settings.limits, compress=loaded.scene.output.compress))
     clock.stop()
     record.timings = summary.timings
     record.close(summary.status, summary.message)
@@ -161,7 +215,7 @@ def _run(
     summary: RunSummary,
     clock: Stopwatch,
     on_frame: Callable[[LedgerRow, RunSummary], None],
-    stop: Callable[[], bool],
+    halt: Halt,
 ) -> None:
     """Compute and store frame after frame; the record and the summary follow the frames that are sealed."""
     rows: list[LedgerRow] = []
@@ -169,7 +223,7 @@ def _run(
 
     def after_step() -> bool:
         store.seal_due()
-        ends = stop()
+        ends = halt()
         if ends or checkpoints.due():
             checkpoints.take()
         return ends
@@ -203,6 +257,7 @@ def _run(
             with clock.adding("output_s"):
                 store.write(frame, row)
             report()
+            halt.wrote(store.bytes_written, store.seconds)
     except BaseException:
         # The first error is the one to be told.
         with suppress(RunError):

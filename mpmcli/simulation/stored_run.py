@@ -3,12 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-from mpmcli.errors import RunError
+from mpmcli.errors import NoRoomError, RunError
 from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore
 from mpmcli.output.directory import SCENE
 from mpmcli.output.durable import write_text
 from mpmcli.output.store import HOLD, Store
 from mpmcli.scene import LoadedScene
+from mpmcli.simulation.limits import Halt
 from mpmcli.simulation.resume import Resumption, file_digests
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.summary import RunSummary
@@ -59,16 +60,19 @@ def write_scene(directory: Path, text: str) -> None:
         raise RunError(f"{directory / SCENE} could not be written ({error.strerror or error}).") from error
 
 
-def finish(store: Store, summary: RunSummary) -> None:
+def finish(store: Store, summary: RunSummary, halt: Halt) -> None:
     """Pack what was stored; until then, the result is the directory with its sealed frames."""
     summary.path = summary.directory
     try:
-        summary.path = store.finish()
+        summary.path = store.finish(halt.packing)
     except KeyboardInterrupt:
-        summary.status, summary.message = "interrupted", "the run was interrupted while its frames were packed"
+        if not halt.status:
+            halt.interrupted()
+        where = f"its frames were left unpacked, and stay readable in {store.place}"
+        summary.status, summary.message = halt.status, f"{halt.message}; {where}"
     except RunError as error:
         if summary.status == "finished":
-            summary.status = "failed"
+            summary.status = "stopped" if isinstance(error, NoRoomError) else "failed"
         summary.message = f"{summary.message} {error}".strip()
 
 

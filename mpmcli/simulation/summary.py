@@ -13,7 +13,7 @@ class RunSummary:
 
     Attributes:
         directory: where the result is; path: the file to open, None where no frame was written.
-        status: "finished", "unstable", "interrupted" or "failed".
+        status: "finished", "unstable", "interrupted" by a signal, "stopped" at a limit or for want of room, "failed".
         message: why it ended early, "" where it did not.
         frames, steps, particles: counts; frames_expected: of the whole run; steps_before:
             those of earlier processes, where the run was resumed.

@@ -22,6 +22,7 @@ from mpmcli.solver.collider_steps import read_loads
 from mpmcli.solver.external_forces import ExternalForces
 from mpmcli.solver.frame_arrays import FrameArrays
 from mpmcli.solver.groups import require_inside
+from mpmcli.solver.launch_budget import LaunchBudget
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.run import COLLAPSE, Run
 from mpmcli.solver.run_values import RunValues
@@ -29,9 +30,6 @@ from mpmcli.solver.state import Progress, SavedState
 from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
 from mpmcli.solver.step_control import StepControl
 from mpmcli.solver.sums import Sums
-
-# Particle-steps of a run in one launch: some tenths of a second, after which the host may stop the run.
-BUDGET = 5_000_000
 
 
 class BatchRun(Run):
@@ -68,6 +66,7 @@ class BatchRun(Run):
         self._row.set_counts(records=0, arrived=0, steps=0)
         self._exchange = Exchange(batch.layout, self._numbers, self._counts)
         self.groups = groups_of(batch, slot, scene, self._particles)
+        self._budget = LaunchBudget(self.particle_count)
         self._recorder = BatchRecorder(batch, slot, self.particle_count, scene.time.frames)
         entries = Drives.of(scene, [group.bodies for group in self.groups])[1]
         self._values = RunValues(batch.values.device, slot, entries, scene.time.end)
@@ -204,12 +203,14 @@ class BatchRun(Run):
             None where the batch must launch; and the frames that it has recorded.
         """
         while self._row.count("arrived") == 0:
-            self._row.set_counts(status=GOING, budget=max(1, BUDGET // self.particle_count), steps=0)
+            self._row.set_counts(status=GOING, budget=self._budget.steps, steps=0)
             if self._row.count("records"):
                 self._recorder.make_room()
+            since = self.batch.seconds
             yield None
             before = self.step_count
             self._exchange.pull(self.state)
+            self._budget.took(self._row.count("steps"), self.batch.seconds - since)
             status = self._row.count("status")
             if self._row.count("records"):
                 yield from self._recorded(before)

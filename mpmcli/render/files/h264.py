@@ -1,5 +1,8 @@
 """H.264 in an .mp4, by the ffmpeg that imageio-ffmpeg provides."""
 
+import errno
+import os
+import signal
 import subprocess
 import tempfile
 from collections.abc import Iterable
@@ -18,6 +21,10 @@ QUALITY = 18
 PRESET = "veryfast"
 # Fixed, since the bytes of a film depend on the number of threads.
 THREADS = 2
+# Exit statuses of ffmpeg that stand for a full disk, with the errors.
+FULL_STATUS = {256 - number: number for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)}
+if hasattr(signal, "SIGXFSZ"):
+    FULL_STATUS[-signal.SIGXFSZ] = errno.EFBIG
 # Lines of ffmpeg's stderr that are quoted on failure.
 LAST_WORDS = 2
 # Players assume BT.709 for large pictures, while ffmpeg writes BT.601 by default.
@@ -38,6 +45,7 @@ def write_h264(images: Iterable[np.ndarray], place: Path, name: Path, fps: float
     Raises:
         InputError: there is no ffmpeg.
         RunError: ffmpeg failed.
+        OSError: the disk is full.
     """
     program = _ffmpeg()
     process: subprocess.Popen[bytes] | None = None
@@ -98,6 +106,8 @@ def _finish(process: subprocess.Popen, said: IO[bytes], name: Path) -> None:
     status = process.wait()
     if status != 0:
         said.seek(0)
+        if status in FULL_STATUS:
+            raise OSError(FULL_STATUS[status], os.strerror(FULL_STATUS[status]))
         words = " ".join(said.read().decode("utf-8", errors="replace").split("\n")[-LAST_WORDS - 1 :]).strip()
         how = f"it was ended by signal {-status}" if status < 0 else f"its status is {status}"
         raise RunError(

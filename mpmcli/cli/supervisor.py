@@ -1,0 +1,190 @@
+"""The process that a user starts: it passes signals to the one that computes, and ends that one where it takes long.
+
+Python attends to a signal between two instructions. Compiling kernels, a step of a large scene, or a film in a library
+may take longer than a batch system waits, and no code of the same process can do anything meanwhile. So commands that
+take long run in a child process. What a user sees is one process: exit codes, signals, and the time of its end.
+"""
+
+import ctypes
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from mpmcli.cli.interrupt import INTERRUPTED, TERMINATED
+
+# Commands that may take long.
+LONG = ("simulate", "sweep", "render", "validate", "export", "dataset", "plot")
+# Time from the first and from a second signal to the end by force, s.
+PATIENCE, LITTLE = 3.5, 0.5
+REQUESTS = ("SIGINT", "SIGTERM", "SIGHUP")
+# Linux: the signal that a process gets when its parent is gone (prctl).
+DEATH_SIGNAL = 1
+
+_announced: int | None = None
+
+
+def may_supervise(arguments: Sequence[str]) -> bool:
+    """Return whether a command line is to run in a child process; --debug keeps it in this one."""
+    first = next((word for word in arguments if not word.startswith("-")), "")
+    asks = {"-h", "--help", "--debug"} & set(arguments)
+    return first in LONG and not asks and hasattr(os, "fork") and hasattr(signal, "sigtimedwait")
+
+
+def supervise(work: Callable[[], int]) -> int:
+    """Do work in a child process; return its exit code, or that of an interrupt where it had to be ended.
+
+    A child that was killed by a signal takes this process with it, by the same signal; one that crashed makes exit
+    code 1, with a sentence. The signals are blocked when this returns, as the process is about to end.
+    """
+    # Ignored ones, as in `mpmcli ... &` or under nohup, stay ignored.
+    requests = {
+        getattr(signal, name) for name in REQUESTS if signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN
+    }
+    watched = requests | {signal.SIGCHLD, signal.SIGTSTP}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, watched)
+    told, tells = os.pipe()
+    us = os.getpid()
+    child = os.fork()
+    if not child:
+        os.close(told)
+        _begin_child(us, tells)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        code = work()
+        _flush()
+        # As after `sys.exit`; the caller must not go on in two processes.
+        sys.exit(code)
+    os.close(tells)
+    with suppress(OSError):
+        os.setpgid(child, child)
+    # The signals stay blocked: what comes now is too late.
+    return _attend(child, requests, watched, told)
+
+
+def announce(directory: Path) -> None:
+    """Tell the supervisor which result this process is about to write, in order to close it after an end by force."""
+    if _announced is None:
+        return
+    place = directory.absolute()
+    made = [str(path) for path in (place, *place.parents) if not path.exists()]
+    os.write(_announced, json.dumps({"directory": str(place), "made": made[::-1]}).encode() + b"\n")
+
+
+def _begin_child(parent: int, tells: int) -> None:
+    global _announced
+    _announced = tells
+    # Ctrl-C at the terminal goes to the supervisor alone.
+    with suppress(OSError):
+        os.setpgid(0, 0)
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
+
+
+def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signals], told: int) -> int:
+    """Pass signals on until the child has ended."""
+    first: signal.Signals | None = None
+    deadline: float | None = None
+    while True:
+        if deadline is None:
+            came = signal.sigwaitinfo(watched)
+        else:
+            came = signal.sigtimedwait(watched, max(0.0, deadline - time.monotonic()))
+        if came is None:
+            _kill_tree(child)
+            os.waitpid(child, 0)
+            _close_result(child, told, first)
+            return _interrupted(first)
+        number = signal.Signals(came.si_signo)
+        if number in requests:
+            with suppress(ProcessLookupError):
+                os.kill(child, number)
+            wait = PATIENCE if first is None else LITTLE
+            deadline = min(time.monotonic() + wait, deadline or float("inf"))
+            first = first or number
+        elif number == signal.SIGTSTP:
+            _pause(child)
+        else:
+            ended, status = os.waitpid(child, os.WNOHANG)
+            if ended and first is not None and os.WIFSIGNALED(status):
+                # It came where Python is not ready for it, as at its end.
+                _close_result(child, told, first)
+                return _interrupted(first)
+            if ended:
+                return _code(status)
+
+
+def _interrupted(first: signal.Signals) -> int:
+    _say("interrupted")
+    return INTERRUPTED if first == signal.SIGINT else TERMINATED
+
+
+def _kill_tree(child: int) -> None:
+    """Kill a child and all processes that it has started."""
+    import psutil
+
+    with suppress(psutil.Error):
+        process = psutil.Process(child)
+        # Stopped, it starts no more.
+        process.suspend()
+        for one in [*process.children(recursive=True), process]:
+            with suppress(psutil.Error):
+                one.kill()
+
+
+def _pause(child: int) -> None:
+    """Stop with the child, as Ctrl-Z asks, until this process is continued."""
+    with suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGSTOP)
+    os.kill(os.getpid(), signal.SIGSTOP)
+    with suppress(ProcessLookupError):
+        os.killpg(child, signal.SIGCONT)
+
+
+def _code(status: int) -> int:
+    if not os.WIFSIGNALED(status):
+        return os.waitstatus_to_exitcode(status)
+    number = os.WTERMSIG(status)
+    try:
+        name = signal.Signals(number).name
+    except ValueError:
+        name = f"signal {number}"
+    if number == signal.SIGKILL:
+        _say("error: the process was killed (SIGKILL), perhaps for want of memory; what it had reported is kept.")
+        os.kill(os.getpid(), signal.SIGKILL)
+    _say(f"error: the process crashed ({name}); what it had reported is kept.")
+    return 1
+
+
+def _close_result(child: int, told: int, first: signal.Signals) -> None:
+    """Write into run.json how the run ended that the child was writing, or remove it where it has no frame."""
+    os.set_blocking(told, False)
+    try:
+        lines = os.read(told, 2**20).splitlines()
+    except OSError:
+        return
+    if not lines:
+        return
+    from mpmcli.errors import MpmcliError
+    from mpmcli.output.abandoned import close_abandoned
+
+    facts = json.loads(lines[-1])
+    with suppress(MpmcliError, OSError):
+        close_abandoned(Path(facts["directory"]), [Path(path) for path in facts["made"]], child, first.name)
+
+
+def _say(line: str) -> None:
+    with suppress(OSError, ValueError, AttributeError):
+        print(line, file=sys.stderr, flush=True)
+
+
+def _flush() -> None:
+    from mpmcli.cli.streams import flush_streams
+
+    flush_streams()
