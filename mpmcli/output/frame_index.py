@@ -21,6 +21,7 @@ class FrameIndex:
         frames, steps: (T,) frame number, and time steps since the start.
         offsets, counts: (T,) first row and number of rows of each frame in its file.
         ledger: T rows.
+        checksums: (T, A) uint32, CRC-32 of each array of the layout in each frame; None where the file has none.
     """
 
     layout: FrameLayout
@@ -31,11 +32,13 @@ class FrameIndex:
     offsets: np.ndarray
     counts: np.ndarray
     ledger: list[LedgerRow]
+    checksums: np.ndarray | None = None
 
     @classmethod
     def joined(cls, indices: Sequence["FrameIndex"]) -> "FrameIndex":
         """The index that one file with the frames of all these, one after the other, has."""
         counts = np.concatenate([index.counts for index in indices])
+        checksums = [index.checksums for index in indices]
         return cls(
             layout=indices[0].layout,
             header=indices[0].header,
@@ -45,4 +48,5 @@ class FrameIndex:
             offsets=np.cumsum(counts) - counts,
             counts=counts,
             ledger=[row for index in indices for row in index.ledger],
+            checksums=None if any(table is None for table in checksums) else np.concatenate(checksums),
         )

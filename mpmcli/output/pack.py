@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from mpmcli.errors import InputError, RunError
+from mpmcli.output.checksums import damaged
 from mpmcli.output.durable import require_free_space, sealed, sync_file
 from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.hdf5_items import DamageError
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, part_tables, read_array, read_index
 
 
@@ -43,13 +45,8 @@ def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = Fa
     try:
         with sealed(target, size) as temporary:
             with VtkhdfWriter(temporary, first.layout, counts, compress=compress) as writer:
-                k = 0
-                for segment, index in zip(segments, indices, strict=True):
-                    frames, rows = len(index.counts), int(index.counts.sum())
-                    with closing(open_vtkhdf(segment)) as source:
-                        for name in first.layout.arrays:
-                            writer.write_array(k, name, read_array(source, name, 0, rows), frames=frames)
-                    k += frames
+                _copy(segments, indices, writer, by_name=compress)
+                _require_unchanged(writer.checksums, expected, segments, indices)
                 writer.finish(expected.times, expected.frames, expected.steps, expected.ledger, header=expected.header)
             sync_file(temporary)
             difference = find_difference(temporary, segments, expected)
@@ -60,6 +57,37 @@ def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = Fa
         raise RunError(f"{target} could not be written ({reason}); {kept}.") from error
 
 
+def _copy(segments: Sequence[Path], indices: Sequence[FrameIndex], writer: VtkhdfWriter, *, by_name: bool) -> None:
+    """Copy all arrays of all segments, segment by segment, or array by array, which opens each segment more often."""
+    names = list(indices[0].layout.arrays)
+    for group in [[name] for name in names] if by_name else [names]:
+        k = 0
+        for segment, index in zip(segments, indices, strict=True):
+            frames, rows = len(index.counts), int(index.counts.sum())
+            with closing(open_vtkhdf(segment)) as source:
+                for name in group:
+                    writer.write_array(k, name, read_array(source, name, 0, rows), frames=frames)
+            k += frames
+
+
+def _require_unchanged(
+    found: np.ndarray, expected: FrameIndex, segments: Sequence[Path], indices: Sequence[FrameIndex]
+) -> None:
+    """Compare the checksums of what was read with those of the segments, where these have any.
+
+    Raises:
+        InputError: they differ.
+    """
+    k = 0
+    for segment, index in zip(segments, indices, strict=True):
+        if index.checksums is not None:
+            differing = np.argwhere(found[k : k + len(index.counts)] != index.checksums)
+            for frame, column in differing[:1]:
+                name = list(expected.layout.arrays)[column]
+                raise damaged(str(segment), f"{name} of frame {index.frames[frame]}")
+        k += len(index.counts)
+
+
 def find_difference(packed: Path, segments: Sequence[Path], expected: FrameIndex) -> str:
     """Compare a packed file with its segments, bit for bit.
 
@@ -67,7 +95,10 @@ def find_difference(packed: Path, segments: Sequence[Path], expected: FrameIndex
         What differs first, in words; "" when nothing does.
     """
     with closing(open_vtkhdf(packed)) as file:
-        index = read_index(file)
+        try:
+            index = read_index(file)
+        except DamageError as error:
+            return str(error).rstrip(".")
         for table in ("times", "frames", "steps", "offsets", "counts"):
             if not _same(getattr(index, table), getattr(expected, table)):
                 return f"the {table} of the frames"

@@ -19,13 +19,25 @@ import numpy as np
 from mpmcli import __version__
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.checksums import (
+    Checksums,
+    attribute_checksum,
+    checksum,
+    load_checksums,
+    store_checksums,
+    table_checksum,
+)
+from mpmcli.output.file_checksum import append_checksum, gaps_of
 from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.hdf5_items import held
 from mpmcli.output.layout import POSITION, FrameLayout
 from mpmcli.output.ledger_table import COLUMNS, ledger_columns, ledger_rows
 
 # A newer upper bound makes files that no VTK can open ("bad version number for layout message").
 LIBVER = ("v110", "v110")
-FORMAT = 1
+# 1 has no checksums.
+FORMAT = 2
+OLDEST = 1
 CONNECTIVITY = "Vertices/Connectivity"
 UNUSED_CELLS = ("Lines", "Polygons", "Strips")
 CHUNK_BYTES = 2**20
@@ -45,6 +57,9 @@ class VtkhdfWriter:
 
     Arrays are contiguous on disk: no chunk is padded, and a reader may map them. With `compress` they
     are gzip-1 with shuffle, the one filter that every VTK has, in chunks of about 1 MiB.
+
+    The bytes of a file depend on its content alone, if arrays are written from the first frame to the last, and
+    compressed ones one after the other; not on how many frames are written at once.
     """
 
     def __init__(self, path: Path, layout: FrameLayout, counts: Sequence[int], *, compress: bool = False) -> None:
@@ -52,6 +67,11 @@ class VtkhdfWriter:
         self._counts = np.asarray(counts, dtype=np.int64)
         self._offsets = np.concatenate([[0], np.cumsum(self._counts)])
         self._compress = compress
+        self._checksums = np.zeros((len(counts), len(layout.arrays)), np.uint32)
+        self._columns = {name: column for column, name in enumerate(layout.arrays)}
+        # Of compressed arrays, rows that do not fill a chunk yet.
+        self._waiting: dict[str, np.ndarray] = {}
+        self._path, self._finished = path, False
         self._file = h5py.File(path, "w", libver=LIBVER, locking="best-effort", rdcc_nbytes=8 * CHUNK_BYTES)
         root = self._root = self._file.create_group("VTKHDF")
         root.attrs["Version"] = [2, 0]
@@ -71,11 +91,39 @@ class VtkhdfWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
+        gaps = gaps_of(list(self._datasets.values())) if self._finished else []
         self._file.close()
+        if self._finished:
+            append_checksum(self._path, gaps)
 
     def write_array(self, k: int, name: str, stored: np.ndarray, frames: int = 1) -> None:
         """Write one array of `frames` frames from the k-th on, in the form of the file (see `ArrayLayout.pad`)."""
-        self._datasets[name][self._offsets[k] : self._offsets[k + frames]] = stored
+        data, first = self._datasets[name], self._offsets[k]
+        rows = np.ascontiguousarray(stored, data.dtype)
+        for j in range(k, k + frames):
+            frame = rows[self._offsets[j] - first : self._offsets[j + 1] - first]
+            self._checksums[j, self._columns[name]] = checksum(frame)
+        if data.chunks is None:
+            data[first : self._offsets[k + frames]] = rows
+        else:
+            self._write_chunks(name, rows, int(self._offsets[k + frames]))
+
+    @property
+    def checksums(self) -> np.ndarray:
+        """Those of the frames written so far, (T, arrays of the layout) uint32."""
+        return self._checksums
+
+    def _write_chunks(self, name: str, rows: np.ndarray, end: int) -> None:
+        """Write whole chunks, each at once; those of the last rows of the array whole or not."""
+        data = self._datasets[name]
+        if name in self._waiting:
+            rows = np.concatenate([self._waiting.pop(name), rows])
+        first, size = end - len(rows), data.chunks[0]
+        while len(rows) >= size or (len(rows) and end == len(data)):
+            data[first : first + len(rows[:size])] = rows[:size]
+            first, rows = first + len(rows[:size]), rows[size:]
+        if len(rows):
+            self._waiting[name] = rows
 
     def finish(
         self,
@@ -109,6 +157,8 @@ class VtkhdfWriter:
         steps_group = self._root["Steps"]
         steps_group["Values"] = np.asarray(times, dtype=np.float64)
         steps_group.attrs["NSteps"] = len(self._counts)
+        store_checksums(self._file, "mpmcli", [f"VTKHDF/{_path(name)}" for name in self._columns], self._checksums)
+        self._finished = True
 
     def _storage(self, shape: tuple[int, ...], row_bytes: int) -> dict:
         if not self._compress or shape[0] == 0:
@@ -168,36 +218,76 @@ def open_vtkhdf(path: Path) -> h5py.File:
     except OSError as error:
         reason = "is not an HDF5 file, or a damaged one" if path.exists() else "does not exist"
         raise InputError(f"{path} {reason}; give a particles.vtkhdf of mpmcli or its directory.") from error
-    if "VTKHDF" in file and "mpmcli" in file and file["mpmcli"].attrs.get("format") == FORMAT:
+    try:
+        form = _format(file)
+    except BaseException:
+        file.close()
+        raise
+    if form is not None and OLDEST <= form <= FORMAT:
         return file
-    newer = "mpmcli" in file and file["mpmcli"].attrs.get("format", 0) > FORMAT
     file.close()
-    if newer:
+    if form is not None and form > FORMAT:
         raise InputError(f"{path} was written by a newer version of mpmcli; update mpmcli to read it.")
     raise InputError(f"{path} is an HDF5 file, but mpmcli did not write it: its group /mpmcli is missing.")
 
 
+def _format(file: h5py.File) -> int | None:
+    """Return the format of a file, None where it is not of mpmcli."""
+    try:
+        held(file, "VTKHDF")
+        return int(held(file, "mpmcli").attrs["format"])
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError):
+        return None
+
+
 def read_index(file: h5py.File) -> FrameIndex:
-    """Read everything but the particles."""
-    group, steps = file["mpmcli"], file["VTKHDF/Steps"]
-    header = json.loads(group.attrs["header"])
+    """Read everything but the particles.
+
+    Raises:
+        DamageError: it has changed since it was written.
+        InputError: a link in the file leads elsewhere.
+    """
+    checksums = load_checksums(file, "mpmcli") if _format(file) > 1 else None
+
+    def table(path: str) -> np.ndarray:
+        found = held(file, path)[:]
+        if checksums is not None:
+            checksums.require(path, table_checksum(found))
+        return found
+
+    def attribute(name: str) -> str:
+        found = group.attrs[name]
+        if checksums is not None:
+            checksums.require(f"mpmcli@{name}", attribute_checksum(found))
+        return found
+
+    group = held(file, "mpmcli")
+    header = json.loads(attribute("header"))
     if "scene" in group.attrs:
-        header["scene"] = group.attrs["scene"]
+        header["scene"] = attribute("scene")
+    layout = FrameLayout.from_dict(json.loads(attribute("layout")))
+    ledger = held(file, "ledger")
     return FrameIndex(
-        layout=FrameLayout.from_dict(json.loads(group.attrs["layout"])),
+        layout=layout,
         header=header,
-        times=steps["Values"][:],
-        frames=group["frame"][:],
-        steps=group["step"][:],
-        offsets=steps["PointOffsets"][:],
-        counts=file["VTKHDF/NumberOfPoints"][:],
-        ledger=ledger_rows({name: file["ledger"][name][:] for name in COLUMNS if name in file["ledger"]}),
+        times=table("VTKHDF/Steps/Values"),
+        frames=table("mpmcli/frame"),
+        steps=table("mpmcli/step"),
+        offsets=table("VTKHDF/Steps/PointOffsets"),
+        counts=table("VTKHDF/NumberOfPoints"),
+        ledger=ledger_rows({name: table(f"ledger/{name}") for name in COLUMNS if name in ledger}),
+        checksums=checksums and _columns_of(checksums, layout),
     )
 
 
+def _columns_of(checksums: Checksums, layout: FrameLayout) -> np.ndarray:
+    """Return the checksums of the frames, (T, A) uint32, in the order of the arrays of the layout."""
+    return checksums.table[:, [checksums.arrays.index(f"VTKHDF/{_path(name)}") for name in layout.arrays]]
+
+
 def read_array(file: h5py.File, name: str, offset: int, count: int) -> np.ndarray:
-    """Read one array of one frame, in the form of the file."""
-    return file["VTKHDF"][_path(name)][offset : offset + count]
+    """Read one array of one frame, in the form of the file; its checksum is not compared."""
+    return held(file, f"VTKHDF/{_path(name)}")[offset : offset + count]
 
 
 def _path(name: str) -> str:
