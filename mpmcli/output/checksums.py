@@ -61,9 +61,13 @@ class Checksums:
         Raises:
             DamageError: one differs, is missing, or is not known.
         """
-        for key in sorted(found.keys() | self.items.keys()):
-            if found.get(key) != self.items.get(key):
-                raise damaged(self.file, item_name(key))
+        for error in self.differences(found):
+            raise error
+
+    def differences(self, found: Mapping[str, int]) -> list[DamageError]:
+        """Return an error for each item (`item_checksums`) that differs, is missing, or is not known."""
+        keys = sorted(found.keys() | self.items.keys())
+        return [damaged(self.file, item_name(key)) for key in keys if found.get(key) != self.items.get(key)]
 
     def require_frame(self, t: int, path: str, rows: np.ndarray, number: int) -> None:
         """Compare the checksum of the rows of a frame.

@@ -1,7 +1,7 @@
 """The index of the frames of an output: times and ledger, without the particles."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,13 @@ class FrameIndex:
     counts: np.ndarray
     ledger: list[LedgerRow]
     checksums: np.ndarray | None = None
+
+    def first(self, count: int) -> "FrameIndex":
+        """The index of at most `count` frames from the first on."""
+        tables = {
+            name: getattr(self, name)[:count] for name in ("times", "frames", "steps", "offsets", "counts", "ledger")
+        }
+        return replace(self, **tables, checksums=None if self.checksums is None else self.checksums[:count])
 
     @classmethod
     def joined(cls, indices: Sequence["FrameIndex"]) -> "FrameIndex":

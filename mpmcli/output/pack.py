@@ -14,7 +14,7 @@ from mpmcli.output.hdf5_items import DamageError
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, part_tables, read_array, read_index
 
 
-def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = False) -> None:
+def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = False, frames: int | None = None) -> None:
     """Write all frames of `segments` into `target`, compare every number, then give it its name.
 
     Memory is that of one array of one segment. The segments are left as they are.
@@ -23,6 +23,7 @@ def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = Fa
         segments: sealed VTKHDF files of one run, in order.
         target: file to make; an existing one is replaced at the very end.
         compress: gzip-1 with shuffle.
+        frames: how many to take, all if None.
 
     Raises:
         RunError: the disk cannot hold the packed file, the segments do not belong together, or the
@@ -36,6 +37,9 @@ def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = Fa
     for segment, index in zip(segments, indices, strict=True):
         if index.layout != first.layout or index.header != first.header:
             raise RunError(f"{segment} is of another run than {segments[0]}: the frames were left unpacked.")
+    if frames is not None:
+        indices = _first_frames(indices, frames)
+        segments = segments[: len(indices)]
     expected = FrameIndex.joined(indices)
     counts = expected.counts.tolist()
     kept = f"the {len(counts)} frames written are kept in {segments[0].parent} and stay readable there"
@@ -49,7 +53,7 @@ def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = Fa
                 _require_unchanged(writer.checksums, expected, segments, indices)
                 writer.finish(expected.times, expected.frames, expected.steps, expected.ledger, header=expected.header)
             sync_file(temporary)
-            difference = find_difference(temporary, segments, expected)
+            difference = find_difference(temporary, segments, expected, [int(i.counts.sum()) for i in indices])
             if difference:
                 raise RunError(f"{target.name} does not read back as it was written ({difference}); {kept}.")
     except (OSError, RuntimeError, InputError) as error:
@@ -88,8 +92,21 @@ def _require_unchanged(
         k += len(index.counts)
 
 
-def find_difference(packed: Path, segments: Sequence[Path], expected: FrameIndex) -> str:
+def _first_frames(indices: Sequence[FrameIndex], frames: int) -> list[FrameIndex]:
+    found = []
+    for index in indices:
+        if frames <= 0:
+            break
+        found.append(index.first(frames))
+        frames -= len(index.counts)
+    return found
+
+
+def find_difference(packed: Path, segments: Sequence[Path], expected: FrameIndex, rows_of: Sequence[int]) -> str:
     """Compare a packed file with its segments, bit for bit.
+
+    Args:
+        rows_of: rows of each segment that were packed.
 
     Returns:
         What differs first, in words; "" when nothing does.
@@ -114,9 +131,8 @@ def find_difference(packed: Path, segments: Sequence[Path], expected: FrameIndex
         if root["Steps"].attrs["NSteps"] != len(expected.counts):
             return "NSteps"
         first = 0
-        for segment in segments:
+        for segment, rows in zip(segments, rows_of, strict=True):
             with closing(open_vtkhdf(segment)) as source:
-                rows = int(source["VTKHDF/NumberOfPoints"][:].sum())
                 for name in expected.layout.arrays:
                     written, stored = read_array(file, name, first, rows), read_array(source, name, 0, rows)
                     if not _same(written, stored):
