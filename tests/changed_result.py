@@ -1,4 +1,4 @@
-"""Changes to a file of frames that its checksums do not tell of, as if mpmcli had written it so."""
+"""Changes to a result that its checksums do not tell of, as if mpmcli had written it so."""
 
 import json
 from collections.abc import Iterator
@@ -10,6 +10,14 @@ import numpy as np
 
 from mpmcli.output.checksums import NAME, checksum, store_checksums
 from mpmcli.output.file_checksum import append_checksum, gaps_of
+from mpmcli.output.sums_file import SUMS, path_digest, read_sums, write_sums
+
+
+def accept_changes(directory: Path) -> None:
+    """Give the files of a series the checksums of what they hold now; of those that are gone none."""
+    found = [directory / name for name in read_sums(directory)]
+    (directory / SUMS).unlink()
+    write_sums(directory, {path.name: [path_digest(path)] for path in found if path.exists()})
 
 
 @contextmanager

@@ -29,8 +29,8 @@ def read_series(path: Path) -> tuple[FrameIndex, list[Path], Digests | None]:
         The index; the file of each frame; the SHA-256 that each file may have, None of a series without checksums.
 
     Raises:
-        DamageError: a file is missing, damaged or has changed since it was written.
-        InputError: a newer mpmcli wrote it, or it names a file that is no frame of it.
+        InputError: a file is missing or has changed since it was written, a newer mpmcli wrote it, or it names a file
+            that is no frame of it.
     """
     for _ in range(TRIES - 1):
         try:
@@ -62,7 +62,7 @@ def _read(path: Path) -> tuple[FrameIndex, list[Path], Digests | None]:
         rows, columns = parse_ledger_csv(table)
         frames, steps, counts = (np.array(columns[name][: len(times)]) for name in FRAME_COLUMNS)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ElementTree.ParseError) as error:
-        raise DamageError(
+        raise InputError(
             f"{path} is not a series of mpmcli: it needs {SERIES_HEADER}, {SERIES_LEDGER} and its frames "
             "beside it, as mpmcli wrote them."
         ) from error
