@@ -35,6 +35,21 @@ def one_line(text: str) -> str:
     return " ".join("".join(character if character.isprintable() else " " for character in text).split())
 
 
+def visible(text: str) -> str:
+    """Return a text with an escape, such as \\u001b, in place of each character but line breaks and tabs without glyph.
+
+    What stands in a file can so not speak to the terminal. In JSON the escapes stand for the characters.
+    """
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in "\n\t" else _escape(c) for c in text)
+
+
+def _escape(character: str) -> str:
+    units = character.encode("utf-16-be", "surrogatepass").hex()
+    return "".join(f"\\u{units[k : k + 4]}" for k in range(0, len(units), 4))
+
+
 def size_text(count: float) -> str:
     """Write a number of bytes with three digits and its unit."""
     for unit in SIZES[:-1]:

@@ -12,6 +12,7 @@ from mpmcli import __version__
 from mpmcli.cli.interrupt import catch_interrupts, interrupt_came
 from mpmcli.cli.streams import flush_streams
 from mpmcli.errors import MpmcliError
+from mpmcli.plain_text import visible
 
 # Name of each command, the module that holds it, and its line in the help: so that help loads no module.
 COMMANDS = {
@@ -123,7 +124,7 @@ def run(arguments: list[str]) -> int:
 def _print_error(line: str) -> None:
     """Print a line on stderr, where somebody still reads it."""
     with suppress(OSError, ValueError):
-        click.echo(line, err=True)
+        click.echo(visible(line), err=True)
 
 
 def _usage_sentence(error: click.ClickException) -> str:

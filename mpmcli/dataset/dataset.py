@@ -166,6 +166,7 @@ class _ResultTrajectory(Trajectory):
                 f"{result.path} has frames of {counts.min()} to {counts.max()} particles: "
                 "a trajectory has the same ones in all frames."
             )
+        _require_no_gap(result)
         self._result = result
         self.number, self.split, self.draws = 0, SPLITS[0], {}
         self.header = result.header
@@ -193,6 +194,22 @@ class _ResultTrajectory(Trajectory):
             return array(0)
         chosen = range(self.frame_count)[frames]
         return np.stack([array(k) for k in chosen]) if chosen else array(0)[None][:0]
+
+
+def _require_no_gap(result: Result) -> None:
+    """Refuse the segments of a run of which some are missing, and would be read as if time had jumped.
+
+    Raises:
+        InputError: so.
+    """
+    if result.kind != "segments":
+        return
+    told = (result.record or {}).get("frames_written")
+    written = told if isinstance(told, int) else 0
+    # A run that goes on may have sealed some after they were listed.
+    count = result.frame_count if result.frame_count >= written else open_result(result.path).frame_count
+    if not np.array_equal(result.numbers, np.arange(len(result.numbers))) or count < written:
+        raise InputError(f"{result.path} lacks some of its frames: mpmcli repair keeps those before the first gap.")
 
 
 class Dataset:

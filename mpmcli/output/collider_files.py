@@ -120,6 +120,11 @@ def write_collider_series(
     return sorted({name for _, _, name in entries} | ({SERIES} if entries else set()))
 
 
+def expected_files(header: Mapping[str, Any], colliders: Sequence[Collider]) -> list[str]:
+    """Return the names of the files that `write_collider_files` makes."""
+    return [name for name, moves in ((RESTING, False), (MOVING, True)) if _things(header, colliders, moving=moves)]
+
+
 def read_stored_surfaces(directory: Path) -> dict[int, Triangles]:
     """Return the surfaces of colliders that were read from files, by number, as a packed result keeps them.
 

@@ -9,7 +9,7 @@ import h5py
 
 from mpmcli.errors import InputError
 from mpmcli.output.checksums import NAME, Checksums, checksum, item_checksums, load_checksums
-from mpmcli.output.collider_files import MOVING, RESTING
+from mpmcli.output.collider_files import MOVING, RESTING, expected_files
 from mpmcli.output.file_checksum import checksum_is_right, gaps_of
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.hdf5_items import held
@@ -87,7 +87,8 @@ def verify_result(path: Path) -> Verification:
         for name in (RESTING, MOVING):
             if (directory / name).exists():
                 _verify_colliders(directory / name, found)
-        _verify_scene(directory, found)
+        if not found.faults:
+            _verify_beside(directory, found)
     return found
 
 
@@ -230,15 +231,17 @@ def _verify_colliders(path: Path, found: Verification) -> None:
     found.faults += faults
 
 
-def _verify_scene(directory: Path, found: Verification) -> None:
-    """Compare scene.toml with the text in the frames."""
-    path = directory / SCENE
-    if found.faults or not path.exists():
-        return
-    text = open_result(directory).header.stored.get("scene")
-    found.files += 1
-    if text is not None and path.read_bytes() != text.encode("utf-8"):
-        found.faults.append(f"{path} is not the scene of the frames: it has changed since it was written.")
+def _verify_beside(directory: Path, found: Verification) -> None:
+    """Compare scene.toml, and which colliders have files, with what the frames say of the scene."""
+    header, path = open_result(directory).header, directory / SCENE
+    text, colliders = header.stored.get("scene"), header.read_colliders({})
+    if path.exists() and text is not None:
+        found.files += 1
+        if path.read_bytes() != text.encode("utf-8"):
+            found.faults.append(f"{path} is not the scene of the frames: it has changed since it was written.")
+    if (directory / PACKED).exists() and colliders and None not in colliders and directory == found.path:
+        missing = [name for name in expected_files(header.stored, colliders) if not (directory / name).exists()]
+        found.faults += [f"{directory / name} is missing: the scene has colliders." for name in missing]
 
 
 def _first_line(error: BaseException) -> str:
