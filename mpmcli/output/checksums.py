@@ -82,16 +82,19 @@ class Checksums:
             raise damaged(self.file, f"the data set {path} of frame {number}")
 
 
-def store_checksums(root: h5py.Group, place: str, arrays: Sequence[str], table: np.ndarray) -> None:
+def store_checksums(
+    root: h5py.Group, place: str, arrays: Sequence[str], table: np.ndarray, known: Mapping[str, int] | None = None
+) -> None:
     """Write the checksums of all below a group.
 
     Args:
         root: the group; all of it has been written.
         place: path from it of the group that gets the data set.
         arrays: paths of the arrays with frames; table: (T, A) uint32.
+        known: what `item_checksums` would find, None to read all items again.
     """
     path = f"{place}/{NAME}" if place else NAME
-    found = item_checksums(root, arrays, path)
+    found = item_checksums(root, arrays, path) if known is None else known
     text = json.dumps({"arrays": list(arrays), "items": found}, sort_keys=True)
     table = np.asarray(table, "<u4")
     data = root.create_dataset(path, data=table, track_times=False)
@@ -140,12 +143,18 @@ def item_checksums(root: h5py.Group, arrays: Collection[str], own: str) -> dict[
 
 def dataset_checksum(data: h5py.Dataset, *, bare: bool = False) -> int:
     """Return the checksum of the type, the shape and, unless `bare`, the content of a data set."""
-    return table_checksum(data[...]) if not bare else zlib.crc32(_kind(data))
+    return kind_checksum(data.dtype, data.shape) if bare else table_checksum(data[...])
+
+
+def kind_checksum(dtype: np.dtype, shape: tuple[int, ...]) -> int:
+    """Return the checksum of the type and the shape of a data set."""
+    return zlib.crc32(f"{dtype.str} {shape}\n".encode())
 
 
 def table_checksum(array: np.ndarray) -> int:
     """Return the checksum of the type, the shape and the content of a data set that was read."""
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8), zlib.crc32(_kind(array)))
+    own = kind_checksum(array.dtype, array.shape)
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8), own)
 
 
 def attribute_checksum(value: Any) -> int:
@@ -161,10 +170,6 @@ def item_name(key: str) -> str:
     if not at:
         return f"the data set {key}"
     return f"the attribute {name} of {path}" if path else f"the attribute {name}"
-
-
-def _kind(array: h5py.Dataset | np.ndarray) -> bytes:
-    return f"{array.dtype.str} {array.shape}\n".encode()
 
 
 def _own(text: str, table: np.ndarray) -> int:

@@ -11,7 +11,8 @@ from mpmcli.output.checksums import damaged
 from mpmcli.output.durable import require_free_space, sealed, sync_file
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.hdf5_items import DamageError
-from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, part_tables, read_array, read_index
+from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, read_array, read_index
+from mpmcli.output.vtkhdf_parts import part_tables
 
 
 def pack_segments(segments: Sequence[Path], target: Path, *, compress: bool = False, frames: int | None = None) -> None:

@@ -12,6 +12,7 @@ point numbers, so that the cells cost 8 bytes per particle once and not for ever
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -23,6 +24,7 @@ from mpmcli.output.checksums import (
     Checksums,
     attribute_checksum,
     checksum,
+    kind_checksum,
     load_checksums,
     store_checksums,
     table_checksum,
@@ -32,14 +34,13 @@ from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.hdf5_items import held
 from mpmcli.output.layout import POSITION, FrameLayout
 from mpmcli.output.ledger_table import COLUMNS, ledger_columns, ledger_rows
+from mpmcli.output.vtkhdf_parts import CONNECTIVITY, part_tables
 
 # A newer upper bound makes files that no VTK can open ("bad version number for layout message").
 LIBVER = ("v110", "v110")
 # 1 has no checksums.
 FORMAT = 2
 OLDEST = 1
-CONNECTIVITY = "Vertices/Connectivity"
-UNUSED_CELLS = ("Lines", "Polygons", "Strips")
 CHUNK_BYTES = 2**20
 # Size without the particles: headers, tables of the steps, ledger. Used to reserve disk space.
 OVERHEAD_BYTES = 64 * 1024
@@ -73,9 +74,11 @@ class VtkhdfWriter:
         self._waiting: dict[str, np.ndarray] = {}
         self._path, self._finished = path, False
         self._file = h5py.File(path, "w", libver=LIBVER, locking="best-effort", rdcc_nbytes=8 * CHUNK_BYTES)
-        root = self._root = self._file.create_group("VTKHDF")
-        root.attrs["Version"] = [2, 0]
-        root.attrs["Type"] = np.bytes_("PolyData")
+        # Checksums of all items but the arrays of the frames, noted as they are written.
+        self._items: dict[str, int] = {}
+        root = self._file.create_group("VTKHDF")
+        self._put_attribute("VTKHDF", "Version", np.array([2, 0]))
+        self._put_attribute("VTKHDF", "Type", np.bytes_("PolyData"))
         # Kept open to the end: closing a dataset empties its cache, and a chunk shared by two frames
         # would be compressed and stored twice.
         self._datasets = {}
@@ -83,9 +86,10 @@ class VtkhdfWriter:
             shape = array.stored_shape(int(self._offsets[-1]))
             options = self._storage(shape, array.bytes_per_particle)
             self._datasets[name] = root.create_dataset(_path(name), shape, array.dtype, **options)
+            self._items[f"VTKHDF/{_path(name)}"] = kind_checksum(np.dtype(array.dtype), shape)
         for name, table in part_tables(self._counts).items():
             options = self._storage(table.shape, table.itemsize) if name == CONNECTIVITY else {}
-            root.create_dataset(name, data=table, **options)
+            self._put(f"VTKHDF/{name}", table, **options)
 
     def __enter__(self) -> "VtkhdfWriter":
         return self
@@ -141,24 +145,33 @@ class VtkhdfWriter:
             rows: the ledger, one row per frame.
             header: facts about the run that JSON can hold; its "scene", the TOML text, becomes an attribute.
         """
-        ledger = self._file.create_group("ledger")
         for name, column in ledger_columns(rows).items():
-            ledger.create_dataset(name, data=column)
-        group = self._file.create_group("mpmcli")
-        group["frame"] = np.asarray(frames, dtype=np.int64)
-        group["step"] = np.asarray(steps, dtype=np.int64)
-        group.attrs["format"] = FORMAT
-        group.attrs["version"] = __version__
-        group.attrs["dimension"] = self._layout.dimension
-        group.attrs["layout"] = json.dumps(self._layout.to_dict())
-        if "scene" in header:
-            group.attrs["scene"] = header["scene"]
-        group.attrs["header"] = json.dumps({key: value for key, value in header.items() if key != "scene"})
-        steps_group = self._root["Steps"]
-        steps_group["Values"] = np.asarray(times, dtype=np.float64)
-        steps_group.attrs["NSteps"] = len(self._counts)
-        store_checksums(self._file, "mpmcli", [f"VTKHDF/{_path(name)}" for name in self._columns], self._checksums)
+            self._put(f"ledger/{name}", column)
+        self._put("mpmcli/frame", np.asarray(frames, dtype=np.int64))
+        self._put("mpmcli/step", np.asarray(steps, dtype=np.int64))
+        facts = {
+            "format": np.int64(FORMAT),
+            "version": __version__,
+            "dimension": np.int64(self._layout.dimension),
+            "layout": json.dumps(self._layout.to_dict()),
+            **({"scene": header["scene"]} if "scene" in header else {}),
+            "header": json.dumps({key: value for key, value in header.items() if key != "scene"}),
+        }
+        for name, value in facts.items():
+            self._put_attribute("mpmcli", name, value)
+        self._put("VTKHDF/Steps/Values", np.asarray(times, dtype=np.float64))
+        self._put_attribute("VTKHDF/Steps", "NSteps", np.int64(len(self._counts)))
+        arrays = [f"VTKHDF/{_path(name)}" for name in self._columns]
+        store_checksums(self._file, "mpmcli", arrays, self._checksums, self._items)
         self._finished = True
+
+    def _put(self, path: str, table: np.ndarray, **options: Any) -> None:
+        self._file.create_dataset(path, data=table, **options)
+        self._items[path] = table_checksum(table)
+
+    def _put_attribute(self, path: str, name: str, value: Any) -> None:
+        self._file[path].attrs[name] = value
+        self._items[f"{path}@{name}"] = attribute_checksum(value)
 
     def _storage(self, shape: tuple[int, ...], row_bytes: int) -> dict:
         if not self._compress or shape[0] == 0:
@@ -172,35 +185,6 @@ class VtkhdfWriter:
             "compression_opts": 1,
             "shuffle": True,
         }
-
-
-def part_tables(counts: np.ndarray) -> dict[str, np.ndarray]:
-    """Everything under /VTKHDF that follows from the (T,) particle counts alone, by path.
-
-    Each frame is one part with one poly-vertex cell, or none where it has no particles.
-    """
-    number = len(counts)
-    cells = (counts > 0).astype(np.int64)
-    zeros, cell_offsets = np.zeros(number, np.int64), np.zeros((number, 4), np.int64)
-    cell_offsets[:, 0] = np.cumsum(cells) - cells
-    tables = {
-        "NumberOfPoints": counts,
-        "Vertices/NumberOfCells": cells,
-        "Vertices/NumberOfConnectivityIds": counts,
-        "Vertices/Offsets": np.concatenate([[0, n] if n else [0] for n in counts]).astype(np.int64),
-        CONNECTIVITY: np.arange(counts.max(), dtype=np.int64),
-        "Steps/PartOffsets": np.arange(number, dtype=np.int64),
-        "Steps/NumberOfParts": np.ones(number, np.int64),
-        "Steps/PointOffsets": np.cumsum(counts) - counts,
-        "Steps/CellOffsets": cell_offsets,
-        # Point numbers count from the frame's first particle, so every frame uses the same list.
-        "Steps/ConnectivityIdOffsets": np.zeros((number, 4), np.int64),
-    }
-    for name in UNUSED_CELLS:
-        # The reader opens all four kinds of cells, used or not.
-        tables[f"{name}/NumberOfCells"] = tables[f"{name}/NumberOfConnectivityIds"] = zeros
-        tables[f"{name}/Connectivity"], tables[f"{name}/Offsets"] = zeros[:0], zeros
-    return tables
 
 
 def open_vtkhdf(path: Path) -> h5py.File:
