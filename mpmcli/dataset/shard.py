@@ -25,8 +25,8 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import NAME as CHECKSUMS
+from mpmcli.output.checksums import attribute_checksum, kind_checksum, store_checksums, table_checksum
 from mpmcli.output.checksums import checksum as checksum_of_frame
-from mpmcli.output.checksums import store_checksums
 from mpmcli.output.hdf5_items import held, items
 from mpmcli.output.ledger_table import ledger_columns
 
@@ -92,20 +92,29 @@ def write_trajectory(file: h5py.File, data: TrajectoryData, *, compress: bool = 
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     # Fields keep their order.
     group = file.create_group(group_name(data.number), track_order=True)
-    group.attrs.update(_attributes(data))
-    for name, array in _arrays(data).items():
+    attributes, arrays = _attributes(data), _arrays(data)
+    group.attrs.update(attributes)
+    for name, array in arrays.items():
         moves = name in (*MOVING, *data.fields)
         options = _storage(array) if compress and moves and array.size else {}
         group.create_dataset(name, data=array, track_times=False, **options)
-    add_checksums(group)
+    names = [*MOVING, *data.fields]
+    known = {f"@{name}": attribute_checksum(value) for name, value in attributes.items()}
+    for name, array in arrays.items():
+        known[name] = kind_checksum(array.dtype, array.shape) if name in names else table_checksum(array)
+    store_checksums(group, "", names, _table([arrays[name] for name in names]), known)
 
 
 def add_checksums(group: h5py.Group) -> None:
-    """Write the checksums of a trajectory that has all else."""
+    """Write the checksums of a trajectory that an older version has written."""
     names = moving_names(group)
-    table = [[checksum_of_frame(rows) for rows in held(group, name)[...]] for name in names]
-    frames = len(held(group, "time"))
-    store_checksums(group, "", names, np.array(table, np.uint32).reshape(len(names), frames).T)
+    store_checksums(group, "", names, _table([held(group, name)[...] for name in names]))
+
+
+def _table(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the checksums of arrays of T frames, (T, A) uint32."""
+    columns = [[checksum_of_frame(rows) for rows in array] for array in arrays]
+    return np.array(columns, np.uint32).reshape(len(arrays), len(arrays[0])).T
 
 
 def moving_names(group: h5py.Group) -> list[str]:
