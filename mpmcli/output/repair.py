@@ -96,6 +96,9 @@ def _pack(segments: Sequence[Path], done: Repair, *, damaged: bool) -> None:
         if not hole and first > frames:
             hole = True
             done.lost.append(f"{_frames(frames, first - 1)} missing: no segment in {segment.parent} holds them.")
+        if not hole and first < frames:
+            done.notes.append(f"{segment} holds frames that others hold, too: left where it is.")
+            continue
         if hole:
             if verdict.whole:
                 beyond.append((first, first + verdict.frames - 1))
@@ -109,7 +112,7 @@ def _pack(segments: Sequence[Path], done: Repair, *, damaged: bool) -> None:
     if not frames:
         raise InputError(f"{done.path} holds no frame that could be repaired. {' '.join(done.lost)}")
     _replace(chosen, frames, done, damaged=damaged)
-    if not done.lost:
+    if not done.lost and len(chosen) == len(segments):
         with suppress(OSError):
             remove_segments(done.path)
         done.packed = len(chosen)

@@ -185,7 +185,8 @@ def _verify_count(directory: Path, files: Sequence[Path], counts: Sequence[int],
         for file, count in zip(files, counts, strict=True):
             first = int(file.stem.split("_")[1])
             if first != frames:
-                found.faults.append(f"{directory / SEGMENTS} lacks the frames {frames} to {first - 1}.")
+                told = f"lacks the frames {frames} to {first - 1}" if first > frames else f"holds frame {first} twice"
+                found.faults.append(f"{directory / SEGMENTS} {told}.")
                 return
             frames += count
     if isinstance(written, int) and found.frames < written:
