@@ -9,7 +9,7 @@ import random
 import shutil
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import redirect_stderr, redirect_stdout
@@ -177,9 +177,10 @@ def _of_hdf5(path: Path) -> dict[str, object]:
     return found
 
 
-def trials(count: int, kinds: tuple[str, ...] = ("flip",), first: int = 0) -> list[Trial]:
+def trials(
+    count: int, kinds: tuple[str, ...] = ("flip",), first: int = 0, subjects: Sequence[str] = (*RESULTS, *EXPORTS)
+) -> list[Trial]:
     """Return so many trials of each kind, of all subjects in turn."""
-    subjects = (*RESULTS, *EXPORTS)
     return [Trial(subjects[k % len(subjects)], kind, k) for kind in kinds for k in range(first, first + count)]
 
 
@@ -204,6 +205,8 @@ def table(found: list[Outcome]) -> list[tuple[str, ...]]:
     for kind in kinds:
         for subject in (*RESULTS, *EXPORTS, "all"):
             own = [one for one in found if one.trial.kind == kind and subject in (one.trial.subject, "all")]
+            if not own:
+                continue
             exported = Counter(one.exported for one in own)
             counts = (
                 len(own),
