@@ -1,6 +1,9 @@
 """Tables, sizes, counts and titles as plain text."""
 
+import re
+
 SIZES = ("B", "kB", "MB", "GB", "TB", "PB")
+_UNUSUAL = re.compile(r"[^\x20-\x7e\n\t]")
 
 
 def text_table(head: tuple[str, ...], rows: list[tuple[str, ...]], left: set[int]) -> str:
@@ -40,13 +43,13 @@ def visible(text: str) -> str:
 
     What stands in a file can so not speak to the terminal. In JSON the escapes stand for the characters.
     """
-    if text.isascii() and text.isprintable():
-        return text
-    return "".join(c if c.isprintable() or c in "\n\t" else _escape(c) for c in text)
+    return _UNUSUAL.sub(_escape, text)
 
 
-def _escape(character: str) -> str:
-    units = character.encode("utf-16-be", "surrogatepass").hex()
+def _escape(match: re.Match[str]) -> str:
+    if match[0].isprintable():
+        return match[0]
+    units = match[0].encode("utf-16-be", "surrogatepass").hex()
     return "".join(f"\\u{units[k : k + 4]}" for k in range(0, len(units), 4))
 
 
