@@ -1,6 +1,9 @@
 """Tables, sizes, counts and titles as plain text."""
 
+import re
+
 SIZES = ("B", "kB", "MB", "GB", "TB", "PB")
+_UNUSUAL = re.compile(r"[^\x20-\x7e\n\t]")
 
 
 def text_table(head: tuple[str, ...], rows: list[tuple[str, ...]], left: set[int]) -> str:
@@ -33,6 +36,21 @@ def duration_text(seconds: float) -> str:
 def one_line(text: str) -> str:
     """Return a text without line breaks and other characters that have no glyph."""
     return " ".join("".join(character if character.isprintable() else " " for character in text).split())
+
+
+def visible(text: str) -> str:
+    """Return a text with an escape, such as \\u001b, in place of each character but line breaks and tabs without glyph.
+
+    What stands in a file can so not speak to the terminal. In JSON the escapes stand for the characters.
+    """
+    return _UNUSUAL.sub(_escape, text)
+
+
+def _escape(match: re.Match[str]) -> str:
+    if match[0].isprintable():
+        return match[0]
+    units = match[0].encode("utf-16-be", "surrogatepass").hex()
+    return "".join(f"\\u{units[k : k + 4]}" for k in range(0, len(units), 4))
 
 
 def size_text(count: float) -> str:

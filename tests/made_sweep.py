@@ -20,6 +20,7 @@ from mpmcli.dataset.shard import checksum, group_name, write_trajectory
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_run import run_sweep
 from mpmcli.dataset.sweep_state import SweepSettings
+from mpmcli.output.file_checksum import append_checksum
 
 COUNT, PER_SHARD = 12, 3
 # Of the numbers that are not stable.
@@ -43,6 +44,7 @@ def made_row(task: Task, number: int) -> Row:
     with h5py.File(path, "w") as opened:
         write_trajectory(opened, data)
         found = checksum(opened[group_name(number)])
+    append_checksum(path)
     return Row(
         number=number,
         split=drawn.split,

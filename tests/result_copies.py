@@ -8,8 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest import mock
 
-import h5py
 import numpy as np
+from changed_result import changed
 from command import run_here
 
 from mpmcli.frames.frame import Frame
@@ -94,7 +94,7 @@ class StoredRun:
     def patched(self, directory: Path, k: int, name: str, p: int, value: object) -> Path:
         """Copy the packed result, change one value in the file itself, and return the directory."""
         shutil.copytree(self.directory, directory)
-        with h5py.File(directory / PACKED, "r+") as file:
+        with changed(directory / PACKED) as file:
             array = file["VTKHDF"]["Points" if name == "position" else f"PointData/{name}"]
             row = k * self.particles + p
             # Vectors of the plane have a third component, which is 0.

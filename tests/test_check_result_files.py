@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import h5py
 import numpy as np
 import pytest
+from changed_result import accept_changes, changed
 from result_copies import StoredRun, real_run
 from test_check_result import rules, the
 
@@ -118,7 +119,7 @@ def test_all_segments_damaged(segments):
     ],
 )
 def test_numbers_of_packed_frames_that_are_wrong(packed, swaps, rule, frame):
-    with h5py.File(packed / PACKED, "r+") as file:
+    with changed(packed / PACKED) as file:
         numbers = file["mpmcli/frame"]
         numbers[:] = [swaps.get(k, k) for k in numbers[:].tolist()]
     check = check_result(packed)
@@ -129,14 +130,14 @@ def test_numbers_of_packed_frames_that_are_wrong(packed, swaps, rule, frame):
 
 @pytest.mark.parametrize("time", [0.1201, 0.0801, np.nan])
 def test_a_time_that_is_wrong(packed, time):
-    with h5py.File(packed / PACKED, "r+") as file:
+    with changed(packed / PACKED) as file:
         file["VTKHDF/Steps/Values"][K] = time
     check = check_result(packed)
     assert the(check, "frame-time").frame == check.first_bad_frame == K
 
 
 def test_a_packed_array_that_has_lost_its_last_rows(run, packed):
-    with h5py.File(packed / PACKED, "r+") as file:
+    with changed(packed / PACKED) as file:
         values = file["VTKHDF/PointData/velocity"][:-5]
         del file["VTKHDF/PointData/velocity"]
         file["VTKHDF/PointData/velocity"] = values
@@ -159,7 +160,7 @@ def test_a_run_that_is_packed_while_it_is_checked(run, segments, monkeypatch):
 
 
 def test_ids_that_change(packed, run):
-    with h5py.File(packed / PACKED, "r+") as file:
+    with changed(packed / PACKED) as file:
         ids = file["VTKHDF/PointData/id"]
         first = K * run.particles
         ids[first + 3], ids[first + 4] = 4, 3
@@ -171,7 +172,7 @@ def test_ids_that_change(packed, run):
 def test_a_damaged_chunk_of_a_compressed_file_is_one_frame_and_not_the_whole(run, packed):
     """Each chunk holds whole frames; one whose bytes are overwritten does not decompress."""
     path = packed / PACKED
-    with h5py.File(path, "r+") as file:
+    with changed(path) as file:
         values = file["VTKHDF/PointData/density"][:]
         del file["VTKHDF/PointData/density"]
         file["VTKHDF/PointData"].create_dataset("density", data=values, chunks=(run.particles,), compression="gzip")
@@ -202,6 +203,7 @@ def test_frames_of_a_series_that_changed_places(series):
     content = one.read_bytes()
     one.write_bytes(two.read_bytes())
     two.write_bytes(content)
+    accept_changes(series)
     check = check_result(series)
     assert the(check, "ledger").frame == check.first_bad_frame == K and check.verdict == "unstable"
 
@@ -217,6 +219,7 @@ def test_a_list_of_a_series_that_was_changed(series, change):
     else:
         collection[K], collection[K + 1] = entries[K + 1], entries[K]
     tree.write(series / SERIES)
+    accept_changes(series)
     check = check_result(series)
     assert the(check, "frame-time").frame == check.first_bad_frame == K and check.verdict == "unstable"
 
@@ -232,6 +235,7 @@ def test_a_table_of_a_series_that_is_cut_off(series, name):
 def test_a_row_of_the_ledger_that_is_gone(series):
     lines = (series / SERIES_LEDGER).read_text(encoding="utf-8").splitlines(keepends=True)
     (series / SERIES_LEDGER).write_text("".join(lines[:-1]), encoding="utf-8")
+    accept_changes(series)
     check = check_result(series)
     assert the(check, "ledger-missing").frame == 10 and check.verdict == "unstable"
 
@@ -276,7 +280,7 @@ def test_what_is_no_result_is_bad_input(run, packed, series, tmp_path):
             check_result(tmp_path / name)
     with pytest.raises(InputError, match=r"one frame of a series"):
         check_result(series / series_frame_name(0))
-    with h5py.File(packed / PACKED, "r+") as file:
+    with changed(packed / PACKED) as file:
         file["mpmcli"].attrs["format"] = 99
     with pytest.raises(InputError, match="newer version"):
         check_result(packed)

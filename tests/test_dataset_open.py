@@ -137,7 +137,7 @@ def test_what_cannot_be_read_is_said_in_a_sentence(tmp_path):
     shard.write_bytes((path / "shards" / "00000.h5").read_bytes())
     refused(path, "trajectory 0 lies in .*00000.h5 and in .*00001.h5")
     with h5py.File(shard, "w") as file:
-        file.attrs["format"], file.attrs["version"] = "mpmcli-dataset", 2
+        file.attrs["format"], file.attrs["version"] = "mpmcli-dataset", 3
     refused(path, "newer version")
     with h5py.File(shard, "w"):
         pass

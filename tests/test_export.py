@@ -184,7 +184,7 @@ def test_an_empty_split_is_left_out_and_said(tmp_path, form):
     path = write_dataset(tmp_path / "set", [made_trajectory(k, split="train") for k in range(2)])
     answer = exported(path, form, tmp_path / "out")
     end = "h5" if form == "lagrangebench" else "npz"
-    assert answer["files"] == ["metadata.json", f"train.{end}"]
+    assert answer["files"] == ["checksums.sha256", "metadata.json", f"train.{end}"]
     assert [note for note in answer["notes"] if f"valid.{end} is left out" in note]
     assert answer["trajectories"] == {"train": 2, "valid": 0, "test": 0}
 
@@ -218,7 +218,7 @@ def test_vtkhdf_of_a_result_has_the_bytes_that_simulate_packs(tmp_path, dimensio
 def test_vtkhdf_of_a_dataset_opens_as_a_result(tmp_path, dimension):
     path = made_dataset(tmp_path / "set", dimension=dimension)
     answer = exported(path, "vtkhdf", tmp_path / "out", "--trajectory", 2)
-    assert answer["files"] == ["000002.vtkhdf", "metadata.json"]
+    assert answer["files"] == ["000002.vtkhdf", "checksums.sha256", "metadata.json"]
     source, result = mpmcli.dataset.open(path)[2], open_result(tmp_path / "out" / "000002.vtkhdf")
     assert result.ledger == source.ledger and result.header.stored == source.header.stored
     assert result.field_names == source.field_names and result.times.tolist() == source.times.tolist()
@@ -283,6 +283,7 @@ def test_an_earlier_export_is_replaced_only_when_asked(tmp_path):
     exported(path, "npz", target)
     assert "--overwrite" in refused(path, "gns", target)
     assert sorted(exported(path, "gns", target, "--overwrite")["files"]) == [
+        "checksums.sha256",
         "metadata.json",
         "test.npz",
         "train.npz",

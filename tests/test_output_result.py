@@ -3,6 +3,7 @@
 import h5py
 import numpy as np
 import pytest
+from changed_result import changed
 from test_output_frames import FIELDS, make_frame
 from test_output_segments import fill
 
@@ -46,7 +47,7 @@ def test_what_is_no_result_is_named(tmp_path):
 
 def test_a_file_that_contradicts_itself_is_damaged(tmp_path):
     fill(tmp_path / "run", [make_frame(0, 20, 3)])
-    with h5py.File(tmp_path / "run" / "particles.vtkhdf", "r+") as f:
+    with changed(tmp_path / "run" / "particles.vtkhdf") as f:
         f["mpmcli"].attrs["header"] = "{no JSON"
     with pytest.raises(InputError, match="is damaged: its list of frames cannot be read"):
         open_result(tmp_path / "run")

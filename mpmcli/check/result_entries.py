@@ -11,6 +11,7 @@ from mpmcli.check.finding import FrameFindings
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.hdf5_items import DamageError
 from mpmcli.output.header import RunHeader
 from mpmcli.output.result import Result, open_result
 from mpmcli.output.run_record import read_record
@@ -184,6 +185,8 @@ def _is_damage(path: Path, error: Exception) -> bool:
         if not packed.exists() and not (path / SERIES).exists():
             return ours  # a run that wrote no frame
         path = packed if packed.exists() else path / SERIES
+    if isinstance(error, DamageError):
+        return True
     # open_result sets a cause if the file could not be read, and none if it is of another kind or version.
     if isinstance(error, InputError) and error.__cause__ is None:
         return False

@@ -29,13 +29,18 @@ def status(dataset: Path, as_json: bool) -> None:
 @quiet_option
 @json_option
 def verify(dataset: Path, quiet: bool, as_json: bool) -> int:
-    """Read all of DATASET, and compare every checksum and count with its manifest.
+    """Read all of DATASET, and compare every checksum and count with its manifest; or an export with its checksums.
 
     The exit code is 1 if anything differs or is missing.
     """
     from mpmcli.cli.progress_bar import ProgressBar
+    from mpmcli.dataset.export_directory import is_export, verify_export
     from mpmcli.dataset.report import status_of, verify
 
+    if is_export(dataset):
+        found = verify_export(dataset)
+        print_json(found.as_dict()) if as_json else print_text(found.text())
+        return 1 if found.faults else 0
     total = len({row.file for row in status_of(dataset).rows if row.file})
     with ProgressBar(total, "files", quiet=quiet) as bar:
         found = verify(dataset, lambda done, total: bar.show(done))

@@ -1,22 +1,39 @@
 """`mpmcli info`."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from mpmcli.cli.options import json_option, plugin_option, set_option
 from mpmcli.cli.streams import print_json, print_text
 
+if TYPE_CHECKING:
+    from mpmcli.dataset.report import Verification as DatasetVerification
+    from mpmcli.output.verify import Verification
+
 
 @click.command("info")
 @click.argument("path", type=click.Path(path_type=Path))
 @set_option
 @plugin_option
+@click.option("--verify", is_flag=True, help="Read all of a result, a dataset or an export, and compare its checksums.")
 @json_option
-def command(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], as_json: bool) -> None:
-    """Say what PATH holds: a scene (.toml), or a result (its directory, particles.vtkhdf or particles.pvd)."""
+def command(
+    path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], verify: bool, as_json: bool
+) -> int | None:
+    """Say what PATH holds: a scene (.toml), or a result (its directory, particles.vtkhdf or particles.pvd).
+
+    With --verify the exit code is 1 if anything has changed since it was written, or is missing.
+    """
     from mpmcli.errors import InputError
 
+    if verify:
+        if path.suffix == ".toml" or overrides or plugins:
+            raise InputError(f"--verify is for results, datasets and exports, and {path} is none; leave it out.")
+        found = _verified(path)
+        print_json(found.as_dict()) if as_json else print_text(found.text())
+        return 1 if found.faults else 0
     if path.suffix == ".toml":
         facts = _of_scene(path, overrides, plugins)
     else:
@@ -26,10 +43,22 @@ def command(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], a
         facts = _of_result(path)
     if as_json:
         print_json(facts)
-        return
+        return None
     known = {name: value for name, value in facts.items() if value not in (None, "", [], {})}
     width = max(len(name) for name in known)
     print_text("\n".join(f"{name.replace('_', ' '):<{width}}  {_plain(value)}" for name, value in known.items()))
+    return None
+
+
+def _verified(path: Path) -> "Verification | DatasetVerification":
+    from mpmcli.dataset.dataset import is_dataset
+    from mpmcli.dataset.export_directory import is_export, verify_export
+    from mpmcli.dataset.report import verify
+    from mpmcli.output.verify import verify_result
+
+    if is_export(path):
+        return verify_export(path)
+    return verify(path) if is_dataset(path) else verify_result(path)
 
 
 def _of_scene(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...]) -> dict:

@@ -7,6 +7,7 @@ import click
 
 from mpmcli.cli.options import json_option, quiet_option
 from mpmcli.cli.streams import print_json, print_text
+from mpmcli.plain_text import visible
 from mpmcli.render.settings import parse_size
 
 DEFAULT = "ledger.png"
@@ -58,7 +59,7 @@ def command(
     history = read_history(opened)
     for note in history.notes:
         if not quiet:
-            click.echo(note, err=True)
+            click.echo(visible(note), err=True)
     picture, panels = ledger_picture(history, width_height, theme)  # type: ignore[arg-type]
     write_picture(path, picture, MARK + settings_digest({"theme": theme, "size": width_height}))
     if as_json:

@@ -14,6 +14,7 @@ from mpmcli.cli.interrupt import catch_interrupts, interrupt_came, interrupted_c
 from mpmcli.cli.streams import flush_streams
 from mpmcli.cli.supervisor import may_supervise, supervise
 from mpmcli.errors import MpmcliError
+from mpmcli.plain_text import visible
 
 # Name of each command, the module that holds it, and its line in the help: so that help loads no module.
 COMMANDS = {
@@ -21,7 +22,8 @@ COMMANDS = {
     "check": "Say which step is safe and why, or whether a result stayed stable.",
     "sweep": "Compute a dataset of many varied runs.",
     "dataset": "Count, verify and merge datasets.",
-    "info": "Say what a result or a scene holds.",
+    "info": "Say what a result or a scene holds, and whether it has changed.",
+    "repair": "Make a readable file of a broken run.",
     "render": "Draw frames of a result: pictures, films, montages.",
     "plot": "Draw a result's ledger: energies, momentum, steps, volumes, reach.",
     "export": "Write a dataset or a result for learners, numpy or ParaView.",
@@ -130,7 +132,7 @@ def run(arguments: list[str]) -> int:
 def _print_error(line: str) -> None:
     """Print a line on stderr, where somebody still reads it."""
     with suppress(OSError, ValueError):
-        click.echo(line, err=True)
+        click.echo(visible(line), err=True)
 
 
 def _usage_sentence(error: click.ClickException) -> str:

@@ -8,6 +8,7 @@ import click
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
 from mpmcli.cli.options import json_option, quiet_option
 from mpmcli.cli.streams import print_json, print_text
+from mpmcli.plain_text import visible
 from mpmcli.render.settings import COLLIDERS, MODES
 from mpmcli.render.theme import THEMES
 
@@ -127,7 +128,7 @@ def command(
     with ProgressBar(plan.due, "frames", quiet=quiet) as bar, interrupts_wait():
         done = plan.carry_out(workers, watch=bar.show, stop=interrupt_came)
     for warning in done.warnings:
-        click.echo(f"warning: {warning}", err=True)
+        click.echo(visible(f"warning: {warning}"), err=True)
     if as_json:
         print_json(done.as_dict())
     elif not quiet:

@@ -9,6 +9,7 @@ import click
 
 from mpmcli.errors import RunError
 from mpmcli.plain_json import finite_json
+from mpmcli.plain_text import visible
 
 
 def print_json(content: object) -> None:
@@ -21,13 +22,13 @@ def print_json(content: object) -> None:
 
 
 def print_text(text: str) -> None:
-    """Print an answer on stdout, with a newline; a closed pipe is no error.
+    """Print an answer on stdout, with a newline and control characters escaped; a closed pipe is no error.
 
     Raises:
         RunError: stdout is closed, or cannot be written to, as on a full disk.
     """
     try:
-        click.echo(text)
+        click.echo(visible(text))
         # click writes nothing, and raises nothing, where there is no stdout.
         sys.stdout.flush()
     except BrokenPipeError:

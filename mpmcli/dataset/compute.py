@@ -23,6 +23,7 @@ from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.materials.registry import load_plugins
 from mpmcli.output.durable import sealed
+from mpmcli.output.file_checksum import append_checksum
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.engine import Arch
 from mpmcli.simulation.recording import Recording
@@ -183,8 +184,10 @@ def _stored(task: Task, row: Row, drawn: Draw, scene: Scene, run: Recording, ret
         path.parent.mkdir(parents=True, exist_ok=True)
         data = trajectory_data(drawn, run)
         try:
-            with sealed(path, stored_bytes(data)) as temporary, h5py.File(temporary, "w") as opened:
-                write_trajectory(opened, data, compress=scene.output.compress)
+            with sealed(path, stored_bytes(data)) as temporary:
+                with h5py.File(temporary, "w") as opened:
+                    write_trajectory(opened, data, compress=scene.output.compress)
+                append_checksum(temporary)
         except (OSError, RuntimeError) as error:
             reason = getattr(error, "strerror", None) or error
             raise RunError(f"trajectory {row.number} could not be written to {path} ({reason}).") from error

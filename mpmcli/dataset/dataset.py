@@ -1,6 +1,5 @@
 """Reading a dataset: its trajectories by number, with arrays that are read when they are asked for."""
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from functools import cached_property
@@ -10,21 +9,13 @@ from typing import Any
 import numpy as np
 
 from mpmcli.dataset.paths import SHARDS, SWEEP
-from mpmcli.dataset.shard import (
-    LABELS,
-    LEDGER,
-    MOVING,
-    SPLITS,
-    TABLES,
-    group_name,
-    open_shard,
-    read_ledger,
-    shard_splits,
-)
+from mpmcli.dataset.shard import LABELS, MOVING, SPLITS, moving_names, open_shard, shard_splits
+from mpmcli.dataset.stored_trajectory import StoredGroup
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import Result, open_result
+from mpmcli.output.hdf5_items import held
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.run_record import RECORD
@@ -141,24 +132,23 @@ class _StoredTrajectory(Trajectory):
     def __init__(self, shard: Path, number: int) -> None:
         self._shard = shard
         with open_shard(shard) as file:
-            group = file[group_name(number)]
-            self.number, self.split = number, str(group.attrs["split"])
-            self.draws = json.loads(group.attrs["draws"])
-            self.header = RunHeader.read(json.loads(group.attrs["header"]))
-            self.times, self.steps, self.frames = (group[name][:] for name in TABLES)
-            self.particle_count = group["position"].shape[1]
-            fixed = (*MOVING, *LABELS, *TABLES, LEDGER)
-            self.field_names = tuple(name for name in group if name not in fixed)
+            stored = StoredGroup(file, number)
+            self.number, self.split = number, str(stored.attribute("split"))
+            self.draws = stored.attribute("draws")
+            self.header = RunHeader.read(stored.attribute("header"))
+            self.times, self.steps, self.frames = stored.tables()
+            self.particle_count = held(stored.group, "position").shape[1]
+            self.field_names = tuple(name for name in moving_names(stored.group) if name not in MOVING)
 
     @property
     def ledger(self) -> list[LedgerRow]:
         with open_shard(self._shard) as file:
-            return read_ledger(file[group_name(self.number)])
+            return StoredGroup(file, self.number).ledger()
 
     def _read(self, name: str, frames: slice) -> np.ndarray:
         with open_shard(self._shard) as file:
-            array = file[group_name(self.number)][name]
-            return array[:] if name in LABELS else array[frames]
+            stored = StoredGroup(file, self.number)
+            return stored.table(name) if name in LABELS else stored.frames(name, frames)
 
 
 class _ResultTrajectory(Trajectory):
@@ -176,6 +166,7 @@ class _ResultTrajectory(Trajectory):
                 f"{result.path} has frames of {counts.min()} to {counts.max()} particles: "
                 "a trajectory has the same ones in all frames."
             )
+        _require_no_gap(result)
         self._result = result
         self.number, self.split, self.draws = 0, SPLITS[0], {}
         self.header = result.header
@@ -203,6 +194,22 @@ class _ResultTrajectory(Trajectory):
             return array(0)
         chosen = range(self.frame_count)[frames]
         return np.stack([array(k) for k in chosen]) if chosen else array(0)[None][:0]
+
+
+def _require_no_gap(result: Result) -> None:
+    """Refuse the segments of a run of which some are missing, and would be read as if time had jumped.
+
+    Raises:
+        InputError: so.
+    """
+    if result.kind != "segments":
+        return
+    told = (result.record or {}).get("frames_written")
+    written = told if isinstance(told, int) else 0
+    # A run that goes on may have sealed some after they were listed.
+    count = result.frame_count if result.frame_count >= written else open_result(result.path).frame_count
+    if not np.array_equal(result.numbers, np.arange(len(result.numbers))) or count < written:
+        raise InputError(f"{result.path} lacks some of its frames: mpmcli repair keeps those before the first gap.")
 
 
 class Dataset:

@@ -9,7 +9,7 @@ from typing import Any
 
 from mpmcli.dataset import export_gns, export_lagrangebench, export_npz, export_vtkhdf
 from mpmcli.dataset.dataset import Dataset
-from mpmcli.dataset.export_directory import METADATA, check_export_directory, new_directory
+from mpmcli.dataset.export_directory import METADATA, check_export_directory, new_directory, seal_export
 from mpmcli.dataset.facts import common_facts
 from mpmcli.dataset.shard import SPLITS
 from mpmcli.dataset.thinned import SEED, ThinnedTrajectory
@@ -134,6 +134,7 @@ def export(
             more, notes = form.write(temporary, chosen, tick)
             text = json.dumps(finite_json(metadata | more), indent=2, allow_nan=False) + "\n"
             (temporary / METADATA).write_text(text, encoding="utf-8", newline="\n")
+            seal_export(temporary)
             files = {path.name: path.stat().st_size for path in sorted(temporary.iterdir())}
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or error

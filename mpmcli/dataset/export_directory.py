@@ -8,13 +8,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from mpmcli.dataset.facts import EXPORTED_BY
+from mpmcli.dataset.facts import EXPORTED_BY, FORMAT_KEY
 from mpmcli.errors import InputError
 from mpmcli.output import check_directory
 from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory, sync_file
+from mpmcli.output.sums_file import SUMS, path_digest, sums_faults, sums_text
+from mpmcli.output.verify import Verification
 
 METADATA = "metadata.json"
-_OURS = re.compile(r"metadata\.json|(train|valid|test)\.(h5|npz)|\d{6,}\.(npz|vtkhdf)")
+_OURS = re.compile(r"metadata\.json|checksums\.sha256|(train|valid|test)\.(h5|npz)|\d{6,}\.(npz|vtkhdf)")
 
 
 def check_export_directory(directory: Path, overwrite: bool) -> None:
@@ -75,6 +77,32 @@ def new_directory(directory: Path, overwrite: bool) -> Iterator[Path]:
             with suppress(OSError):
                 parent.rmdir()
         raise
+
+
+def is_export(path: Path) -> bool:
+    """Return whether a directory holds an export, whole or not."""
+    return path.is_dir() and (_is_export(path) or ((path / SUMS).exists() and (path / METADATA).exists()))
+
+
+def seal_export(directory: Path) -> None:
+    """Write the checksums of all files of an export that is complete."""
+    sums = {path.name: [path_digest(path)] for path in directory.iterdir()}
+    (directory / SUMS).write_text(sums_text(sums), encoding="ascii", newline="\n")
+
+
+def verify_export(directory: Path) -> Verification:
+    """Compare the files of an export with its checksums."""
+    found = Verification(directory)
+    if not (directory / SUMS).exists() and _is_export(directory) and not _of_this_format(directory):
+        found.files = sum(1 for path in directory.iterdir() if _OURS.fullmatch(path.name))
+        found.unchecked.append(str(directory))
+        return found
+    found.files, found.faults = sums_faults(directory)
+    return found
+
+
+def _of_this_format(directory: Path) -> bool:
+    return FORMAT_KEY in json.loads((directory / METADATA).read_text(encoding="utf-8"))
 
 
 def _is_export(directory: Path) -> bool:

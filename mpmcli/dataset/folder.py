@@ -9,10 +9,11 @@ import h5py
 
 from mpmcli.dataset.manifest import Row
 from mpmcli.dataset.paths import PENDING, SHARDS, file_name
-from mpmcli.dataset.shard import FORMAT, VERSION, checksum, group_name
+from mpmcli.dataset.shard import CHECKSUMS, FORMAT, VERSION, add_checksums, checksum, group_name
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.directory import check_directory
 from mpmcli.output.durable import require_free_space, sealed
+from mpmcli.output.file_checksum import append_checksum
 from mpmcli.output.lock import LOCK
 
 # Bytes of a shard, about: large enough for a file system and for copies over a network, small enough to lose.
@@ -92,6 +93,10 @@ class Folder:
                     for row, path in zip(accepted, sources, strict=True):
                         with h5py.File(path, "r") as source:
                             source.copy(group_name(row.number), joined)
+                            if CHECKSUMS not in joined[group_name(row.number)]:
+                                # An older version has computed it.
+                                add_checksums(joined[group_name(row.number)])
+                append_checksum(temporary)
                 damaged = _differing(temporary, accepted)
                 if damaged is not None:
                     raise RunError(f"{target} does not hold trajectory {damaged} as it was computed; {kept}.")

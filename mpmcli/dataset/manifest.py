@@ -1,6 +1,7 @@
 """The manifest of a dataset: a SQLite file with a row for each trajectory that has been tried."""
 
 import json
+import re
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -13,6 +14,7 @@ from mpmcli import __version__
 from mpmcli.check.finding import Verdict
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.durable import sealed
+from mpmcli.plain_text import one_line
 
 MANIFEST = "manifest.sqlite"
 FORMAT = 1
@@ -112,7 +114,12 @@ class Manifest:
             InputError: there is no manifest, or it cannot be read.
         """
         with self._reading() as connection:
-            return [Row(*row) for row in connection.execute(f"{_SELECT} ORDER BY number")]
+            rows = [Row(*row) for row in connection.execute(f"{_SELECT} ORDER BY number")]
+        for row in rows:
+            # Paths are data: none leads out of the dataset.
+            if row.file and not _PLACE.fullmatch(row.file):
+                raise InputError(f"{self.path} places trajectory {row.number} in {one_line(row.file)}: it is damaged.")
+        return rows
 
     def put(self, rows: Iterable[Row]) -> None:
         """Add rows, or replace those of the same numbers, all at once and durably.
@@ -148,4 +155,5 @@ class Manifest:
             raise InputError(f"{self.path} cannot be read ({error}); copy it again, or run the sweep again.") from error
 
 
+_PLACE = re.compile(r"(shards|pending|quarantine)/\w+\.h5")
 _SELECT = f"SELECT {', '.join(COLUMNS)} FROM trajectories"

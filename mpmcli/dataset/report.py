@@ -1,16 +1,22 @@
 """What a dataset holds, as its manifest and its files tell: counts, reasons, and whether every checksum is right."""
 
+import json
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import h5py
+
 from mpmcli.dataset.folder import Folder
 from mpmcli.dataset.manifest import VERDICTS, Manifest, Row
 from mpmcli.dataset.paths import SHARDS
 from mpmcli.dataset.shard import checksum, group_name, open_shard
+from mpmcli.dataset.stored_trajectory import StoredGroup
 from mpmcli.errors import InputError
-from mpmcli.plain_text import counted
+from mpmcli.output.file_checksum import checksum_is_right
+from mpmcli.output.hdf5_items import held
+from mpmcli.plain_text import counted, one_line
 
 # Trajectories that a text names.
 MOST_NAMED = 10
@@ -148,14 +154,33 @@ def _faults_of(file: Path, rows: list[Row]) -> list[str]:
         with open_shard(file) as opened:
             names = {group_name(row.number): row for row in rows}
             others = sorted(opened.keys() - names.keys())
-            faults += [f"{file} holds {name}, which the manifest does not place there." for name in others]
+            faults += [f"{file} holds {one_line(name)}, which the manifest does not place there." for name in others]
             for name, row in names.items():
-                if name not in opened:
+                if opened.get(name, getlink=True) is None:
                     faults.append(f"{file} lacks trajectory {row.number}.")
-                elif checksum(opened[name]) != row.checksum:
-                    faults.append(f"trajectory {row.number} in {file} has changed: its checksum differs.")
-                elif opened[name]["position"].shape[:2] != (row.frames, row.particles):
-                    faults.append(f"trajectory {row.number} in {file} has other counts than its row.")
+                else:
+                    faults += _trajectory_faults(opened, row)
+            checked = opened.attrs["version"] > 1
+        if checked and not faults and not checksum_is_right(file):
+            faults.append(f"{file} has changed between its data: the checksum at its end differs.")
     except InputError as error:
         faults.append(str(error))
     return faults
+
+
+def _trajectory_faults(file: h5py.File, row: Row) -> list[str]:
+    """Compare a trajectory with its row, and with its own checksums, where its version has any."""
+    try:
+        stored = StoredGroup(file, row.number)
+        if checksum(stored.group) != row.checksum:
+            return [f"trajectory {row.number} in {file.filename} has changed: its checksum differs."]
+        if held(stored.group, "position").shape[:2] != (row.frames, row.particles):
+            return [f"trajectory {row.number} in {file.filename} has other counts than its row."]
+        if stored.attribute("split") != row.split or stored.attribute("draws") != json.loads(row.draws):
+            return [f"trajectory {row.number} in {file.filename} has other draws or another split than its row."]
+        stored.require_all()
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError):
+        return [f"trajectory {row.number} in {file.filename} is damaged: it cannot be read."]
+    except InputError as error:
+        return [str(error)]
+    return []

@@ -1,11 +1,14 @@
 """A shard: one HDF5 file with some trajectories of a dataset, whose bytes depend on its content alone.
 
-/                     format = "mpmcli-dataset", version = 1
+/                     format = "mpmcli-dataset", version = 2
 /000007               number, split, draws (JSON), header (JSON, see `RunHeader`)
 /000007/position      (T, N, d) m; velocity (T, N, d) m/s; each output field (T, N) or (T, N, ...)
 /000007/body          (N,) int32; material (N,) int32, index into the laws of the header
 /000007/time          (T,) float64, s; step (T,) int64; frame (T,) int64
 /000007/ledger/mass   and every other column of the ledger, T rows
+/000007/checksums     of each frame and of all else, see `output/checksums.py`; not in version 1
+
+The last bytes of the file are a checksum of all before (`output/file_checksum.py`).
 """
 
 import json
@@ -21,9 +24,13 @@ import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.ledger_table import COLUMNS, ledger_columns, ledger_rows
+from mpmcli.output.checksums import NAME as CHECKSUMS
+from mpmcli.output.checksums import attribute_checksum, kind_checksum, store_checksums, table_checksum
+from mpmcli.output.checksums import checksum as checksum_of_frame
+from mpmcli.output.hdf5_items import held, items
+from mpmcli.output.ledger_table import ledger_columns
 
-FORMAT, VERSION = "mpmcli-dataset", 1
+FORMAT, VERSION = "mpmcli-dataset", 2
 SPLITS = ("train", "valid", "test")
 MOVING, LABELS, TABLES = ("position", "velocity"), ("body", "material"), ("time", "step", "frame")
 LEDGER = "ledger"
@@ -87,11 +94,34 @@ def write_trajectory(file: h5py.File, data: TrajectoryData, *, compress: bool = 
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     # Fields keep their order.
     group = file.create_group(group_name(data.number), track_order=True)
-    group.attrs.update(_attributes(data))
-    for name, array in _arrays(data).items():
+    attributes, arrays = _attributes(data), _arrays(data)
+    group.attrs.update(attributes)
+    for name, array in arrays.items():
         moves = name in (*MOVING, *data.fields)
         options = _storage(array) if compress and moves and array.size else {}
         group.create_dataset(name, data=array, track_times=False, **options)
+    names = [*MOVING, *data.fields]
+    known = {f"@{name}": attribute_checksum(value) for name, value in attributes.items()}
+    for name, array in arrays.items():
+        known[name] = kind_checksum(array.dtype, array.shape) if name in names else table_checksum(array)
+    store_checksums(group, "", names, _table([arrays[name] for name in names]), known)
+
+
+def add_checksums(group: h5py.Group) -> None:
+    """Write the checksums of a trajectory that an older version has written."""
+    names = moving_names(group)
+    store_checksums(group, "", names, _table([held(group, name)[...] for name in names]))
+
+
+def _table(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the checksums of arrays of T frames, (T, A) uint32."""
+    columns = [[checksum_of_frame(rows) for rows in array] for array in arrays]
+    return np.array(columns, np.uint32).reshape(len(arrays), len(arrays[0])).T
+
+
+def moving_names(group: h5py.Group) -> list[str]:
+    """Return the names of the arrays that have frames, in their order."""
+    return [name for name in group if name not in (*LABELS, *TABLES, LEDGER, CHECKSUMS)]
 
 
 def _attributes(data: TrajectoryData) -> dict[str, int | str]:
@@ -122,9 +152,8 @@ def checksum_of(data: TrajectoryData) -> str:
 
 def checksum(group: h5py.Group) -> str:
     """Return the SHA-256, hexadecimal, of all that a trajectory's group holds, compressed or not."""
-    names: list[str] = []
-    group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-    return _checksum(group.attrs, ((name, group[name][...]) for name in sorted(names)))
+    names = [name for name, item in items(group) if isinstance(item, h5py.Dataset) and name != CHECKSUMS]
+    return _checksum(group.attrs, ((name, held(group, name)[...]) for name in sorted(names)))
 
 
 def _checksum(attributes: Mapping[str, Any], arrays: Iterable[tuple[str, np.ndarray]]) -> str:
@@ -151,6 +180,8 @@ def open_shard(path: Path) -> Iterator[h5py.File]:
         with h5py.File(path, "r", locking=False) as file:
             if file.attrs.get("format") != FORMAT:
                 raise InputError(f"{path} is no shard of a dataset of mpmcli: its format is not {FORMAT}.")
+            if file.attrs["version"] < 1:
+                raise ValueError("there is no such version")
             if file.attrs["version"] > VERSION:
                 raise InputError(f"{path} was written by a newer version of mpmcli; update mpmcli to read it.")
             yield file
@@ -166,15 +197,16 @@ def shard_splits(path: Path) -> dict[int, str]:
         InputError: as `open_shard`.
     """
     with open_shard(path) as file:
-        splits = {int(group.attrs["number"]): str(group.attrs["split"]) for group in file.values()}
+        splits = {}
+        for name in file:
+            group = held(file, name)
+            number = int(group.attrs["number"])
+            if group_name(number) != name:
+                raise ValueError("a trajectory has the name of another")
+            splits[number] = str(group.attrs["split"])
         if not set(splits.values()) <= set(SPLITS):
             raise ValueError("a split has another name")
         return splits
-
-
-def read_ledger(group: h5py.Group) -> list[LedgerRow]:
-    """Read the ledger of a trajectory."""
-    return ledger_rows({name: group[LEDGER][name][:] for name in COLUMNS if name in group[LEDGER]})
 
 
 def _fault(data: TrajectoryData) -> str:

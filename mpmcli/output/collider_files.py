@@ -16,9 +16,12 @@ import h5py
 import numpy as np
 
 from mpmcli.errors import RunError
+from mpmcli.output.checksums import load_checksums, store_checksums, table_checksum
 from mpmcli.output.durable import require_free_space, sealed, write_text
+from mpmcli.output.file_checksum import append_checksum
+from mpmcli.output.hdf5_items import held
 from mpmcli.output.stored_colliders import triangles_of
-from mpmcli.output.vtkhdf import LIBVER
+from mpmcli.output.vtkhdf import FORMAT, LIBVER
 from mpmcli.scene.collider_surface import collider_surface
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.surface import Surface, joined
@@ -90,8 +93,11 @@ def write_collider_files(
 
 def write_collider_series(
     directory: Path, header: Mapping[str, Any], times: Sequence[float], colliders: Sequence[Collider]
-) -> None:
+) -> list[str]:
     """Write the colliders of a run, if it has any, as .vtu files and the .pvd that lists them.
+
+    Returns:
+        Names of the files.
 
     Raises:
         RunError: the disk is full or refuses.
@@ -111,16 +117,36 @@ def write_collider_series(
         lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "<Collection>"]
         lines += [f'<DataSet timestep="{t!r}" group="" part="{p}" file="{name}"/>' for t, p, name in sorted(entries)]
         write_text(directory / SERIES, "\n".join([*lines, "</Collection>", "</VTKFile>", ""]))
+    return sorted({name for _, _, name in entries} | ({SERIES} if entries else set()))
+
+
+def expected_files(header: Mapping[str, Any], colliders: Sequence[Collider]) -> list[str]:
+    """Return the names of the files that `write_collider_files` makes."""
+    return [name for name, moves in ((RESTING, False), (MOVING, True)) if _things(header, colliders, moving=moves)]
 
 
 def read_stored_surfaces(directory: Path) -> dict[int, Triangles]:
-    """Return the surfaces of colliders that were read from files, by number, as a packed result keeps them."""
+    """Return the surfaces of colliders that were read from files, by number, as a packed result keeps them.
+
+    Raises:
+        InputError: one has changed since it was written, or lies in another file.
+    """
     found = {}
     for name in (RESTING, MOVING):
-        with suppress(OSError, KeyError, ValueError), h5py.File(directory / name, "r", locking=False) as file:
-            for number, group in file["mpmcli/surfaces"].items():
-                found[int(number)] = Triangles(group["vertices"][...], group["triangles"][...])
+        with suppress(OSError, RuntimeError, KeyError, ValueError), _opened(directory / name) as file:
+            checksums = load_checksums(file, "mpmcli") if held(file, "mpmcli").attrs.get("format", 1) > 1 else None
+            for number in held(file, "mpmcli/surfaces"):
+                paths = [f"mpmcli/surfaces/{number}/{part}" for part in ("vertices", "triangles")]
+                arrays = [held(file, path)[...] for path in paths]
+                for path, array in zip(paths, arrays, strict=True):
+                    if checksums is not None:
+                        checksums.require(path, table_checksum(array))
+                found[int(number)] = Triangles(*arrays)
     return found
+
+
+def _opened(path: Path) -> h5py.File:
+    return h5py.File(path, "r", locking=False)
 
 
 def _things(header: Mapping[str, Any], colliders: Sequence[Collider], *, moving: bool) -> Things | None:
@@ -179,10 +205,13 @@ def _write_vtkhdf(path: Path, things: Things, times: Sequence[float]) -> None:
         steps["Values"] = np.asarray(times, float)
         steps.attrs["NSteps"] = len(times)
         names = {number: c.name for number, c in zip(things.numbers, things.colliders, strict=True)}
-        file.create_group("mpmcli").attrs["colliders"] = json.dumps(names)
+        group = file.create_group("mpmcli")
+        group.attrs["colliders"], group.attrs["format"] = json.dumps(names), FORMAT
         for number, (vertices, triangles) in things.meshes.items():
             group = file.create_group(f"mpmcli/surfaces/{number}")
             group["vertices"], group["triangles"] = vertices, triangles
+        store_checksums(file, "mpmcli", [], np.empty((0, 0), np.uint32))
+    append_checksum(path)
 
 
 def _write_vtu(path: Path, things: Things, time: float) -> None:

@@ -1,7 +1,7 @@
 """The index of the frames of an output: times and ledger, without the particles."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ class FrameIndex:
         frames, steps: (T,) frame number, and time steps since the start.
         offsets, counts: (T,) first row and number of rows of each frame in its file.
         ledger: T rows.
+        checksums: (T, A) uint32, CRC-32 of each array of the layout in each frame; None where the file has none.
     """
 
     layout: FrameLayout
@@ -31,11 +32,20 @@ class FrameIndex:
     offsets: np.ndarray
     counts: np.ndarray
     ledger: list[LedgerRow]
+    checksums: np.ndarray | None = None
+
+    def first(self, count: int) -> "FrameIndex":
+        """The index of at most `count` frames from the first on."""
+        tables = {
+            name: getattr(self, name)[:count] for name in ("times", "frames", "steps", "offsets", "counts", "ledger")
+        }
+        return replace(self, **tables, checksums=None if self.checksums is None else self.checksums[:count])
 
     @classmethod
     def joined(cls, indices: Sequence["FrameIndex"]) -> "FrameIndex":
         """The index that one file with the frames of all these, one after the other, has."""
         counts = np.concatenate([index.counts for index in indices])
+        checksums = [index.checksums for index in indices]
         return cls(
             layout=indices[0].layout,
             header=indices[0].header,
@@ -45,4 +55,5 @@ class FrameIndex:
             offsets=np.cumsum(counts) - counts,
             counts=counts,
             ledger=[row for index in indices for row in index.ledger],
+            checksums=None if any(table is None for table in checksums) else np.concatenate(checksums),
         )

@@ -9,9 +9,12 @@ from typing import Any
 import numpy as np
 
 from mpmcli.errors import InputError, NoRoomError, RunError
+from mpmcli.output.checksums import damaged
 from mpmcli.output.durable import is_full, require_free_space, sealed, sync_file
 from mpmcli.output.frame_index import FrameIndex
-from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, part_tables, read_array, read_index
+from mpmcli.output.hdf5_items import DamageError
+from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, read_array, read_index
+from mpmcli.output.vtkhdf_parts import part_tables
 
 
 def pack_segments(
@@ -19,6 +22,7 @@ def pack_segments(
     target: Path,
     *,
     compress: bool = False,
+    frames: int | None = None,
     header: Mapping[str, Any] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> None:
@@ -30,6 +34,7 @@ def pack_segments(
         segments: sealed VTKHDF files of one run, in order.
         target: file to make; an existing one is replaced at the very end.
         compress: gzip-1 with shuffle.
+        frames: how many to take, all if None.
         header: of the packed file, that of the segments by default; "scene" may differ, as a resumed run may end later.
         stop: called for each array; True ends the packing.
 
@@ -47,6 +52,9 @@ def pack_segments(
     for segment, index in zip(segments, indices, strict=True):
         if index.layout != first.layout or any(index.header.get(key) != facts[key] for key in facts if key != "scene"):
             raise RunError(f"{segment} is of another run than {segments[0]}: the frames were left unpacked.")
+    if frames is not None:
+        indices = _first_frames(indices, frames)
+        segments = segments[: len(indices)]
     expected = replace(FrameIndex.joined(indices), header=facts)
     counts = expected.counts.tolist()
     kept = f"the {len(counts)} frames written are kept in {segments[0].parent} and stay readable there"
@@ -56,18 +64,11 @@ def pack_segments(
     try:
         with sealed(target, size) as temporary:
             with VtkhdfWriter(temporary, first.layout, counts, compress=compress) as writer:
-                k = 0
-                for segment, index in zip(segments, indices, strict=True):
-                    frames, rows = len(index.counts), int(index.counts.sum())
-                    with closing(open_vtkhdf(segment)) as source:
-                        for name in first.layout.arrays:
-                            if stop():
-                                raise KeyboardInterrupt
-                            writer.write_array(k, name, read_array(source, name, 0, rows), frames=frames)
-                    k += frames
+                _copy(segments, indices, writer, stop, by_name=compress)
+                _require_unchanged(writer.checksums, expected, segments, indices)
                 writer.finish(expected.times, expected.frames, expected.steps, expected.ledger, header=expected.header)
             sync_file(temporary)
-            difference = find_difference(temporary, segments, expected, stop)
+            difference = find_difference(temporary, segments, expected, [int(i.counts.sum()) for i in indices], stop)
             if difference:
                 raise RunError(f"{target.name} does not read back as it was written ({difference}); {kept}.")
     except (OSError, RuntimeError, InputError) as error:
@@ -76,10 +77,67 @@ def pack_segments(
         raise fault(f"{target} could not be written ({reason}); {kept}.") from error
 
 
+def _copy(
+    segments: Sequence[Path],
+    indices: Sequence[FrameIndex],
+    writer: VtkhdfWriter,
+    stop: Callable[[], bool],
+    *,
+    by_name: bool,
+) -> None:
+    """Copy all arrays of all segments, segment by segment, or array by array, which opens each segment more often."""
+    names = list(indices[0].layout.arrays)
+    for group in [[name] for name in names] if by_name else [names]:
+        k = 0
+        for segment, index in zip(segments, indices, strict=True):
+            frames, rows = len(index.counts), int(index.counts.sum())
+            with closing(open_vtkhdf(segment)) as source:
+                for name in group:
+                    if stop():
+                        raise KeyboardInterrupt
+                    writer.write_array(k, name, read_array(source, name, 0, rows), frames=frames)
+            k += frames
+
+
+def _require_unchanged(
+    found: np.ndarray, expected: FrameIndex, segments: Sequence[Path], indices: Sequence[FrameIndex]
+) -> None:
+    """Compare the checksums of what was read with those of the segments, where these have any.
+
+    Raises:
+        InputError: they differ.
+    """
+    k = 0
+    for segment, index in zip(segments, indices, strict=True):
+        if index.checksums is not None:
+            differing = np.argwhere(found[k : k + len(index.counts)] != index.checksums)
+            for frame, column in differing[:1]:
+                name = list(expected.layout.arrays)[column]
+                raise damaged(str(segment), f"{name} of frame {index.frames[frame]}")
+        k += len(index.counts)
+
+
+def _first_frames(indices: Sequence[FrameIndex], frames: int) -> list[FrameIndex]:
+    found = []
+    for index in indices:
+        if frames <= 0:
+            break
+        found.append(index.first(frames))
+        frames -= len(index.counts)
+    return found
+
+
 def find_difference(
-    packed: Path, segments: Sequence[Path], expected: FrameIndex, stop: Callable[[], bool] = lambda: False
+    packed: Path,
+    segments: Sequence[Path],
+    expected: FrameIndex,
+    rows_of: Sequence[int],
+    stop: Callable[[], bool] = lambda: False,
 ) -> str:
     """Compare a packed file with its segments, bit for bit.
+
+    Args:
+        rows_of: rows of each segment that were packed.
 
     Returns:
         What differs first, in words; "" when nothing does.
@@ -88,7 +146,10 @@ def find_difference(
         KeyboardInterrupt: `stop` returned True.
     """
     with closing(open_vtkhdf(packed)) as file:
-        index = read_index(file)
+        try:
+            index = read_index(file)
+        except DamageError as error:
+            return str(error).rstrip(".")
         for table in ("times", "frames", "steps", "offsets", "counts"):
             if not _same(getattr(index, table), getattr(expected, table)):
                 return f"the {table} of the frames"
@@ -104,9 +165,8 @@ def find_difference(
         if root["Steps"].attrs["NSteps"] != len(expected.counts):
             return "NSteps"
         first = 0
-        for segment in segments:
+        for segment, rows in zip(segments, rows_of, strict=True):
             with closing(open_vtkhdf(segment)) as source:
-                rows = int(source["VTKHDF/NumberOfPoints"][:].sum())
                 for name in expected.layout.arrays:
                     if stop():
                         raise KeyboardInterrupt

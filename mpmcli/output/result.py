@@ -1,29 +1,29 @@
 """Reading results: packed file, directory, running or broken directory, VTK series, all alike."""
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
-from xml.etree import ElementTree
 
 import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.checksums import checksum, damaged
 from mpmcli.output.collider_files import read_stored_surfaces
 from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.hdf5_items import DamageError
 from mpmcli.output.header import RunHeader
-from mpmcli.output.layout import POSITION, STANDARD, FrameLayout
-from mpmcli.output.ledger_table import FRAME_COLUMNS, parse_ledger_csv
+from mpmcli.output.layout import POSITION, STANDARD
 from mpmcli.output.run_record import read_record
 from mpmcli.output.run_status import run_status
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
-from mpmcli.output.series import SERIES, SERIES_HEADER, SERIES_LEDGER, read_vtu
-from mpmcli.output.vtkhdf import FORMAT, open_vtkhdf, read_array, read_index
+from mpmcli.output.series import SERIES, read_vtu
+from mpmcli.output.series_index import read_series
+from mpmcli.output.vtkhdf import open_vtkhdf, read_array, read_index
 from mpmcli.scene.colliders import Collider
 
 Kind = Literal["packed", "segments", "series"]
@@ -127,17 +127,36 @@ class Result(ABC):
         """Read arrays of the k-th frame in the form of the file."""
 
 
-class _PackedResult(Result):
+class _StoredResult(Result):
+    """Frames in VTKHDF files."""
+
+    def _read_arrays(self, path: Path, k: int, names: Sequence[str], offset: int) -> dict[str, np.ndarray]:
+        """Read arrays of the k-th frame, which begins at row `offset` of a file, and compare their checksums."""
+        count, checksums = int(self.particle_counts[k]), self.index.checksums
+        try:
+            with closing(open_vtkhdf(path)) as file:
+                stored = {name: read_array(file, name, offset, count) for name in names}
+        except (OSError, RuntimeError, ValueError, KeyError) as error:
+            raise DamageError(f"{path} is damaged: a frame that it lists cannot be read.") from error
+        if checksums is not None:
+            columns = list(self.index.layout.arrays)
+            for name, array in stored.items():
+                if checksum(array) != checksums[k, columns.index(name)]:
+                    raise damaged(str(path), f"{name} of frame {self.numbers[k]}")
+        return stored
+
+
+class _PackedResult(_StoredResult):
     kind = "packed"
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, _index_of(path))
 
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
-        return _read_arrays(self.path, names, int(self.index.offsets[k]), int(self.particle_counts[k]))
+        return self._read_arrays(self.path, k, names, int(self.index.offsets[k]))
 
 
-class _SegmentsResult(Result):
+class _SegmentsResult(_StoredResult):
     kind = "segments"
 
     def __init__(self, path: Path, segments: Sequence[Path]) -> None:
@@ -151,39 +170,20 @@ class _SegmentsResult(Result):
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
         segment, offset = self._places[k]
         try:
-            return _read_arrays(segment, names, offset, int(self.particle_counts[k]))
+            return self._read_arrays(segment, k, names, offset)
         except InputError:
             packed = self.path / PACKED
             if segment.exists() or not packed.exists():
                 raise
             # The run has ended since, and its frames were packed: the same ones, and perhaps more.
-            return _read_arrays(packed, names, int(self.index.offsets[k]), int(self.particle_counts[k]))
+            return self._read_arrays(packed, k, names, int(self.index.offsets[k]))
 
 
 class _SeriesResult(Result):
     kind = "series"
 
     def __init__(self, path: Path) -> None:
-        directory = path.parent
-        try:
-            # The .pvd is read first: the ledger is replaced before it, so it holds at least as many rows.
-            entries = list(ElementTree.parse(path).iter("DataSet"))
-            times = np.array([float(entry.attrib["timestep"]) for entry in entries])
-            self._files = [directory / Path(entry.attrib["file"]).name for entry in entries]
-            facts = json.loads((directory / SERIES_HEADER).read_text(encoding="utf-8"))
-            table = (directory / SERIES_LEDGER).read_text(encoding="utf-8")
-            if facts["format"] > FORMAT:
-                raise InputError(f"{path} is of a newer version of mpmcli; update mpmcli to read it.")
-            layout = FrameLayout.from_dict(facts["layout"])
-            rows, columns = parse_ledger_csv(table)
-            frames, steps, counts = (np.array(columns[name][: len(times)]) for name in FRAME_COLUMNS)
-        except (OSError, ValueError, KeyError, TypeError, ElementTree.ParseError) as error:
-            raise InputError(
-                f"{path} is not a series of mpmcli: it needs {SERIES_HEADER}, {SERIES_LEDGER} and its frames "
-                "beside it, as mpmcli wrote them."
-            ) from error
-        rows = rows[: len(times)]
-        index = FrameIndex(layout, facts["header"], times, frames, steps, 0 * counts, counts, rows)
+        index, self._files, self._digests = read_series(path)
         super().__init__(path, index)
 
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -191,7 +191,8 @@ class _SeriesResult(Result):
             # meshio cannot read back the empty arrays that it wrote.
             arrays = self.index.layout.arrays
             return {name: np.empty(arrays[name].stored_shape(0), arrays[name].dtype) for name in names}
-        stored = read_vtu(self._files[k])
+        path = self._files[k]
+        stored = read_vtu(path, None if self._digests is None else self._digests.get(path.name, ()))
         return {name: stored[name] for name in names}
 
 
@@ -246,12 +247,4 @@ def _index_of(path: Path) -> FrameIndex:
             return read_index(file)
         # What h5py, numpy and JSON raise on a file whose content contradicts itself.
         except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-            raise InputError(f"{path} is damaged: its list of frames cannot be read.") from error
-
-
-def _read_arrays(path: Path, names: Sequence[str], offset: int, count: int) -> dict[str, np.ndarray]:
-    try:
-        with closing(open_vtkhdf(path)) as file:
-            return {name: read_array(file, name, offset, count) for name in names}
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
-        raise InputError(f"{path} is damaged: a frame that it lists cannot be read.") from error
+            raise DamageError(f"{path} is damaged: its list of frames cannot be read.") from error

@@ -19,6 +19,8 @@ from mpmcli.output.store import Store
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, read_index
 
 PACKED = "particles.vtkhdf"
+# What `mpmcli repair` calls a damaged one, and the new one before it takes its name.
+DAMAGED, REPAIRED = "particles.damaged.vtkhdf", "particles.repaired.vtkhdf"
 SEGMENTS = "segments"
 SEGMENT_NAME = re.compile(r"frame_\d{6,}\.vtkhdf")
 

@@ -22,6 +22,7 @@ from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.layout import POSITION, FrameLayout
 from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_csv
 from mpmcli.output.store import Store
+from mpmcli.output.sums_file import path_digest, read_sums, text_digest, write_sums
 from mpmcli.output.vtkhdf import FORMAT, OVERHEAD_BYTES
 
 SERIES = "particles.pvd"
@@ -50,19 +51,28 @@ class VtkSeriesStore(Store):
         self._times: list[float] = []
         self._frames: dict[str, list[int]] = {name: [] for name in FRAME_COLUMNS}
         self._rows: list[LedgerRow] = []
+        self._sums: dict[str, list[str]] = {}
 
     def go_on_after(self, index: FrameIndex) -> None:
         super().go_on_after(index)
         self._times, self._rows = index.times.tolist(), list(index.ledger)
         for name, column in zip(FRAME_COLUMNS, (index.frames, index.steps, index.counts), strict=True):
             self._frames[name] = column.tolist()
-        # The scene may end later than it did.
-        self._write_header(index.layout)
+        self._sums = read_sums(self._directory)
+        # The scene may end later than it did: a reader may find the former header or the new one.
+        before = self._sums[SERIES_HEADER]
+        text = self._header_text(index.layout)
+        self._sums[SERIES_HEADER] = [*before[-1:], text_digest(text)]
+        write_sums(self._directory, self._sums)
+        write_text(self._directory / SERIES_HEADER, text)
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
         """Write the colliders, and return the .pvd, complete after every frame; None where no frame was written."""
         if self.frames_written:
-            write_collider_series(self._directory, self._header, self._times, self._colliders)
+            names = write_collider_series(self._directory, self._header, self._times, self._colliders)
+            self._sums |= {name: [path_digest(self._directory / name)] for name in names}
+            self._sums |= {name: digests[-1:] for name, digests in self._sums.items()}
+            write_sums(self._directory, self._sums)
         return self._directory / SERIES if self.frames_written else None
 
     def _holds_result(self) -> bool:
@@ -79,24 +89,35 @@ class VtkSeriesStore(Store):
         for frame in frames:
             with sealed(self._directory / series_frame_name(frame.index)) as temporary:
                 _write_vtu(temporary, dict(layout.stored(frame)), compress=self._compress)
+                self._sums[series_frame_name(frame.index)] = [path_digest(temporary)]
         if frames[0].index == 0:
-            self._write_header(layout)
+            text = self._header_text(layout)
+            self._sums[SERIES_HEADER] = [text_digest(text)]
+            write_text(self._directory / SERIES_HEADER, text)
         self._rows += rows
         for frame in frames:
             self._times.append(float(frame.time))
             for name, value in zip(FRAME_COLUMNS, (frame.index, frame.step, len(frame.position)), strict=True):
                 self._frames[name].append(int(value))
-        write_text(self._directory / SERIES_LEDGER, ledger_csv(self._rows, self._frames))
         # The .pvd comes last: what it lists is there.
-        write_text(self._directory / SERIES, _pvd_text(self._times))
+        texts = {SERIES_LEDGER: ledger_csv(self._rows, self._frames), SERIES: _pvd_text(self._times)}
+        for name, text in texts.items():
+            # A reader may find the former file or the new one, whenever the run ends.
+            self._sums[name] = [*self._sums.get(name, [])[-1:], text_digest(text)]
+        write_sums(self._directory, self._sums)
+        for name, text in texts.items():
+            write_text(self._directory / name, text)
 
-    def _write_header(self, layout: FrameLayout) -> None:
+    def _header_text(self, layout: FrameLayout) -> str:
         facts = {"format": FORMAT, "version": __version__, "header": self._header, "layout": layout.to_dict()}
-        write_text(self._directory / SERIES_HEADER, json.dumps(facts, indent=1) + "\n")
+        return json.dumps(facts, indent=1) + "\n"
 
 
-def read_vtu(path: Path) -> dict[str, np.ndarray]:
+def read_vtu(path: Path, digests: Sequence[str] | None = None) -> dict[str, np.ndarray]:
     """Read the arrays of one frame, in the form of the file.
+
+    Args:
+        digests: SHA-256 that the file may have; None for any.
 
     Raises:
         InputError: the file is missing or damaged.
@@ -104,6 +125,8 @@ def read_vtu(path: Path) -> dict[str, np.ndarray]:
     from meshio import vtu
 
     try:
+        if digests is not None and path_digest(path) not in digests:
+            raise ValueError("its checksum differs")
         mesh = vtu.read(path)
     # A damaged file makes meshio and the XML parser raise almost anything.
     except Exception as error:

@@ -21,6 +21,7 @@ from mpmcli.output.lock import LOCK
 from mpmcli.output.result import open_result
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments, segment_name
 from mpmcli.output.series import SERIES
+from mpmcli.output.verify import verify_file
 from mpmcli.output.vtkhdf import open_vtkhdf, read_index
 from mpmcli.plain_text import counted
 from mpmcli.scene import LoadedScene, scene_to_toml
@@ -31,8 +32,6 @@ from mpmcli.solver.state import SavedState
 # What may change between two parts of a run: it may end later, with frames as far apart, and its file be compressed.
 MAY_CHANGE = ("time.end", "time.frames", "output.compress")
 _NONE = object()
-# What h5py, numpy and JSON raise on a file whose content contradicts itself.
-DAMAGE = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError)
 
 
 @dataclass(frozen=True)
@@ -162,13 +161,16 @@ def _sound_index(directory: Path) -> FrameIndex | None:
     found: list[FrameIndex] = []
     count = 0
     for path in [*([directory / PACKED] if (directory / PACKED).exists() else []), *sealed_segments(directory)]:
-        try:
-            with closing(open_vtkhdf(path)) as file:
-                index = read_index(file)
-        except (InputError, *DAMAGE) as error:
+        verdict = verify_file(path)
+        if not verdict.whole:
             if path.name == PACKED:
-                raise InputError(f"{path} is damaged: take it away to resume the run without its frames.") from error
+                faults = " ".join(verdict.faults)
+                raise InputError(
+                    f"{faults} `mpmcli repair {directory}` keeps the frames before that; then resume the run."
+                )
             break
+        with closing(open_vtkhdf(path)) as file:
+            index = read_index(file)
         first = int(index.frames[0])
         if first < count:
             # The packed file has it.

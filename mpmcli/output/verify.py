@@ -1,0 +1,249 @@
+"""Whether a result has changed since it was written: every byte is read, and compared with its checksum."""
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import h5py
+
+from mpmcli.errors import InputError
+from mpmcli.output.checksums import NAME, Checksums, checksum, item_checksums, load_checksums
+from mpmcli.output.collider_files import MOVING, RESTING, expected_files
+from mpmcli.output.file_checksum import checksum_is_right, gaps_of
+from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.hdf5_items import held
+from mpmcli.output.result import open_result
+from mpmcli.output.run_record import read_record
+from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
+from mpmcli.output.series import SERIES
+from mpmcli.output.sums_file import SUMS, sums_faults
+from mpmcli.output.vtkhdf import open_vtkhdf, read_array, read_index
+from mpmcli.plain_text import counted
+
+# What h5py raises on damaged files.
+HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError, MemoryError)
+SCENE = "scene.toml"
+
+
+@dataclass
+class Verification:
+    """What a comparison of files with their checksums has found.
+
+    Attributes:
+        path: as given.
+        files, frames: how many were read.
+        faults: one sentence each.
+        unchecked: files that an older version has written, which have no checksums; they can be read.
+    """
+
+    path: Path
+    files: int = 0
+    frames: int = 0
+    faults: list[str] = field(default_factory=list)
+    unchecked: list[str] = field(default_factory=list)
+
+    def as_dict(self) -> dict:
+        """Return it as JSON can hold it."""
+        return {**asdict(self), "path": str(self.path), "ok": not self.faults}
+
+    def text(self) -> str:
+        """Return the outcome, and a line for each fault."""
+        read = f"{counted(self.files, 'file')}, {counted(self.frames, 'frame')}"
+        outcome = counted(len(self.faults), "fault") if self.faults else "ok"
+        lines = [f"{path} has no checksums: an older version of mpmcli wrote it." for path in self.unchecked]
+        if self.unchecked and not self.faults:
+            outcome = "all of it can be read"
+        return "\n".join([f"{self.path}: {read}: {outcome}", *self.faults, *lines])
+
+
+def verify_result(path: Path) -> Verification:
+    """Read all of a result, and compare it with its checksums.
+
+    Args:
+        path: what `open_result` takes. Colliders, scene.toml and unpacked segments in its directory are read too.
+
+    Raises:
+        InputError: there is nothing at `path`, or nothing that mpmcli wrote.
+    """
+    path = Path(path)
+    if path.name == SEGMENTS and path.is_dir():
+        path = path.parent
+    found = Verification(path)
+    directory = path if path.is_dir() else path.parent
+    if path.suffix == ".pvd" or (path.is_dir() and (path / SERIES).exists() and not (path / PACKED).exists()):
+        _verify_series(path / SERIES if path.is_dir() else path, found)
+    elif path.is_dir():
+        files = [path / PACKED] if (path / PACKED).exists() else sealed_segments(path)
+        if not files:
+            open_result(path)
+        counts = [_verify_frames(file, found) for file in files]
+        _verify_count(directory, files, counts, found)
+    else:
+        if not path.exists():
+            raise InputError(f"{path} does not exist: give a {PACKED}, a {SERIES} or their directory.")
+        _verify_frames(path, found)
+    if path.is_dir() or path.name == PACKED:
+        for name in (RESTING, MOVING):
+            if (directory / name).exists():
+                _verify_colliders(directory / name, found)
+        if not found.faults:
+            _verify_beside(directory, found)
+    return found
+
+
+@dataclass
+class FileVerdict:
+    """What a comparison of a file of frames with its checksums has found.
+
+    Attributes:
+        frames: that it lists.
+        prefix: number of frames before the first one that is damaged; 0 where its list of frames is.
+        faults: one sentence each.
+        checked: whether it has checksums.
+    """
+
+    frames: int = 0
+    prefix: int = 0
+    faults: list[str] = field(default_factory=list)
+    checked: bool = True
+
+    @property
+    def whole(self) -> bool:
+        """Whether all its frames are as they were written, whatever else is wrong."""
+        return 0 < self.frames == self.prefix
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.faults
+
+
+def verify_file(path: Path) -> FileVerdict:
+    """Compare all of a VTKHDF file of particles with its checksums."""
+    found = FileVerdict()
+    try:
+        with closing(open_vtkhdf(path)) as file:
+            found.checked = held(file, "mpmcli").attrs["format"] > 1
+            index = read_index(file)
+            found.prefix = found.frames = len(index.times)
+            if found.checked:
+                checksums = load_checksums(file, "mpmcli")
+                found.faults += map(str, checksums.differences(_items_of(file, checksums)))
+            for k in range(found.frames):
+                for name in _damaged_arrays(file, index, k):
+                    found.faults.append(f"{path} is damaged: {name} of frame {index.frames[k]} has changed.")
+                    found.prefix = min(found.prefix, k)
+            gaps = gaps_of([held(file, key) for key in checksums.arrays]) if found.checked and found.sound else []
+        if found.checked and found.sound and not checksum_is_right(path, gaps):
+            found.faults.append(f"{path} is damaged: it has changed between its data sets, or at its end.")
+    except HDF5_ERRORS as error:
+        found.faults.append(f"{path} is damaged: it cannot be read ({_first_line(error)}).")
+    except InputError as error:
+        found.faults.append(str(error))
+    return found
+
+
+def _items_of(file: h5py.File, checksums: Checksums) -> dict[str, int]:
+    return item_checksums(file, checksums.arrays, f"mpmcli/{NAME}")
+
+
+def _damaged_arrays(file: h5py.File, index: FrameIndex, k: int) -> list[str]:
+    """Return the names of the arrays of a frame that are not as they were written, or, without checksums, cut off."""
+    found = []
+    for column, name in enumerate(index.layout.arrays):
+        try:
+            rows = read_array(file, name, int(index.offsets[k]), int(index.counts[k]))
+            right = len(rows) == index.counts[k]
+            if right and index.checksums is not None:
+                right = checksum(rows) == index.checksums[k, column]
+        except HDF5_ERRORS:
+            right = False
+        if not right:
+            found.append(name)
+    return found
+
+
+def _verify_frames(path: Path, found: Verification) -> int:
+    """Verify a file, and return the number of its frames."""
+    verdict = verify_file(path)
+    found.files += 1
+    found.frames += verdict.frames
+    found.faults += verdict.faults
+    if not verdict.checked:
+        found.unchecked.append(str(path))
+    return verdict.frames
+
+
+def _verify_count(directory: Path, files: Sequence[Path], counts: Sequence[int], found: Verification) -> None:
+    """Compare the numbers of the frames with their places, and with the record, which counts what was sealed."""
+    if found.faults:
+        return
+    written = (read_record(directory) or {}).get("frames_written")
+    if files[0].name != PACKED:
+        frames = 0
+        for file, count in zip(files, counts, strict=True):
+            first = int(file.stem.split("_")[1])
+            if first != frames:
+                told = f"lacks the frames {frames} to {first - 1}" if first > frames else f"holds frame {first} twice"
+                found.faults.append(f"{directory / SEGMENTS} {told}.")
+                return
+            frames += count
+    if isinstance(written, int) and found.frames < written:
+        there = counted(found.frames, "frame")
+        found.faults.append(f"{directory} holds {there}, but its run has written {written}.")
+
+
+def _verify_series(path: Path, found: Verification) -> None:
+    directory = path.parent
+    try:
+        result = open_result(path)
+        found.frames = result.frame_count
+    except InputError as error:
+        found.faults.append(str(error))
+    if (directory / SUMS).exists() or found.faults:
+        found.files, faults = sums_faults(directory)
+        found.faults += [fault for fault in faults if fault not in found.faults]
+        return
+    found.unchecked.append(str(path))
+    for k in range(result.frame_count):
+        found.files += 1
+        try:
+            result.frame(k)
+        except InputError as error:
+            found.faults.append(str(error))
+
+
+def _verify_colliders(path: Path, found: Verification) -> None:
+    found.files += 1
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            if held(file, "mpmcli").attrs.get("format", 1) == 1:
+                found.unchecked.append(str(path))
+                return
+            checksums = load_checksums(file, "mpmcli")
+            faults = [str(error) for error in checksums.differences(_items_of(file, checksums))]
+        if not faults and not checksum_is_right(path):
+            faults.append(f"{path} is damaged: it has changed between its data sets, or at its end.")
+    except HDF5_ERRORS as error:
+        faults = [f"{path} is damaged: it cannot be read ({_first_line(error)})."]
+    except InputError as error:
+        faults = [str(error)]
+    found.faults += faults
+
+
+def _verify_beside(directory: Path, found: Verification) -> None:
+    """Compare scene.toml, and which colliders have files, with what the frames say of the scene."""
+    header, path = open_result(directory).header, directory / SCENE
+    text, colliders = header.stored.get("scene"), header.read_colliders({})
+    if path.exists() and text is not None:
+        found.files += 1
+        if path.read_bytes() != text.encode("utf-8"):
+            found.faults.append(f"{path} is not the scene of the frames: it has changed since it was written.")
+    if (directory / PACKED).exists() and colliders and None not in colliders and directory == found.path:
+        missing = [name for name in expected_files(header.stored, colliders) if not (directory / name).exists()]
+        found.faults += [f"{directory / name} is missing: the scene has colliders." for name in missing]
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0].strip("'\"")
