@@ -21,6 +21,8 @@ from mpmcli.cli.interrupt import INTERRUPTED, TERMINATED
 LONG = ("simulate", "sweep", "render", "validate", "export", "dataset", "plot")
 # Time from the first and from a second signal to the end by force, s.
 PATIENCE, LITTLE = 3.5, 0.5
+# Time from the first signal to the preparations for that end, s.
+SOON = 1.0
 REQUESTS = ("SIGINT", "SIGTERM", "SIGHUP")
 # Linux: the signal that a process gets when its parent is gone (prctl).
 DEATH_SIGNAL = 1
@@ -91,11 +93,18 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
     """Pass signals on until the child has ended."""
     first: signal.Signals | None = None
     deadline: float | None = None
+    ready = False
     while True:
         if deadline is None:
             came = signal.sigwaitinfo(watched)
         else:
-            came = signal.sigtimedwait(watched, max(0.0, deadline - time.monotonic()))
+            pause = deadline - time.monotonic()
+            came = signal.sigtimedwait(watched, max(0.0, pause if ready else min(pause, SOON)))
+        if came is None and not ready:
+            # What is needed then takes a while to load.
+            _load()
+            ready = True
+            continue
         if came is None:
             _kill_tree(child)
             os.waitpid(child, 0)
@@ -118,6 +127,14 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
                 return _interrupted(first)
             if ended:
                 return _code(status)
+
+
+def _load() -> None:
+    import psutil
+
+    import mpmcli.output.abandoned
+
+    assert psutil and mpmcli.output.abandoned
 
 
 def _interrupted(first: signal.Signals) -> int:
