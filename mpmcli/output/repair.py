@@ -13,6 +13,7 @@ from mpmcli.errors import InputError
 from mpmcli.output.collider_files import write_collider_files
 from mpmcli.output.durable import sync_directory, write_text
 from mpmcli.output.header import RunHeader
+from mpmcli.output.lock import take_lock
 from mpmcli.output.pack import pack_segments
 from mpmcli.output.run_record import RECORD, read_record
 from mpmcli.output.segments import DAMAGED, PACKED, REPAIRED, SEGMENTS, remove_segments, sealed_segments
@@ -58,7 +59,7 @@ def repair(directory: Path) -> Repair:
     A result that is packed and sound is left alone.
 
     Raises:
-        InputError: there is no result, it is still written to, or no frame of it can be read; nothing was changed.
+        InputError: there is no result, another process writes it, or no frame of it can be read; nothing was changed.
         RunError: the disk refuses, or the new file does not read back; nothing was removed.
     """
     directory = Path(directory)
@@ -68,6 +69,11 @@ def repair(directory: Path) -> Repair:
         directory = directory.parent
     if not directory.is_dir():
         raise InputError(f"{directory} is no directory of a run: give the one that holds {PACKED} or {SEGMENTS}.")
+    with take_lock(directory):
+        return _repair(directory)
+
+
+def _repair(directory: Path) -> Repair:
     done = Repair(directory)
     packed, segments = directory / PACKED, sealed_segments(directory)
     verdict = verify_file(packed) if packed.exists() else None
