@@ -11,6 +11,7 @@ from mpmcli.solver.activity import open_faces
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.box import build_box_search
 from mpmcli.solver.collider_steps import ColliderSteps
+from mpmcli.solver.fixed_point import FixedPoint
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid, drift_allowed, node_width, tile_edge
 from mpmcli.solver.nodes import NodeUpdate
@@ -68,7 +69,10 @@ class Kernels:
             period=period,
             walls_move=len(moving.faces) > 0,
             opens=open_faces(faces),
+            deterministic=scene.solver.deterministic and not backend.on_cpu,
         )
+        if self.grid.deterministic:
+            self.grid.fixed = FixedPoint(self.grid, groups, backend.arch)
         walls, images = build_walls(
             faces, scene.solver, PAD, self.grid.cells, self.grid.shape, scheme.spline.on_node, friction, moving
         )
