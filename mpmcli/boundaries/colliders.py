@@ -37,6 +37,7 @@ class Colliders:
         turns: numbers of a torque: 1 in 2D, 3 in 3D; loads: of a force and a torque.
         rows: rows of nodes of a run, along the last axis; run: whose colliders act; spacing: h, m.
         taken: impulse, N s, and angular impulse about the pivot, N m s, of each collider, by rows of nodes.
+        sums: those of a step in fixed point (`solver.fixed_loads`); None where each is added to `taken` at once.
     """
 
     def __init__(
@@ -69,6 +70,7 @@ class Colliders:
         self.velocity = ti.Vector.field(d, float, shape=n)
         self.turning = ti.Matrix.field(d, d, float, shape=n)
         self.count = ti.field(int, shape=runs)
+        self.deterministic, self.sums = False, None
         self.taken = ti.Vector.field(self.loads, ti.f64 if on_cpu else float, shape=n * self.rows)
 
     def write(self, scene: Scene, run: int = 0) -> None:
@@ -135,9 +137,10 @@ class Colliders:
         return row
 
     @ti.func
-    def take(self, row: int, k: int, impulse: ti.template(), arm: ti.template()):
-        """Book the impulse that collider k has taken, N s, at an arm from its pivot, m."""
+    def take(self, node: ti.template(), k: int, impulse: ti.template(), arm: ti.template()):
+        """Book the impulse that collider k has taken from a node, N s, at an arm from its pivot, m."""
         d = ti.static(self.dimension)
+        row = self.row_of(node)
         place = (self.run * self.rows + row) * self.room + k
         load = ti.Vector.zero(float, ti.static(self.loads))
         for a in ti.static(range(d)):
@@ -148,12 +151,20 @@ class Colliders:
             for a in ti.static(range(3)):
                 b, c = ti.static((a + 1) % 3), ti.static((a + 2) % 3)
                 load[3 + a] = arm[b] * impulse[c] - arm[c] * impulse[b]
-        for a in ti.static(range(self.loads)):
-            if ti.static(self.on_cpu):
-                # Parts of a step share no row.
-                self.taken[place][a] = self.taken[place][a] + ti.cast(load[a], ti.f64)
-            else:
-                ti.atomic_add(self.taken[place][a], load[a])
+        if ti.static(self.deterministic):
+            self.sums.add(place, row * ti.static(self.shape[-1]) + node[ti.static(d - 1)], load)
+        else:
+            for a in ti.static(range(self.loads)):
+                if ti.static(self.on_cpu):
+                    # Parts of a step share no row.
+                    self.taken[place][a] = self.taken[place][a] + ti.cast(load[a], ti.f64)
+                else:
+                    ti.atomic_add(self.taken[place][a], load[a])
+
+    @ti.func
+    def settle(self, place: int):
+        """Book what a collider has taken from a row of nodes in a step, where that is summed in fixed point."""
+        self.sums.settle(self.taken, place)
 
     @ti.func
     def constrain(self, node: ti.template(), velocity: ti.template(), mass: float):
@@ -175,7 +186,7 @@ class Colliders:
                     phi, normal = self.distance(i, arm, face)
                     if phi <= REACH * self.spacing:
                         after = self.met(i, arm, normal, result)
-                        self.take(self.row_of(node), k, mass * (result - after), arm)
+                        self.take(node, k, mass * (result - after), arm)
                         for a in ti.static(range(d)):
                             result[a] = after[a]
         return result

@@ -83,7 +83,7 @@ class SolverSettings(Table):
     deterministic: Annotated[
         Flag,
         Field(
-            description="Whether a GPU adds in fixed point, so that two runs have the same bytes; steps take longer, and "
-            "what it adds is rounded otherwise. On the CPU they have in any case, and nothing changes."
+            description="Whether a GPU adds in fixed point, so that two runs have the same bytes. On the CPU they have "
+            "them in any case, and nothing changes."
         ),
     ] = False

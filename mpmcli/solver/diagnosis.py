@@ -58,6 +58,7 @@ CRUSHED = "was crushed to nothing"
 LEFT = "left the domain"
 OUTRAN = "outran the nodes prepared for it"
 FASTER = "got more momentum in a step than the sums of solver.deterministic have room for"
+HARDER = "is near a node that hit a collider harder than the sums of solver.deterministic have room for"
 DENSER = "lies where more mass meets than the sums of solver.deterministic have room for"
 STIFFER = "a stiffer material, a finer domain.spacing or a lower time.safety may keep it from that"
 SUGGESTIONS = {
@@ -66,6 +67,7 @@ SUGGESTIONS = {
     CRUSHED: STIFFER,
     LEFT: "check the speeds and forces of the scene, or lower time.safety or time.step",
     FASTER: "check the speeds, forces and materials of the scene, or lower time.safety",
+    HARDER: "check the speeds of the scene, or lower time.safety",
     DENSER: "look for particles that lie on each other, or leave solver.deterministic out",
     OUTRAN: "lower time.step, so that speeds are measured more often",
 }
@@ -85,25 +87,22 @@ def first_unsound(snapshot: Snapshot) -> int | None:
     return int(unsound[snapshot.id[unsound].argmin()]) if len(unsound) else None
 
 
-def first_beyond(
-    snapshots: Sequence[Snapshot], particle: int | None, place: np.ndarray | None
-) -> tuple[Snapshot, int, str]:
-    """Return what was too much for sums in fixed point: a particle (in solver order) of a group, and the cause.
+def first_beyond(snapshots: Sequence[Snapshot], particle: int | None, place: np.ndarray | None) -> tuple[Snapshot, int]:
+    """Return the group and the number, in solver order, of the particle at which sums in fixed point had no room.
 
     Args:
-        particle: id of one that is too fast; place: otherwise that of a node that is too heavy, (d,), as x, m; the
-            particle is the nearest one.
+        particle: its id, where that is known; place: otherwise that of the node, (d,), as x, m; it is the nearest one.
     """
     if particle is not None:
         found = [(snapshot, np.flatnonzero(snapshot.id == particle)) for snapshot in snapshots]
-        return next((snapshot, int(rows[0]), FASTER) for snapshot, rows in found if len(rows))
+        return next((snapshot, int(rows[0])) for snapshot, rows in found if len(rows))
     nearest = []
     for g, snapshot in enumerate(snapshots):
         away = ((snapshot.x - place) ** 2).sum(1)
-        p = np.lexsort((snapshot.id, away))[0]
-        nearest.append((away[p], g, int(p)))
+        p = int(np.lexsort((snapshot.id, away))[0])
+        nearest.append((float(away[p]), g, p))
     _, g, p = min(nearest)
-    return snapshots[g], p, DENSER
+    return snapshots[g], p
 
 
 def rate_of_change(snapshot: Snapshot, spacing: float) -> np.ndarray:

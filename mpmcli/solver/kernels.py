@@ -78,7 +78,7 @@ class Kernels:
         )
         self.colliders = None
         if scene.colliders:
-            self.colliders = ColliderSteps(scene, self.grid.shape, PAD, backend.arch)
+            self.colliders = ColliderSteps(scene, self.grid.shape, PAD, backend.arch, self.grid.fixed)
         nodes = NodeUpdate(self.grid, images, [walls], self.colliders and self.colliders.colliders)
         self.contact = contact_between(groups, [len(group.bodies) for group in groups], self.grid, backend)
         self.particles = ParticleUpdate(
@@ -111,6 +111,19 @@ class Kernels:
         if self.contact is not None:
             self.contact.fill_all(self.particles.grid.spacing)
         self._find_box()
+
+    def set_pace(self, step: float) -> None:
+        """Let sums in fixed point have room for steps of which `step`, s, is stable."""
+        self.grid.fixed.set_step(step)
+        if self.colliders is not None:
+            self.colliders.loads.set_step(step)
+
+    def forget_beyond(self) -> None:
+        """Forget what was beyond sums in fixed point."""
+        if self.grid.deterministic:
+            self.grid.fixed.forget()
+            if self.colliders is not None:
+                self.colliders.loads.forget()
 
     def share_work(self) -> None:
         """Share the work of a sort among threads anew, after its tables were loaded."""

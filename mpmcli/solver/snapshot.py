@@ -54,9 +54,7 @@ def read_group(group: ParticleGroup) -> Snapshot:
     return Snapshot(group, **group.to_numpy())
 
 
-def fill(
-    arrays: FrameArrays, snapshots: Sequence[Snapshot], seen: Sequence[Observation], *, by_id: bool
-) -> list[Sums]:
+def fill(arrays: FrameArrays, snapshots: Sequence[Snapshot], seen: Sequence[Observation], *, by_id: bool) -> list[Sums]:
     """Fill all rows of one time, and return the sums over the particles of each law, as `build_frame_reader` does.
 
     Args:
