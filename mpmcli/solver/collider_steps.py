@@ -12,8 +12,6 @@ from mpmcli.errors import InputError
 from mpmcli.scene import Scene
 from mpmcli.scene.expression import names_in
 from mpmcli.scene.quadrature import Mean
-from mpmcli.solver.fixed_loads import FixedLoads
-from mpmcli.solver.fixed_point import FixedPoint
 from mpmcli.stability.limits import collider_limit
 
 # Devices that know single precision only.
@@ -25,16 +23,15 @@ class ColliderSteps:
 
     Attributes:
         colliders, motion: on the device; motion is None where none moves.
-        loads: what they take in a step in fixed point, None where it is not.
     """
 
     def __init__(
-        self, scene: Scene, shape: Sequence[int], first: int, arch: str, fixed: FixedPoint | None = None
+        self, scene: Scene, shape: Sequence[int], first: int, arch: str, *, deterministic: bool = False
     ) -> None:
         """Put those of a scene on a grid with `shape` nodes per axis, whose node `first` is the lower corner.
 
         Args:
-            fixed: of the grid.
+            deterministic: see `Colliders`.
 
         Raises:
             InputError: one moves, and the device knows single precision only.
@@ -42,13 +39,12 @@ class ColliderSteps:
         kind = ColliderKind.of(scene)
         if kind.moving and arch in WITHOUT_DOUBLES:
             raise InputError(f"colliders that move need double precision, which --arch {arch} lacks; give --arch cpu")
-        self.colliders = Colliders(kind, scene.dimension, shape, first, 1, on_cpu=arch == "cpu")
+        in_doubles = arch == "cpu" and not deterministic
+        self.colliders = Colliders(
+            kind, scene.dimension, shape, first, 1, on_cpu=in_doubles, deterministic=deterministic
+        )
         self.colliders.spacing = scene.domain.spacing
         self.colliders.write(scene)
-        self.loads = None
-        if fixed is not None:
-            self.loads = FixedLoads(scene, fixed, shape, self.colliders.turns)
-            self.colliders.deterministic, self.colliders.sums = True, self.loads
         self.motion = ColliderMotion(self.colliders, 1) if kind.moving else None
         self._means: list[tuple[int, int, Mean]] = []
         if self.motion is not None:

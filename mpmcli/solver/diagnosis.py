@@ -58,7 +58,6 @@ CRUSHED = "was crushed to nothing"
 LEFT = "left the domain"
 OUTRAN = "outran the nodes prepared for it"
 FASTER = "got more momentum in a step than the sums of solver.deterministic have room for"
-HARDER = "is near a node that hit a collider harder than the sums of solver.deterministic have room for"
 DENSER = "lies where more mass meets than the sums of solver.deterministic have room for"
 STIFFER = "a stiffer material, a finer domain.spacing or a lower time.safety may keep it from that"
 SUGGESTIONS = {
@@ -67,7 +66,6 @@ SUGGESTIONS = {
     CRUSHED: STIFFER,
     LEFT: "check the speeds and forces of the scene, or lower time.safety or time.step",
     FASTER: "check the speeds, forces and materials of the scene, or lower time.safety",
-    HARDER: "check the speeds of the scene, or lower time.safety",
     DENSER: "look for particles that lie on each other, or leave solver.deterministic out",
     OUTRAN: "lower time.step, so that speeds are measured more often",
 }

@@ -35,7 +35,10 @@ class FixedPoint:
     """
 
     def __init__(self, grid: Grid, groups: Sequence[ParticleGroup], arch: str) -> None:
-        """Allocate for these particles."""
+        """Allocate for these particles; `forget` comes before the first step.
+
+        No kernel is launched here: what is allocated after one is a buffer of its own.
+        """
         self.wide, self.dimension = arch in WIDE, grid.dimension
         self.nodes = self._sums(grid.width, grid.node_count)
         self.before = self._sums(grid.width, grid.node_count) if grid.scheme.keeps_before else None
@@ -55,7 +58,6 @@ class FixedPoint:
         # Scale of momenta, its inverse, and the speed that has room.
         self.pace = ti.Vector.field(3, float, shape=())
         self.beyond = ti.field(int, shape=2)
-        self.forget()
 
     def _sums(self, width: int, count: int) -> FixedSums:
         return FixedSums(width, count, wide=self.wide)

@@ -78,7 +78,9 @@ class Kernels:
         )
         self.colliders = None
         if scene.colliders:
-            self.colliders = ColliderSteps(scene, self.grid.shape, PAD, backend.arch, self.grid.fixed)
+            self.colliders = ColliderSteps(
+                scene, self.grid.shape, PAD, backend.arch, deterministic=self.grid.deterministic
+            )
         nodes = NodeUpdate(self.grid, images, [walls], self.colliders and self.colliders.colliders)
         self.contact = contact_between(groups, [len(group.bodies) for group in groups], self.grid, backend)
         self.particles = ParticleUpdate(
@@ -101,6 +103,7 @@ class Kernels:
             self.step = build_cpu_step(self.grid, nodes, self.particles, groups, self.orders, gravity)
         else:
             self.step = build_gpu_step(self.grid, nodes, self.particles, groups, gravity)
+        self.forget_beyond()
 
     def sort(self) -> None:
         """Sort the particles of every group by tile, and find the nodes in use."""
@@ -112,18 +115,10 @@ class Kernels:
             self.contact.fill_all(self.particles.grid.spacing)
         self._find_box()
 
-    def set_pace(self, step: float) -> None:
-        """Let sums in fixed point have room for steps of which `step`, s, is stable."""
-        self.grid.fixed.set_step(step)
-        if self.colliders is not None:
-            self.colliders.loads.set_step(step)
-
     def forget_beyond(self) -> None:
         """Forget what was beyond sums in fixed point."""
         if self.grid.deterministic:
             self.grid.fixed.forget()
-            if self.colliders is not None:
-                self.colliders.loads.forget()
 
     def share_work(self) -> None:
         """Share the work of a sort among threads anew, after its tables were loaded."""

@@ -146,7 +146,7 @@ def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = Fal
         *(("find contact",) if separate else ()),
         *(("find friction",) if rough else ()),
         "update grid" + (" with colliders" if scene.colliders else ""),
-        *(("read loads in fixed point",) if deterministic and scene.colliders else ()),
+        *(("add up loads",) if deterministic and scene.colliders else ()),
         *(f"gather {name}" for name in names),
     )
 
@@ -206,8 +206,9 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     tables += _contact_bytes(scene, nodes, tile, real)
     if scene.solver.solids == "total" and len(scene.sources) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(counts.values()))
-    loads = ColliderKind.of(scene).bytes_needed(dimension, nodes // (tile * Grid.tile_counts(cells, tile)[-1]))
-    tables += loads * (1 + deterministic)
+    tables += ColliderKind.of(scene).bytes_needed(dimension, nodes // (tile * Grid.tile_counts(cells, tile)[-1]))
+    if deterministic:
+        tables += nodes * len(scene.colliders) * dimension * real
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
     host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)
     passes = passes_of(members, scene, deterministic=deterministic)

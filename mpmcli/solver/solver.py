@@ -11,7 +11,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.collider_steps import read_loads
-from mpmcli.solver.diagnosis import DENSER, FASTER, HARDER, UnstableRunError, first_beyond
+from mpmcli.solver.diagnosis import DENSER, FASTER, UnstableRunError, first_beyond
 from mpmcli.solver.emission_kernels import SolverEmission
 from mpmcli.solver.external_forces import drive
 from mpmcli.solver.frame_arrays import FrameArrays
@@ -109,7 +109,7 @@ class Solver(Run):
             self._kernels.colliders.begin_step(state.time, dt)
         if self.grid.deterministic:
             stable = self.scene.time.safety * self.nearest_limit.value
-            self._kernels.set_pace(max(kick, min(stable, self.scene.time.end)))
+            self.grid.fixed.set_step(max(kick, min(stable, self.scene.time.end)))
         result = self._kernels.step(dt, kick, state.relaxed_in(dt))
         state.time = state.time + dt if until is None else until
         state.last_step = dt
@@ -216,13 +216,11 @@ class Solver(Run):
         Raises:
             UnstableRunError: they had none.
         """
-        particle, heavy = self.grid.fixed.found_beyond()
-        hard = None if self._kernels.colliders is None else self._kernels.colliders.loads.found_beyond()
-        node = hard if heavy is None else heavy
+        particle, node = self.grid.fixed.found_beyond()
         if particle is not None or node is not None:
             place = None if node is None else (np.array(np.unravel_index(node, self.grid.shape)) - PAD) * self.spacing
             snapshot, p = first_beyond([read_group(group) for group in self.groups], particle, place)
-            cause = FASTER if particle is not None else HARDER if heavy is None else DENSER
+            cause = DENSER if particle is None else FASTER
             raise UnstableRunError(self._diagnose(snapshot, p, cause, dt))
 
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:

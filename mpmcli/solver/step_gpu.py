@@ -49,7 +49,7 @@ def build_gpu_step(
             nodes.update(node, grid.linear_index(node), gravity.in_step(kick, 0))
         if ti.static(grid.deterministic and nodes.collides):
             for q in range(nodes.colliders.rows * nodes.colliders.room):
-                nodes.colliders.settle(q)
+                nodes.colliders.book_row(q)
         for g, group in ti.static(numbered):
             for p in range(group.present()):
                 particles.advance(g, group, p, dt)
