@@ -90,7 +90,7 @@ def test_two_runs_on_vulkan_have_the_same_bytes(
     scene = mixed(dimension, materials)
     first, second = twice(scene, backend_of("f32", 1, "vulkan"))
     assert list(same(first, second)) == []
-    assert first[-1][0].step > 25
+    assert first[-1][0].step > 20
     expected = list(Solver(scene, backend_of("f32", 1)).frames())
     assert np.abs(first[-1][0].position - expected[-1][0].position).max() < 1e-5
 
@@ -185,7 +185,7 @@ def test_momentum_is_kept_to_the_rounding_of_the_sums(backend_of: Callable) -> N
     scale = sum(float((body.mass * np.linalg.norm(body.velocity, axis=1)).sum()) for body in lifted)
     # Besides, round-off of G2P: a few units in the last place of the momentum of each particle.
     assert (change <= 20 * (9 * solver.particle_count * unit / 2 + 8 * np.finfo(float).eps * scale)).all()
-    assert scale > 100
+    assert scale > 50
 
 
 def momentum_of(solver: Solver) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 A particle that moves, deforms and is pushed by less than FARTHEST cells in a stable step T adds at most its mass times
 FARTHEST h / T to the momentum of a node, which therefore has at most its own mass times that. A node has at most
-DENSEST times the mass that the densest body fills a cell with, or all of it (docs/theory.md, 7.3). Both are checked,
+DENSEST times the mass that the densest body fills a cell with, or all of it (docs/theory.md, 8.4). Both are checked,
 the one for each particle before it is added, the other for each node; then no sum can overflow.
 """
 

@@ -1,4 +1,4 @@
-"""Sums in fixed point: integers, to which atomics add in any order with the same result (docs/theory.md, 7.3)."""
+"""Sums in fixed point: integers, to which atomics add in any order with the same result (docs/theory.md, 8.4)."""
 
 import math
 
