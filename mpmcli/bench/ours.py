@@ -85,7 +85,8 @@ class Ours:
         scene = parse_scene(data, laws=parameter_models(), source=data["title"], directory=directory).scene
         backend = choose_backend(arch, threads, precision, compile_cache=False)
         count = sum(body.count for body in particles) if particles else estimate_particles(scene)
-        batched = batched and suits_batch(count, backend) and (backend.on_cpu or not scene.comes_and_goes)
+        alone = scene.comes_and_goes or scene.solver.deterministic
+        batched = batched and suits_batch(count, backend) and (backend.on_cpu or not alone)
         if batched and backend.on_cpu:
             backend = replace(backend, threads=useful_threads(count, threads))
         start(backend)

@@ -37,10 +37,20 @@ class Colliders:
         turns: numbers of a torque: 1 in 2D, 3 in 3D; loads: of a force and a torque.
         rows: rows of nodes of a run, along the last axis; run: whose colliders act; spacing: h, m.
         taken: impulse, N s, and angular impulse about the pivot, N m s, of each collider, by rows of nodes.
+        deterministic: whether the nodes of a row are added up in their order; then `given` is the impulse that each
+            node gives each collider in a step, N s, else None.
     """
 
     def __init__(
-        self, kind: ColliderKind, dimension: int, shape: Sequence[int], first: int, runs: int, *, on_cpu: bool
+        self,
+        kind: ColliderKind,
+        dimension: int,
+        shape: Sequence[int],
+        first: int,
+        runs: int,
+        *,
+        on_cpu: bool,
+        deterministic: bool = False,
     ) -> None:
         """Allocate colliders on a grid with `shape` nodes per axis, whose node `first` is the lower corner."""
         d, n = dimension, runs * kind.count
@@ -70,6 +80,8 @@ class Colliders:
         self.turning = ti.Matrix.field(d, d, float, shape=n)
         self.count = ti.field(int, shape=runs)
         self.taken = ti.Vector.field(self.loads, ti.f64 if on_cpu else float, shape=n * self.rows)
+        self.deterministic = deterministic
+        self.given = ti.Vector.field(d, float, shape=n * math.prod(shape)) if deterministic else None
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the colliders of a run, at time 0."""
@@ -137,8 +149,19 @@ class Colliders:
     @ti.func
     def take(self, row: int, k: int, impulse: ti.template(), arm: ti.template()):
         """Book the impulse that collider k has taken, N s, at an arm from its pivot, m."""
-        d = ti.static(self.dimension)
         place = (self.run * self.rows + row) * self.room + k
+        load = self.load_of(impulse, arm)
+        for a in ti.static(range(self.loads)):
+            if ti.static(self.on_cpu):
+                # Parts of a step share no row.
+                self.taken[place][a] = self.taken[place][a] + ti.cast(load[a], ti.f64)
+            else:
+                ti.atomic_add(self.taken[place][a], load[a])
+
+    @ti.func
+    def load_of(self, impulse: ti.template(), arm: ti.template()):
+        """Return an impulse, N s, at an arm, m, with its angular impulse, N m s."""
+        d = ti.static(self.dimension)
         load = ti.Vector.zero(float, ti.static(self.loads))
         for a in ti.static(range(d)):
             load[a] = impulse[a]
@@ -148,12 +171,36 @@ class Colliders:
             for a in ti.static(range(3)):
                 b, c = ti.static((a + 1) % 3), ti.static((a + 2) % 3)
                 load[3 + a] = arm[b] * impulse[c] - arm[c] * impulse[b]
-        for a in ti.static(range(self.loads)):
-            if ti.static(self.on_cpu):
-                # Parts of a step share no row.
-                self.taken[place][a] = self.taken[place][a] + ti.cast(load[a], ti.f64)
-            else:
-                ti.atomic_add(self.taken[place][a], load[a])
+        return load
+
+    @ti.func
+    def book_row(self, q: int):
+        """Book what collider q % room has taken from the nodes of row q // room in a step, in their order."""
+        d = ti.static(self.dimension)
+        nodes = ti.static(self.shape[-1])
+        k, rest = q % self.room, q // self.room
+        first = rest * nodes
+        x = ti.Vector.zero(float, d)
+        for b in ti.static(range(d - 1)):
+            a = ti.static(d - 2 - b)
+            x[a] = ti.cast(rest % ti.static(self.shape[a]) - self.first, float) * self.spacing
+            rest = rest // ti.static(self.shape[a])
+        if k < self.count[0]:
+            near = True
+            for a in ti.static(range(d - 1)):
+                arm = x[a] - self.place[k][a]
+                near = near and arm >= self.reach[k][0, a] and arm <= self.reach[k][1, a]
+            if near:
+                total = ti.Vector.zero(float, ti.static(self.loads))
+                for n in range(nodes):
+                    x[ti.static(d - 1)] = ti.cast(n - self.first, float) * self.spacing
+                    load = self.load_of(self.given[(first + n) * self.room + k], x - self.place[k])
+                    for a in ti.static(range(self.loads)):
+                        total[a] += load[a]
+                    for a in ti.static(range(d)):
+                        self.given[(first + n) * self.room + k][a] = 0.0
+                for a in ti.static(range(self.loads)):
+                    self.taken[q][a] = self.taken[q][a] + total[a]
 
     @ti.func
     def constrain(self, node: ti.template(), velocity: ti.template(), mass: float):
@@ -175,7 +222,12 @@ class Colliders:
                     phi, normal = self.distance(i, arm, face)
                     if phi <= REACH * self.spacing:
                         after = self.met(i, arm, normal, result)
-                        self.take(self.row_of(node), k, mass * (result - after), arm)
+                        if ti.static(self.deterministic):
+                            place = (self.row_of(node) * ti.static(self.shape[-1]) + node[d - 1]) * self.room + k
+                            for a in ti.static(range(d)):
+                                self.given[place][a] = self.given[place][a] + mass * (result[a] - after[a])
+                        else:
+                            self.take(self.row_of(node), k, mass * (result - after), arm)
                         for a in ti.static(range(d)):
                             result[a] = after[a]
         return result

@@ -80,3 +80,10 @@ class SolverSettings(Table):
             "the velocity of nodes on and behind them to zero, as is usual: first-order, to compare with."
         ),
     ] = "folded"
+    deterministic: Annotated[
+        Flag,
+        Field(
+            description="Whether a GPU adds in fixed point, so that two runs have the same bytes. On the CPU they have "
+            "them in any case, and nothing changes."
+        ),
+    ] = False

@@ -170,8 +170,8 @@ class Runner:
 def _keeps(scene: Scene, particles: Sequence[BodyParticles], backend: Backend) -> bool:
     """Return whether a scene with these particles is computed by kernels that are kept for others."""
     count = sum(len(body.position) for body in particles)
-    if scene.comes_and_goes and not backend.on_cpu:
-        # There a batch does not sort.
+    if (scene.comes_and_goes or scene.solver.deterministic) and not backend.on_cpu:
+        # There a batch does not sort, and does not add in fixed point.
         return False
     return suits_batch(count, backend) and (count < FEW_PARTICLES or not backend.on_cpu)
 

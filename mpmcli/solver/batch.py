@@ -146,6 +146,8 @@ class Batch:
         on_cpu = backend.on_cpu
         if kind.comings.any and not on_cpu:
             raise InputError("a batch on a GPU knows no emitters and no open faces; run these scenes one by one.")
+        if kind.settings.deterministic and not on_cpu:
+            raise InputError("a batch on a GPU adds in any order; run deterministic scenes one by one.")
         width = node_width(d, on_cpu=on_cpu)
         scheme = scheme_of(kind.settings)
         stencil = scheme.spline.nodes

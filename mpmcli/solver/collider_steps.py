@@ -25,8 +25,13 @@ class ColliderSteps:
         colliders, motion: on the device; motion is None where none moves.
     """
 
-    def __init__(self, scene: Scene, shape: Sequence[int], first: int, arch: str) -> None:
+    def __init__(
+        self, scene: Scene, shape: Sequence[int], first: int, arch: str, *, deterministic: bool = False
+    ) -> None:
         """Put those of a scene on a grid with `shape` nodes per axis, whose node `first` is the lower corner.
+
+        Args:
+            deterministic: see `Colliders`.
 
         Raises:
             InputError: one moves, and the device knows single precision only.
@@ -34,7 +39,10 @@ class ColliderSteps:
         kind = ColliderKind.of(scene)
         if kind.moving and arch in WITHOUT_DOUBLES:
             raise InputError(f"colliders that move need double precision, which --arch {arch} lacks; give --arch cpu")
-        self.colliders = Colliders(kind, scene.dimension, shape, first, 1, on_cpu=arch == "cpu")
+        in_doubles = arch == "cpu" and not deterministic
+        self.colliders = Colliders(
+            kind, scene.dimension, shape, first, 1, on_cpu=in_doubles, deterministic=deterministic
+        )
         self.colliders.spacing = scene.domain.spacing
         self.colliders.write(scene)
         self.motion = ColliderMotion(self.colliders, 1) if kind.moving else None

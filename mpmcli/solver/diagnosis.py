@@ -1,5 +1,6 @@
 """Describes why a run stopped: which particle, where, what happened to it, and which limit was nearest."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,12 +57,16 @@ INVERTED = "was turned inside out"
 CRUSHED = "was crushed to nothing"
 LEFT = "left the domain"
 OUTRAN = "outran the nodes prepared for it"
+FASTER = "got more momentum in a step than the sums of solver.deterministic have room for"
+DENSER = "lies where more mass meets than the sums of solver.deterministic have room for"
 STIFFER = "a stiffer material, a finer domain.spacing or a lower time.safety may keep it from that"
 SUGGESTIONS = {
     NOT_FINITE: "lower time.safety, or look for a number in the scene that is far from what you mean",
     INVERTED: STIFFER,
     CRUSHED: STIFFER,
     LEFT: "check the speeds and forces of the scene, or lower time.safety or time.step",
+    FASTER: "check the speeds, forces and materials of the scene, or lower time.safety",
+    DENSER: "look for particles that lie on each other, or leave solver.deterministic out",
     OUTRAN: "lower time.step, so that speeds are measured more often",
 }
 FORCED = 'time.step = "auto" would have taken steps that are stable'
@@ -69,12 +74,33 @@ OTHERWISE = "check the speeds, forces and materials of the scene"
 
 
 def first_unsound(snapshot: Snapshot) -> int | None:
-    """Return the first particle (in solver order) that is crushed, inverted or not finite, None where all are sound."""
+    """Return a particle (in solver order) that is crushed, inverted or not finite, None where all are sound.
+
+    Of several it is that with the smallest id.
+    """
     sound = snapshot.volume_ratio > SMALLEST_J
     for values in (snapshot.x, snapshot.v, snapshot.C):
         sound &= np.isfinite(values).reshape(len(sound), -1).all(1)
     unsound = np.flatnonzero(~sound)
-    return int(unsound[0]) if len(unsound) else None
+    return int(unsound[snapshot.id[unsound].argmin()]) if len(unsound) else None
+
+
+def first_beyond(snapshots: Sequence[Snapshot], particle: int | None, place: np.ndarray | None) -> tuple[Snapshot, int]:
+    """Return the group and the number, in solver order, of the particle at which sums in fixed point had no room.
+
+    Args:
+        particle: its id, where that is known; place: otherwise that of the node, (d,), as x, m; it is the nearest one.
+    """
+    if particle is not None:
+        found = [(snapshot, np.flatnonzero(snapshot.id == particle)) for snapshot in snapshots]
+        return next((snapshot, int(rows[0])) for snapshot, rows in found if len(rows))
+    nearest = []
+    for g, snapshot in enumerate(snapshots):
+        away = ((snapshot.x - place) ** 2).sum(1)
+        p = int(np.lexsort((snapshot.id, away))[0])
+        nearest.append((float(away[p]), g, p))
+    _, g, p = min(nearest)
+    return snapshots[g], p
 
 
 def rate_of_change(snapshot: Snapshot, spacing: float) -> np.ndarray:

@@ -71,6 +71,8 @@ class Grid:
         period: the axes along which the domain repeats.
         weighs_before: whether `before` holds masses too, of which walls that move ask for.
         opens: (axis, side) of every face that material may leave through: nodes beyond it are like all others.
+        fixed: sums in fixed point, from which `FixedPoint.settle` sets the fields; None where P2G adds to these itself.
+            deterministic: whether there are such sums; then there are no `means`.
         box: (2, d) ints: first node in use and number of nodes in use, per axis.
     """
 
@@ -89,6 +91,7 @@ class Grid:
         period: Period | None = None,
         walls_move: bool = False,
         opens: Sequence[tuple[int, int]] = (),
+        deterministic: bool = False,
     ) -> None:
         """Allocate nodes for a number of runs, the nodes of one after those of another.
 
@@ -120,11 +123,13 @@ class Grid:
         self.filling = ti.Vector.field(width, float, shape=runs * self.node_count) if keeps_filling else None
         self.holding = self.filling if keeps_filling else self.nodes
         self.means = tuple(
-            ti.Vector.field(2, float, shape=runs * self.node_count) if wanted else None for wanted in averaged
+            ti.Vector.field(2, float, shape=runs * self.node_count) if wanted and not deterministic else None
+            for wanted in averaged
         )
         self.kept_means = tuple(means for means in self.means if means is not None)
         self.period = period or Period((("slip", "slip"),) * dimension, at_once=False)
         self.weighs_before = walls_move and scheme.keeps_before
+        self.deterministic, self.fixed = deterministic, None
         self.box = ti.field(int, shape=(2 * runs, dimension))
 
     @staticmethod
@@ -139,14 +144,17 @@ class Grid:
 
     @ti.func
     def clear(self, node: int):
-        """Set a node to zero."""
-        self.nodes[node] = ti.Vector.zero(float, self.width)
-        if ti.static(self.scheme.keeps_before):
-            self.before[node] = ti.Vector.zero(float, self.width)
-        if ti.static(self.keeps_filling):
-            self.filling[node] = ti.Vector.zero(float, self.width)
-        for means in ti.static(self.kept_means):
-            means[node] = ti.Vector.zero(float, 2)
+        """Set to zero what P2G adds to at a node."""
+        if ti.static(self.deterministic):
+            self.fixed.clear(node)
+        else:
+            self.nodes[node] = ti.Vector.zero(float, self.width)
+            if ti.static(self.scheme.keeps_before):
+                self.before[node] = ti.Vector.zero(float, self.width)
+            if ti.static(self.keeps_filling):
+                self.filling[node] = ti.Vector.zero(float, self.width)
+            for means in ti.static(self.kept_means):
+                means[node] = ti.Vector.zero(float, 2)
 
     @ti.func
     def linear_index(self, base: ti.template()):

@@ -11,6 +11,7 @@ from mpmcli.solver.activity import open_faces
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.box import build_box_search
 from mpmcli.solver.collider_steps import ColliderSteps
+from mpmcli.solver.fixed_point import FixedPoint
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid, drift_allowed, node_width, tile_edge
 from mpmcli.solver.nodes import NodeUpdate
@@ -68,13 +69,18 @@ class Kernels:
             period=period,
             walls_move=len(moving.faces) > 0,
             opens=open_faces(faces),
+            deterministic=scene.solver.deterministic and not backend.on_cpu,
         )
+        if self.grid.deterministic:
+            self.grid.fixed = FixedPoint(self.grid, groups, backend.arch)
         walls, images = build_walls(
             faces, scene.solver, PAD, self.grid.cells, self.grid.shape, scheme.spline.on_node, friction, moving
         )
         self.colliders = None
         if scene.colliders:
-            self.colliders = ColliderSteps(scene, self.grid.shape, PAD, backend.arch)
+            self.colliders = ColliderSteps(
+                scene, self.grid.shape, PAD, backend.arch, deterministic=self.grid.deterministic
+            )
         nodes = NodeUpdate(self.grid, images, [walls], self.colliders and self.colliders.colliders)
         self.contact = contact_between(groups, [len(group.bodies) for group in groups], self.grid, backend)
         self.particles = ParticleUpdate(
@@ -97,6 +103,7 @@ class Kernels:
             self.step = build_cpu_step(self.grid, nodes, self.particles, groups, self.orders, gravity)
         else:
             self.step = build_gpu_step(self.grid, nodes, self.particles, groups, gravity)
+        self.forget_beyond()
 
     def sort(self) -> None:
         """Sort the particles of every group by tile, and find the nodes in use."""
@@ -107,6 +114,11 @@ class Kernels:
         if self.contact is not None:
             self.contact.fill_all(self.particles.grid.spacing)
         self._find_box()
+
+    def forget_beyond(self) -> None:
+        """Forget what was beyond sums in fixed point."""
+        if self.grid.deterministic:
+            self.grid.fixed.forget()
 
     def share_work(self) -> None:
         """Share the work of a sort among threads anew, after its tables were loaded."""

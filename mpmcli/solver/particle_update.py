@@ -34,8 +34,8 @@ class ParticleUpdate:
         run: number of the run that a view is for.
         watches_box: whether a particle whose stencil has left the nodes in use is lost: on a GPU, where speeds are not
             read back at every step.
-        lost: per group, the first particle (in solver order) that left the domain, was inverted or is not finite, or
-            NOT_LOST.
+        lost: per group, the first particle (in solver order, by its id where the grid is `deterministic`) that left the
+            domain, was inverted or is not finite, or NOT_LOST.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class ParticleUpdate:
         if volume_ratio(group, group.stored(p)) > SMALLEST_J:
             scatter(g, group, self, p, kick)
         else:
-            ti.atomic_min(self.lost[self.first_lost + g], p)
+            self.lose(g, group, p)
         if ti.static(self.grid.keeps_filling):
             if relaxed > 0.0:
                 scatter_volume(group.x[p], group.row(p)[VOLUME], self.grid, True)
@@ -157,8 +157,16 @@ class ParticleUpdate:
         for c in ti.static(range(d)):
             group.x[p][c] = ti.select(sound, inside[c], x[c])
         if not sound:
-            ti.atomic_min(self.lost[self.first_lost + g], p)
+            self.lose(g, group, p)
         return deforming
+
+    @ti.func
+    def lose(self, g: ti.template(), group: ti.template(), p: int):
+        """Note that a particle is lost."""
+        if ti.static(self.grid.deterministic):
+            ti.atomic_min(self.lost[self.first_lost + g], group.id[p])
+        else:
+            ti.atomic_min(self.lost[self.first_lost + g], p)
 
     @ti.func
     def moved(self, group: ti.template(), x: ti.template(), remainder: ti.template(), v: ti.template(), dt: float):

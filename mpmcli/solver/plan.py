@@ -16,6 +16,7 @@ from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
 from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.backend import Backend
+from mpmcli.solver.fixed_point import FixedPoint
 from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import Grid, gradient_width, node_width, tile_edge
 from mpmcli.solver.ordering import TileOrder
@@ -127,8 +128,12 @@ def fields_of(
     return fields | ({"activity": 4} if comes_and_goes else {})
 
 
-def passes_of(members: Sequence[Law], scene: Scene) -> tuple[str, ...]:
-    """Return the loops of one step: the particles of each law, and the grid."""
+def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = False) -> tuple[str, ...]:
+    """Return the loops of one step: the particles of each law, and the grid.
+
+    Args:
+        deterministic: whether P2G is in fixed point.
+    """
     names = [law.name for law in members]
     separate = bool(_separating_axes(scene))
     rough = scene.solver.walls != "zeroed" and bool(_rough_axes(scene))
@@ -137,9 +142,11 @@ def passes_of(members: Sequence[Law], scene: Scene) -> tuple[str, ...]:
         "clear grid",
         *(f"average volumes of {law.name}" for law in members if averages_volume(scene.solver, law)),
         *(f"scatter {name}" + (" with forces" if name in pushed else "") for name in names),
+        *(("read sums in fixed point",) if deterministic else ()),
         *(("find contact",) if separate else ()),
         *(("find friction",) if rough else ()),
         "update grid" + (" with colliders" if scene.colliders else ""),
+        *(("add up loads",) if deterministic and scene.colliders else ()),
         *(f"gather {name}" for name in names),
     )
 
@@ -187,15 +194,24 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     scheme = scheme_of(scene.solver)
     tile = tile_edge(scheme.spline.nodes, dimension, on_cpu=backend.on_cpu)
     nodes = Grid.nodes_needed(cells, tile)
-    node_bytes = real * (width * (1 + scheme.keeps_before + needs_filling(scene, members)) + 2 * sum(averaged))
+    filling, deterministic = needs_filling(scene, members), scene.solver.deterministic and not backend.on_cpu
+    node_bytes = real * (width * (1 + scheme.keeps_before + filling) + 2 * sum(averaged))
+    if deterministic:
+        node_bytes += FixedPoint.bytes_needed(
+            width, before=scheme.keeps_before, filling=filling, averaged=sum(averaged)
+        )
+        # In their place.
+        node_bytes -= real * 2 * sum(averaged)
     tables = len(groups) * TileOrder.bytes_needed(cells, tile, backend.threads)
     tables += _contact_bytes(scene, nodes, tile, real)
     if scene.solver.solids == "total" and len(scene.sources) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(counts.values()))
     tables += ColliderKind.of(scene).bytes_needed(dimension, nodes // (tile * Grid.tile_counts(cells, tile)[-1]))
+    if deterministic:
+        tables += nodes * len(scene.colliders) * dimension * real
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
     host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)
-    passes = passes_of(members, scene)
+    passes = passes_of(members, scene, deterministic=deterministic)
     return Plan(groups, nodes, widest + 8, node_bytes, nodes * node_bytes + tables, host_bytes, passes)
 
 

@@ -208,4 +208,4 @@ class Run:
             observation(self.last_step, group.first, group.count, stress=stress, stored=(s.deformation, s.internal))
             for observation, group, s in zip(self._observations, self.groups, snapshots, strict=True)
         ]
-        return fill(arrays, snapshots, seen)
+        return fill(arrays, snapshots, seen, by_id=self.scene.solver.deterministic)

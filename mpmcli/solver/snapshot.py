@@ -1,7 +1,7 @@
 """Host copies of the particles on a device, for what numpy computes of them: frames of a GPU, and diagnoses."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -54,11 +54,28 @@ def read_group(group: ParticleGroup) -> Snapshot:
     return Snapshot(group, **group.to_numpy())
 
 
-def fill(arrays: FrameArrays, snapshots: Sequence[Snapshot], seen: Sequence[Observation]) -> list[Sums]:
-    """Fill all rows of one time, and return the sums over the particles of each law, as `build_frame_reader` does."""
+def fill(arrays: FrameArrays, snapshots: Sequence[Snapshot], seen: Sequence[Observation], *, by_id: bool) -> list[Sums]:
+    """Fill all rows of one time, and return the sums over the particles of each law, as `build_frame_reader` does.
+
+    Args:
+        by_id: whether sums are formed in the order of the ids, not in the solver's, which on a GPU differs from run to
+            run.
+    """
+    result = []
     for snapshot, observed in zip(snapshots, seen, strict=True):
         _fill(arrays, snapshot, observed)
-    return [_sums(s, o) for s, o in zip(snapshots, seen, strict=True)]
+        energy = observed.energy
+        if by_id:
+            order = np.argsort(snapshot.id)
+            snapshot, energy = _reordered(snapshot, order), energy[order]
+        result.append(_sums(snapshot, energy))
+    return result
+
+
+def _reordered(snapshot: Snapshot, order: np.ndarray) -> Snapshot:
+    values = {field.name: getattr(snapshot, field.name) for field in fields(snapshot) if field.name != "group"}
+    kept = {name: None if value is None else value[order] for name, value in values.items()}
+    return Snapshot(snapshot.group, **kept)
 
 
 def _fill(arrays: FrameArrays, snapshot: Snapshot, seen: Observation) -> None:
@@ -79,7 +96,7 @@ def _fill(arrays: FrameArrays, snapshot: Snapshot, seen: Observation) -> None:
         arrays["activity"][0, rows] = snapshot.activity
 
 
-def _sums(snapshot: Snapshot, seen: Observation) -> Sums:
+def _sums(snapshot: Snapshot, energy: np.ndarray) -> Sums:
     """Sum over the particles of a law, by the products sum m a a^T with a = (1, x, v, C)."""
     count, d = snapshot.x.shape
     products = np.zeros((1 + 2 * d + d * d,) * 2)
@@ -112,6 +129,6 @@ def _sums(snapshot: Snapshot, seen: Observation) -> Sums:
         affine=np.array([products[C, C].trace()]),
         turning=np.array([[turning[a, b] - turning[b, a] for a, b in pairs]]),
         spin=np.array([[spins[b, a] - spins[a, b] for a, b in pairs]]),
-        elastic=np.array([volume @ seen.energy.astype(np.float64)]),
+        elastic=np.array([volume @ energy.astype(np.float64)]),
         speed_squared=np.array([np.einsum("pc,pc->p", snapshot.v, snapshot.v).max()], np.float64),
     )

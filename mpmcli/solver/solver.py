@@ -12,6 +12,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.collider_steps import read_loads
+from mpmcli.solver.diagnosis import DENSER, FASTER, UnstableRunError, first_beyond
 from mpmcli.solver.emission_kernels import SolverEmission
 from mpmcli.solver.external_forces import drive
 from mpmcli.solver.frame_arrays import FrameArrays
@@ -21,6 +22,8 @@ from mpmcli.solver.kernels import Kernels
 from mpmcli.solver.observe import build_observation
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.run import COLLAPSE, Run
+from mpmcli.solver.snapshot import read_group
+from mpmcli.solver.splines import PAD
 from mpmcli.solver.state import SavedState, State
 from mpmcli.solver.state_bounds import build_measurement
 from mpmcli.solver.step_control import StepControl
@@ -123,6 +126,9 @@ class Solver(Run):
         state.external_forces.begin_step(since, since + kick)
         if self._kernels.colliders is not None:
             self._kernels.colliders.begin_step(state.time, dt)
+        if self.grid.deterministic:
+            stable = self.scene.time.safety * self.nearest_limit.value
+            self.grid.fixed.set_step(max(kick, min(stable, self.scene.time.end)))
         result = self._kernels.step(dt, kick, state.relaxed_in(dt))
         state.time = state.time + dt if until is None else until
         state.last_step = dt
@@ -175,6 +181,8 @@ class Solver(Run):
         # On the CPU every step reports it.
         if not self.backend.on_cpu and self._kernels.particles.any_lost():
             self._stop(dt, self._lost())
+        if self.grid.deterministic:
+            self._require_room(dt)
         if not self.state.step_control.measure(due):
             # A particle was crushed or inverted by the last step; the next one would not scatter it.
             self._stop(dt, self._lost())
@@ -186,6 +194,7 @@ class Solver(Run):
     def state_was_replaced(self) -> None:
         """Sort and measure particles whose state was set from outside; none of them counts as lost."""
         self._kernels.particles.lost.fill(NOT_LOST)
+        self._kernels.forget_beyond()
         self.state.drift = math.inf
         self.measure_state(self.last_step)
 
@@ -213,7 +222,25 @@ class Solver(Run):
 
     def _lost(self) -> list[int | None]:
         """Return a lost particle of each group, in solver order, None where none is known."""
-        return [None if p == NOT_LOST else int(p) for p in self._kernels.particles.lost.to_numpy()]
+        lost = self._kernels.particles.lost.to_numpy().tolist()
+        if self.grid.deterministic:
+            # There it is the id, as the order depends on atomics.
+            rows = [np.flatnonzero(g.id.to_numpy() == p) for g, p in zip(self.groups, lost, strict=True)]
+            return [int(found[0]) if len(found) else None for found in rows]
+        return [None if p == NOT_LOST else p for p in lost]
+
+    def _require_room(self, dt: float) -> None:
+        """Stop where sums in fixed point had no room.
+
+        Raises:
+            UnstableRunError: they had none.
+        """
+        particle, node = self.grid.fixed.found_beyond()
+        if particle is not None or node is not None:
+            place = None if node is None else (np.array(np.unravel_index(node, self.grid.shape)) - PAD) * self.spacing
+            snapshot, p = first_beyond([read_group(group) for group in self.groups], particle, place)
+            cause = DENSER if particle is None else FASTER
+            raise UnstableRunError(self._diagnose(snapshot, p, cause, dt))
 
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield the state as it is and then one frame for each output time to come, with its ledger row.

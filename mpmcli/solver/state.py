@@ -107,6 +107,7 @@ class State(Progress):
         if self._schedule is not None:
             self._schedule.begin()
         self._kernels.particles.lost.fill(NOT_LOST)
+        self._kernels.forget_beyond()
 
     def save(self) -> SavedState:
         """Copy the state to the host."""
@@ -140,6 +141,7 @@ class State(Progress):
         for group, count in zip(self._groups, saved.numbers.get("active", ()), strict=False):
             group.set_active(count)
         self._kernels.particles.lost.fill(NOT_LOST)
+        self._kernels.forget_beyond()
         self._kernels.share_work()
 
     def _fields(self) -> dict[str, ti.Field]:

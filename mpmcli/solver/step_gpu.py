@@ -1,4 +1,4 @@
-"""The step on a GPU: one kernel, whose scatter adds atomically, and which reads nothing back."""
+"""The step on a GPU: one kernel, whose scatter adds atomically, in fixed point or not, and which reads nothing back."""
 
 from collections.abc import Callable, Sequence
 
@@ -30,6 +30,9 @@ def build_gpu_step(
         for g, group in ti.static(numbered):
             for p in range(group.present()):
                 particles.scatter(g, group, p, kick, relaxed)
+        if ti.static(grid.deterministic):
+            for q in range(grid.box_nodes()):
+                grid.fixed.settle(grid, grid.linear_index(grid.box_node(q)), relaxed)
         for g, group in ti.static(numbered):
             if ti.static(group.law.relaxes):
                 for p in range(group.present()):
@@ -44,6 +47,9 @@ def build_gpu_step(
         for q in range(grid.box_nodes()):
             node = grid.box_node(q)
             nodes.update(node, grid.linear_index(node), gravity.in_step(kick, 0))
+        if ti.static(grid.deterministic and nodes.collides):
+            for q in range(nodes.colliders.rows * nodes.colliders.room):
+                nodes.colliders.book_row(q)
         for g, group in ti.static(numbered):
             for p in range(group.present()):
                 particles.advance(g, group, p, dt)

@@ -9,6 +9,7 @@ instructions; that halves the time of the gather in 3D.
 
 import taichi as ti
 
+from mpmcli.solver.fixed_sums import FixedSums
 from mpmcli.solver.particle_arrays import MASS, VOLUME
 from mpmcli.solver.particle_friction import friction_of_walls
 from mpmcli.solver.reference_grid import pulled_back, push_of_walls
@@ -57,7 +58,12 @@ def scatter(g: ti.template(), group: ti.template(), particles: ti.template(), p:
     base, distance = grid.scheme.spline.stencil(group.on_grid(p), grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
     middle, change = momentum(grid, distance, mass, row[VOLUME], v, C, stress, kick)
-    add_linear(grid.nodes, grid, grid.linear_index(base), w, middle, change, True)
+    first = grid.linear_index(base)
+    if ti.static(grid.deterministic):
+        if not add_fixed(grid.fixed.nodes, grid, first, w, mass, middle, change):
+            grid.fixed.note(group.id[p])
+    else:
+        add_linear(grid.nodes, grid, first, w, middle, change, True)
     if ti.static(grid.scheme.keeps_before):
         # Last, and with a copy: before it, Taichi 1.7.4 loses what a force with branches adds to v and C.
         own_v, own_C = group.motion_on_grid(p)
@@ -117,7 +123,11 @@ def scatter_before(
             middle[c] -= change[a, c] * (distance[a] - 1.0)
     if ti.static(grid.weighs_before):
         middle[grid.dimension] = mass
-    add_linear(grid.before, grid, grid.linear_index(base), w, middle, change, atomic)
+    if ti.static(grid.deterministic):
+        # With stress and forces it was noted where there is no room.
+        add_fixed(grid.fixed.before, grid, grid.linear_index(base), w, mass, middle, change)
+    else:
+        add_linear(grid.before, grid, grid.linear_index(base), w, middle, change, atomic)
 
 
 @ti.func
@@ -128,7 +138,32 @@ def scatter_volume(x: ti.template(), volume: float, grid: ti.template(), atomic:
     middle = ti.Vector.zero(float, grid.width)
     middle[ti.static(grid.dimension)] = volume
     change = ti.Matrix.zero(float, ti.static(grid.dimension), grid.width)
-    add_linear(grid.filling, grid, grid.linear_index(base), w, middle, change, atomic)
+    if ti.static(grid.deterministic):
+        middle[ti.static(grid.dimension)] = volume * grid.fixed.volume_scale
+        add_linear(grid.fixed.filling, grid, grid.linear_index(base), w, middle, change, atomic)
+    else:
+        add_linear(grid.filling, grid, grid.linear_index(base), w, middle, change, atomic)
+
+
+@ti.func
+def add_fixed(
+    sums: ti.template(),
+    grid: ti.template(),
+    first: int,
+    w: ti.template(),
+    mass: float,
+    middle: ti.template(),
+    change: ti.template(),
+):
+    """Add momentum and mass to sums in fixed point, as `add_linear` to fields, where there is room for them.
+
+    Returns:
+        Whether there was; `middle` and `change` are scaled then.
+    """
+    fits = grid.fixed.scaled(mass, middle, change)
+    if fits:
+        add_linear(sums, grid, first, w, middle, change, True)
+    return fits
 
 
 @ti.func
@@ -146,7 +181,8 @@ def add_linear(
     Without `atomic` no other thread may write those nodes.
 
     Args:
-        field: of the nodes; first: linear index of the first node.
+        field: of the nodes, or sums in fixed point, to which the rest is scaled.
+        first: linear index of the first node.
         middle: the quantity at the middle node; change: its change per cell, a row for each axis.
     """
     d = ti.static(grid.dimension)
@@ -177,7 +213,9 @@ def add_linear(
 @ti.func
 def add(field: ti.template(), node: int, share: ti.template(), atomic: ti.template()):
     """Add a share of momentum and mass to a node."""
-    if ti.static(atomic):
+    if ti.static(isinstance(field, FixedSums)):
+        field.add(node, share)
+    elif ti.static(atomic):
         ti.atomic_add(field[node], share)
     else:
         field[node] = field[node] + share

@@ -81,31 +81,52 @@ def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: i
     group.to_mean[p] = own
     volume, cell = group.row(p)[VOLUME], cell_of(grid, group.on_grid(p))
     group.cell[p] = cell
-    ti.atomic_add(grid.means[g][cell][0], volume * own)
-    ti.atomic_add(grid.means[g][cell][1], volume)
+    if ti.static(grid.deterministic):
+        grid.fixed.add_mean(g, cell, volume, own)
+    else:
+        ti.atomic_add(grid.means[g][cell][0], volume * own)
+        ti.atomic_add(grid.means[g][cell][1], volume)
 
 
 @ti.func
 def clear_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
     """Set the sums of the cell of particle p, and of its images, to zero."""
     cell = cell_of(grid, group.on_grid(p))
-    grid.means[g][cell] = ti.Vector.zero(float, 2)
+    clear_cell(grid, g, cell)
     if ti.static(len(grid.period.axes) > 0):
         for images in range(1, ti.static(2**grid.dimension)):
             image, exists = grid.period.image(grid.place_of(cell), images)
             if exists:
-                grid.means[g][grid.linear_index(image)] = ti.Vector.zero(float, 2)
+                clear_cell(grid, g, grid.linear_index(image))
+
+
+@ti.func
+def clear_cell(grid: ti.template(), g: ti.template(), cell: int):
+    """Set the sums of a cell to zero."""
+    if ti.static(grid.deterministic):
+        grid.fixed.means[g].clear(cell)
+    else:
+        grid.means[g][cell] = ti.Vector.zero(float, 2)
+
+
+@ti.func
+def sums_of_cell(grid: ti.template(), g: ti.template(), cell: int):
+    """Return the sums of a cell."""
+    if ti.static(grid.deterministic):
+        return grid.fixed.mean(g, cell)
+    else:
+        return grid.means[g][cell]
 
 
 @ti.func
 def missing_to_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
     """Return the mean of ln J over the cell of particle p less its own, once all were added."""
-    sums = grid.means[g][group.cell[p]]
+    sums = sums_of_cell(grid, g, group.cell[p])
     if ti.static(len(grid.period.axes) > 0):
         for images in range(1, ti.static(2**grid.dimension)):
             image, exists = grid.period.image(grid.place_of(group.cell[p]), images)
             if exists:
-                more = grid.means[g][grid.linear_index(image)]
+                more = sums_of_cell(grid, g, grid.linear_index(image))
                 for k in ti.static(range(2)):
                     sums[k] += more[k]
     return sums[0] / sums[1] - group.to_mean[p]

@@ -1,0 +1,263 @@
+"""`solver.deterministic`: a GPU adds in fixed point, so that two runs have the same bytes.
+
+The path of a GPU runs on software Vulkan, with two integers of 32 bits a sum, and on the CPU, with one of 64 bits.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import taichi as ti
+from solver_state import scene_of
+from test_batch import same, scene_named
+
+from mpmcli.errors import InputError
+from mpmcli.scene import BodyParticles, Scene
+from mpmcli.simulation.runner import _keeps
+from mpmcli.solver.backend import Backend
+from mpmcli.solver.batch import Batch, Kind
+from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.fixed_point import DENSEST
+from mpmcli.solver.fixed_sums import FixedSums
+from mpmcli.solver.plan import make_plan
+from mpmcli.solver.solver import Solver
+
+WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5}
+JELLY = {"law": "neo_hookean", "density": 900.0, "youngs_modulus": 5e4, "poissons_ratio": 0.47}
+SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e5, "friction_angle": 30.0}
+
+
+class OfGpu(Backend):
+    """The path of a GPU on the threads of the CPU."""
+
+    on_cpu = False
+
+
+def on_gpu_path(backend: Backend) -> Backend:
+    # A GPU counts as one thread.
+    return OfGpu("cpu", 1, backend.precision, backend.compile_cache, backend.optimisation)
+
+
+def mixed(
+    dimension: int, materials: Sequence[dict] = (WATER, JELLY, SAND), *, deterministic: bool = True, **solver: object
+) -> Scene:
+    """Return bodies that meet: water, a jelly that averages its volumes, and sand, or others."""
+    low = (0.0, 0.0, 0.0), (0.45, 0.1, 0.2), (0.1, 0.4, 0.1)
+    high = (0.4, 0.3, 0.9), (0.65, 0.4, 0.7), (0.5, 0.7, 0.5)
+    bodies = [
+        {
+            "name": f"body {k}",
+            "material": material,
+            "shape": {"box": {"min": list(first[:dimension]), "max": list(last[:dimension])}},
+            "velocity": [speed, -0.5, 0.0][:dimension],
+            "sampling": "jittered",
+        }
+        for k, (material, first, last, speed) in enumerate(zip(materials, low, high, (1.0, -1.0, -1.0), strict=False))
+    ]
+    return scene_of(
+        domain={
+            "size": [1.0] * dimension,
+            "spacing": 0.1,
+            "gravity": [0.0, -9.81, 0.0][:dimension],
+            "walls": "separate",
+        },
+        time={"end": 0.12, "frames": 3},
+        bodies=bodies,
+        solver={"deterministic": deterministic, **solver},
+    )
+
+
+def twice(scene: Scene, backend: Backend) -> tuple[list, list]:
+    """Return the frames and ledger rows of two runs, with kernels compiled once."""
+    solver = Solver(scene, backend)
+    begin = solver.state.save()
+    first = list(solver.frames())
+    solver.state.load(begin)
+    return first, list(solver.frames())
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(
+    ("dimension", "materials"),
+    [(2, (WATER,)), *(pytest.param(d, (WATER, JELLY, SAND), marks=pytest.mark.slow) for d in (2, 3))],
+    ids=["2D, water", "2D, all", "3D, all"],
+)
+def test_two_runs_on_vulkan_have_the_same_bytes(
+    backend_of: Callable, dimension: int, materials: tuple[dict, ...]
+) -> None:
+    """Frames and ledger; and as far from the CPU as a sum in another order: 30 steps of round-off."""
+    scene = mixed(dimension, materials)
+    first, second = twice(scene, backend_of("f32", 1, "vulkan"))
+    assert list(same(first, second)) == []
+    assert first[-1][0].step > 20
+    expected = list(Solver(scene, backend_of("f32", 1)).frames())
+    assert np.abs(first[-1][0].position - expected[-1][0].position).max() < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_two_runs_on_threads_have_the_same_bytes(backend_of: Callable, precision: str) -> None:
+    scene = mixed(2, precision=precision, transfer="aflip")
+    first, second = twice(scene, on_gpu_path(backend_of(precision, 3)))
+    assert list(same(first, second)) == []
+    expected = list(Solver(scene, backend_of(precision, 1)).frames())
+    error = np.abs(first[-1][0].position - expected[-1][0].position).max()
+    assert error < {"f32": 1e-5, "f64": 1e-12}[precision]
+
+
+@pytest.mark.slow
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", ["colliders", "rough walls", "periodic, a wall moves", "periodic, 3D, f_bar"])
+def test_every_sum_has_the_same_bytes(backend_of: Callable, name: str) -> None:
+    """What colliders take, friction, images, and means of volume over periodic faces."""
+    scene = scene_named(name)
+    scene = scene.model_copy(update={"solver": scene.solver.model_copy(update={"deterministic": True})})
+    first, second = twice(scene, backend_of("f32", 1, "vulkan"))
+    assert list(same(first, second)) == []
+    expected = list(Solver(scene, backend_of("f32", 1)).frames())
+    for (frame, row), (other, other_row) in zip(first, expected, strict=True):
+        assert np.abs(frame.position - other.position).max() < 60 * np.finfo(np.float32).eps
+        assert np.allclose(row.collider_force, other_row.collider_force, rtol=1e-3, atol=1e-3)
+
+
+@pytest.fixture
+def sums_of(backend_of: Callable) -> Iterator[Callable[[np.ndarray, bool], tuple[np.ndarray, ...]]]:
+    backend_of("f32", 3)
+
+    def add(numbers: np.ndarray, wide: bool) -> tuple[np.ndarray, ...]:
+        sums = FixedSums(1, 2, wide=wide)
+        source, found = ti.field(ti.f32, shape=len(numbers)), ti.field(ti.f32, shape=())
+        source.from_numpy(numbers)
+
+        @ti.kernel
+        def run():
+            for k in range(source.shape[0]):
+                sums.add(1, ti.Vector([source[k]]))
+
+        @ti.kernel
+        def read():
+            found[None] = sums.value(1)[0]
+
+        run()
+        read()
+        low = np.zeros((2, 1), np.int64) if wide else sums.low.to_numpy()
+        return sums.high.to_numpy()[:, 0], low[:, 0], np.float32(found[None])
+
+    yield add
+
+
+@pytest.mark.parametrize("wide", [True, False], ids=["64 bits", "2 x 32 bits"])
+def test_sums_are_those_of_rounded_numbers_in_any_order(sums_of: Callable, wide: bool) -> None:
+    """In rational arithmetic, to the last bit; so that a sum is off by at most half a unit a number."""
+    rng = np.random.default_rng(1)
+    # Sums stay below `largest`, and numbers reach from it to far below a unit.
+    numbers = (rng.uniform(-1, 1, 20_000) * 2.0 ** rng.uniform(-20, 13, 20_000)).astype(np.float32)
+    unit = Fraction(1) if wide else Fraction(1, 2**15)
+    # Which way halves are rounded is up to the device.
+    numbers = np.array([x for x in numbers if (Fraction(float(x)) / unit).denominator != 2], np.float32)
+    high, low, value = sums_of(numbers, wide)
+    exact = int(high[1]) + int(low[1]) * unit
+    assert exact == sum(round(Fraction(float(x)) / unit) * unit for x in numbers)
+    assert abs(exact - sum(Fraction(float(x)) for x in numbers)) <= len(numbers) * unit / 2
+    assert value == pytest.approx(float(exact), rel=2**-22)
+    again = sums_of(rng.permutation(numbers), wide)
+    assert (high[1], low[1]) == (again[0][1], again[1][1])
+    assert high[0] == low[0] == 0
+
+
+def test_momentum_is_kept_to_the_rounding_of_the_sums(backend_of: Callable) -> None:
+    """Bodies collide in the void: each of the 9 shares of a particle is off by half a unit of the sums a step."""
+    scene = mixed(2, (WATER, WATER), precision="f64")
+    domain = scene.domain.model_copy(update={"gravity": (0.0, 0.0)})
+    lifted = [
+        BodyParticles(b.name, 0.6 * b.position + 0.2, b.velocity, b.affine, 0.36 * b.volume, 0.36 * b.mass)
+        for b in Solver(scene, on_gpu_path(backend_of("f64", 3)))._particles
+    ]
+    still = scene.model_copy(update={"domain": domain})
+    solver = Solver(still, on_gpu_path(backend_of("f64", 3)), lifted)
+    before = momentum_of(solver)
+    for _ in range(20):
+        solver.step(1e-3)
+    solver.measure_state(1e-3)
+    unit = solver.grid.fixed.pace[None][1]
+    change = np.abs(momentum_of(solver) - before)
+    scale = sum(float((body.mass * np.linalg.norm(body.velocity, axis=1)).sum()) for body in lifted)
+    # Besides, round-off of G2P: a few units in the last place of the momentum of each particle.
+    assert (change <= 20 * (9 * solver.particle_count * unit / 2 + 8 * np.finfo(float).eps * scale)).all()
+    assert scale > 50
+
+
+def momentum_of(solver: Solver) -> np.ndarray:
+    found = np.zeros(solver.scene.dimension)
+    for group in solver.groups:
+        mass = group.rows[:, 0][group.body.to_numpy() if group.several else np.zeros(group.count, int)]
+        found += mass @ group.motion_to_numpy()[0]
+    return found
+
+
+def lone_pool() -> Scene:
+    """Return 256 cells of water, at rest."""
+    return scene_of(
+        domain={"size": [2.0, 2.0], "spacing": 0.1, "gravity": [0.0, 0.0]},
+        time={"end": 1.0, "frames": 1},
+        bodies=[{"name": "pool", "material": WATER, "shape": {"box": {"min": [0.2, 0.2], "max": [1.8, 1.8]}}}],
+        solver={"deterministic": True},
+    )
+
+
+def test_what_the_sums_have_no_room_for_stops_the_run(backend_of: Callable) -> None:
+    """A particle that would cross all of the domain in a step, and all particles in one place, 0.56 of them on a node.
+
+    Sums have room for DENSEST to twice as many times the mass of a full cell.
+    """
+    assert 2 * DENSEST < 0.75**2 * 256
+    solver = Solver(lone_pool(), on_gpu_path(backend_of("f32", 2)))
+    (group,), begin = solver.groups, solver.state.save()
+    solver.step(1e-3)
+    velocity, C = group.motion_to_numpy()
+    velocity[group.id.to_numpy() == 7] = 1e6
+    group.set_motion(velocity, C)
+    solver.step(1e-3)
+    with pytest.raises(UnstableRunError, match=r"particle 7 of .* got more momentum in a step than the sums of"):
+        solver.measure_state(1e-3)
+    solver.state.load(begin)
+    solver.step(1e-4)
+    solver.measure_state(1e-4)
+    group.x.fill(0.5)
+    solver.state_was_replaced()
+    solver.step(1e-4)
+    with pytest.raises(UnstableRunError, match=r"at \(0\.5, 0\.5\) m lies where more mass meets than the sums"):
+        solver.measure_state(1e-4)
+
+
+def test_on_the_cpu_nothing_changes(backend_of: Callable) -> None:
+    """The same bytes, plan and fields."""
+    backend = backend_of("f32", 2)
+    with_it, without = (mixed(2, (WATER,), deterministic=asked) for asked in (True, False))
+    assert make_plan(with_it, backend) == make_plan(without, backend)
+    solver = Solver(with_it, backend)
+    assert solver.grid.fixed is None and not solver.grid.deterministic
+    assert list(same(list(solver.frames()), list(Solver(without, backend).frames()))) == []
+
+
+def test_a_gpu_without_it_has_nothing_of_it(backend_of: Callable) -> None:
+    """And with it a node needs 8 bytes a number more, in place of the means of volume."""
+    backend = on_gpu_path(backend_of("f32", 2))
+    plain, asked = (mixed(2, (JELLY,), deterministic=asked) for asked in (False, True))
+    assert Solver(plain, backend).grid.fixed is None
+    grid = Solver(asked, backend).grid
+    bytes_of = 8 * sum(sums.width for sums in grid.fixed.kept) - 4 * 2
+    assert make_plan(asked, backend).bytes_per_node - make_plan(plain, backend).bytes_per_node == bytes_of
+    passes = make_plan(asked, backend).passes
+    assert [name for name in passes if name not in make_plan(plain, backend).passes] == ["read sums in fixed point"]
+
+
+def test_deterministic_runs_share_no_batch_on_a_gpu(backend_of: Callable) -> None:
+    scene, backend = lone_pool(), Backend("vulkan", 1, "f32", True)
+    (particles,) = Solver(scene, backend_of("f32", 1))._particles
+    assert not _keeps(scene, [particles], backend)
+    plain = scene.model_copy(update={"solver": scene.solver.model_copy(update={"deterministic": False})})
+    assert _keeps(plain, [particles], backend)
+    with pytest.raises(InputError, match="run deterministic scenes one by one"):
+        Batch(Kind.of(scene, [particles]), backend)
