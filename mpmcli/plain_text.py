@@ -1,5 +1,7 @@
 """Tables, sizes, counts and titles as plain text."""
 
+import json
+
 SIZES = ("B", "kB", "MB", "GB", "TB", "PB")
 
 
@@ -33,6 +35,18 @@ def duration_text(seconds: float) -> str:
 def one_line(text: str) -> str:
     """Return a text without line breaks and other characters that have no glyph."""
     return " ".join("".join(character if character.isprintable() else " " for character in text).split())
+
+
+def escaped(text: str) -> str:
+    """Return a text whose characters without a glyph are written as JSON escapes, but line breaks and tabs.
+
+    Text from files may hold sequences that change what a terminal shows.
+    """
+    if all(line.isprintable() for line in text.split("\n")):
+        return text
+    return "".join(
+        c if c.isprintable() or c in "\n\t" else json.dumps(c)[1:-1] if c != "\x7f" else "\\u007f" for c in text
+    )
 
 
 def size_text(count: float) -> str:

@@ -10,7 +10,7 @@ import click
 
 from mpmcli import __version__
 from mpmcli.cli.interrupt import catch_interrupts, interrupt_came
-from mpmcli.cli.streams import flush_streams
+from mpmcli.cli.streams import flush_streams, print_note
 from mpmcli.errors import MpmcliError
 
 # Name of each command, the module that holds it, and its line in the help: so that help loads no module.
@@ -122,7 +122,7 @@ def run(arguments: list[str]) -> int:
 def _print_error(line: str) -> None:
     """Print a line on stderr, where somebody still reads it."""
     with suppress(OSError, ValueError):
-        click.echo(line, err=True)
+        print_note(line)
 
 
 def _usage_sentence(error: click.ClickException) -> str:

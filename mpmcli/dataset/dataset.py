@@ -18,7 +18,6 @@ from mpmcli.dataset.shard import (
     TABLES,
     group_name,
     open_shard,
-    read_ledger,
     shard_splits,
 )
 from mpmcli.errors import InputError
@@ -27,6 +26,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import Result, open_result
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
+from mpmcli.output.ledger_table import read_ledger
 from mpmcli.output.run_record import RECORD
 from mpmcli.output.segments import PACKED, SEGMENTS
 from mpmcli.output.series import SERIES
@@ -153,7 +153,7 @@ class _StoredTrajectory(Trajectory):
     @property
     def ledger(self) -> list[LedgerRow]:
         with open_shard(self._shard) as file:
-            return read_ledger(file[group_name(self.number)])
+            return read_ledger(file[group_name(self.number)][LEDGER])
 
     def _read(self, name: str, frames: slice) -> np.ndarray:
         with open_shard(self._shard) as file:

@@ -21,7 +21,8 @@ import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.ledger_table import COLUMNS, ledger_columns, ledger_rows
+from mpmcli.output.guarded_read import read_whole
+from mpmcli.output.ledger_table import ledger_columns
 
 FORMAT, VERSION = "mpmcli-dataset", 1
 SPLITS = ("train", "valid", "test")
@@ -116,7 +117,7 @@ def checksum(group: h5py.Group) -> str:
     """Return the SHA-256, hexadecimal, of all that a trajectory's group holds, compressed or not."""
     names: list[str] = []
     group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-    return _checksum(group.attrs, ((name, group[name][...]) for name in sorted(names)))
+    return _checksum(group.attrs, ((name, read_whole(group, name, "iufS")) for name in sorted(names)))
 
 
 def _checksum(attributes: Mapping[str, Any], arrays: Iterable[tuple[str, np.ndarray]]) -> str:
@@ -162,11 +163,6 @@ def shard_splits(path: Path) -> dict[int, str]:
         if not set(splits.values()) <= set(SPLITS):
             raise ValueError("a split has another name")
         return splits
-
-
-def read_ledger(group: h5py.Group) -> list[LedgerRow]:
-    """Read the ledger of a trajectory."""
-    return ledger_rows({name: group[LEDGER][name][:] for name in COLUMNS if name in group[LEDGER]})
 
 
 def _fault(data: TrajectoryData) -> str:

@@ -16,7 +16,9 @@ import h5py
 import numpy as np
 
 from mpmcli.errors import RunError
+from mpmcli.output.damage import DAMAGE
 from mpmcli.output.durable import require_free_space, sealed, write_text
+from mpmcli.output.guarded_read import read_whole
 from mpmcli.output.stored_colliders import triangles_of
 from mpmcli.output.vtkhdf import LIBVER
 from mpmcli.scene.collider_surface import collider_surface
@@ -117,10 +119,24 @@ def read_stored_surfaces(directory: Path) -> dict[int, Triangles]:
     """Return the surfaces of colliders that were read from files, by number, as a packed result keeps them."""
     found = {}
     for name in (RESTING, MOVING):
-        with suppress(OSError, KeyError, ValueError), h5py.File(directory / name, "r", locking=False) as file:
+        with suppress(*DAMAGE), h5py.File(directory / name, "r", locking=False) as file:
             for number, group in file["mpmcli/surfaces"].items():
-                found[int(number)] = Triangles(group["vertices"][...], group["triangles"][...])
+                found[int(number)] = _surface(read_whole(group, "vertices", "f"), read_whole(group, "triangles", "iu"))
     return found
+
+
+def _surface(vertices: np.ndarray, triangles: np.ndarray) -> Triangles:
+    """Return a surface of vertices (n, 3) and triangles (m, 3).
+
+    Raises:
+        ValueError: it is none.
+    """
+    shapes = vertices.shape == (len(vertices), 3) and triangles.shape == (len(triangles), 3)
+    if not (shapes and triangles.size and np.isfinite(vertices).all()):
+        raise ValueError("it is no surface")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise ValueError("a triangle has no vertex")
+    return Triangles(vertices.astype(np.float64), triangles.astype(np.int64))
 
 
 def _things(header: Mapping[str, Any], colliders: Sequence[Collider], *, moving: bool) -> Things | None:

@@ -15,6 +15,7 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.collider_files import read_stored_surfaces
+from mpmcli.output.damage import DAMAGE, first_line
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import POSITION, STANDARD, FrameLayout
@@ -57,7 +58,10 @@ class Result(ABC):
         self.numbers = index.frames
         self.particle_counts = index.counts
         self.ledger: list[LedgerRow] = index.ledger
-        self.header = RunHeader.read(index.header)
+        try:
+            self.header = RunHeader.read(index.header)
+        except DAMAGE as error:
+            raise InputError(f"{path} is damaged: its header cannot be read ({first_line(error)}).") from error
         self.dimension = index.layout.dimension
         names = [name for name in index.layout.arrays if name not in (POSITION, *STANDARD)]
         self.field_names: tuple[str, ...] = tuple(names)
@@ -92,7 +96,9 @@ class Result(ABC):
             if name not in self._index.layout.arrays:
                 known = ", ".join(self.field_names) or "none"
                 raise InputError(f'{self.path} holds no field "{name}": its fields are {known}.')
-        stored = self._read(k, names)
+        stored = self._sound(k, names)
+        if any(len(array) != self.particle_counts[k] for array in stored.values()):
+            raise InputError(f"{self.path} is damaged: frame {k} is cut off.")
         index = self._index
         return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
 
@@ -107,7 +113,7 @@ class Result(ABC):
 
         The numbers are 0, 1, 2, ... unless something has changed the file.
         """
-        stored = self._read(k, [POSITION, *STANDARD, *self.field_names])
+        stored = self._sound(k, [POSITION, *STANDARD, *self.field_names])
         index = self._index
         frame = index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
         return frame, stored["id"]
@@ -116,6 +122,17 @@ class Result(ABC):
         """Read all frames, one at a time."""
         for k in range(self.frame_count):
             yield self.frame(k, fields)
+
+    def _sound(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Read arrays of the k-th frame, which have the types and shapes that the file tells of them."""
+        if k >= min(len(self.particle_counts), len(self.numbers), len(self._index.steps)):
+            raise InputError(f"{self.path} is damaged: it lists frame {k}, and tells nothing of it.")
+        stored = self._read(k, names)
+        for name, array in stored.items():
+            told = self._index.layout.arrays[name]
+            if array.dtype != told.dtype or array.shape[1:] != told.stored_shape(0)[1:]:
+                raise InputError(f"{self.path} is damaged: {name} is {array.shape} of {array.dtype} in frame {k}.")
+        return stored
 
     @abstractmethod
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -165,20 +182,22 @@ class _SeriesResult(Result):
             entries = list(ElementTree.parse(path).iter("DataSet"))
             times = np.array([float(entry.attrib["timestep"]) for entry in entries])
             self._files = [directory / Path(entry.attrib["file"]).name for entry in entries]
-            facts = json.loads((directory / SERIES_HEADER).read_text(encoding="utf-8"))
-            table = (directory / SERIES_LEDGER).read_text(encoding="utf-8")
-            if facts["format"] > FORMAT:
+            facts = dict(json.loads((directory / SERIES_HEADER).read_text(encoding="utf-8")))
+            if isinstance(facts["format"], int) and facts["format"] > FORMAT:
                 raise InputError(f"{path} is of a newer version of mpmcli; update mpmcli to read it.")
+            table = (directory / SERIES_LEDGER).read_text(encoding="utf-8")
             layout = FrameLayout.from_dict(facts["layout"])
             rows, columns = parse_ledger_csv(table)
             frames, steps, counts = (np.array(columns[name][: len(times)]) for name in FRAME_COLUMNS)
-        except (OSError, ValueError, KeyError, TypeError, ElementTree.ParseError) as error:
+            index = FrameIndex(layout, facts["header"], times, frames, steps, 0 * counts, counts, rows[: len(times)])
+            index = index.checked()
+        except (*DAMAGE, ElementTree.ParseError) as error:
+            if isinstance(error, InputError):
+                raise
             raise InputError(
                 f"{path} is not a series of mpmcli: it needs {SERIES_HEADER}, {SERIES_LEDGER} and its frames "
                 "beside it, as mpmcli wrote them."
             ) from error
-        rows = rows[: len(times)]
-        index = FrameIndex(layout, facts["header"], times, frames, steps, 0 * counts, counts, rows)
         super().__init__(path, index)
 
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -187,7 +206,9 @@ class _SeriesResult(Result):
             arrays = self._index.layout.arrays
             return {name: np.empty(arrays[name].stored_shape(0), arrays[name].dtype) for name in names}
         stored = read_vtu(self._files[k])
-        return {name: stored[name] for name in names}
+        if missing := [name for name in names if name not in stored]:
+            raise InputError(f"{self._files[k]} is damaged: it lacks {missing[0]}.")
+        return {name: np.asarray(stored[name]) for name in names}
 
 
 def open_result(path: Path) -> Result:
@@ -238,8 +259,7 @@ def _index_of(path: Path) -> FrameIndex:
     with closing(open_vtkhdf(path)) as file:
         try:
             return read_index(file)
-        # What h5py, numpy and JSON raise on a file whose content contradicts itself.
-        except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        except DAMAGE as error:
             raise InputError(f"{path} is damaged: its list of frames cannot be read.") from error
 
 
@@ -247,5 +267,7 @@ def _read_arrays(path: Path, names: Sequence[str], offset: int, count: int) -> d
     try:
         with closing(open_vtkhdf(path)) as file:
             return {name: read_array(file, name, offset, count) for name in names}
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
+    except DAMAGE as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path} is damaged: a frame that it lists cannot be read.") from error

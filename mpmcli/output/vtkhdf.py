@@ -20,8 +20,9 @@ from mpmcli import __version__
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.guarded_read import read_rows, read_whole
 from mpmcli.output.layout import POSITION, FrameLayout
-from mpmcli.output.ledger_table import COLUMNS, ledger_columns, ledger_rows
+from mpmcli.output.ledger_table import ledger_columns, read_ledger
 
 # A newer upper bound makes files that no VTK can open ("bad version number for layout message").
 LIBVER = ("v110", "v110")
@@ -168,36 +169,45 @@ def open_vtkhdf(path: Path) -> h5py.File:
     except OSError as error:
         reason = "is not an HDF5 file, or a damaged one" if path.exists() else "does not exist"
         raise InputError(f"{path} {reason}; give a particles.vtkhdf of mpmcli or its directory.") from error
-    if "VTKHDF" in file and "mpmcli" in file and file["mpmcli"].attrs.get("format") == FORMAT:
+    try:
+        form = file["mpmcli"].attrs.get("format") if "VTKHDF" in file and "mpmcli" in file else None
+        known = isinstance(form, np.integer) and isinstance(file["VTKHDF"], h5py.Group)
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+        file.close()
+        raise InputError(f"{path} is damaged: its group /mpmcli cannot be read.") from error
+    if known and form == FORMAT:
         return file
-    newer = "mpmcli" in file and file["mpmcli"].attrs.get("format", 0) > FORMAT
     file.close()
-    if newer:
+    if known and form > FORMAT:
         raise InputError(f"{path} was written by a newer version of mpmcli; update mpmcli to read it.")
     raise InputError(f"{path} is an HDF5 file, but mpmcli did not write it: its group /mpmcli is missing.")
 
 
 def read_index(file: h5py.File) -> FrameIndex:
-    """Read everything but the particles."""
+    """Read everything but the particles.
+
+    Raises:
+        Exception: what h5py, numpy and JSON raise, and ValueError, where the file contradicts itself.
+    """
     group, steps = file["mpmcli"], file["VTKHDF/Steps"]
-    header = json.loads(group.attrs["header"])
+    header = dict(json.loads(group.attrs["header"]))
     if "scene" in group.attrs:
         header["scene"] = group.attrs["scene"]
     return FrameIndex(
         layout=FrameLayout.from_dict(json.loads(group.attrs["layout"])),
         header=header,
-        times=steps["Values"][:],
-        frames=group["frame"][:],
-        steps=group["step"][:],
-        offsets=steps["PointOffsets"][:],
-        counts=file["VTKHDF/NumberOfPoints"][:],
-        ledger=ledger_rows({name: file["ledger"][name][:] for name in COLUMNS if name in file["ledger"]}),
-    )
+        times=read_whole(steps, "Values", "f"),
+        frames=read_whole(group, "frame", "iu"),
+        steps=read_whole(group, "step", "iu"),
+        offsets=read_whole(steps, "PointOffsets", "iu"),
+        counts=read_whole(file, "VTKHDF/NumberOfPoints", "iu"),
+        ledger=read_ledger(file["ledger"]),
+    ).checked()
 
 
 def read_array(file: h5py.File, name: str, offset: int, count: int) -> np.ndarray:
     """Read one array of one frame, in the form of the file."""
-    return file["VTKHDF"][_path(name)][offset : offset + count]
+    return read_rows(file["VTKHDF"], _path(name), offset, count)
 
 
 def _path(name: str) -> str:

@@ -24,6 +24,7 @@ from mpmcli.scene.repair import Renames, original_path, repaired
 from mpmcli.scene.sampling import points_per_cell
 from mpmcli.scene.schema import Scene, scene_model
 from mpmcli.scene.sentences import problems_of
+from mpmcli.scene.tables import too_deep
 
 _POSITION = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 # Messages of tomllib that a plainer sentence replaces.
@@ -217,7 +218,9 @@ def _read(file: File, kind: str) -> str:
 
 def _parse(text: str, source: str) -> dict[str, Any]:
     try:
-        return tomllib.loads(text)
+        found = tomllib.loads(text)
+        if not too_deep(found):
+            return found
     except tomllib.TOMLDecodeError as error:
         said = str(error)
         place = source
@@ -227,4 +230,5 @@ def _parse(text: str, source: str) -> dict[str, Any]:
             place += f":{line}" + (f":{column}" if column else "")
         raise InputError(f"{place}: not valid TOML: {_SYNTAX.get(said, said[:1].lower() + said[1:])}") from None
     except (ValueError, RecursionError):
-        raise InputError(f"{source}: not valid TOML: a number is too long or lists are too deep") from None
+        pass
+    raise InputError(f"{source}: not valid TOML: a number is too long or lists are too deep")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mpmcli.scene.ply_file import read_ply
 from mpmcli.scene.rotation import rotation
 from mpmcli.scene.triangles import Surface
 
@@ -56,13 +57,21 @@ def data_set(path: Path) -> object:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = pv.read(path)
+            found = _ply(path) if path.suffix.lower() == ".ply" else pv.read(path)
     # A damaged file makes VTK, meshio and the XML parser raise almost anything, and meshio exit.
     except (Exception, SystemExit):
         raise MeshFileError("it is no mesh that can be read (STL, OBJ, PLY and VTU are)") from None
     finally:
         vtkObject.SetGlobalWarningDisplay(shown)
     return found.combine() if isinstance(found, pv.MultiBlock) else found
+
+
+def _ply(path: Path) -> object:
+    import pyvista as pv
+
+    points, polygons = read_ply(path)
+    faces = [np.array([], np.int64), *(part for polygon in polygons for part in ([len(polygon)], polygon))]
+    return pv.PolyData(points, np.concatenate(faces)) if polygons else pv.PolyData(points)
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -93,8 +93,10 @@ def _is_number(text: str) -> bool:
 
 def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
     try:
-        found = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError):
+        # Mapped, so that a header cannot claim more than the file holds.
+        found = np.load(path, mmap_mode="r", allow_pickle=False)
+    # Of a damaged header, Python's own tokenizer and parser raise almost anything.
+    except Exception:
         raise PointFileError("it is no array of numpy") from None
     if found.dtype.names:
         return {name: found[name].reshape(-1).astype(np.float64) for name in found.dtype.names}

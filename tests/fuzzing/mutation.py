@@ -20,8 +20,35 @@ NUMBERS = (
     *(float("inf"), float("-inf"), float("nan")),
 )
 TEXTS = (
-    *("", " ", "a", "nan", "true", "0", "1e999", "../../etc/passwd", "/etc/passwd", "/dev/zero", ".", "..", "a/b", "\0"),
-    *("\x1b[31mred\x1b[0m", "\x07", "\u202e", "\ud7ff", "\U0001f600", "é" * 40, "x" * 5000, "[bold]", "%s", "{0}", "a\nb"),
+    *(
+        "",
+        " ",
+        "a",
+        "nan",
+        "true",
+        "0",
+        "1e999",
+        "../../etc/passwd",
+        "/etc/passwd",
+        "/dev/zero",
+        ".",
+        "..",
+        "a/b",
+        "\0",
+    ),
+    *(
+        "\x1b[31mred\x1b[0m",
+        "\x07",
+        "\u202e",
+        "\ud7ff",
+        "\U0001f600",
+        "é" * 40,
+        "x" * 5000,
+        "[bold]",
+        "%s",
+        "{0}",
+        "a\nb",
+    ),
     *("t", "x", "X", "t**t", "1/0", "(" * 200, "-" * 3000 + "1", "sin(t)", "9" * 400, "t if t > 1 else x", "[" * 99),
 )
 _NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
@@ -215,7 +242,9 @@ def hdf5_mutant(data: bytes, rng: Random) -> bytes:
             name = rng.choice(names)
             # What one of these refuses leaves the file as it was.
             with suppress(Exception):
-                rng.choice((_h5_values, _h5_values, _h5_attribute, _h5_attribute, _h5_replace, _h5_link))(file, name, rng)
+                rng.choice((_h5_values, _h5_values, _h5_attribute, _h5_attribute, _h5_replace, _h5_link))(
+                    file, name, rng
+                )
     return buffer.getvalue()
 
 
@@ -326,5 +355,9 @@ def _sqlite_damage(connection: sqlite3.Connection, table: str, rng: Random) -> N
             connection.execute(f"UPDATE {table} SET value = ? WHERE rowid = ?", (text, row))
         case _:
             value = rng.choice((*NUMBERS, *TEXTS, "../../../etc/passwd", "/etc/passwd", "../result"))
-            where = "" if rng.random() < 0.3 else " WHERE rowid = (SELECT rowid FROM " + table + " ORDER BY random() LIMIT 1)"
+            where = (
+                ""
+                if rng.random() < 0.3
+                else " WHERE rowid = (SELECT rowid FROM " + table + " ORDER BY random() LIMIT 1)"
+            )
             connection.execute(f"UPDATE {table} SET {column} = ?{where}", (value,))

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import click
-from fuzzing.readers import command_of
 
+from fuzzing.readers import command_of
+from mpmcli.cli.streams import print_note
 from mpmcli.errors import MpmcliError
 
 MOST_OUTPUT = 2**22
@@ -42,7 +43,7 @@ def fault_of(words: Sequence[object]) -> Fault | None:
             command, arguments = command_of([str(word) for word in words])
             command.main(arguments, prog_name="mpmcli", standalone_mode=False)
         except (MpmcliError, click.ClickException) as error:
-            err.write(str(error))
+            print_note(str(error))
         except (click.exceptions.Exit, SystemExit):
             pass
         except Exception as error:

@@ -8,7 +8,15 @@ from random import Random
 import tomli_w
 
 from fuzzing import seeds
-from fuzzing.mutation import bytes_mutant, hdf5_mutant, json_mutant, sqlite_mutant, text_mutant, tree_mutant, value_mutant
+from fuzzing.mutation import (
+    bytes_mutant,
+    hdf5_mutant,
+    json_mutant,
+    sqlite_mutant,
+    text_mutant,
+    tree_mutant,
+    value_mutant,
+)
 from fuzzing.seeds import Files
 
 Words = Sequence[str]
@@ -66,7 +74,14 @@ def _scene_text(rng: Random) -> Input:
 
 def _override(rng: Random) -> Input:
     files = seeds.chosen(seeds.scenes(), rng)
-    keys = ("time.end", "bodies[0].velocity", "bodies.0.material.density", "domain.gravity", "solver.precision", "title")
+    keys = (
+        "time.end",
+        "bodies[0].velocity",
+        "bodies.0.material.density",
+        "domain.gravity",
+        "solver.precision",
+        "title",
+    )
     said = f"{rng.choice(keys)}={value_mutant(rng)}".encode("utf-8", "replace")
     word = text_mutant(said, rng) if rng.random() < 0.5 else said
     word = word.replace(b"\0", b"0").decode("utf-8", "replace")
