@@ -6,7 +6,6 @@ Source: G. Turk, The PLY Polygon File Format, 1994.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -35,14 +34,12 @@ class _Element:
     properties: list[_Property]
 
 
-def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
+def read_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the points (n, 3) float64, and of each polygon the numbers of its corners.
 
     Raises:
-        OSError: the file cannot be read.
         ValueError, KeyError, IndexError: it is no PLY file, or a damaged one.
     """
-    data = path.read_bytes()
     order, elements, start = _header(data)
     source = _Words(data[start:].split()) if order == "" else _Bytes(data[start:], order)
     points, polygons = np.empty((0, 3)), []
@@ -52,9 +49,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
             points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
         elif element.name == "face":
             polygons = columns[next(name for name in _CORNERS if name in columns)]
-    if any(len(polygon) and not 0 <= polygon.min() <= polygon.max() < len(points) for polygon in polygons):
-        raise ValueError("a face has a corner that is no vertex")
-    return points, [polygon.astype(np.int64) for polygon in polygons if len(polygon) > 2]
+    return points, polygons
 
 
 def _header(data: bytes) -> tuple[str, list[_Element], int]:
@@ -90,12 +85,32 @@ class _Words:
         columns: dict[str, list] = {p.name: [] for p in element.properties}
         if element.count > len(self.words):
             raise ValueError("it ends too early")
+        if (found := self._uniform(element)) is not None:
+            return found
         for _ in range(element.count if columns else 0):
             for p in element.properties:
                 count = int(self._next(1)[0]) if p.length else 1
                 numbers = np.array([float(word) for word in self._next(count)])
                 columns[p.name].append(numbers if p.length else numbers[0])
         return columns if any(p.length for p in element.properties) else {n: np.array(c) for n, c in columns.items()}
+
+    def _uniform(self, element: _Element) -> dict[str, np.ndarray] | None:
+        """Return an element of single numbers, or of one list that is as long in each, None for any other."""
+        one, n = element.properties[:1], element.count
+        listed = [p for p in element.properties if p.length]
+        if not one or not n or (listed and len(element.properties) > 1) or self.at >= len(self.words):
+            return None
+        width = 1 + int(self.words[self.at]) if listed else len(element.properties)
+        words = self.words[self.at : self.at + n * width]
+        if width < 1 or len(words) < n * width:
+            return None
+        table = np.array(words, np.float64).reshape(n, width)
+        if listed and (table[:, 0] != width - 1).any():
+            return None
+        self.at += n * width
+        return (
+            {one[0].name: table[:, 1:]} if listed else {p.name: table[:, k] for k, p in enumerate(element.properties)}
+        )
 
     def _next(self, count: int) -> list[bytes]:
         found = self.words[self.at : self.at + count]
@@ -116,6 +131,8 @@ class _Bytes:
             return self._table(element.count, element.properties)
         if element.count > len(self.data):
             raise ValueError("it ends too early")
+        if (found := self._uniform(element)) is not None:
+            return found
         columns: dict[str, list] = {p.name: [] for p in element.properties}
         for _ in range(element.count):
             for p in element.properties:
@@ -123,6 +140,23 @@ class _Bytes:
                 numbers = self._numbers(p.type, count)
                 columns[p.name].append(numbers if p.length else numbers[0])
         return columns
+
+    def _uniform(self, element: _Element) -> dict[str, np.ndarray] | None:
+        """Return an element of one list that is as long in each, None for any other."""
+        if len(element.properties) > 1 or not element.count:
+            return None
+        p, n = element.properties[0], element.count
+        head = np.dtype(self.order + p.length)
+        length = int(np.frombuffer(self.data, head, 1, self.at)[0])
+        size = head.itemsize + length * np.dtype(p.type).itemsize
+        if length < 1 or self.at + n * size > len(self.data):
+            return None
+        row = np.dtype([("length", head), ("numbers", self.order + p.type, (length,))])
+        found = np.frombuffer(self.data, row, n, self.at)
+        if (found["length"] != length).any():
+            return None
+        self.at += n * size
+        return {p.name: found["numbers"]}
 
     def _table(self, count: int, properties: list[_Property]) -> dict[str, np.ndarray]:
         row = np.dtype([(p.name, self.order + p.type) for p in properties])

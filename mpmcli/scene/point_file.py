@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mpmcli.scene.mesh_file import MeshFileError, data_set
+from mpmcli.scene.geometry_file import GeometryFileError, read_geometry
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sentences import listed, nearest, quoted
 
@@ -107,19 +107,18 @@ def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
 
 def _data_set(path: Path, d: int, velocity: str | None) -> tuple[np.ndarray, np.ndarray | None]:
     try:
-        found = data_set(path)
-    except MeshFileError:
+        found = read_geometry(path)
+    except GeometryFileError:
         raise PointFileError("it is no file of points that can be read (CSV, NPY, PLY and VTU are)") from None
-    points = getattr(found, "points", None)
-    if points is None or not len(points):
+    if not len(found.points):
         raise PointFileError("it holds no point")
-    chosen = [_in_plane(np.array(points, dtype=np.float64), d, "points")]
+    chosen = [_in_plane(found.points, d, "points")]
     if velocity is None:
         return chosen[0], None
-    if velocity not in found.point_data:
-        known = listed(quoted(list(found.point_data.keys())), "and") if len(found.point_data.keys()) else "none"
+    if velocity not in found.arrays:
+        known = listed(quoted(list(found.arrays)), "and") if found.arrays else "none"
         raise PointFileError(f'its points have no array "{velocity}"; they have {known}')
-    values = np.array(found.point_data[velocity], dtype=np.float64)
+    values = np.array(found.arrays[velocity], dtype=np.float64)
     if values.ndim != 2 or values.shape[1] not in (d, 3):
         raise PointFileError(f'its array "{velocity}" must have {d} numbers for each point')
     return chosen[0], _in_plane(values, d, "velocities")
