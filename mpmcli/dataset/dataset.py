@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from mpmcli.dataset.paths import SHARDS, SWEEP
@@ -24,6 +25,7 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import Result, open_result
+from mpmcli.output.guarded_read import read_whole, require_stored
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.ledger_table import read_ledger
@@ -145,10 +147,29 @@ class _StoredTrajectory(Trajectory):
             self.number, self.split = number, str(group.attrs["split"])
             self.draws = json.loads(group.attrs["draws"])
             self.header = RunHeader.read(json.loads(group.attrs["header"]))
-            self.times, self.steps, self.frames = (group[name][:] for name in TABLES)
-            self.particle_count = group["position"].shape[1]
+            self.times, self.steps, self.frames = (read_whole(group, name) for name in TABLES)
             fixed = (*MOVING, *LABELS, *TABLES, LEDGER)
             self.field_names = tuple(name for name in group if name not in fixed)
+            self.particle_count = self._particles(group)
+
+    def _particles(self, group: h5py.Group) -> int:
+        """Return N, where all arrays are of T frames and N particles.
+
+        Raises:
+            ValueError: they are not.
+        """
+        shapes = {name: require_stored(group, name).shape for name in (*MOVING, *LABELS, *TABLES, *self.field_names)}
+        frames, particles, d = shapes["position"]
+        right = {name: (particles,) for name in LABELS} | {name: (frames,) for name in TABLES}
+        right |= {name: (frames, particles, *shapes[name][2:]) for name in self.field_names}
+        right |= {name: (frames, particles, d) for name in MOVING}
+        if right != shapes or d != self.header.dimension or not frames:
+            raise ValueError("the arrays of a trajectory have different shapes")
+        if any(group[name].dtype.kind == "f" for name in LABELS) or any(
+            group[name].dtype.kind != "f" for name in MOVING
+        ):
+            raise ValueError("the arrays of a trajectory have other types")
+        return particles
 
     @property
     def ledger(self) -> list[LedgerRow]:
@@ -157,7 +178,7 @@ class _StoredTrajectory(Trajectory):
 
     def _read(self, name: str, frames: slice) -> np.ndarray:
         with open_shard(self._shard) as file:
-            array = file[group_name(self.number)][name]
+            array = require_stored(file[group_name(self.number)], name)
             return array[:] if name in LABELS else array[frames]
 
 

@@ -21,7 +21,9 @@ import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.damage import DAMAGE
 from mpmcli.output.guarded_read import read_whole
+from mpmcli.output.hdf5_heaps import require_sound_heaps
 from mpmcli.output.ledger_table import ledger_columns
 
 FORMAT, VERSION = "mpmcli-dataset", 1
@@ -140,6 +142,7 @@ def open_shard(path: Path) -> Iterator[h5py.File]:
     if not path.exists():
         raise InputError(f"{path} is missing: the dataset is not complete.")
     try:
+        require_sound_heaps(path)
         # A sealed shard never changes, so no lock is taken.
         with h5py.File(path, "r", locking=False) as file:
             if file.attrs.get("format") != FORMAT:
@@ -147,8 +150,9 @@ def open_shard(path: Path) -> Iterator[h5py.File]:
             if file.attrs["version"] > VERSION:
                 raise InputError(f"{path} was written by a newer version of mpmcli; update mpmcli to read it.")
             yield file
-    # What h5py, numpy and JSON raise on a file whose content contradicts itself.
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except DAMAGE as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path} is damaged: what it should hold cannot be read.") from error
 
 

@@ -19,6 +19,7 @@ from mpmcli.errors import RunError
 from mpmcli.output.damage import DAMAGE
 from mpmcli.output.durable import require_free_space, sealed, write_text
 from mpmcli.output.guarded_read import read_whole
+from mpmcli.output.hdf5_heaps import require_sound_heaps
 from mpmcli.output.stored_colliders import triangles_of
 from mpmcli.output.vtkhdf import LIBVER
 from mpmcli.scene.collider_surface import collider_surface
@@ -119,9 +120,12 @@ def read_stored_surfaces(directory: Path) -> dict[int, Triangles]:
     """Return the surfaces of colliders that were read from files, by number, as a packed result keeps them."""
     found = {}
     for name in (RESTING, MOVING):
-        with suppress(*DAMAGE), h5py.File(directory / name, "r", locking=False) as file:
-            for number, group in file["mpmcli/surfaces"].items():
-                found[int(number)] = _surface(read_whole(group, "vertices", "f"), read_whole(group, "triangles", "iu"))
+        with suppress(*DAMAGE):
+            require_sound_heaps(directory / name)
+            with h5py.File(directory / name, "r", locking=False) as file:
+                for number, group in file["mpmcli/surfaces"].items():
+                    shape = read_whole(group, "vertices", "f"), read_whole(group, "triangles", "iu")
+                    found[int(number)] = _surface(*shape)
     return found
 
 

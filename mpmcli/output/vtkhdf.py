@@ -21,6 +21,7 @@ from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.guarded_read import read_rows, read_whole
+from mpmcli.output.hdf5_heaps import require_sound_heaps
 from mpmcli.output.layout import POSITION, FrameLayout
 from mpmcli.output.ledger_table import ledger_columns, read_ledger
 
@@ -161,6 +162,7 @@ def open_vtkhdf(path: Path) -> h5py.File:
         InputError: the file is missing, damaged, or was not written by mpmcli.
     """
     try:
+        require_sound_heaps(path)
         try:
             file = h5py.File(path, "r", locking=False)
         except OSError:

@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
@@ -36,7 +36,7 @@ class Campaign:
 
     Attributes:
         directory: where the inputs are written, one after the other; best in memory.
-        findings: where those with a forbidden outcome are kept.
+        given: inputs in place of those that follow; findings: where those with a forbidden outcome are kept.
         done: inputs that ran; faults: how many of each kind were found.
     """
 
@@ -46,13 +46,16 @@ class Campaign:
     count: int
     directory: Path
     findings: Path
+    given: Sequence[Input] = ()
     done: int = 0
     faults: Counter[str] = field(default_factory=Counter)
 
     def run(self, tell: Callable[["Campaign"], None] = lambda campaign: None) -> None:
         """Run all of them."""
         at, end = self.first, self.first + self.count
-        TARGETS[self.target].make(Random(0))
+        if not self.given:
+            # What seeds need is loaded once.
+            TARGETS[self.target].make(Random(0))
         while at < end:
             at = self._in_a_process(at, min(at + OF_ONE_PROCESS, end))
             self.done = at - self.first
@@ -60,6 +63,8 @@ class Campaign:
 
     def input(self, number: int) -> Input:
         """Return an input."""
+        if self.given:
+            return self.given[number]
         return TARGETS[self.target].make(Random(f"{self.target}/{self.seed}/{number}"))
 
     def _in_a_process(self, first: int, end: int) -> int:

@@ -336,6 +336,8 @@ def sqlite_mutant(data: bytes, rng: Random) -> bytes:
 
 def _sqlite_damage(connection: sqlite3.Connection, table: str, rng: Random) -> None:
     columns = [row[1] for row in connection.execute(f"PRAGMA table_info({table})")]
+    if not columns:
+        return
     column = rng.choice(columns)
     match rng.randrange(10):
         case 0:

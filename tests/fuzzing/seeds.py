@@ -22,7 +22,8 @@ Files = dict[str, bytes]
 
 RECORD = b"""{"program": "mpmcli", "version": "0.1", "command": ["mpmcli", "simulate", "scene.toml"],
 "backend": {"arch": "cpu", "threads": 1, "precision": "f32"}, "seeds": {}, "frames_expected": 6, "particles": 4,
-"notes": ["left: none"], "status": "finished", "frames_written": 6, "steps": 50, "time": 0.1, "timings": {"wall_s": 1.0},
+"notes": ["left: none"],
+"status": "finished", "frames_written": 6, "steps": 50, "time": 0.1, "timings": {"wall_s": 1.0},
 "limits": {"wave": 2, "speed": 2}, "energy": {"first": 20.0, "last": 20.0}, "started": "2026-01-01T00:00:00+00:00",
 "failure": {"message": "It stopped.", "step": 3, "limit": "wave"}, "ended": "2026-01-01T00:00:01+00:00"}
 """
