@@ -10,20 +10,7 @@ from command import CONFIGS
 from fuzzing.mutation import NUMBERS, TEXTS, paths_of, value_mutant
 
 Node = dict[str, Any]
-WORDS = (
-    "drop",
-    "left",
-    "t",
-    "x",
-    "sin(t)",
-    "0.1*x",
-    "-9.81",
-    "auto",
-    "2*pi*t",
-    "velocity",
-    "exp(-t)",
-    "X if X > 0.5 else Y",
-)
+WORDS = ("drop", "left", "t", "x", "sin(t)", "0.1*x", "-9.81", "auto", "2*pi*t", "velocity", "X if X > 1 else Y")
 DEEPEST = 7
 
 
@@ -35,7 +22,7 @@ def schema() -> Node:
 
 def scene_of(rng: Random) -> dict[str, Any]:
     """Return a scene that follows the schema, in 2D or in 3D."""
-    return {**value_of(schema(), rng, 0), "constants": {"a": 1.0, "b": "a*t"}}
+    return {**_table(_resolved(schema()), rng, 0), "constants": {"a": 1.0, "b": "a*t"}}
 
 
 def revised(scene: dict[str, Any], rng: Random) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What became of one input: a command of mpmcli in this process, whose unexpected exceptions are not turned into words."""
+"""What became of one input: a command of mpmcli in this process, with unexpected exceptions as they are."""
 
 import io
 import traceback
