@@ -46,14 +46,23 @@ class GeometryFileError(Exception):
     """There is no such file, or it cannot be read; the text is empty in the latter case."""
 
 
+def absence(path: Path) -> str:
+    """Say why there is no file at a path, "" where there is one."""
+    try:
+        return "" if path.is_file() else "it is no file" if path.exists() else "there is no such file"
+    # A name that is too long, or a directory that may not be read.
+    except (OSError, ValueError):
+        return "there is no such file"
+
+
 def read_geometry(path: Path) -> Geometry:
     """Return the points and the triangles in a file.
 
     Raises:
         GeometryFileError: there is no such file, or it cannot be read.
     """
-    if not path.is_file():
-        raise GeometryFileError("there is no such file" if not path.exists() else "it is no file")
+    if fault := absence(path):
+        raise GeometryFileError(fault)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         return _by_vtk(path)

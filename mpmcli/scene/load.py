@@ -212,8 +212,9 @@ def _read(file: File, kind: str) -> str:
             f"{file}: this is no text in UTF-8 (byte {error.start} is {error.object[error.start]:#04x}); "
             f"give a {kind} in TOML"
         ) from None
-    except OSError as error:
-        raise InputError(f"{file}: the file cannot be read: {error.strerror}") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{file}: the file cannot be read: {reason}") from None
 
 
 def _parse(text: str, source: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mpmcli.scene.geometry_file import GeometryFileError, read_geometry
+from mpmcli.scene.geometry_file import GeometryFileError, absence, read_geometry
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sentences import listed, nearest, quoted
 
@@ -29,8 +29,8 @@ def read_points(path: Path, d: int, velocity: str | Sequence[str] | None) -> tup
     Raises:
         PointFileError: there is no such file, it cannot be read, or it lacks what is asked for.
     """
-    if not path.is_file():
-        raise PointFileError("there is no such file" if not path.exists() else "it is no file")
+    if fault := absence(path):
+        raise PointFileError(fault)
     table = path.suffix.lower() in TABLES
     fits = velocity is None or (
         len(velocity) == d and not isinstance(velocity, str) if table else isinstance(velocity, str)
