@@ -48,7 +48,7 @@ def read_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
         if element.name == "vertex":
             points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
         elif element.name == "face":
-            polygons = columns[next(name for name in _CORNERS if name in columns)]
+            polygons = columns.get(_CORNERS[0], columns.get(_CORNERS[1], []))
     return points, polygons
 
 
