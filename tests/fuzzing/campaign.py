@@ -167,6 +167,7 @@ def place(one: Input, directory: Path, before: Files | None = None) -> None:
     if before is None or any((directory / name).exists() for name in OUTPUTS):
         shutil.rmtree(directory, ignore_errors=True)
         before = {}
+    directory.mkdir(parents=True, exist_ok=True)
     for name in before.keys() - one.files.keys():
         (directory / name).unlink(missing_ok=True)
     for name, data in one.files.items():

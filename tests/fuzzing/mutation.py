@@ -353,9 +353,8 @@ def _sqlite_damage(connection: sqlite3.Connection, table: str, rng: Random) -> N
         case 5 | 6 if "value" in columns:
             rows = connection.execute(f"SELECT rowid, value FROM {table}").fetchall()
             row, value = rng.choice(rows)
-            text = (
-                json.dumps(value_mutant(rng)) if rng.random() < 0.5 else json_mutant(str(value).encode(), rng).decode()
-            )
+            text = json_mutant(str(value).encode(), rng).decode()
+            text = json.dumps(value_mutant(rng)) if rng.random() < 0.5 else text
             connection.execute(f"UPDATE {table} SET value = ? WHERE rowid = ?", (text, row))
         case _:
             value = rng.choice((*NUMBERS, *TEXTS, "../../../etc/passwd", "/etc/passwd", "../result"))
