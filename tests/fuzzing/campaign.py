@@ -24,7 +24,7 @@ from fuzzing.targets import TARGETS, Input
 MOST_SECONDS = 20.0
 MOST_BYTES = 2**30
 # Inputs of one process; what it has cached counts as its memory.
-OF_ONE_PROCESS = 1000
+OF_ONE_PROCESS = 200
 KEPT_OF_A_KIND = 3
 # What commands write.
 OUTPUTS = ("out", "README.md")
