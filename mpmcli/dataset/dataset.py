@@ -7,7 +7,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from mpmcli.dataset.paths import SHARDS, SWEEP
@@ -19,6 +18,7 @@ from mpmcli.dataset.shard import (
     TABLES,
     group_name,
     open_shard,
+    particles_of,
     shard_splits,
 )
 from mpmcli.errors import InputError
@@ -150,26 +150,7 @@ class _StoredTrajectory(Trajectory):
             self.times, self.steps, self.frames = (read_whole(group, name) for name in TABLES)
             fixed = (*MOVING, *LABELS, *TABLES, LEDGER)
             self.field_names = tuple(name for name in group if name not in fixed)
-            self.particle_count = self._particles(group)
-
-    def _particles(self, group: h5py.Group) -> int:
-        """Return N, where all arrays are of T frames and N particles.
-
-        Raises:
-            ValueError: they are not.
-        """
-        shapes = {name: require_stored(group, name).shape for name in (*MOVING, *LABELS, *TABLES, *self.field_names)}
-        frames, particles, d = shapes["position"]
-        right = {name: (particles,) for name in LABELS} | {name: (frames,) for name in TABLES}
-        right |= {name: (frames, particles, *shapes[name][2:]) for name in self.field_names}
-        right |= {name: (frames, particles, d) for name in MOVING}
-        if right != shapes or d != self.header.dimension or not frames:
-            raise ValueError("the arrays of a trajectory have different shapes")
-        if any(group[name].dtype.kind == "f" for name in LABELS) or any(
-            group[name].dtype.kind != "f" for name in MOVING
-        ):
-            raise ValueError("the arrays of a trajectory have other types")
-        return particles
+            self.particle_count = particles_of(group, self.header.dimension, self.field_names)
 
     @property
     def ledger(self) -> list[LedgerRow]:

@@ -22,7 +22,7 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.damage import DAMAGE
-from mpmcli.output.guarded_read import read_whole
+from mpmcli.output.guarded_read import read_whole, require_stored
 from mpmcli.output.hdf5_heaps import require_sound_heaps
 from mpmcli.output.ledger_table import ledger_columns
 
@@ -167,6 +167,23 @@ def shard_splits(path: Path) -> dict[int, str]:
         if not set(splits.values()) <= set(SPLITS):
             raise ValueError("a split has another name")
         return splits
+
+
+def particles_of(group: h5py.Group, d: int, names: Sequence[str]) -> int:
+    """Return N, the number of particles of a trajectory in d dimensions with fields of these names.
+
+    Raises:
+        KeyError, ValueError: its arrays are not of T frames and N particles, or of other types.
+    """
+    shapes = {name: require_stored(group, name).shape for name in (*MOVING, *LABELS, *TABLES, *names)}
+    frames, particles, axes = shapes["position"]
+    right = {name: (particles,) for name in LABELS} | {name: (frames,) for name in TABLES}
+    right |= {name: (frames, particles, *shapes[name][2:]) for name in names}
+    right |= {name: (frames, particles, d) for name in MOVING}
+    kinds = {group[name].dtype.kind for name in MOVING}, {group[name].dtype.kind for name in LABELS}
+    if right != shapes or axes != d or not frames or kinds[0] != {"f"} or not kinds[1] <= {"i", "u"}:
+        raise ValueError("the arrays of a trajectory have different shapes")
+    return particles
 
 
 def _fault(data: TrajectoryData) -> str:
