@@ -189,7 +189,14 @@ def paths_of(tree: Any, path: tuple = ()) -> Iterator[tuple]:
 
 def tree_mutant(tree: Any, rng: Random) -> Any:
     """Replace, remove, double or move values of a tree of tables and lists."""
-    tree = copy.deepcopy(tree)
+    try:
+        return _tree_mutant(copy.deepcopy(tree), rng)
+    except RecursionError:
+        # What is doubled was made too deep before.
+        return value_mutant(rng)
+
+
+def _tree_mutant(tree: Any, rng: Random) -> Any:
     for _ in range(rng.choice((1, 1, 2, 3))):
         paths = list(paths_of(tree))
         if not paths or rng.random() < 0.01:
