@@ -38,7 +38,7 @@ def one_line(text: str) -> str:
     return " ".join("".join(character if character.isprintable() else " " for character in text).split())
 
 
-def visible(text: str) -> str:
+def escaped(text: str) -> str:
     """Return a text with an escape, such as \\u001b, in place of each character but line breaks and tabs without glyph.
 
     What stands in a file can so not speak to the terminal. In JSON the escapes stand for the characters.

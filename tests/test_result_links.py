@@ -19,7 +19,7 @@ from mpmcli.errors import InputError
 from mpmcli.output import SegmentStore, open_result
 from mpmcli.output.collider_files import read_stored_surfaces
 from mpmcli.output.segments import PACKED
-from mpmcli.plain_text import visible
+from mpmcli.plain_text import escaped
 
 GOLDEN = Path(__file__).resolve().parent / "golden"
 LINKS = ("external", "soft", "virtual", "raw")
@@ -165,6 +165,6 @@ def test_names_from_files_do_not_speak_to_the_terminal(tmp_path):
 
 def test_escapes_are_those_of_json():
     text = "".join(map(chr, [*range(32), 0x7F, 0x9B, 0x202E, 0xDCFF, 0xE0001])) + "Grüße, 日本 😀"
-    shown = visible(text)
+    shown = escaped(text)
     assert all(character.isprintable() or character in "\n\t" for character in shown)
-    assert json.loads(f'"{shown}"', strict=False) == text and visible("Grüße\n") == "Grüße\n"
+    assert json.loads(f'"{shown}"', strict=False) == text and escaped("Grüße\n") == "Grüße\n"

@@ -11,6 +11,7 @@ from mpmcli.check.finding import FrameFindings
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.damage import DAMAGE, first_line
 from mpmcli.output.hdf5_items import DamageError
 from mpmcli.output.header import RunHeader
 from mpmcli.output.result import Result, open_result
@@ -20,8 +21,6 @@ from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_HEADER
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-# Exceptions of HDF5, numpy and the XML reader on files with inconsistent content.
-DAMAGE = (InputError, OSError, RuntimeError, ValueError, KeyError, IndexError, TypeError, AttributeError)
 RUN_AGAIN = "Copy the file again from where it was made, or run the scene again."
 
 
@@ -56,7 +55,7 @@ class Entry:
         try:
             frame, ids = self.result.numbered_frame(self.k)
         except DAMAGE as error:
-            raise InputError(f"Frame {self.number} cannot be read ({_first_line(error).rstrip('.')}).") from error
+            raise InputError(f"Frame {self.number} cannot be read ({first_line(error)}).") from error
         lengths = {name: len(array) for name, array in arrays_of(frame, ids).items()}
         shortest = min(lengths, key=lambda name: lengths[name])
         if lengths[shortest] < max(lengths.values()):
@@ -137,7 +136,7 @@ def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
         if not _is_damage(path, error):
             raise
         directory = path if path.is_dir() else path.parent
-        findings.add("error", "unreadable", 0, f"No frame can be read: {_first_line(error).rstrip('.')}", RUN_AGAIN)
+        findings.add("error", "unreadable", 0, f"No frame can be read: {first_line(error)}", RUN_AGAIN)
         return OpenedResult(path, "none", RunHeader.read({}), read_record(directory), [])
     listed = min(len(result.ledger), len(result.numbers), len(result.particle_counts))
     if listed < result.frame_count:
@@ -156,7 +155,7 @@ def _open_segments(directory: Path, findings: FrameFindings) -> OpenedResult:
             result = open_result(segment)
             entries += [_entry(result, k, number + k) for k in range(result.frame_count)]
         except DAMAGE as error:
-            what = f"The segment of frame {number} cannot be read ({_first_line(error).rstrip('.')})"
+            what = f"The segment of frame {number} cannot be read ({first_line(error)})"
             findings.add("error", "unreadable", number, what, RUN_AGAIN)
     header = entries[0].result.header if entries else RunHeader.read({})
     return OpenedResult(directory, "segments", header, read_record(directory), entries)
@@ -194,7 +193,3 @@ def _is_damage(path: Path, error: Exception) -> bool:
         return True
     with path.open("rb") as file:
         return file.read(8) == HDF5_SIGNATURE
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from mpmcli.cli.options import json_option, quiet_option
-from mpmcli.cli.streams import print_json, print_text
+from mpmcli.cli.streams import print_json, print_note, print_text
 
 
 @click.group("dataset")
@@ -65,7 +65,7 @@ def card(dataset: Path, montage: str) -> None:
     try:
         write_montage(dataset, montage)
     except InputError as error:
-        click.echo(f"note: the card has no new picture: {error}", err=True)
+        print_note(f"note: the card has no new picture: {error}")
     print_text(str(write_card(dataset)))
 
 

@@ -6,8 +6,7 @@ import click
 
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
 from mpmcli.cli.options import json_option, quiet_option
-from mpmcli.cli.streams import print_json, print_text
-from mpmcli.plain_text import visible
+from mpmcli.cli.streams import print_json, print_note, print_text
 
 
 @click.command("export")
@@ -80,7 +79,7 @@ def command(
         summary = export(opened, settings, watch)
     if not quiet:
         for note in summary.notes:
-            click.echo(visible(f"note: {note}"), err=True)
+            print_note(f"note: {note}")
     if as_json:
         print_json(summary.as_dict())
     elif not quiet:

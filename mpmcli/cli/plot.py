@@ -6,8 +6,7 @@ from pathlib import Path
 import click
 
 from mpmcli.cli.options import json_option, quiet_option
-from mpmcli.cli.streams import print_json, print_text
-from mpmcli.plain_text import visible
+from mpmcli.cli.streams import print_json, print_note, print_text
 from mpmcli.render.settings import parse_size
 
 DEFAULT = "ledger.png"
@@ -59,7 +58,7 @@ def command(
     history = read_history(opened)
     for note in history.notes:
         if not quiet:
-            click.echo(visible(note), err=True)
+            print_note(note)
     picture, panels = ledger_picture(history, width_height, theme)  # type: ignore[arg-type]
     write_picture(path, picture, MARK + settings_digest({"theme": theme, "size": width_height}))
     if as_json:

@@ -11,10 +11,9 @@ import click
 
 from mpmcli import __version__
 from mpmcli.cli.interrupt import catch_interrupts, interrupt_came, interrupted_code
-from mpmcli.cli.streams import flush_streams
+from mpmcli.cli.streams import flush_streams, print_note
 from mpmcli.cli.supervisor import may_supervise, supervise
 from mpmcli.errors import MpmcliError
-from mpmcli.plain_text import visible
 
 # Name of each command, the module that holds it, and its line in the help: so that help loads no module.
 COMMANDS = {
@@ -132,7 +131,7 @@ def run(arguments: list[str]) -> int:
 def _print_error(line: str) -> None:
     """Print a line on stderr, where somebody still reads it."""
     with suppress(OSError, ValueError):
-        click.echo(visible(line), err=True)
+        print_note(line)
 
 
 def _usage_sentence(error: click.ClickException) -> str:

@@ -7,8 +7,7 @@ import click
 
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
 from mpmcli.cli.options import json_option, quiet_option
-from mpmcli.cli.streams import print_json, print_text
-from mpmcli.plain_text import visible
+from mpmcli.cli.streams import print_json, print_note, print_text
 from mpmcli.render.settings import COLLIDERS, MODES
 from mpmcli.render.theme import THEMES
 
@@ -128,12 +127,12 @@ def command(
     with ProgressBar(plan.due, "frames", quiet=quiet) as bar, interrupts_wait():
         done = plan.carry_out(workers, watch=bar.show, stop=interrupt_came)
     for warning in done.warnings:
-        click.echo(visible(f"warning: {warning}"), err=True)
+        print_note(f"warning: {warning}")
     if as_json:
         print_json(done.as_dict())
     elif not quiet:
         kept = len(done.pictures) - done.made
         there = f", {kept} {'was' if kept == 1 else 'were'} there already" if kept else ""
-        click.echo(f"{counted(done.made, 'picture')} made{there}", err=True)
+        print_note(f"{counted(done.made, 'picture')} made{there}")
         print_text("\n".join(map(str, done.paths)))
     return 0

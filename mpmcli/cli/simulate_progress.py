@@ -3,9 +3,8 @@
 from contextlib import suppress
 from types import TracebackType
 
-import click
-
 from mpmcli.cli.progress_bar import ProgressBar
+from mpmcli.cli.streams import print_note
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.plain_text import counted
 from mpmcli.simulation.summary import RunSummary
@@ -64,4 +63,4 @@ class SimulateProgress:
         """Print why the run ended early, even when quiet."""
         if summary.message:
             with suppress(OSError):
-                click.echo(f"error: {summary.message}", err=True)
+                print_note(f"error: {summary.message}")

@@ -9,7 +9,7 @@ import click
 
 from mpmcli.errors import RunError
 from mpmcli.plain_json import finite_json
-from mpmcli.plain_text import visible
+from mpmcli.plain_text import escaped
 
 
 def print_json(content: object) -> None:
@@ -28,7 +28,7 @@ def print_text(text: str) -> None:
         RunError: stdout is closed, or cannot be written to, as on a full disk.
     """
     try:
-        click.echo(visible(text))
+        click.echo(escaped(text))
         # click writes nothing, and raises nothing, where there is no stdout.
         sys.stdout.flush()
     except BrokenPipeError:
@@ -38,6 +38,11 @@ def print_text(text: str) -> None:
         raise RunError(f"The result could not be printed on stdout ({error.strerror}).") from error
     except (AttributeError, ValueError) as error:
         raise RunError("The result could not be printed, as stdout is closed.") from error
+
+
+def print_note(text: str) -> None:
+    """Print a note, a warning or an error on stderr."""
+    click.echo(escaped(text), err=True)
 
 
 def flush_streams() -> None:

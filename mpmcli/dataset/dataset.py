@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 
 from mpmcli.dataset.paths import SHARDS, SWEEP
-from mpmcli.dataset.shard import LABELS, MOVING, SPLITS, moving_names, open_shard, shard_splits
+from mpmcli.dataset.shard import LABELS, MOVING, SPLITS, moving_names, open_shard, particles_of, shard_splits
 from mpmcli.dataset.stored_trajectory import StoredGroup
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import Result, open_result
-from mpmcli.output.hdf5_items import held
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.run_record import RECORD
@@ -137,8 +136,8 @@ class _StoredTrajectory(Trajectory):
             self.draws = stored.attribute("draws")
             self.header = RunHeader.read(stored.attribute("header"))
             self.times, self.steps, self.frames = stored.tables()
-            self.particle_count = held(stored.group, "position").shape[1]
             self.field_names = tuple(name for name in moving_names(stored.group) if name not in MOVING)
+            self.particle_count = particles_of(stored.group, self.header.dimension, self.field_names)
 
     @property
     def ledger(self) -> list[LedgerRow]:

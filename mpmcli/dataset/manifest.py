@@ -105,6 +105,9 @@ class Manifest:
             facts = {name: json.loads(value) for name, value in connection.execute("SELECT name, value FROM sweep")}
         if facts.get("format") != FORMAT:
             raise InputError(f"{self.path} has format {facts.get('format')}; this version of mpmcli reads {FORMAT}.")
+        wrong = [name for name, sound in _SOUND.items() if not sound(facts.get(name))]
+        if wrong:
+            raise InputError(f"{self.path} is damaged: what it says of {wrong[0]} cannot be; copy it again.")
         return facts
 
     def rows(self) -> list[Row]:
@@ -116,6 +119,8 @@ class Manifest:
         with self._reading() as connection:
             rows = [Row(*row) for row in connection.execute(f"{_SELECT} ORDER BY number")]
         for row in rows:
+            if wrong := [f.name for f in fields(Row) if type(getattr(row, f.name)) is not f.type]:
+                raise InputError(f"{self.path} is damaged: the {wrong[0]} of trajectory {row.number} cannot be read.")
             # Paths are data: none leads out of the dataset.
             if row.file and not _PLACE.fullmatch(row.file):
                 raise InputError(f"{self.path} places trajectory {row.number} in {one_line(row.file)}: it is damaged.")
@@ -151,9 +156,26 @@ class Manifest:
             # Not mode=ro, which could not roll back what a killed writer left.
             with closing(sqlite3.connect(f"file:{self.path}?mode=rw", uri=True)) as connection:
                 yield connection
-        except (sqlite3.Error, TypeError, ValueError) as error:
+        except (sqlite3.Error, TypeError, ValueError, RecursionError, MemoryError) as error:
             raise InputError(f"{self.path} cannot be read ({error}); copy it again, or run the sweep again.") from error
 
 
 _PLACE = re.compile(r"(shards|pending|quarantine)/\w+\.h5")
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and 0 < value <= 10**9
+
+
+def _is_part(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_count, value)) and value[0] <= value[1]
+
+
+# What the facts of a sweep must be.
+_SOUND = {
+    "key": lambda value: isinstance(value, str),
+    "count": _is_count,
+    "per_shard": _is_count,
+    "part": _is_part,
+}
 _SELECT = f"SELECT {', '.join(COLUMNS)} FROM trajectories"

@@ -27,6 +27,9 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import NAME as CHECKSUMS
 from mpmcli.output.checksums import attribute_checksum, kind_checksum, store_checksums, table_checksum
 from mpmcli.output.checksums import checksum as checksum_of_frame
+from mpmcli.output.damage import DAMAGE
+from mpmcli.output.guarded_read import read_whole, require_stored
+from mpmcli.output.hdf5_heaps import require_sound_heaps
 from mpmcli.output.hdf5_items import held, items
 from mpmcli.output.ledger_table import ledger_columns
 
@@ -153,7 +156,7 @@ def checksum_of(data: TrajectoryData) -> str:
 def checksum(group: h5py.Group) -> str:
     """Return the SHA-256, hexadecimal, of all that a trajectory's group holds, compressed or not."""
     names = [name for name, item in items(group) if isinstance(item, h5py.Dataset) and name != CHECKSUMS]
-    return _checksum(group.attrs, ((name, held(group, name)[...]) for name in sorted(names)))
+    return _checksum(group.attrs, ((name, read_whole(group, name, "iufS")) for name in sorted(names)))
 
 
 def _checksum(attributes: Mapping[str, Any], arrays: Iterable[tuple[str, np.ndarray]]) -> str:
@@ -176,6 +179,7 @@ def open_shard(path: Path) -> Iterator[h5py.File]:
     if not path.exists():
         raise InputError(f"{path} is missing: the dataset is not complete.")
     try:
+        require_sound_heaps(path)
         # A sealed shard never changes, so no lock is taken.
         with h5py.File(path, "r", locking=False) as file:
             if file.attrs.get("format") != FORMAT:
@@ -185,8 +189,9 @@ def open_shard(path: Path) -> Iterator[h5py.File]:
             if file.attrs["version"] > VERSION:
                 raise InputError(f"{path} was written by a newer version of mpmcli; update mpmcli to read it.")
             yield file
-    # What h5py, numpy and JSON raise on a file whose content contradicts itself.
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except DAMAGE as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(f"{path} is damaged: what it should hold cannot be read.") from error
 
 
@@ -207,6 +212,23 @@ def shard_splits(path: Path) -> dict[int, str]:
         if not set(splits.values()) <= set(SPLITS):
             raise ValueError("a split has another name")
         return splits
+
+
+def particles_of(group: h5py.Group, d: int, names: Sequence[str]) -> int:
+    """Return N, the number of particles of a trajectory in d dimensions with fields of these names.
+
+    Raises:
+        KeyError, ValueError: its arrays are not of T frames and N particles, or of other types.
+    """
+    shapes = {name: require_stored(group, name).shape for name in (*MOVING, *LABELS, *TABLES, *names)}
+    frames, particles, axes = shapes["position"]
+    right = {name: (particles,) for name in LABELS} | {name: (frames,) for name in TABLES}
+    right |= {name: (frames, particles, *shapes[name][2:]) for name in names}
+    right |= {name: (frames, particles, d) for name in MOVING}
+    kinds = {group[name].dtype.kind for name in MOVING}, {group[name].dtype.kind for name in LABELS}
+    if right != shapes or axes != d or not frames or kinds[0] != {"f"} or not kinds[1] <= {"i", "u"}:
+        raise ValueError("the arrays of a trajectory have different shapes")
+    return particles
 
 
 def _fault(data: TrajectoryData) -> str:

@@ -9,8 +9,9 @@ import numpy as np
 from mpmcli.dataset.shard import LEDGER, TABLES, group_name
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import NAME, Checksums, attribute_checksum, item_checksums, load_checksums, table_checksum
+from mpmcli.output.guarded_read import read_whole, require_stored
 from mpmcli.output.hdf5_items import held
-from mpmcli.output.ledger_table import COLUMNS, ledger_rows
+from mpmcli.output.ledger_table import read_ledger
 
 
 class StoredGroup:
@@ -38,13 +39,13 @@ class StoredGroup:
             self._checksums.require(f"@{name}", attribute_checksum(found))
         return json.loads(found) if name in ("draws", "header") else found
 
-    def table(self, path: str) -> np.ndarray:
-        """Read all of an array without frames.
+    def table(self, path: str, kinds: str = "iuf") -> np.ndarray:
+        """Read all of an array without frames, which has one of these kinds of numpy types.
 
         Raises:
             InputError: as `attribute`.
         """
-        found = held(self.group, path)[...]
+        found = read_whole(self.group, path, kinds)
         if self._checksums is not None:
             self._checksums.require(path, table_checksum(found))
         return found
@@ -55,7 +56,7 @@ class StoredGroup:
         Raises:
             InputError: as `attribute`.
         """
-        data = held(self.group, name)
+        data = require_stored(self.group, name)
         found = data[chosen]
         if self._checksums is not None:
             for t, rows in zip(range(len(data))[chosen], found, strict=True):
@@ -80,5 +81,4 @@ class StoredGroup:
 
     def ledger(self) -> list[LedgerRow]:
         """Read the ledger."""
-        columns = held(self.group, LEDGER)
-        return ledger_rows({name: self.table(f"{LEDGER}/{name}") for name in COLUMNS if name in columns})
+        return read_ledger(held(self.group, LEDGER), lambda name, kinds: self.table(f"{LEDGER}/{name}", kinds))

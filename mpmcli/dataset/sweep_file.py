@@ -11,6 +11,7 @@ from mpmcli.dataset.sweep_check import sweep_problems
 from mpmcli.errors import InputError
 from mpmcli.scene import parse_scene
 from mpmcli.scene.expand import Laws
+from mpmcli.scene.geometry_file import absence
 from mpmcli.scene.load import read_toml, report
 from mpmcli.scene.locate import key_lines, line_of
 from mpmcli.scene.problem import Path, Problem
@@ -72,7 +73,7 @@ def _base_file(path: File, text: str, data: dict[str, Any]) -> File:
     if not isinstance(name, str):
         raise InputError(f"{place}: must be text in quotes; found {written(name)}")
     beside = path.parent / name
-    found = next((file for file in (beside, File(name)) if file.is_file()), None)
+    found = next((file for file in (beside, File(name)) if not absence(file)), None)
     if found is None:
         raise InputError(f"{place}: there is no such file: neither {beside} nor {File.cwd() / name} is one")
     return found

@@ -15,10 +15,13 @@ from typing import Any
 import h5py
 import numpy as np
 
-from mpmcli.errors import RunError
+from mpmcli.errors import InputError, RunError
 from mpmcli.output.checksums import load_checksums, store_checksums, table_checksum
+from mpmcli.output.damage import DAMAGE
 from mpmcli.output.durable import require_free_space, sealed, write_text
 from mpmcli.output.file_checksum import append_checksum
+from mpmcli.output.guarded_read import read_whole
+from mpmcli.output.hdf5_heaps import require_sound_heaps
 from mpmcli.output.hdf5_items import held
 from mpmcli.output.stored_colliders import triangles_of
 from mpmcli.output.vtkhdf import FORMAT, LIBVER
@@ -133,20 +136,33 @@ def read_stored_surfaces(directory: Path) -> dict[int, Triangles]:
     """
     found = {}
     for name in (RESTING, MOVING):
-        with suppress(OSError, RuntimeError, KeyError, ValueError), _opened(directory / name) as file:
-            checksums = load_checksums(file, "mpmcli") if held(file, "mpmcli").attrs.get("format", 1) > 1 else None
-            for number in held(file, "mpmcli/surfaces"):
-                paths = [f"mpmcli/surfaces/{number}/{part}" for part in ("vertices", "triangles")]
-                arrays = [held(file, path)[...] for path in paths]
-                for path, array in zip(paths, arrays, strict=True):
-                    if checksums is not None:
-                        checksums.require(path, table_checksum(array))
-                found[int(number)] = Triangles(*arrays)
+        faults = tuple(kind for kind in DAMAGE if kind is not InputError)
+        with suppress(*faults):
+            require_sound_heaps(directory / name)
+            with h5py.File(directory / name, "r", locking=False) as file:
+                checksums = load_checksums(file, "mpmcli") if held(file, "mpmcli").attrs.get("format", 1) > 1 else None
+                for number in held(file, "mpmcli/surfaces"):
+                    paths = [f"mpmcli/surfaces/{number}/{part}" for part in ("vertices", "triangles")]
+                    arrays = [read_whole(file, path, kinds) for path, kinds in zip(paths, ("f", "iu"), strict=True)]
+                    for path, array in zip(paths, arrays, strict=True):
+                        if checksums is not None:
+                            checksums.require(path, table_checksum(array))
+                    found[int(number)] = _surface(*arrays)
     return found
 
 
-def _opened(path: Path) -> h5py.File:
-    return h5py.File(path, "r", locking=False)
+def _surface(vertices: np.ndarray, triangles: np.ndarray) -> Triangles:
+    """Return a surface of vertices (n, 3) and triangles (m, 3).
+
+    Raises:
+        ValueError: it is none.
+    """
+    shapes = vertices.shape == (len(vertices), 3) and triangles.shape == (len(triangles), 3)
+    if not (shapes and triangles.size and np.isfinite(vertices).all()):
+        raise ValueError("it is no surface")
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise ValueError("a triangle has no vertex")
+    return Triangles(vertices.astype(np.float64), triangles.astype(np.int64))
 
 
 def _things(header: Mapping[str, Any], colliders: Sequence[Collider], *, moving: bool) -> Things | None:

@@ -9,6 +9,9 @@ import numpy as np
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.layout import FrameLayout
 
+# Particles, more than any file holds.
+_MOST = 2**53
+
 
 @dataclass(frozen=True)
 class FrameIndex:
@@ -40,6 +43,29 @@ class FrameIndex:
             name: getattr(self, name)[:count] for name in ("times", "frames", "steps", "offsets", "counts", "ledger")
         }
         return replace(self, **tables, checksums=None if self.checksums is None else self.checksums[:count])
+
+    def checked(self) -> "FrameIndex":
+        """Return this index, with tables of int64 and float64.
+
+        Raises:
+            ValueError: the tables of a file contradict each other, or the file lists no frame.
+        """
+        tables = self.frames, self.steps, self.offsets, self.counts
+        # A series whose ledger is cut off lists fewer frames than its .pvd.
+        if any(table.ndim != 1 or not 0 < len(table) <= len(self.times) for table in (self.times, *tables)):
+            raise ValueError("the tables of the frames have different lengths")
+        if any(table.min() < 0 or table.max() > _MOST for table in tables):
+            raise ValueError("a frame has no place in the file")
+        d = self.layout.dimension
+        for row in self.ledger:
+            loads = [len(vector) for load in (row.collider_force, row.collider_torque) for vector in load]
+            angles = 1 if d == 2 else 3
+            if len(row.linear_momentum) != d or len(row.angular_momentum) != angles or {*loads} - {d, angles}:
+                raise ValueError("a vector of the ledger has another number of components")
+        frames, steps, offsets, counts = (table.astype(np.int64) for table in tables)
+        return replace(
+            self, times=self.times.astype(np.float64), frames=frames, steps=steps, offsets=offsets, counts=counts
+        )
 
     @classmethod
     def joined(cls, indices: Sequence["FrameIndex"]) -> "FrameIndex":

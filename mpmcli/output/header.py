@@ -12,6 +12,7 @@ from mpmcli import __version__
 from mpmcli.output.header_walls import sticking_axes, words_of
 from mpmcli.output.scene_header import BodyHeader, body_headers, volumes_from_files
 from mpmcli.output.stored_colliders import ColliderFacts
+from mpmcli.output.stored_facts import require_header, require_scene
 from mpmcli.scene import Scene
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.scene.sheets import emitted_volumes
@@ -131,8 +132,14 @@ class RunHeader(ColliderFacts):
 
     @classmethod
     def read(cls, stored: Mapping[str, Any]) -> "RunHeader":
-        """Read the header that a file holds; what it does not say itself is taken from the scene's text in it."""
+        """Read the header that a file holds; what it does not say itself is taken from the scene's text in it.
+
+        Raises:
+            ValueError: an entry has another type than a run writes.
+        """
+        require_header(stored)
         scene = _parsed(stored.get("scene", ""))
+        require_scene(scene)
         domain, time, solver = (scene.get(name, {}) for name in ("domain", "time", "solver"))
         d = int(stored.get("dimension", 0)) or len(domain.get("size", (0, 0)))
         origin = _vector(stored.get("origin", domain.get("origin")), d)
@@ -245,7 +252,8 @@ class RunHeader(ColliderFacts):
 def _parsed(text: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
+    # Also of numbers that are too long, and of lists that are too deep.
+    except (ValueError, RecursionError):
         return {}
 
 
@@ -257,7 +265,7 @@ def _laws(stored: Mapping[str, Any]) -> tuple[LawHeader, ...]:
     """Return the laws; an older file has their names only, and nothing is known of a law that mpmcli does not have."""
     names = [str(name) for name in stored.get("materials", ())]
     facts = stored.get("laws", ())
-    if len(facts) == len(names):
+    if len(facts) == len(names) and all(isinstance(entry, dict) for entry in facts):
         return tuple(LawHeader(name, **entry) for name, entry in zip(names, facts, strict=True))
     from mpmcli.materials.registry import laws
 

@@ -10,6 +10,8 @@ from mpmcli.frames.frame import Frame
 POSITION = "Points"  # VTK's name; every other array keeps its own
 STANDARD = ("id", "body", "material", "velocity")
 # 2D is plane strain: out of the plane F is the identity, and every other tensor is stored as zero.
+# Of one array, for each particle: more than any law has.
+_MOST_COMPONENTS = 1000
 OUT_OF_PLANE = {"deformation_gradient": 1.0}
 # What both VTK and meshio read back without conversion.
 DTYPES = tuple(np.dtype(code) for code in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"))
@@ -161,9 +163,24 @@ class FrameLayout:
 
     @classmethod
     def from_dict(cls, plain: dict) -> "FrameLayout":
-        """Undo `to_dict`."""
+        """Undo `to_dict`.
+
+        Raises:
+            KeyError, TypeError, ValueError: it is none.
+        """
         d = plain["dimension"]
-        return cls(d, {name: ArrayLayout(name, t, tuple(s), d) for name, (t, s) in plain["arrays"].items()})
+        arrays = {name: ArrayLayout(name, str(t), tuple(s), d) for name, (t, s) in dict(plain["arrays"]).items()}
+        known = {dtype.name for dtype in DTYPES}
+        for name, array in arrays.items():
+            whole = all(type(n) is int and 0 < n <= _MOST_COMPONENTS for n in array.shape)
+            if array.dtype not in known or not whole or not _shape_fits(array.shape, d):
+                raise ValueError(f"{name} is no array of a frame")
+        vectors, labels = (arrays[POSITION], arrays["velocity"]), (arrays[name] for name in ("id", "body", "material"))
+        if d not in (2, 3) or any(array.shape != (d,) or array.dtype[0] != "f" for array in vectors):
+            raise ValueError("positions or velocities are no vectors")
+        if any(array.shape or array.dtype[0] == "f" for array in labels):
+            raise ValueError("labels are no whole numbers")
+        return cls(d, arrays)
 
 
 def _named_arrays(frame: Frame) -> Iterator[tuple[str, np.ndarray]]:

@@ -3,13 +3,14 @@
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 
 import h5py
 import numpy as np
 
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.guarded_read import read_whole
 
 COLUMNS = tuple(f.name for f in fields(LedgerRow))
 VECTORS = ("linear_momentum", "angular_momentum")
@@ -49,6 +50,25 @@ def _stored(rows: Sequence[LedgerRow]) -> tuple[str, ...]:
     """Return the names of the columns of some rows of one run."""
     comes_and_goes = bool(rows) and rows[0].emitted is not None
     return tuple(name for name in COLUMNS if comes_and_goes or name not in COMINGS)
+
+
+def read_ledger(group: h5py.Group, read: Callable[[str, str], np.ndarray] | None = None) -> list[LedgerRow]:
+    """Read the ledger in a group of a file.
+
+    Args:
+        read: (name, kinds of types) -> column, which compares its checksum; `read_whole` by default.
+
+    Raises:
+        KeyError, ValueError: a column is missing, or is none.
+    """
+    found = {}
+    for name in COLUMNS:
+        if name in group:
+            kinds = "S" if name == TEXT else "iu" if name in INTEGERS else "f"
+            found[name] = read(name, kinds) if read else read_whole(group, name, kinds)
+            if found[name].ndim != 1 + (name in VECTORS) + 2 * (name in LOADS):
+                raise ValueError(f"the column {name} of the ledger is {found[name].shape}")
+    return ledger_rows(found)
 
 
 def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:

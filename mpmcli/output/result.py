@@ -14,6 +14,7 @@ from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import checksum, damaged
 from mpmcli.output.collider_files import read_stored_surfaces
+from mpmcli.output.damage import DAMAGE, first_line
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.hdf5_items import DamageError
 from mpmcli.output.header import RunHeader
@@ -60,7 +61,10 @@ class Result(ABC):
         self.numbers = index.frames
         self.particle_counts = index.counts
         self.ledger: list[LedgerRow] = index.ledger
-        self.header = RunHeader.read(index.header)
+        try:
+            self.header = RunHeader.read(index.header)
+        except DAMAGE as error:
+            raise InputError(f"{path} is damaged: its header cannot be read ({first_line(error)}).") from error
         self.dimension = index.layout.dimension
         names = [name for name in index.layout.arrays if name not in (POSITION, *STANDARD)]
         self.field_names: tuple[str, ...] = tuple(names)
@@ -97,7 +101,9 @@ class Result(ABC):
             if name not in self.index.layout.arrays:
                 known = ", ".join(self.field_names) or "none"
                 raise InputError(f'{self.path} holds no field "{name}": its fields are {known}.')
-        stored = self._read(k, names)
+        stored = self._sound(k, names)
+        if any(len(array) != self.particle_counts[k] for array in stored.values()):
+            raise InputError(f"{self.path} is damaged: frame {k} is cut off.")
         index = self.index
         return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
 
@@ -112,7 +118,7 @@ class Result(ABC):
 
         The numbers are 0, 1, 2, ... unless something has changed the file.
         """
-        stored = self._read(k, [POSITION, *STANDARD, *self.field_names])
+        stored = self._sound(k, [POSITION, *STANDARD, *self.field_names])
         index = self.index
         frame = index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
         return frame, stored["id"]
@@ -121,6 +127,17 @@ class Result(ABC):
         """Read all frames, one at a time."""
         for k in range(self.frame_count):
             yield self.frame(k, fields)
+
+    def _sound(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Read arrays of the k-th frame, which have the types and shapes that the file tells of them."""
+        if k >= min(len(self.particle_counts), len(self.numbers), len(self.index.steps)):
+            raise InputError(f"{self.path} is damaged: it lists frame {k}, and tells nothing of it.")
+        stored = self._read(k, names)
+        for name, array in stored.items():
+            told = self.index.layout.arrays[name]
+            if array.dtype != told.dtype or array.shape[1:] != told.stored_shape(0)[1:]:
+                raise InputError(f"{self.path} is damaged: {name} is {array.shape} of {array.dtype} in frame {k}.")
+        return stored
 
     @abstractmethod
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -136,7 +153,9 @@ class _StoredResult(Result):
         try:
             with closing(open_vtkhdf(path)) as file:
                 stored = {name: read_array(file, name, offset, count) for name in names}
-        except (OSError, RuntimeError, ValueError, KeyError) as error:
+        except DAMAGE as error:
+            if isinstance(error, InputError):
+                raise
             raise DamageError(f"{path} is damaged: a frame that it lists cannot be read.") from error
         if checksums is not None:
             columns = list(self.index.layout.arrays)
@@ -193,7 +212,9 @@ class _SeriesResult(Result):
             return {name: np.empty(arrays[name].stored_shape(0), arrays[name].dtype) for name in names}
         path = self._files[k]
         stored = read_vtu(path, None if self._digests is None else self._digests.get(path.name, ()))
-        return {name: stored[name] for name in names}
+        if missing := [name for name in names if name not in stored]:
+            raise InputError(f"{path} is damaged: it lacks {missing[0]}.")
+        return {name: np.asarray(stored[name]) for name in names}
 
 
 def open_result(path: Path) -> Result:
@@ -245,6 +266,7 @@ def _index_of(path: Path) -> FrameIndex:
     with closing(open_vtkhdf(path)) as file:
         try:
             return read_index(file)
-        # What h5py, numpy and JSON raise on a file whose content contradicts itself.
-        except (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        except DAMAGE as error:
+            if isinstance(error, InputError):
+                raise
             raise DamageError(f"{path} is damaged: its list of frames cannot be read.") from error

@@ -15,6 +15,7 @@ from mpmcli.errors import RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import write_text
 from mpmcli.output.owner import Owner, time_now
+from mpmcli.output.stored_facts import sound_record
 
 RECORD = "run.json"
 PROGRAM = "mpmcli"
@@ -143,12 +144,12 @@ def host_facts() -> dict[str, Any]:
 
 
 def read_record(directory: Path) -> dict[str, Any] | None:
-    """Read run.json; None when there is none, or it is not of mpmcli."""
+    """Read run.json; None when there is none, or it is not of mpmcli. Entries of other types than ours are left out."""
     try:
         record = json.loads((Path(directory) / RECORD).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
-    return record if isinstance(record, dict) and record.get("program") == PROGRAM else None
+    return sound_record(record) if isinstance(record, dict) and record.get("program") == PROGRAM else None
 
 
 def _plain(value: Any) -> Any:

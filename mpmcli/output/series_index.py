@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mpmcli.errors import InputError
+from mpmcli.output.damage import DAMAGE
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.hdf5_items import DamageError
 from mpmcli.output.layout import FrameLayout
@@ -46,7 +47,9 @@ def _read(path: Path) -> tuple[FrameIndex, list[Path], Digests | None]:
         # The .pvd is read first: the ledger is replaced before it, so it holds at least as many rows.
         places = [path, directory / SERIES_HEADER, directory / SERIES_LEDGER]
         listed, header, table = (place.read_bytes().decode("utf-8") for place in places)
-        facts = json.loads(header)
+        facts = dict(json.loads(header))
+        if not isinstance(facts["format"], int):
+            raise ValueError("the format is no number")
         if facts["format"] > FORMAT:
             raise InputError(f"{path} is of a newer version of mpmcli; update mpmcli to read it.")
         sums = read_sums(directory) if facts["format"] > 1 else None
@@ -61,10 +64,13 @@ def _read(path: Path) -> tuple[FrameIndex, list[Path], Digests | None]:
         layout = FrameLayout.from_dict(facts["layout"])
         rows, columns = parse_ledger_csv(table)
         frames, steps, counts = (np.array(columns[name][: len(times)]) for name in FRAME_COLUMNS)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, ElementTree.ParseError) as error:
+        tables = times, frames, steps, 0 * counts, counts
+        index = FrameIndex(layout, facts["header"], *tables, rows[: len(times)]).checked()
+    except (*DAMAGE, ElementTree.ParseError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(
             f"{path} is not a series of mpmcli: it needs {SERIES_HEADER}, {SERIES_LEDGER} and its frames "
             "beside it, as mpmcli wrote them."
         ) from error
-    index = FrameIndex(layout, facts["header"], times, frames, steps, 0 * counts, counts, rows[: len(times)])
     return index, [directory / name for name in names], sums

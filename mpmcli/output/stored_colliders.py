@@ -53,7 +53,7 @@ class ColliderFacts:
     def _scene(self) -> Mapping[str, Any]:
         try:
             return tomllib.loads(self.stored.get("scene", ""))
-        except tomllib.TOMLDecodeError:
+        except (ValueError, RecursionError):
             return {}
 
     @property

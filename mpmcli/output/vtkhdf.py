@@ -31,9 +31,11 @@ from mpmcli.output.checksums import (
 )
 from mpmcli.output.file_checksum import append_checksum, gaps_of
 from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.guarded_read import read_rows, read_whole
+from mpmcli.output.hdf5_heaps import require_sound_heaps
 from mpmcli.output.hdf5_items import held
 from mpmcli.output.layout import POSITION, FrameLayout
-from mpmcli.output.ledger_table import COLUMNS, ledger_columns, ledger_rows
+from mpmcli.output.ledger_table import ledger_columns, read_ledger
 from mpmcli.output.vtkhdf_parts import CONNECTIVITY, part_tables
 
 # A newer upper bound makes files that no VTK can open ("bad version number for layout message").
@@ -194,6 +196,7 @@ def open_vtkhdf(path: Path) -> h5py.File:
         InputError: the file is missing, damaged, or was not written by mpmcli.
     """
     try:
+        require_sound_heaps(path)
         try:
             file = h5py.File(path, "r", locking=False)
         except OSError:
@@ -218,8 +221,9 @@ def open_vtkhdf(path: Path) -> h5py.File:
 def _format(file: h5py.File) -> int | None:
     """Return the format of a file, None where it is not of mpmcli."""
     try:
-        held(file, "VTKHDF")
-        return int(held(file, "mpmcli").attrs["format"])
+        form = held(file, "mpmcli").attrs["format"]
+        ours = isinstance(form, np.integer) and isinstance(held(file, "VTKHDF"), h5py.Group)
+        return int(form) if ours else None
     except (OSError, RuntimeError, KeyError, TypeError, ValueError):
         return None
 
@@ -230,11 +234,12 @@ def read_index(file: h5py.File) -> FrameIndex:
     Raises:
         DamageError: it has changed since it was written.
         InputError: a link in the file leads elsewhere.
+        Exception: what h5py, numpy and JSON raise, and ValueError, where the file contradicts itself.
     """
     checksums = load_checksums(file, "mpmcli") if _format(file) > 1 else None
 
-    def table(path: str) -> np.ndarray:
-        found = held(file, path)[:]
+    def table(path: str, kinds: str = "iu") -> np.ndarray:
+        found = read_whole(file, path, kinds)
         if checksums is not None:
             checksums.require(path, table_checksum(found))
         return found
@@ -246,22 +251,21 @@ def read_index(file: h5py.File) -> FrameIndex:
         return found
 
     group = held(file, "mpmcli")
-    header = json.loads(attribute("header"))
+    header = dict(json.loads(attribute("header")))
     if "scene" in group.attrs:
         header["scene"] = attribute("scene")
     layout = FrameLayout.from_dict(json.loads(attribute("layout")))
-    ledger = held(file, "ledger")
     return FrameIndex(
         layout=layout,
         header=header,
-        times=table("VTKHDF/Steps/Values"),
+        times=table("VTKHDF/Steps/Values", "f"),
         frames=table("mpmcli/frame"),
         steps=table("mpmcli/step"),
         offsets=table("VTKHDF/Steps/PointOffsets"),
         counts=table("VTKHDF/NumberOfPoints"),
-        ledger=ledger_rows({name: table(f"ledger/{name}") for name in COLUMNS if name in ledger}),
+        ledger=read_ledger(held(file, "ledger"), lambda name, kinds: table(f"ledger/{name}", kinds)),
         checksums=checksums and _columns_of(checksums, layout),
-    )
+    ).checked()
 
 
 def _columns_of(checksums: Checksums, layout: FrameLayout) -> np.ndarray:
@@ -271,7 +275,7 @@ def _columns_of(checksums: Checksums, layout: FrameLayout) -> np.ndarray:
 
 def read_array(file: h5py.File, name: str, offset: int, count: int) -> np.ndarray:
     """Read one array of one frame, in the form of the file; its checksum is not compared."""
-    return held(file, f"VTKHDF/{_path(name)}")[offset : offset + count]
+    return read_rows(file, f"VTKHDF/{_path(name)}", offset, count)
 
 
 def _path(name: str) -> str:

@@ -24,6 +24,7 @@ from mpmcli.scene.repair import Renames, original_path, repaired
 from mpmcli.scene.sampling import points_per_cell
 from mpmcli.scene.schema import Scene, scene_model
 from mpmcli.scene.sentences import problems_of
+from mpmcli.scene.tables import too_deep
 
 _POSITION = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 # Messages of tomllib that a plainer sentence replaces.
@@ -211,13 +212,16 @@ def _read(file: File, kind: str) -> str:
             f"{file}: this is no text in UTF-8 (byte {error.start} is {error.object[error.start]:#04x}); "
             f"give a {kind} in TOML"
         ) from None
-    except OSError as error:
-        raise InputError(f"{file}: the file cannot be read: {error.strerror}") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{file}: the file cannot be read: {reason}") from None
 
 
 def _parse(text: str, source: str) -> dict[str, Any]:
     try:
-        return tomllib.loads(text)
+        found = tomllib.loads(text)
+        if not too_deep(found):
+            return found
     except tomllib.TOMLDecodeError as error:
         said = str(error)
         place = source
@@ -227,4 +231,5 @@ def _parse(text: str, source: str) -> dict[str, Any]:
             place += f":{line}" + (f":{column}" if column else "")
         raise InputError(f"{place}: not valid TOML: {_SYNTAX.get(said, said[:1].lower() + said[1:])}") from None
     except (ValueError, RecursionError):
-        raise InputError(f"{source}: not valid TOML: a number is too long or lists are too deep") from None
+        pass
+    raise InputError(f"{source}: not valid TOML: a number is too long or lists are too deep")

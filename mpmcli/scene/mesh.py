@@ -26,7 +26,8 @@ def file_version(path: Path) -> tuple[int, int]:
     """Return what tells versions of a file apart: when it was changed, ns, and its bytes; zeros where there is none."""
     try:
         stat = path.stat()
-    except OSError:
+    # Of a name with a null character, ValueError.
+    except (OSError, ValueError):
         return 0, 0
     return stat.st_mtime_ns, stat.st_size
 

@@ -1,11 +1,11 @@
 """Triangles from a file: STL, OBJ, PLY, VTU and what else PyVista or meshio read; welded, closed, facing outwards."""
 
 import math
-import warnings
 from pathlib import Path
 
 import numpy as np
 
+from mpmcli.scene.geometry_file import GeometryFileError, read_geometry
 from mpmcli.scene.rotation import rotation
 from mpmcli.scene.triangles import Surface
 
@@ -39,52 +39,17 @@ def read_mesh(
     return vertices + np.array(translate), triangles
 
 
-def data_set(path: Path) -> object:
-    """Return the VTK data set in a file.
-
-    Raises:
-        MeshFileError: there is no such file, or it cannot be read.
-    """
-    if not path.is_file():
-        raise MeshFileError("there is no such file" if not path.exists() else "it is no file")
-    import pyvista as pv
-    from vtkmodules.vtkCommonCore import vtkObject
-
-    # What readers say of a damaged file, they would write to the terminal.
-    shown = vtkObject.GetGlobalWarningDisplay()
-    vtkObject.GlobalWarningDisplayOff()
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            found = pv.read(path)
-    # A damaged file makes VTK, meshio and the XML parser raise almost anything, and meshio exit.
-    except (Exception, SystemExit):
-        raise MeshFileError("it is no mesh that can be read (STL, OBJ, PLY and VTU are)") from None
-    finally:
-        vtkObject.SetGlobalWarningDisplay(shown)
-    return found.combine() if isinstance(found, pv.MultiBlock) else found
-
-
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return points (n, 3) and triangles (m, 3) of the surface of what a file holds."""
-    found = data_set(path)
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
-    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
-
-    surface, triangles = vtkDataSetSurfaceFilter(), vtkTriangleFilter()
-    surface.SetInputData(found)
-    triangles.SetInputConnection(surface.GetOutputPort())
-    triangles.PassVertsOff()
-    triangles.PassLinesOff()
-    triangles.Update()
-    result = triangles.GetOutput()
-    if not result.GetNumberOfPolys():
+    try:
+        found = read_geometry(path)
+    except GeometryFileError as error:
+        raise MeshFileError(str(error) or "it is no mesh that can be read (STL, OBJ, PLY and VTU are)") from None
+    if not len(found.triangles):
         raise MeshFileError("it holds no triangle")
-    points = vtk_to_numpy(result.GetPoints().GetData()).astype(np.float64)
-    if not np.isfinite(points).all():
+    if not np.isfinite(found.vertices[np.unique(found.triangles)]).all():
         raise MeshFileError("it holds a vertex that is not finite")
-    return points, vtk_to_numpy(result.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
+    return found.vertices, found.triangles
 
 
 def _welded(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

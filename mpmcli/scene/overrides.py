@@ -1,6 +1,5 @@
 """Overrides such as `--set time.end=0.5`: one value of the parsed scene replaced, or added."""
 
-import copy
 import re
 import tomllib
 from collections.abc import Sequence
@@ -9,6 +8,7 @@ from typing import Any
 from mpmcli.errors import InputError
 from mpmcli.scene.problem import Path, path_text
 from mpmcli.scene.sentences import listed, nearest, written
+from mpmcli.scene.tables import copied, too_deep
 
 _PATH = re.compile(r"[^.\[\]]+(?:\[\d+\])*(?:\.[^.\[\]]+(?:\[\d+\])*)*")
 _PART = re.compile(r"\[(\d+)\]|([^.\[\]]+)")
@@ -26,7 +26,9 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> tuple[dic
     Raises:
         InputError: one line for every override that cannot be read or placed.
     """
-    data = copy.deepcopy(data)
+    if too_deep(data):
+        raise InputError("lists or tables of the scene are too deep")
+    data = copied(data)
     placed: dict[Path, str] = {}
     faults = []
     for override in overrides:
@@ -35,6 +37,8 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> tuple[dic
             placed[set_value(data, path, value)] = f"--set {override}"
         except InputError as fault:
             faults.append(f"--set {override}: {fault}")
+    if not faults and too_deep(data):
+        faults = [f"--set {override}: nests lists and tables too deeply" for override in overrides]
     if faults:
         raise InputError("\n".join(faults))
     return data, placed

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mpmcli.scene.mesh_file import MeshFileError, data_set
+from mpmcli.scene.geometry_file import GeometryFileError, absence, read_geometry
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sentences import listed, nearest, quoted
 
@@ -29,8 +29,8 @@ def read_points(path: Path, d: int, velocity: str | Sequence[str] | None) -> tup
     Raises:
         PointFileError: there is no such file, it cannot be read, or it lacks what is asked for.
     """
-    if not path.is_file():
-        raise PointFileError("there is no such file" if not path.exists() else "it is no file")
+    if fault := absence(path):
+        raise PointFileError(fault)
     table = path.suffix.lower() in TABLES
     fits = velocity is None or (
         len(velocity) == d and not isinstance(velocity, str) if table else isinstance(velocity, str)
@@ -93,8 +93,10 @@ def _is_number(text: str) -> bool:
 
 def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
     try:
-        found = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError):
+        # Mapped, so that a header cannot claim more than the file holds.
+        found = np.load(path, mmap_mode="r", allow_pickle=False)
+    # Of a damaged header, Python's own tokenizer and parser raise almost anything.
+    except Exception:
         raise PointFileError("it is no array of numpy") from None
     if found.dtype.names:
         return {name: found[name].reshape(-1).astype(np.float64) for name in found.dtype.names}
@@ -105,19 +107,18 @@ def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
 
 def _data_set(path: Path, d: int, velocity: str | None) -> tuple[np.ndarray, np.ndarray | None]:
     try:
-        found = data_set(path)
-    except MeshFileError:
+        found = read_geometry(path)
+    except GeometryFileError:
         raise PointFileError("it is no file of points that can be read (CSV, NPY, PLY and VTU are)") from None
-    points = getattr(found, "points", None)
-    if points is None or not len(points):
+    if not len(found.points):
         raise PointFileError("it holds no point")
-    chosen = [_in_plane(np.array(points, dtype=np.float64), d, "points")]
+    chosen = [_in_plane(found.points, d, "points")]
     if velocity is None:
         return chosen[0], None
-    if velocity not in found.point_data:
-        known = listed(quoted(list(found.point_data.keys())), "and") if len(found.point_data.keys()) else "none"
+    if velocity not in found.arrays:
+        known = listed(quoted(list(found.arrays)), "and") if found.arrays else "none"
         raise PointFileError(f'its points have no array "{velocity}"; they have {known}')
-    values = np.array(found.point_data[velocity], dtype=np.float64)
+    values = np.array(found.arrays[velocity], dtype=np.float64)
     if values.ndim != 2 or values.shape[1] not in (d, 3):
         raise PointFileError(f'its array "{velocity}" must have {d} numbers for each point')
     return chosen[0], _in_plane(values, d, "velocities")

@@ -3,13 +3,13 @@
 Only to find what else is wrong; a scene with an unknown key is always refused.
 """
 
-import copy
 from typing import Any
 
 from pydantic import BaseModel
 
 from mpmcli.scene.problem import Path, value_at
 from mpmcli.scene.sentences import known_keys, nearest, path_in
+from mpmcli.scene.tables import copied
 
 # Path in the repaired data -> path in the scene as it was written.
 Renames = dict[Path, Path]
@@ -27,7 +27,7 @@ def repaired(
     """
     paths: set[Path] = set()
     renames: Renames = {}
-    result = copy.deepcopy(data)
+    result = copied(data)
     for loc in unknown:
         path = path_in(data, loc)
         paths.add(path)

@@ -1,0 +1,151 @@
+"""Files that contradict themselves: refused with a sentence before they cost time, memory or the interpreter."""
+
+import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import pyvista as pv
+from fuzzing.seeds import datasets, results
+
+from mpmcli.dataset.manifest import Manifest
+from mpmcli.errors import InputError
+from mpmcli.output import open_result, read_record
+from mpmcli.output.guarded_read import read_rows, read_whole
+from mpmcli.output.hdf5_heaps import require_sound_heaps
+from mpmcli.plain_text import escaped
+from mpmcli.scene.geometry_file import GeometryFileError, read_geometry
+from mpmcli.scene.overrides import apply_overrides
+from mpmcli.scene.tables import copied, too_deep
+
+
+def placed(directory: Path, files: dict[str, bytes]) -> Path:
+    for name, data in files.items():
+        (directory / name).parent.mkdir(parents=True, exist_ok=True)
+        (directory / name).write_bytes(data)
+    return directory
+
+
+def test_a_heap_whose_object_has_no_size(tmp_path: Path) -> None:
+    """HDF5 walks through its objects without end."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["text"] = "wave"
+    require_sound_heaps(path)
+    data = bytearray(path.read_bytes())
+    start = data.index(b"GCOL")
+    # One object of 16 + 8 bytes, and behind it the free space, whose size counts its head.
+    free = start + 16 + 24
+    assert data[free : free + 2] == b"\0\0" and int.from_bytes(data[free + 8 : free + 16], "little") > 16
+    for size in (0, 8, 2**63):
+        data[free + 8 : free + 16] = size.to_bytes(8, "little")
+        path.write_bytes(data)
+        with pytest.raises(OSError, match="heap"):
+            require_sound_heaps(path)
+
+
+def test_a_data_set_of_more_than_the_file_holds(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("vast", (2**40, 3), "f4", chunks=(1024, 3))
+        file.create_dataset("zeros", (10**6,), "f8", data=np.zeros(10**6), compression="gzip", shuffle=True)
+        file["text"] = "wave"
+        file.create_group("group")
+        assert not read_whole(file, "zeros").any() and len(read_rows(file, "zeros", 10**6 - 5, 10)) == 5
+        for name in ("vast", "text", "group"):
+            with pytest.raises(ValueError, match=name):
+                read_whole(file, name)
+        with pytest.raises(ValueError, match="rows"):
+            read_rows(file, "zeros", -1, 3)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"dimension": 7}, {"bodies": 3}, {"origin": ["a", "b"]}, {"scene": "domain = 3"}, {"laws": [{"colour": 1}] * 2}],
+)
+def test_a_header_of_other_types(tmp_path: Path, change: dict) -> None:
+    place = placed(tmp_path, results("packed")[0])
+    assert open_result(place / "result").frame_count == 3
+    with h5py.File(place / "result" / "particles.vtkhdf", "r+") as file:
+        attributes = file["mpmcli"].attrs
+        attributes["header"] = json.dumps(json.loads(attributes["header"]) | change)
+        if "scene" in change:
+            attributes["scene"] = change["scene"]
+    with pytest.raises(InputError, match="is damaged: its header"):
+        open_result(place / "result")
+
+
+def test_entries_of_a_record_that_cannot_be_are_left_out(tmp_path: Path) -> None:
+    record = {"program": "mpmcli", "status": 3, "frames_expected": "many", "steps": 5, "failure": {"limit": "wave"}}
+    (tmp_path / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    assert read_record(tmp_path) == {"program": "mpmcli", "steps": 5, "failure": {"limit": "wave"}}
+
+
+@pytest.mark.parametrize("file", ["../elsewhere.h5", "/etc/hostname", "shards/../../elsewhere.h5"])
+def test_a_manifest_leads_nowhere_else(tmp_path: Path, file: str) -> None:
+    place = placed(tmp_path, datasets()[0]) / "data"
+    assert len(Manifest(place).rows()) == 4
+    with closing(sqlite3.connect(place / "manifest.sqlite")) as connection, connection:
+        connection.execute("UPDATE trajectories SET file = ? WHERE number = 2", (file,))
+    with pytest.raises(InputError, match="trajectory 2 is not in the dataset"):
+        Manifest(place).rows()
+
+
+@pytest.mark.parametrize("form", ["s.ply", "s.stl", "s.obj"])
+@pytest.mark.parametrize("binary", [True, False])
+def test_surfaces_as_vtk_reads_them(tmp_path: Path, form: str, binary: bool) -> None:
+    """A ball of triangles."""
+    path = tmp_path / form
+    shape = pv.Sphere(theta_resolution=7, phi_resolution=5)
+    if form == "s.obj":
+        lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in shape.points.astype(float).tolist()]
+        # Forwards, and backwards from the latest vertex.
+        faces = shape.regular_faces - (shape.n_points if not binary else -1)
+        lines += [f"f {a} {b} {c}" for a, b, c in faces]
+        path.write_text("\n".join(lines), encoding="utf-8")
+    else:
+        shape.save(path, binary=binary)
+    found, told = read_geometry(path), pv.read(path)
+    assert np.abs(found.vertices[found.triangles] - told.points[told.regular_faces]).max() < 1e-6
+    path.write_bytes(path.read_bytes()[: 7 * path.stat().st_size // 10])
+    # Others may end behind any triangle.
+    if form == "s.ply" or (form == "s.stl" and binary):
+        with pytest.raises(GeometryFileError):
+            read_geometry(path)
+
+
+def test_a_process_reads_what_may_crash_it(tmp_path: Path) -> None:
+    path = tmp_path / "s.vtk"
+    path.write_text(
+        "# vtk DataFile Version 3.0\n\nASCII\nDATASET POLYDATA\nPOINTS 1 float\n0 0 0\nPOLYGONS 1 4\n3 0 9999999 -99\n",
+        encoding="utf-8",
+    )
+    with pytest.raises(GeometryFileError):
+        read_geometry(path)
+
+
+def test_tables_of_callers_that_share_one() -> None:
+    """An unknown key that two bodies share was taken out twice."""
+    shared = {"law": "fluid", "density": 1.0}
+    scene = {"bodies": [{"material": shared}, {"material": shared}]}
+    first, second = copied(scene)["bodies"]
+    assert first == second == {"material": shared} and first["material"] is not second["material"]
+    changed, _ = apply_overrides(scene, ["bodies[0].material.density=2.0"])
+    assert [body["material"]["density"] for body in changed["bodies"]] == [2.0, 1.0]
+
+
+def test_how_deep_tables_may_be() -> None:
+    tree: object = 1
+    for _ in range(59):
+        tree = [tree]
+    assert not too_deep(tree) and not too_deep({}) and too_deep([[tree]])
+    with pytest.raises(InputError, match="too deep"):
+        apply_overrides({"title": 1}, ["a" + ".a" * 100 + "=1"])
+
+
+def test_control_characters_are_escaped() -> None:
+    assert escaped("plain é\n\ttext") == "plain é\n\ttext"
+    assert escaped("\x1b[31m\x07\x7f\u202e") == "\\u001b[31m\\u0007\\u007f\\u202e"
+    assert json.loads(escaped(json.dumps("\x7f\u202e\U000e0001", ensure_ascii=False))) == "\x7f\u202e\U000e0001"
