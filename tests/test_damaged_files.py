@@ -91,7 +91,7 @@ def test_a_manifest_leads_nowhere_else(tmp_path: Path, file: str) -> None:
     assert len(Manifest(place).rows()) == 4
     with closing(sqlite3.connect(place / "manifest.sqlite")) as connection, connection:
         connection.execute("UPDATE trajectories SET file = ? WHERE number = 2", (file,))
-    with pytest.raises(InputError, match="places trajectory 2 in .*: it is damaged"):
+    with pytest.raises(InputError, match=r"places trajectory 2 in .*: it is damaged"):
         Manifest(place).rows()
 
 
