@@ -6,7 +6,7 @@ from pathlib import Path
 from mpmcli.errors import InputError
 from mpmcli.output.checkpoints import remove_checkpoints
 from mpmcli.output.collider_files import COLLIDER_FILES, MOVING_FRAME
-from mpmcli.output.durable import TEMPORARY_SUFFIX
+from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory
 from mpmcli.output.run_record import RECORD, read_record
 from mpmcli.output.segments import PACKED, remove_segments, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_FRAME, SERIES_HEADER, SERIES_LEDGER
@@ -77,6 +77,7 @@ def _make(directory: Path) -> None:
         for path in reversed(missing):
             path.mkdir()
             made.append(path)
+            sync_directory(path.parent)
         _refuse_unwritable(directory)
     except (OSError, InputError) as error:
         for path in reversed(made):
