@@ -5,10 +5,10 @@ from hashlib import sha256
 from itertools import pairwise
 
 import numpy as np
-from soak.scenes import TURNING, SoakScene
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from soak.scenes import TURNING, SoakScene
 
 # Growth of energy without a source, relative to the energy turned over: rounding in single precision.
 GROWTH = 1e-3

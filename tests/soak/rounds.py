@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from soak.laws import broken_laws, digest, energy_growth, resting_speed
-from soak.scenes import SoakScene
 
 from mpmcli.errors import MpmcliError
 from mpmcli.frames.frame import Frame
@@ -19,6 +17,8 @@ from mpmcli.simulation.runner import Runner
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.simulate import simulate
 from mpmcli.solver.backend import stop_backend
+from soak.laws import broken_laws, digest, energy_growth, resting_speed
+from soak.scenes import SoakScene
 
 # Growth of the memory over the last half of the rounds that counts as flat, as a fraction.
 FLAT = 0.01
