@@ -145,6 +145,16 @@ def test_resumed_after_a_cut_it_ends_with_the_same_bytes(whole: dict, tmp_path: 
     require_same_end(chosen, whole["bytes"], tmp_path)
 
 
+def test_no_reported_frame_is_lost_while_a_finished_run_is_packed_again(whole: dict, tmp_path: Path) -> None:
+    """After the cut the segments are back beside the packed file: no step is taken, but files are moved."""
+    root = make_copy(whole["last"], tmp_path / "root")
+    with recorded(root, lambda: FRAMES + 1) as record:
+        run(root, resume=True)
+    assert any("segments" in moment for _, _, moment in record.images.values())
+    check_all(record, whole["frames"], tmp_path)
+    assert (root / PACKED).read_bytes() == whole["bytes"]
+
+
 @pytest.fixture(scope="module")
 def longer(whole: dict, tmp_path_factory: pytest.TempPathFactory) -> dict:
     """The finished run resumed to a later end, and all that a power cut in it could leave."""
