@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mpmcli import __version__
-from mpmcli.output.durable import TEMPORARY_SUFFIX, require_free_space, sealed
+from mpmcli.output.durable import TEMPORARY_SUFFIX, require_free_space, sealed, sync_directory
 
 CHECKPOINTS = "checkpoints"
 CHECKPOINT_NAME = re.compile(r"step_\d{9,}\.npz")
@@ -69,7 +69,9 @@ def write_checkpoint(directory: Path, checkpoint: Checkpoint) -> Path:
     text = np.frombuffer(json.dumps({"format": FORMAT, **facts}).encode("utf-8"), np.uint8)
     size = sum(array.nbytes for array in checkpoint.arrays.values()) + text.nbytes + 1024 * (1 + len(checkpoint.arrays))
     require_free_space(directory, size, "a checkpoint", "the frames are kept")
-    folder.mkdir(exist_ok=True)
+    if not folder.is_dir():
+        folder.mkdir()
+        sync_directory(directory)
     path = folder / f"step_{checkpoint.step:09d}.npz"
     with sealed(path, size) as temporary, open(temporary, "wb") as file:
         np.savez(file, **{FACTS: text, **{f"state/{name}": array for name, array in checkpoint.arrays.items()}})

@@ -9,7 +9,7 @@ from pathlib import Path
 from mpmcli.errors import InputError
 from mpmcli.output.checkpoints import remove_checkpoints
 from mpmcli.output.collider_files import COLLIDER_FILES, MOVING_FRAME
-from mpmcli.output.durable import TEMPORARY_SUFFIX
+from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory
 from mpmcli.output.lock import LOCK, DirectoryLock, refuse_locked, take_lock
 from mpmcli.output.run_record import RECORD, read_record
 from mpmcli.output.segments import DAMAGED, PACKED, REPAIRED, remove_segments, sealed_segments
@@ -149,7 +149,9 @@ def _make(directory: Path) -> list[Path]:
     made: list[Path] = []
     try:
         for path in reversed(missing):
-            # Another process may make it at this moment.
+            path.mkdir()
+            made.append(path)
+            sync_directory(path.parent)
             with suppress(FileExistsError):
                 path.mkdir()
                 made.append(path)

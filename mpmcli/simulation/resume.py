@@ -122,20 +122,20 @@ def go_on(engine: Engine, resumption: Resumption, backend: Backend, *, forced: b
 def take_over(directory: Path, resumption: Resumption) -> None:
     """Make the frames that are there the first segments of the run, and remove what follows a damaged one."""
     packed, folder = directory / PACKED, directory / SEGMENTS
+    count = 0
     if packed.exists():
         with closing(open_vtkhdf(packed)) as file:
             count = len(read_index(file).times)
         folder.mkdir(exist_ok=True)
+    for path in sealed_segments(directory):
+        if not count <= int(path.stem.split("_")[1]) < resumption.frames:
+            path.unlink()
+    if count:
+        # Before: a segment whose frames the packed file has must not come back beside it.
+        sync_directory(folder)
         os.replace(packed, folder / segment_name(0))
         sync_directory(folder)
         sync_directory(directory)
-        own = range(1, count)
-    else:
-        own = range(0)
-    for path in sealed_segments(directory):
-        first = int(path.stem.split("_")[1])
-        if first in own or first >= resumption.frames:
-            path.unlink()
 
 
 def file_digests(loaded: LoadedScene) -> dict[str, str]:

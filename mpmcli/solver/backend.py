@@ -2,12 +2,14 @@
 
 import ast
 import contextlib
+import gc
 import inspect
 import io
 import os
 import platform
 import tempfile
 import time
+import weakref
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -131,7 +133,24 @@ def stop_backend() -> None:
     """End the running backend, and with it every field and kernel; another may start then."""
     global _started
     ti.reset()
+    _forget_kernels()
     _started = None
+
+
+def _forget_kernels() -> None:
+    """Let go of kernels that nothing else holds.
+
+    Taichi keeps a list of all kernels ever made, to empty them at a restart. Those made in a function, as ours are,
+    hold everything that they were made for.
+    """
+    runtime = ti.lang.impl.get_runtime()
+    known = [weakref.ref(kernel) for kernel in runtime.kernels]
+    runtime.kernels = []
+    gc.collect()
+    runtime.kernels = [kernel for reference in known if (kernel := reference()) is not None]
+    for kernel in runtime.kernels:
+        # By the fields that it was called with; what was compiled for them is gone.
+        kernel.mapper.mapping.clear()
 
 
 def _settle_cache() -> None:
