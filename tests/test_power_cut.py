@@ -13,7 +13,7 @@ from mpmcli.scene import LoadedScene, parse_scene
 from mpmcli.simulation import stored_run
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.simulate import simulate
-from mpmcli.solver import batch_run
+from mpmcli.solver import launch_budget
 from mpmcli.solver.backend import stop_backend
 
 FRAMES, LATER = 4, 7
@@ -51,7 +51,8 @@ def run(
 def at_once() -> object:
     """Seal each frame at once and launch a few steps at a time, so that a short run has many files."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch_run, "BUDGET", PARTICLES * STEPS)
+        patch.setattr(launch_budget, "FIRST", PARTICLES * STEPS)
+        patch.setattr(launch_budget.LaunchBudget, "took", lambda *_: None)
         patch.setattr(stored_run, "HOLD", 0.0)
         yield
 
