@@ -134,7 +134,7 @@ class TrajectoryCells(Result):
                 array = trajectory.material
             else:
                 array = trajectory.read("position" if name == POSITION else name, slice(frame, frame + 1))[0]
-            stored[name] = self._index.layout.arrays[name].pad(array)
+            stored[name] = self.index.layout.arrays[name].pad(array)
         return stored
 
 
