@@ -13,7 +13,7 @@ from mpmcli.solver.engine import Engine
 # Share of the wall time that checkpoints may take, and the least time between two, s.
 SHARE, LEAST = 0.008, 5.0
 # Before the first one: seconds to compile what reads the device, and bytes written in a second.
-FIRST, RATE = 0.5, 3e8
+FIRST, RATE = 1.0, 3e8
 
 
 class Checkpointer:
