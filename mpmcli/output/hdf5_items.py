@@ -1,5 +1,6 @@
 """What an HDF5 file itself holds: no link or storage that leads to another file is followed."""
 
+import math
 from collections.abc import Iterator
 
 import h5py
@@ -60,5 +61,6 @@ def _require_own_data(data: h5py.Dataset, path: str) -> None:
     file = data.file.filename
     if data.is_virtual or data.external:
         raise InputError(f"{file} takes {path} from another file; mpmcli writes and follows no such link.")
-    if data.nbytes > MOST_INFLATED * data.id.get_storage_size() + SMALL:
+    chunk = math.prod(data.chunks) * data.dtype.itemsize if data.chunks else 0
+    if max(data.nbytes, chunk) > MOST_INFLATED * data.id.get_storage_size() + SMALL:
         raise DamageError(f"{file} is damaged: its data set {path} claims to be more than the file holds.")
