@@ -19,7 +19,7 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.output.checkpoints import CHECKPOINTS, Checkpoint, read_checkpoints, write_checkpoint
 from mpmcli.scene import Scene, load_scene, parse_scene
-from mpmcli.simulation.resume import find_resumption
+from mpmcli.simulation.resume import find_resumption, require_same_run
 from mpmcli.simulation.simulate import RunSettings, simulate
 from mpmcli.solver import launch_budget
 from mpmcli.solver.backend import choose_backend, start, stop_backend
@@ -237,6 +237,15 @@ def test_another_scene_is_refused_with_the_keys_that_differ(whole, overrides, pa
     with pytest.raises(InputError) as error:
         find(whole, whole / "packed", *overrides)
     assert part in str(error.value)
+
+
+@pytest.mark.parametrize(("key", "value"), [("version", "0.0.1"), ("backend", {"arch": "cuda", "precision": "f32"})])
+def test_frames_of_another_version_or_backend_are_refused_before_a_step(whole, key, value):
+    found = find(whole, whole / "packed")
+    header = dict(found.index.header)
+    require_same_run(found, header | {"scene": "another"}, whole)
+    with pytest.raises(InputError, match=f"holds frames whose {key} is "):
+        require_same_run(found, header | {key: value}, whole)
 
 
 def test_what_is_no_run_is_refused_and_left_alone(whole, tmp_path):

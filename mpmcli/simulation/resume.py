@@ -119,6 +119,24 @@ def go_on(engine: Engine, resumption: Resumption, backend: Backend, *, forced: b
     engine.load(SavedState(dict(point.numbers), dict(point.arrays)))
 
 
+def require_same_run(resumption: Resumption, header: Mapping[str, Any], directory: Path) -> None:
+    """Refuse to add frames to those of another version or backend, which could not be packed with them.
+
+    Args:
+        header: that the new frames will have, see `RunHeader.stored`.
+
+    Raises:
+        InputError: the headers differ in more than the scene.
+    """
+    before = {} if resumption.index is None else resumption.index.header
+    for key in (key for key in header if before and key != "scene"):
+        if before.get(key) != header[key]:
+            raise InputError(
+                f"{directory} holds frames whose {key} is {_text(before.get(key))}, and new ones would have "
+                f"{_text(header[key])}: resume the run with the version and the --arch that it was begun with."
+            )
+
+
 def take_over(directory: Path, resumption: Resumption) -> None:
     """Make the frames that are there the first segments of the run, and remove what follows a damaged one."""
     packed, folder = directory / PACKED, directory / SEGMENTS

@@ -19,7 +19,7 @@ from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.checkpointing import Checkpointer
 from mpmcli.simulation.engine import choose_engine
 from mpmcli.simulation.limits import Halt
-from mpmcli.simulation.resume import Resumption, find_resumption, go_on, take_over
+from mpmcli.simulation.resume import Resumption, find_resumption, go_on, require_same_run, take_over
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.stopwatch import Stopwatch
 from mpmcli.simulation.stored_run import finish, new_record, new_store, new_summary, write_scene
@@ -73,6 +73,10 @@ def simulate(
         if settings.resume:
             # Once more, as nobody else can write now.
             earlier = find_resumption(loaded, settings.directory, settings.form)
+            if solver is None and (earlier is None or not earlier.complete):
+                raise InputError(
+                    f"{settings.directory} was changed by another process meanwhile: give the command again."
+                )
             if earlier is None:
                 taken.clear()
         notes = (*loaded.notes, *(finding.line for finding in findings if finding.severity != "note"))
@@ -123,16 +127,18 @@ def _store_run(
     loaded, settings, plan, backend, earlier, notes, began, taken = begun
     scene = loaded.scene
     forced = settings.force and scene.time.step != "auto"
+    text = scene_to_toml(scene)
+    facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
+    header = RunHeader.of(scene, text, [laws()[name] for name in solver.laws], facts)
     if earlier is not None:
+        require_same_run(earlier, header.stored, settings.directory)
         go_on(solver, earlier, backend, forced=forced)
         take_over(settings.directory, earlier)
     summary = new_summary(loaded, settings, plan, backend, earlier, notes)
     on_start(summary)
     record = new_record(loaded, settings, summary, earlier)
-    text = scene_to_toml(scene)
     record.write()
     write_scene(settings.directory, text)
-    header = RunHeader.of(scene, text, [laws()[name] for name in solver.laws], summary.backend)
     store = new_store(loaded, settings, header.stored, earlier)
     checkpoints = Checkpointer(
         settings.directory,
