@@ -93,3 +93,10 @@ def test_mutants_of_containers_are_containers(seed: Callable, mutant: Callable) 
     data = seed()
     found = [mutant(data, Random(k)) for k in range(10)]
     assert all(one[:8] == data[:8] for one in found) and len(set(found)) > 5
+
+
+def test_guided_inputs_reach_new_lines(run_module: Callable, tmp_path: Path) -> None:
+    pytest.importorskip("atheris", reason="the guided form of the fuzzer needs the package atheris")
+    done = run_module(FUZZ, "--guided", "--count", 200, "--findings", tmp_path / "found", "checkpoint")
+    assert done.status == 0, done.stdout + done.stderr
+    assert "DONE   cov: " in done.stderr and not list((tmp_path / "found").iterdir())

@@ -116,7 +116,10 @@ def go_on(engine: Engine, resumption: Resumption, backend: Backend, *, forced: b
         )
     if point.forced != forced:
         raise InputError(f"The run was begun with{'' if point.forced else 'out'} --force: resume it in the same way.")
-    engine.load(SavedState(dict(point.numbers), dict(point.arrays)))
+    try:
+        engine.load(SavedState(dict(point.numbers), dict(point.arrays)))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"The checkpoint of step {point.step} holds something else than a state.") from error
 
 
 def require_same_run(resumption: Resumption, header: Mapping[str, Any], directory: Path) -> None:

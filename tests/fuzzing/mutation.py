@@ -6,6 +6,8 @@ import json
 import re
 import sqlite3
 import struct
+import warnings
+import zipfile
 from collections.abc import Iterator
 from contextlib import suppress
 from random import Random
@@ -327,6 +329,40 @@ def _h5_link(file: h5py.File, name: str, rng: Random) -> None:
             *(h5py.ExternalLink("/etc/passwd", "/"), h5py.ExternalLink("../other.h5", "/VTKHDF/Points")),
         )
     )
+
+
+def npz_mutant(data: bytes, rng: Random) -> bytes:
+    """Damage members of an archive of arrays, which stays one: their headers, their values, their number."""
+    with zipfile.ZipFile(io.BytesIO(data)) as file:
+        members = [(name, file.read(name)) for name in file.namelist()]
+    for _ in range(rng.choice((1, 1, 2))):
+        k = rng.randrange(len(members))
+        name, held = members[k]
+        head, facts = held[:128], held[128:]
+        match rng.randrange(8):
+            case 0:
+                members[k] = text_mutant(name.encode(), rng).decode("utf-8", "replace"), held
+            case 1:
+                members.append(members[k])
+            case 2:
+                members[k] = name, b"\x93NUMPY\x01\x00v\x00" + text_mutant(held[10:128], rng) + facts
+            case 3:
+                shape = f"'shape': ({rng.choice((0, -1, 7, 2**31, 2**40, 2**62))}, {rng.choice((0, 1, 3, -2))})"
+                text = re.sub(rb"'shape': \([^)]*\)", shape.encode(), held[10:128]).ljust(118)[:118]
+                members[k] = name, held[:10] + text + facts
+            case 4 | 5 | 6 if facts[:1] == b"{":
+                made = json_mutant(facts, rng)
+                stated = re.sub(rb"\(\d+,\)", b"(%d,)" % len(made), head[10:])[:118].ljust(118)
+                members[k] = name, head[:10] + stated + made
+            case _:
+                members[k] = name, bytes_mutant(held, rng)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", rng.choice((zipfile.ZIP_STORED,) * 4 + (zipfile.ZIP_DEFLATED,))) as file:
+        for name, held in members:
+            with suppress(ValueError, struct.error, UnicodeError), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                file.writestr(zipfile.ZipInfo(name), held)
+    return buffer.getvalue()
 
 
 def sqlite_mutant(data: bytes, rng: Random) -> bytes:

@@ -10,6 +10,7 @@ from mpmcli.dataset.draw import draw
 from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
+from mpmcli.output.checkpoints import read_checkpoints
 from mpmcli.plot.history import read_history
 from mpmcli.render.render_scene import render_scene_of
 from mpmcli.render.request import Request, plan_render
@@ -48,7 +49,15 @@ def sweep(path: Path) -> None:
         draw(loaded, number).scene(laws)
 
 
-OWN = {command.name: command for command in (read, trajectories, sweep)}
+@click.command("checkpoints")
+@click.argument("path", type=click.Path(path_type=Path))
+def checkpoints(path: Path) -> None:
+    """Read the checkpoints of a run."""
+    for point in read_checkpoints(path):
+        print(point.frame <= 2, point.step, point.time, sum(array.nbytes for array in point.arrays.values()))
+
+
+OWN = {command.name: command for command in (read, trajectories, sweep, checkpoints)}
 
 
 def command_of(words: list[str]) -> tuple[click.Command, list[str]]:

@@ -16,6 +16,7 @@ from made_result import made_frame, made_row
 from mpmcli.dataset.manifest import Manifest, Row
 from mpmcli.dataset.shard import checksum
 from mpmcli.output import SegmentStore, VtkSeriesStore
+from mpmcli.output.checkpoints import Checkpoint, write_checkpoint
 from mpmcli.output.collider_files import RESTING
 
 Files = dict[str, bytes]
@@ -199,6 +200,18 @@ def results(form: str) -> tuple[Files, ...]:
                 _write_surfaces(directory / RESTING)
             found.append(_files_in(directory, "result"))
     return tuple(found)
+
+
+@cache
+def checkpoints() -> tuple[Files, ...]:
+    """Return two checkpoints of a small run."""
+    backend = {"arch": "cpu", "precision": "f32"}
+    with TemporaryDirectory() as place, mock.patch("os.fsync"):
+        for step in (3, 7):
+            arrays = {"fluid.x": np.full((20, 3), step, np.float32), "numbers": np.arange(40.0), "counts": np.arange(9)}
+            numbers = {"time": 0.1, "drift": np.inf, "frames": [1, {"smallest": [0.1, "wave"]}, 0.0]}
+            write_checkpoint(Path(place), Checkpoint(1, step, 0.1, backend, False, numbers, arrays))
+        return (_files_in(Path(place), "run"),)
 
 
 @cache

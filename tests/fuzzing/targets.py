@@ -13,11 +13,13 @@ from fuzzing.mutation import (
     bytes_mutant,
     hdf5_mutant,
     json_mutant,
+    npz_mutant,
     sqlite_mutant,
     text_mutant,
     tree_mutant,
     value_mutant,
 )
+from fuzzing.new_checksums import with_new_checksums
 from fuzzing.seeds import Files
 
 Words = Sequence[str]
@@ -122,6 +124,9 @@ def _result(form: str, rng: Random) -> Input:
     if form == "packed" and rng.random() < 0.6:
         name = "result/particles.vtkhdf"
     files[name] = _damaged(name, files[name], rng)
+    if rng.random() < 0.5:
+        # As if mpmcli had written it so: what the checksums would tell of reaches the readers.
+        files = with_new_checksums(files, name)
     if rng.random() < 0.03:
         del files[name]
     commands = [("info", "result"), ("check", "result"), ("read", "result")]
@@ -142,6 +147,13 @@ def _damaged(name: str, data: bytes, rng: Random) -> bytes:
     if name.endswith(TEXT):
         return (text_mutant if rng.random() < 0.8 else bytes_mutant)(data, rng)
     return bytes_mutant(data, rng)
+
+
+def _checkpoint(rng: Random) -> Input:
+    files = seeds.chosen(seeds.checkpoints(), rng)
+    name = rng.choice(list(files))
+    files[name] = (npz_mutant if rng.random() < 0.6 else bytes_mutant)(files[name], rng)
+    return Input(files, (("checkpoints", "run"),))
 
 
 def _dataset(rng: Random) -> Input:
@@ -166,5 +178,6 @@ TARGETS = {
     "packed": Target(lambda rng: _result("packed", rng), "packed results and their run.json"),
     "segments": Target(lambda rng: _result("segments", rng), "segments"),
     "series": Target(lambda rng: _result("series", rng), "VTK series: PVD, VTU, CSV, JSON"),
+    "checkpoint": Target(_checkpoint, "checkpoints"),
     "dataset": Target(_dataset, "datasets: shards and manifest"),
 }
