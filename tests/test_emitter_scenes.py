@@ -110,6 +110,9 @@ BAD = [
      'emitters[0].volume: takes 2.5 s to flow out of "jet", which has 1 s until end; 0.4 m^2 at most come out by then'),
     ("velocity = [0.0, -2.0]", "velocity = [0.0, -2.0]\nvolume = 0.1\nparticles = 10",
      "emitters[0].volume: particles is given as well; leave one of them out"),
+    ("[2.0, 1.5], max = [2.2, 1.6]", "[2.0, 1.5], max = [2e9, 1.6]",
+     'emitters[0].shape: the mouth of "jet" could hold 2e+11 particles at once, and 1e+07 is the most; '
+     "make it narrower, or the grid coarser"),
     ("[2.0, 1.5], max = [2.2, 1.6]", "[3.9, 1.5], max = [4.5, 1.6]",
      'emitters[0].shape: the mouth of "jet" reaches out of the domain along x by 0.495 m; move it or enlarge the '
      "domain"),

@@ -55,15 +55,15 @@ def scene_bounds(scene: Scene) -> SceneBounds:
         height = float(np.max(np.ptp(corners, axis=0)))
     # What presses on no face pulls as long as the run.
     weight = g if closed.all() else max(float(np.linalg.norm(gravity * closed)) for gravity in gravities)
-    fallen = 2 * weight * height if scene.domain.steady else min(2 * weight * height, pull.impulse**2)
+    fallen = 2 * weight * height if scene.domain.steady else min(2 * weight * height, pull.impulse * pull.impulse)
     if not closed.all():
         initial += max(float(np.linalg.norm(gravity[~closed])) for gravity in gravities) * scene.time.end
-    pushed = min(2 * push.largest * max(scene.domain.size), push.impulse**2)
+    pushed = min(2 * push.largest * max(scene.domain.size), push.impulse * push.impulse)
     return SceneBounds(
         dimension=scene.dimension,
         spacing=scene.domain.spacing,
         gravity=g + push.largest,
-        speed=float(np.sqrt(initial**2 + fallen + pushed)) + sum(abs(one.strength) for one in scene.impulses),
+        speed=float(np.sqrt(initial * initial + fallen + pushed)) + sum(abs(one.strength) for one in scene.impulses),
         height=height,
         density=max(body.material.density for body in scene.sources),
     )

@@ -5,8 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from mpmcli.scene.colliders import Collider, Plane, slope_of
+from mpmcli.scene.composite import Composite
 from mpmcli.scene.expression import Expression
+from mpmcli.scene.mesh import Mesh
 from mpmcli.scene.motion import has_jump
+from mpmcli.scene.polygon import Polygon
 from mpmcli.scene.problem import Problem
 from mpmcli.scene.quadrature import integral_of
 from mpmcli.scene.sampling import lattice_points, particle_places
@@ -16,6 +19,8 @@ from mpmcli.scene.schema import Scene
 _SLACK = 0.1
 # Lattices above this size are not looked at.
 _MOST_PLACES = 1_000_000
+# Cells within the bounding box of a collider whose distances are kept on a grid, of as many nodes.
+_MOST_CELLS = 100_000_000
 
 
 def collider_problems(scene: Scene) -> Iterator[Problem]:
@@ -34,6 +39,7 @@ def collider_problems(scene: Scene) -> Iterator[Problem]:
         placed = placed and not unfit
         if not unfit:
             yield from _out_of_reach(collider, k, scene)
+            yield from _too_large(collider, k, scene)
     if placed:
         yield from _overlaps(scene)
 
@@ -74,6 +80,15 @@ def _out_of_reach(collider: Collider, index: int, scene: Scene) -> Iterator[Prob
             cure = "give its mesh scale = 0.001, if it is in millimetres" if collider.shape.files else "leave it out"
             said = f'collider "{collider.name}" ({spans} m) lies outside of the domain ({box} m); move it, or {cure}'
             yield Problem(("colliders", index, "shape"), said)
+
+
+def _too_large(collider: Collider, index: int, scene: Scene) -> Iterator[Problem]:
+    """Find colliders whose distances would be computed at too many nodes."""
+    if isinstance(collider.form, Mesh | Composite | Polygon):
+        spans = np.ptp(np.array(collider.form.bounds()), axis=0) / scene.domain.spacing
+        if not (count := float(np.prod(spans + 1))) <= _MOST_CELLS:
+            said = f'"{collider.name}" spans {count:.3g} cells, and {_MOST_CELLS:g} is the most for meshes, polygons '
+            yield Problem(("colliders", index, "shape"), said + "and shapes of several; leave out what is out of reach")
 
 
 def _overlaps(scene: Scene) -> Iterator[Problem]:

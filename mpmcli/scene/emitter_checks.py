@@ -8,18 +8,25 @@ from mpmcli.scene.emitters import Emitter
 from mpmcli.scene.problem import Problem
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.schema import Scene
-from mpmcli.scene.sheets import Mouth, mouth_of, sheets_of, sheets_until
+from mpmcli.scene.sheets import Mouth, most_in_mouth, mouth_of, sheets_of, sheets_until
 
 # Fraction of a spacing that counts as round-off.
 _TOLERANCE = 1e-6
 # Particles that a run can number.
 _MOST = 2**31 - 1
+# Particles of one sheet.
+_MOST_IN_MOUTH = 10_000_000
 
 
 def emitter_problems(scene: Scene) -> Iterator[Problem]:
     """Find emitters that cannot be, and solvers that know neither emitters nor open faces."""
     for k, emitter in enumerate(scene.emitters):
         where = ("emitters", k)
+        count = most_in_mouth(emitter, scene.domain.spacing)
+        if not count <= _MOST_IN_MOUTH:
+            said = f'the mouth of "{emitter.name}" could hold {count:.3g} particles at once, and {_MOST_IN_MOUTH:g} is '
+            yield Problem((*where, "shape"), said + "the most; make it narrower, or the grid coarser")
+            continue
         mouth = mouth_of(emitter, scene.domain.spacing)
         if not mouth.filled.any():
             said = (

@@ -75,21 +75,10 @@ def mouth_of(emitter: Emitter, h: float) -> Mouth:
 
 @lru_cache(maxsize=64)
 def _mouth(shape: Shape, velocity: tuple[float, ...], particles_per_cell: int, h: float) -> Mouth:
-    velocity = np.array(velocity)
-    direction = velocity / np.linalg.norm(velocity)
+    direction = np.array(velocity) / np.linalg.norm(velocity)
     d = len(velocity)
     form = shape.form
-    lower, upper = (np.array(bound, float) for bound in form.bounds())
-    centre = (lower + upper) / 2
-    # The axes of the scene that lie most across the flow, made normal to it.
-    across: list[np.ndarray] = []
-    for axis in np.argsort(np.abs(direction), kind="stable")[: d - 1]:
-        vector = np.eye(d)[axis]
-        for other in (direction, *across):
-            vector = vector - (vector @ other) * other
-        across.append(vector / np.linalg.norm(vector))
-    axes = np.array(across)
-    reach = np.abs(axes) @ ((upper - lower) / 2)
+    centre, axes, reach = _section(shape, direction)
     # The section, finely: its extent and its area.
     n = _MEASURED[d]
     steps = 2 * reach / n
@@ -112,6 +101,27 @@ def _mouth(shape: Shape, velocity: tuple[float, ...], particles_per_cell: int, h
     places = centre + (np.array(low) + (cells + 0.5) * np.array(spacings[1:])) @ axes
     filled = form.contains(places).reshape(counts)
     return Mouth(centre, direction, axes, np.array(spacings), np.array(low), tuple(counts), filled, area)
+
+
+def most_in_mouth(emitter: Emitter, h: float) -> float:
+    """Return a bound on the number of particles in a mouth, in a time that does not depend on it."""
+    direction = np.array(emitter.velocity) / np.linalg.norm(emitter.velocity)
+    spacing = h / emitter.particles_per_cell ** (1 / len(direction))
+    return float(np.prod(np.maximum(1.0, 2 * _section(emitter.shape, direction)[2] / spacing)))
+
+
+def _section(shape: Shape, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the centre of a shape, axes normal to a direction, (d - 1, d), and how far it reaches along them."""
+    lower, upper = (np.array(bound, float) for bound in shape.form.bounds())
+    # The axes of the scene that lie most across the flow, made normal to it.
+    across: list[np.ndarray] = []
+    for axis in np.argsort(np.abs(direction), kind="stable")[: len(direction) - 1]:
+        vector = np.eye(len(direction))[axis]
+        for other in (direction, *across):
+            vector = vector - (vector @ other) * other
+        across.append(vector / np.linalg.norm(vector))
+    axes = np.array(across)
+    return (lower + upper) / 2, axes, np.abs(axes) @ ((upper - lower) / 2)
 
 
 def sheets_of(emitter: Emitter, scene: Scene) -> Sheets:
