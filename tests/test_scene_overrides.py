@@ -60,6 +60,7 @@ def test_later_overrides_see_earlier_ones():
     [
         ("time.end", "an override is KEY=VALUE, for example time.end=0.5; the = is missing"),
         ("=3", '"" is no key; a key is a path such as time.end or bodies[0].velocity'),
+        (".".join("a" * 61) + "=3", f'"{"a." * 20}..." has 61 parts, and no value of a scene lies so deep'),
         ("time..end=3", '"time..end" is no key; a key is a path such as time.end or bodies[0].velocity'),
         ("time.end=", "nothing is no TOML value; write a number, a list or a word, or text in quotes"),
         ("time.end=[1", "[1 is no TOML value; write a number, a list or a word, or text in quotes"),

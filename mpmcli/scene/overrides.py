@@ -8,7 +8,7 @@ from typing import Any
 from mpmcli.errors import InputError
 from mpmcli.scene.problem import Path, path_text
 from mpmcli.scene.sentences import listed, nearest, written
-from mpmcli.scene.tables import copied, too_deep
+from mpmcli.scene.tables import MOST_NESTED, copied, too_deep
 
 _PATH = re.compile(r"[^.\[\]]+(?:\[\d+\])*(?:\.[^.\[\]]+(?:\[\d+\])*)*")
 _PART = re.compile(r"\[(\d+)\]|([^.\[\]]+)")
@@ -60,7 +60,10 @@ def key_parts(key: str) -> list[str]:
     """
     if not _PATH.fullmatch(key):
         raise InputError(f'"{key}" is no key; a key is a path such as time.end or bodies[0].velocity')
-    return [index or name.strip() for index, name in _PART.findall(key)]
+    parts = [index or name.strip() for index, name in _PART.findall(key)]
+    if len(parts) > MOST_NESTED:
+        raise InputError(f'"{key[:40]}..." has {len(parts)} parts, and no value of a scene lies so deep')
+    return parts
 
 
 def _value(text: str) -> object:
