@@ -16,6 +16,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import write_text
 from mpmcli.output.owner import Owner, time_now
 from mpmcli.output.stored_facts import sound_record
+from mpmcli.scene.tables import too_deep
 
 RECORD = "run.json"
 PROGRAM = "mpmcli"
@@ -149,7 +150,9 @@ def read_record(directory: Path) -> dict[str, Any] | None:
         record = json.loads((Path(directory) / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         return None
-    return sound_record(record) if isinstance(record, dict) and record.get("program") == PROGRAM else None
+    if not isinstance(record, dict) or record.get("program") != PROGRAM or too_deep(record):
+        return None
+    return sound_record(record)
 
 
 def _plain(value: Any) -> Any:

@@ -172,6 +172,9 @@ class VtkhdfWriter:
         self._items[path] = table_checksum(table)
 
     def _put_attribute(self, path: str, name: str, value: Any) -> None:
+        if isinstance(value, str):
+            # What a damaged file holds may be no text.
+            value = value.encode("utf-8", "replace").decode("utf-8")
         self._file[path].attrs[name] = value
         self._items[f"{path}@{name}"] = attribute_checksum(value)
 

@@ -51,6 +51,9 @@ def time_text(time: float, times: Sequence[float]) -> str:
     factor, unit = next(((f, u) for f, u in TIMES if longest >= 0.1 * f), TIMES[-1])
     ordered = np.unique(np.asarray(times, dtype=np.float64)) / factor
     step = float(np.median(np.diff(ordered))) if len(ordered) > 1 else 0.1
+    if not 0.0 < step < math.inf:
+        # Of times in a damaged file, whose differences may be too large or too small for numbers.
+        step = 0.1
     least = min(max(0, math.ceil(-math.log10(step) - 1e-9)), DIGITS_MAX)
     # The digits of an exact step such as 0.25; one more than necessary for others such as 1/3.
     exact = (least + more for more in range(3) if abs(step * 10 ** (least + more) % 1 - 0.5) >= 0.45)

@@ -99,7 +99,7 @@ def speed_limit(spacing: float, speed: float, gravity: float) -> float:
     if speed == 0 and gravity == 0:
         return math.inf
     # The root in the form that neither cancels nor divides by zero.
-    return 2 * COURANT * spacing / (speed + math.sqrt(speed**2 + 4 * gravity * COURANT * spacing))
+    return 2 * COURANT * spacing / (speed + math.sqrt(speed * speed + 4 * gravity * COURANT * spacing))
 
 
 def deformation_limit(gradient: float) -> float:
