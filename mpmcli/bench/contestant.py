@@ -1,7 +1,7 @@
 """Process of one contestant, controlled by commands on stdin, one per line.
 
-    python -m mpmcli.bench.contestant ours|peer|LAW,LAW,...|FEATURE --dimension 3 --cells 128 --particles 524288
-                                  --step 8e-5 [--threads 2] [--precision f32] [--arch cpu]
+    python -m mpmcli.bench.contestant ours|peer|yardstick|LAW,LAW,...|FEATURE
+        --dimension 3 --cells 128 --particles 524288 --step 8e-5 [--threads 2] [--precision f32] [--arch cpu]
 
 It answers on stdout, one JSON object per line, and waits for commands on stdin without using the processor:
 
@@ -167,6 +167,10 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
         from mpmcli.bench.peers import Peer
 
         return Peer(case, **options)
+    if who == "yardstick":
+        from mpmcli.bench.yardstick import falling_block as block_in_c
+
+        return block_in_c(case, **options)
     if who == "ours":
         from mpmcli.bench.ours import falling_block
 
@@ -181,7 +185,7 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m mpmcli.bench.contestant")
-    parser.add_argument("who", help="ours, peer, the names of laws, with commas between them, or a feature")
+    parser.add_argument("who", help="ours, peer, yardstick, the names of laws, with commas between them, or a feature")
     parser.add_argument("--dimension", type=int, choices=[2, 3], required=True)
     parser.add_argument("--cells", type=int, required=True)
     parser.add_argument("--particles", type=int, required=True)
