@@ -3,9 +3,13 @@
 import statistics
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from mpmcli.bench.report import describe_machine
+from mpmcli.plain_text import counted, text_table
 
 if TYPE_CHECKING:
     from mpmcli.solver.backend import Backend
@@ -19,6 +23,52 @@ LARGEST_ON_VULKAN = 1 << 22
 TRIES = 3
 # Launches between two waits for the device.
 LAUNCHES = 100
+
+# Names of figures in the table, and their units.
+ROWS = (
+    ("copy", "copy_gb_per_s", "GB/s"),
+    *((f"read, {order}", f"read_{order}_g_per_s", "1e9/s") for order in ("random", "sorted")),
+    *((f"atomic add, {order}", f"atomic_add_{order}_g_per_s", "1e9/s") for order in ("random", "sorted", "same")),
+    *((f"plain add, {order}", f"plain_add_{order}_g_per_s", "1e9/s") for order in ("random", "sorted", "same")),
+)
+
+
+@dataclass(frozen=True)
+class DeviceReport:
+    """What `measure_device` found, on which machine."""
+
+    found: dict
+    machine: dict = field(default_factory=describe_machine)
+
+    def as_dict(self) -> dict:
+        """Return everything measured, ready for JSON."""
+        return {"machine": self.machine, "device": self.found}
+
+    def table(self) -> str:
+        """Return the report as text: rates of both tables, then launches."""
+        found = self.found
+        tables = [*found["tables"].values()]
+        head = ("", *(f"{table['bytes'] / 2**20:.3g} MiB" for table in tables), "")
+        rows = [
+            (name, *(f"{table[key]:.3g}" for table in tables), unit) for name, key, unit in ROWS if key in tables[0]
+        ]
+        loops = ", ".join(f"{counted(int(count), 'loop')} {us:.1f}" for count, us in found["launch_us"].items())
+        lines = [
+            f"{self.machine['processor']}, {found['arch']}, {counted(found['threads'], 'thread')}, "
+            f"taichi {self.machine['taichi']}",
+            "",
+            text_table(head, rows, left={0, len(head) - 1}),
+            "",
+            f"Launch of a kernel, us: {loops}; with a number from the host {found['launch_with_argument_us']:.1f}; and",
+            f"waiting for it {found['launch_and_wait_us']:.1f}.",
+            *(
+                [f"Copy by the C library on one thread: {found['memcpy_gb_per_s']:.3g} GB/s, read and written."]
+                if "memcpy_gb_per_s" in found
+                else []
+            ),
+            "sorted: eight neighbours at each place; same: all at one place; plain: load, add, store, on one thread.",
+        ]
+        return "\n".join(lines)
 
 
 def measure_device(backend: "Backend", seconds: float = 0.05, large: int = LARGE, small: int = SMALL) -> dict:

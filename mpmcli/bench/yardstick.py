@@ -77,6 +77,7 @@ class Yardstick:
         self._library = load_yardstick(case.dimension)
         self.particles, self.threads, self.smallest_step = case.particles, threads, case.step
         volume = EDGE**case.dimension / case.particles
+        self._before = np.zeros(len(PHASES))
         self._spacing = 1 / case.cells
         self._shape = (case.particles, case.dimension)
         arrays = [np.ascontiguousarray(array, dtype=np.float32) for array in (position, velocity)]
@@ -97,10 +98,11 @@ class Yardstick:
         """Do nothing: every step waits."""
 
     def phases(self) -> dict[str, float]:
-        """Return the seconds so far in each of PHASES, of processor time on one thread and of wall time on several."""
+        """Return the time in each of PHASES since the last call, s: processor time on one thread, else wall time."""
         found = np.zeros(len(PHASES))
         self._library.yardstick_seconds(self._handle, found.ctypes.data)
-        return dict(zip(PHASES, found.tolist(), strict=True))
+        since, self._before = found - self._before, found
+        return dict(zip(PHASES, since.tolist(), strict=True))
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities, (particles, dimension) float32, in their initial order."""
