@@ -217,10 +217,11 @@ class FakeWorker:
 
     start_seconds = 0.5
 
-    def __init__(self, who: str, step_seconds: float, particles: int, log: list[tuple[str, str]]) -> None:
+    def __init__(self, who: str, step_seconds: float, particles: int, log: list, threads: int) -> None:
         self.who, self.step_seconds, self.log = who, step_seconds, log
         self.ready = {"particles": particles, "bytes_per_particle": None, "threads": 1}
         self.closed = False
+        self.shared = threads > 1
 
     def ask(self, command: str) -> dict:
         self.log.append((self.who, command))
@@ -228,7 +229,9 @@ class FakeWorker:
             case ["first"]:
                 return {"seconds": 2.0 + self.step_seconds}
             case ["run", _]:
-                return {"steps": 100, "seconds": 100 * self.step_seconds}
+                # Of other processes there are as many again.
+                busy = 100 * self.step_seconds
+                return {"steps": 100, "seconds": (2 - self.shared) * busy, "processor_seconds": busy}
         return {"sound": True, "smallest_step": SMALL_2D.step, "peak_memory": 10**8}
 
     def __enter__(self) -> "FakeWorker":
@@ -249,7 +252,7 @@ class TestComparison:
         log, started = [], []
 
         def start(who: str, case: BenchCase, setting: Setting) -> FakeWorker:
-            started.append(FakeWorker(who, SECONDS[who] / setting.threads, particles, log))
+            started.append(FakeWorker(who, SECONDS[who] / setting.threads, particles, log, setting.threads))
             return started[-1]
 
         try:

@@ -29,7 +29,7 @@ class FakeWorker:
             case ["first"]:
                 return {"seconds": 1.0}
             case ["run", _]:
-                return {"steps": 10, "seconds": 10 * self.step}
+                return {"steps": 10, "seconds": 10 * self.step, "processor_seconds": 10 * self.step}
         memory = 200_000_000 + BYTES * self.case.particles
         return {"sound": True, "smallest_step": self.case.step, "peak_memory": memory}
 

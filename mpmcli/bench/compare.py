@@ -200,10 +200,11 @@ class Side:
 
     Attributes:
         who: see `start_worker`.
-        rates: particle-steps/s of each block so far.
+        rates: particle-steps/s of each block so far, by processor time on one thread, and else by wall time.
     """
 
     worker: Worker
+    clock: str
     first_seconds: float
 
     def __init__(self, who: str, case: BenchCase) -> None:
@@ -223,6 +224,8 @@ class Side:
             RunError: it could not start, or runs another number of particles.
         """
         self.worker = stack.enter_context(start(self.who, self.case, setting))
+        # The processor time of one thread excludes that of other processes.
+        self.clock = "processor_seconds" if setting.threads == 1 and setting.arch == "cpu" else "seconds"
         if self.worker.ready["particles"] != self.case.particles:
             name = {"ours": "mpmcli", "peer": self.case.peer}.get(self.who, self.who)
             raise RunError(
@@ -235,7 +238,7 @@ class Side:
     def measure(self, seconds: float) -> None:
         """Measure one block."""
         answer = self.worker.ask(f"run {seconds}")
-        self.rates.append(self.case.particles * answer["steps"] / answer["seconds"])
+        self.rates.append(self.case.particles * answer["steps"] / answer[self.clock])
 
     def finish(self) -> ContestantResult:
         """Return the result, and end the process."""

@@ -7,7 +7,7 @@ It answers on stdout, one JSON object per line, and waits for commands on stdin 
 
     (start)        {"particles": 524288, "bytes_per_particle": 88 or null, "threads": 2}     ready to step
     first          {"seconds": 2.9}                                            one step, kernels compiled
-    run SECONDS    {"steps": 31, "seconds": 1.02}                              steps for about that long
+    run SECONDS    {"steps": 31, "seconds": 1.02, "processor_seconds": 1.01}   steps for about that long
     phases         {"p2g": 0.4, "g2p": 0.5}                                    time in each since the last such command
     finish         {"sound": true, "smallest_step": 8e-5, "peak_memory": 219152384}    and ends
 
@@ -141,8 +141,9 @@ def serve(start: Callable[[], Contestant], commands: Iterable[str], answers: IO[
                     contestant.sync()
                     answer(seconds=time.perf_counter() - begin)
                 case ["run", seconds]:
+                    busy = time.process_time()
                     steps, elapsed = run_block(contestant, float(seconds))
-                    answer(steps=steps, seconds=elapsed)
+                    answer(steps=steps, seconds=elapsed, processor_seconds=time.process_time() - busy)
                 case ["keep", steps]:
                     contestant.advance(int(steps))
                     contestant.sync()
