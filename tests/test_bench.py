@@ -11,7 +11,7 @@ import pytest
 
 from mpmcli.bench import contestant, ours, peers
 from mpmcli.bench.cases import CASES, DENSITY, EDGE, GRAVITY, SPEED, BenchCase
-from mpmcli.bench.compare import Setting, run_bench, start_worker
+from mpmcli.bench.compare import Setting, Side, run_bench, start_worker
 from mpmcli.bench.report import BenchReport, CaseResult, ContestantResult
 from mpmcli.errors import RunError
 
@@ -247,7 +247,11 @@ SECONDS = {"ours": 0.002, "peer": 0.008, "yardstick": 0.001, "mpm99": 0.01, "mpm
 
 class TestComparison:
     def run(
-        self, particles: int = 200, threads: int | tuple[int, ...] = 2, **options
+        self,
+        particles: int = 200,
+        threads: int | tuple[int, ...] = 2,
+        cases: tuple[BenchCase, ...] = (SMALL_2D,),
+        **options,
     ) -> tuple[BenchReport, list[tuple[str, str]], list[FakeWorker]]:
         log, started = [], []
 
@@ -256,7 +260,7 @@ class TestComparison:
             return started[-1]
 
         try:
-            report = run_bench([SMALL_2D], threads=threads, seconds=1.5, start=start, blocks=3, **options)
+            report = run_bench(cases, threads=threads, seconds=1.5, start=start, blocks=3, **options)
         finally:
             assert all(fake.closed for fake in started)
         return report, log, started
@@ -289,6 +293,24 @@ class TestComparison:
         row = report.table().splitlines()[4].split()
         assert row[10:12] == ["0.40", "2.00"]
         assert row[-2:] == ["0.04", "0.03"]
+
+    def test_a_yardstick_that_cannot_start_is_left_out(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The table has its columns where it started at another size."""
+
+        def begin(side: Side, *arguments: object) -> None:
+            if side.who == "yardstick" and side.case.dimension == 2:
+                raise RunError("gcc fell over.")
+            usual(side, *arguments)
+
+        usual = Side.begin
+        monkeypatch.setattr(Side, "begin", begin)
+        lines = []
+        report, _, _ = self.run(yardstick=True, progress=lines.append, cases=(SMALL_2D, SMALL_3D))
+        assert [bool(result.yardstick) for result in report.results] == [False, True]
+        assert "2d-32, 2 threads: yardstick is left out. gcc fell over." in lines
+        assert report.as_dict()["cases"][0]["yardstick"] is None
+        rows = [line.split() for line in report.table().splitlines()[4:6]]
+        assert len(rows[1]) == len(rows[0]) + 2
 
     def test_numbers_of_threads_in_turn(self) -> None:
         """Twice as fast on 2 threads, and on 3 a half faster than that: all efficiencies are 1."""

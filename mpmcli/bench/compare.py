@@ -148,8 +148,10 @@ def run_bench(
         peers: whether all examples that compute a fluid are measured, or the fastest one of each dimension.
         start: makes the process of a contestant; tests replace it.
 
+    The yardstick, or another example than the peer, that cannot start is left out.
+
     Raises:
-        RunError: a contestant could not start or failed.
+        RunError: ours or the peer could not start, or a contestant failed.
     """
     counts = (threads,) if isinstance(threads, int) else tuple(threads)
     tell = progress or (lambda line: None)
@@ -182,9 +184,17 @@ def _run_case(
     where = f"{case.name}, {counted(setting.threads, 'thread')}"
     tell(f"{where}: {case.particles:,} particles, {case.cells}^{case.dimension} cells, against {case.peer}")
     with ExitStack() as stack:
-        sides = [Side(name, case) for name in who]
-        for side in sides:
-            side.begin(stack, setting, start, min(WARM_UP, seconds))
+        sides = []
+        for name in who:
+            side = Side(name, case)
+            try:
+                side.begin(stack, setting, start, min(WARM_UP, seconds))
+            except RunError as error:
+                if name in ("ours", "peer"):
+                    raise
+                tell(f"{where}: {name} is left out. {error}")
+            else:
+                sides.append(side)
         for block in range(blocks):
             for side in sides:
                 side.measure(seconds)

@@ -189,7 +189,8 @@ class BenchReport:
 
     def table(self) -> str:
         """Return the report as text: one line per case, then what the columns mean."""
-        columns = [_row(result) for result in self.results]
+        with_yardstick = any(result.yardstick for result in self.results)
+        columns = [_row(result, with_yardstick=with_yardstick) for result in self.results]
         if len(self.threads) > 1:
             for result, cells in zip(self.results, columns, strict=True):
                 cells |= {"speed-up": f"{self.speed_up(result):.2f}", "efficiency": f"{self.efficiency(result):.0%}"}
@@ -201,7 +202,7 @@ class BenchReport:
         title = heading(self.machine, self.arch, self.threads, self.precision)
         in_c = [
             "C: the yardstick, million particle-steps per second; slower: times that mpmcli is slower than it.",
-        ] * any(result.yardstick for result in self.results)
+        ] * with_yardstick
         several = [
             "speed-up, efficiency: ours over ours with the fewest threads, and for each thread.",
         ] * (len(self.threads) > 1)
@@ -234,10 +235,12 @@ class BenchReport:
         return "\n".join([title, "", table, "", *notes, *held, *smaller, *broken])
 
 
-def _row(result: CaseResult) -> dict[str, str]:
-    """Return the cells of a line, by column."""
+def _row(result: CaseResult, *, with_yardstick: bool) -> dict[str, str]:
+    """Return the cells of a line, by column, with those of the yardstick if the table has them."""
     ours, peer, yardstick, (low, high) = result.ours, result.peer, result.yardstick, result.ratio_range
-    in_c = {} if yardstick is None else {"C": f"{yardstick.rate / 1e6:.2f}", "slower": f"{result.times_slower:.2f}"}
+    in_c = {"C": "", "slower": ""} if with_yardstick else {}
+    if yardstick:
+        in_c = {"C": f"{yardstick.rate / 1e6:.2f}", "slower": f"{result.times_slower:.2f}"}
     return {
         "case": result.case.name,
         "particles": f"{result.case.particles:,}",
