@@ -11,7 +11,7 @@ import pytest
 
 from mpmcli.bench import contestant, ours, peers
 from mpmcli.bench.cases import CASES, DENSITY, EDGE, GRAVITY, SPEED, BenchCase
-from mpmcli.bench.compare import Setting, run_bench, start_worker
+from mpmcli.bench.compare import Setting, Side, run_bench, start_worker
 from mpmcli.bench.report import BenchReport, CaseResult, ContestantResult
 from mpmcli.errors import RunError
 
@@ -20,9 +20,14 @@ SMALL_2D = BenchCase(dimension=2, cells=32, particles=200, step=5e-4)
 SMALL_3D = BenchCase(dimension=3, cells=32, particles=200, step=5e-4)
 
 
-def adapted(case: BenchCase, text: str | None = None) -> str:
-    text = text or peers.example_path(case.peer).read_text(encoding="utf-8")
-    return peers.adapted_source(text, case, threads=3, precision="f64", arch="cpu")
+# Each example and a case that it can solve.
+EXAMPLES = [("mpm88", SMALL_2D), ("mpm3d", SMALL_3D), *((name, SMALL_2D) for name in SMALL_2D.other_peers)]
+
+
+def adapted(case: BenchCase, text: str | None = None, name: str | None = None) -> str:
+    name = name or case.peer
+    text = text or peers.example_path(name).read_text(encoding="utf-8")
+    return peers.adapted_source(text, case, name, threads=3, precision="f64", arch="cpu")
 
 
 class TestCases:
@@ -45,22 +50,25 @@ class TestCases:
 
 
 class TestAdaptedSource:
-    @pytest.mark.parametrize("case", [SMALL_2D, SMALL_3D], ids=lambda case: case.peer)
-    def test_settings_are_ours_and_nothing_is_drawn(self, case: BenchCase) -> None:
-        source = adapted(case)
+    def test_all_examples_are_here(self) -> None:
+        assert {name for name, _ in EXAMPLES} == set(peers.EXAMPLES)
+
+    @pytest.mark.parametrize(("name", "case"), EXAMPLES)
+    def test_settings_are_ours_and_nothing_is_drawn(self, name: str, case: BenchCase) -> None:
+        source = adapted(case, name=name)
         compile(source, "adapted", "exec")
         assert "ti.init(arch=ti.cpu, default_fp=ti.f64, cpu_max_num_threads=3, offline_cache=False)" in source
-        assert "n_particles = 200" in source
+        assert "n_particles = 200" in source or "n_particles, n_grid = 200, 32" in source
         assert "GUI" not in source
         assert "ti.gpu" not in source
 
-    @pytest.mark.parametrize("case", [SMALL_2D, SMALL_3D], ids=lambda case: case.peer)
-    def test_everything_else_is_untouched(self, case: BenchCase) -> None:
+    @pytest.mark.parametrize(("name", "case"), EXAMPLES)
+    def test_everything_else_is_untouched(self, name: str, case: BenchCase) -> None:
         """As many lines as in the example up to where it draws, and only the settings differ."""
-        original = peers.example_path(case.peer).read_text(encoding="utf-8").splitlines()
-        pairs = list(zip(original, adapted(case).splitlines(), strict=False))
+        original = peers.example_path(name).read_text(encoding="utf-8").splitlines()
+        pairs = list(zip(original, adapted(case, name=name).splitlines(), strict=False))
         changed = [new for old, new in pairs if old != new]
-        assert len(changed) == {"mpm3d": 3, "mpm88": 4}[case.peer]
+        assert len(changed) == {"mpm3d": 3, "mpm88": 4, "mpm99": 5, "mpm128": 5}[name]
 
     def test_another_version_of_an_example_is_noticed(self) -> None:
         text = peers.example_path("mpm88").read_text(encoding="utf-8")
@@ -111,6 +119,35 @@ np.save("{module}.npy", side.positions())
         assert np.abs(found - expected).max() < 1e-12
         fallen = SPEED * steps * case.step + GRAVITY * case.step**2 * steps * (steps + 1) / 2
         assert expected[:, 1].mean() == pytest.approx(case.positions()[:, 1].mean() - fallen, abs=1e-12)
+
+    @pytest.mark.parametrize("name", SMALL_2D.other_peers)
+    def test_other_examples_are_the_same_fluid(self, name: str, run_python: Callable, tmp_path: Path) -> None:
+        """From a block that is compressed, the pressure pushes as far.
+
+        Theirs is lambda J (J - 1) where mpm88 has E (J - 1), equal to first order in the strain, here 20 steps of
+        dt dv/dx = 5e-4 * 2: paths differ by 1 % of what the pressure does.
+        """
+        for who in ("mpm88", name):
+            run_python(f"""
+import numpy as np
+from mpmcli.bench.cases import BenchCase
+from mpmcli.bench.peers import Peer
+case = {SMALL_2D!r}
+side = Peer(case, "{who}", threads=1, precision="f64", arch="cpu")
+middle = case.positions().mean(axis=0)
+velocity = case.velocity() - 2 * (case.positions() - middle)
+side._velocity.from_numpy(velocity)
+side.advance(20)
+side.sync()
+assert side.is_sound()
+np.save("{who}.npy", side.positions() - case.positions() - 20 * case.step * velocity)
+""")
+        one, other = np.load(tmp_path / "mpm88.npy"), np.load(tmp_path / f"{name}.npy")
+        fall = GRAVITY * SMALL_2D.step**2 * 20 * 21 / 2
+        one[:, 1] += fall
+        other[:, 1] += fall
+        assert np.abs(one).max() > 1e-4
+        assert np.abs(one - other).max() < 0.02 * np.abs(one).max()
 
 
 class Clock:
@@ -180,10 +217,11 @@ class FakeWorker:
 
     start_seconds = 0.5
 
-    def __init__(self, who: str, step_seconds: float, particles: int, log: list[tuple[str, str]]) -> None:
+    def __init__(self, who: str, step_seconds: float, particles: int, log: list, threads: int) -> None:
         self.who, self.step_seconds, self.log = who, step_seconds, log
         self.ready = {"particles": particles, "bytes_per_particle": None, "threads": 1}
         self.closed = False
+        self.shared = threads > 1
 
     def ask(self, command: str) -> dict:
         self.log.append((self.who, command))
@@ -191,7 +229,9 @@ class FakeWorker:
             case ["first"]:
                 return {"seconds": 2.0 + self.step_seconds}
             case ["run", _]:
-                return {"steps": 100, "seconds": 100 * self.step_seconds}
+                # Of other processes there are as many again.
+                busy = 100 * self.step_seconds
+                return {"steps": 100, "seconds": (2 - self.shared) * busy, "processor_seconds": busy}
         return {"sound": True, "smallest_step": SMALL_2D.step, "peak_memory": 10**8}
 
     def __enter__(self) -> "FakeWorker":
@@ -201,16 +241,26 @@ class FakeWorker:
         self.closed = True
 
 
+# Of a step on one thread.
+SECONDS = {"ours": 0.002, "peer": 0.008, "yardstick": 0.001, "mpm99": 0.01, "mpm128": 0.016}
+
+
 class TestComparison:
-    def run(self, particles: int = 200, **options) -> tuple[BenchReport, list[tuple[str, str]], list[FakeWorker]]:
+    def run(
+        self,
+        particles: int = 200,
+        threads: int | tuple[int, ...] = 2,
+        cases: tuple[BenchCase, ...] = (SMALL_2D,),
+        **options,
+    ) -> tuple[BenchReport, list[tuple[str, str]], list[FakeWorker]]:
         log, started = [], []
 
         def start(who: str, case: BenchCase, setting: Setting) -> FakeWorker:
-            started.append(FakeWorker(who, {"ours": 0.001, "peer": 0.004}[who], particles, log))
+            started.append(FakeWorker(who, SECONDS[who] / setting.threads, particles, log, setting.threads))
             return started[-1]
 
         try:
-            report = run_bench([SMALL_2D], threads=2, seconds=1.5, start=start, blocks=3, **options)
+            report = run_bench(cases, threads=threads, seconds=1.5, start=start, blocks=3, **options)
         finally:
             assert all(fake.closed for fake in started)
         return report, log, started
@@ -226,11 +276,62 @@ class TestComparison:
         assert result.ratio == pytest.approx(4)
         assert result.ours.compile_seconds == pytest.approx(2.0)
 
+    def test_the_yardstick_and_other_examples_take_their_turns(self) -> None:
+        report, log, _ = self.run(yardstick=True, peers=True)
+        assert [who for who, command in log if command == "run 1.5"] == [
+            "ours",
+            "peer",
+            "yardstick",
+            "mpm99",
+            "mpm128",
+        ] * 3
+        (result,) = report.results
+        assert result.times_slower == pytest.approx(2)
+        found = json.loads(json.dumps(report.as_dict()))["cases"][0]
+        assert found["times_slower_than_yardstick"] == pytest.approx(2)
+        assert found["others"]["mpm128"]["particle_steps_per_s"] == pytest.approx(200 / 0.008)
+        row = report.table().splitlines()[4].split()
+        assert row[10:12] == ["0.40", "2.00"]
+        assert row[-2:] == ["0.04", "0.03"]
+
+    def test_a_yardstick_that_cannot_start_is_left_out(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The table has its columns where it started at another size."""
+
+        def begin(side: Side, *arguments: object) -> None:
+            if side.who == "yardstick" and side.case.dimension == 2:
+                raise RunError("gcc fell over.")
+            usual(side, *arguments)
+
+        usual = Side.begin
+        monkeypatch.setattr(Side, "begin", begin)
+        lines = []
+        report, _, _ = self.run(yardstick=True, progress=lines.append, cases=(SMALL_2D, SMALL_3D))
+        assert [bool(result.yardstick) for result in report.results] == [False, True]
+        assert "2d-32, 2 threads: yardstick is left out. gcc fell over." in lines
+        assert report.as_dict()["cases"][0]["yardstick"] is None
+        rows = [line.split() for line in report.table().splitlines()[4:6]]
+        assert len(rows[1]) == len(rows[0]) + 2
+
+    def test_numbers_of_threads_in_turn(self) -> None:
+        """Twice as fast on 2 threads, and on 3 a half faster than that: all efficiencies are 1."""
+        report, _, started = self.run(threads=(1, 2, 3))
+        assert len(started) == 6
+        assert [report.speed_up(result) for result in report.results] == pytest.approx([1, 2, 3])
+        assert [report.efficiency(result) for result in report.results] == pytest.approx([1, 1, 1])
+        assert report.as_dict()["threads"] == [1, 2, 3]
+        assert "cpu, 1, 2 and 3 threads, f32" in report.table()
+        assert report.table().splitlines()[-7].split()[-2:] == ["3.00", "100%"]
+
+    def test_one_number_of_threads_has_no_speed_up(self) -> None:
+        report, _, _ = self.run()
+        assert report.as_dict()["cases"][0]["speed_up"] is None
+        assert "speed-up" not in report.table()
+
     def test_progress_is_told(self) -> None:
         lines = []
         self.run(progress=lines.append)
         assert len(lines) == 4
-        assert lines[-1].startswith("2d-32: block 3 of 3, 0.20 against 0.05")
+        assert lines[-1].startswith("2d-32, 2 threads: block 3 of 3, 0.20 against 0.05")
 
     def test_unequal_numbers_of_particles_are_refused(self) -> None:
         with pytest.raises(RunError, match="199 particles instead of 200"):
@@ -251,8 +352,8 @@ class TestReport:
     peer = replace(side, rates=(1e6, 1e6, 2e6), bytes_per_particle=None, threads=2)
 
     def report(self, peer: ContestantResult = peer) -> BenchReport:
-        result = CaseResult(CASES[-1], ours=self.side, peer=peer)
-        return BenchReport((result,), 2, "f32", "cpu", 1.0, {"processor": "A processor", "taichi": "1.7.4"})
+        result = CaseResult(CASES[-1], 2, ours=self.side, peer=peer)
+        return BenchReport((result,), (2,), "f32", "cpu", 1.0, {"processor": "A processor", "taichi": "1.7.4"})
 
     def test_table(self) -> None:
         lines = self.report().table().splitlines()
@@ -268,7 +369,7 @@ class TestReport:
 
     def test_table_warns_of_smaller_steps(self) -> None:
         def report_of(step: float) -> str:
-            result = CaseResult(CASES[-1], ours=replace(self.side, smallest_step=step), peer=self.peer)
+            result = CaseResult(CASES[-1], 2, ours=replace(self.side, smallest_step=step), peer=self.peer)
             return replace(self.report(), results=(result,)).table()
 
         assert "Beware" not in report_of((1 - 1e-9) * 8e-5)
@@ -277,7 +378,8 @@ class TestReport:
     def test_dictionary_is_json_with_every_block(self) -> None:
         found = json.loads(json.dumps(self.report().as_dict()))
         (case,) = found["cases"]
-        assert found["threads"] == 2
+        assert found["threads"] == [2]
+        assert case["threads"] == 2
         assert case["ours"]["particle_steps_per_s_blocks"] == [2e6, 4e6, 3e6]
         assert (case["ours"]["threads"], case["peer"]["threads"]) == (1, 2)
         assert case["ratio"] == 3
@@ -285,6 +387,6 @@ class TestReport:
         assert case["ours"]["device_bytes_per_particle"] == 96
 
     def test_machine_is_described(self) -> None:
-        found = BenchReport((), 1, "f32", "cpu", 1.0).machine
+        found = BenchReport((), (1,), "f32", "cpu", 1.0).machine
         assert found["processor"]
         assert found["taichi"].startswith("1.7")

@@ -41,6 +41,11 @@ class BenchCase:
         """The example of the taichi package that solves the same problem."""
         return "mpm3d" if self.dimension == 3 else "mpm88"
 
+    @property
+    def other_peers(self) -> tuple[str, ...]:
+        """Other examples of the taichi package that can solve it."""
+        return () if self.dimension == 3 else ("mpm99", "mpm128")
+
     def positions(self) -> np.ndarray:
         """Return the initial positions, (particles, dimension) float64: uniform in the block."""
         return CORNER + EDGE * np.random.default_rng(0).random((self.particles, self.dimension))

@@ -1,4 +1,4 @@
-"""The comparison: both processes run at once and are measured alternately, so that other load affects both equally."""
+"""The comparison: all processes run at once and are measured in turn, so that other load affects all equally."""
 
 import json
 import os
@@ -6,13 +6,15 @@ import statistics
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Self
 
 from mpmcli.bench.cases import CASES, BenchCase
 from mpmcli.bench.report import BenchReport, CaseResult, ContestantResult
 from mpmcli.errors import RunError
+from mpmcli.plain_text import counted
 from mpmcli.processes.questions import module_command
 
 # Measured blocks of each contestant.
@@ -98,7 +100,7 @@ class Worker:
 
 @dataclass(frozen=True)
 class Setting:
-    """Settings of both contestants.
+    """Settings of all contestants.
 
     Attributes:
         threads: of the processor, that each may use.
@@ -112,7 +114,7 @@ class Setting:
 
 
 def start_worker(who: str, case: BenchCase, setting: Setting) -> Worker:
-    """Start "ours", "peer" or the column of some laws for a case, and wait until it can step."""
+    """Start the process of a contestant (see `contestant`) for a case, and wait until it can step."""
     sizes = {"dimension": case.dimension, "cells": case.cells, "particles": case.particles, "step": case.step}
     values = {**sizes, **vars(setting)}
     return Worker([who, *(text for key, value in values.items() for text in (f"--{key}", f"{value}"))])
@@ -120,82 +122,145 @@ def start_worker(who: str, case: BenchCase, setting: Setting) -> Worker:
 
 def run_bench(
     cases: Iterable[BenchCase] = CASES,
-    threads: int = 1,
+    threads: int | Sequence[int] = 1,
     seconds: float = 1.0,
     progress: Callable[[str], None] | None = None,
     *,
     blocks: int = BLOCKS,
     precision: str = "f32",
     arch: str = "cpu",
+    yardstick: bool = False,
+    peers: bool = False,
     start: Callable[[str, BenchCase, Setting], Worker] = start_worker,
 ) -> BenchReport:
-    """Measure every case, ours and the peer's blocks in turn (A B A B), and return the report.
+    """Measure every case, blocks of ours, the peer's and the yardstick's in turn (A B C A B C), and return the report.
 
     Args:
         cases: sizes to measure, of mpmcli.bench.cases.
-        threads: of the processor, for both; ours takes one for each 2,500 particles, as `mpmcli simulate` does.
+        threads: of the processor, for all, one number or several; ours takes one for each 2,500 particles, as
+            `mpmcli simulate` does.
         seconds: length of one block.
-        progress: called with a line of text for each case and each pair of blocks.
+        progress: called with a line of text for each case and each round of blocks.
         blocks: measured blocks of each contestant.
-        precision: "f32" or "f64", for both.
-        arch: device, for both.
+        precision: "f32" or "f64", for all.
+        arch: device, for all.
+        yardstick: whether the yardstick in C is measured, which computes in f32 on the CPU.
+        peers: whether all examples that compute a fluid are measured, or the fastest one of each dimension.
         start: makes the process of a contestant; tests replace it.
 
+    The yardstick, or another example than the peer, that cannot start is left out.
+
     Raises:
-        RunError: a contestant could not start or failed.
+        RunError: ours or the peer could not start, or a contestant failed.
     """
-    setting = Setting(threads, precision, arch)
+    counts = (threads,) if isinstance(threads, int) else tuple(threads)
     tell = progress or (lambda line: None)
-    results = [_run_case(case, setting, seconds, blocks, tell, start) for case in cases]
-    return BenchReport(tuple(results), threads=threads, precision=precision, arch=arch, seconds=seconds)
+    who = ("ours", "peer", *(["yardstick"] if yardstick else []))
+    results = [
+        _run_case(
+            case,
+            Setting(count, precision, arch),
+            (*who, *(case.other_peers if peers else ())),
+            seconds,
+            blocks,
+            tell,
+            start,
+        )
+        for case in cases
+        for count in counts
+    ]
+    return BenchReport(tuple(results), threads=counts, precision=precision, arch=arch, seconds=seconds)
 
 
 def _run_case(
     case: BenchCase,
     setting: Setting,
+    who: Sequence[str],
     seconds: float,
     blocks: int,
     tell: Callable[[str], None],
     start: Callable[[str, BenchCase, Setting], Worker],
 ) -> CaseResult:
-    tell(f"{case.name}: {case.particles:,} particles, {case.cells}^{case.dimension} cells, against {case.peer}")
-    with start("ours", case, setting) as ours, start("peer", case, setting) as peer:
-        contestants = (ours, peer)
-        for worker, who in zip(contestants, ("mpmcli", case.peer), strict=True):
-            if worker.ready["particles"] != case.particles:
-                raise RunError(
-                    f"{who} runs {worker.ready['particles']} particles instead of {case.particles}: "
-                    "the two would not solve the same problem."
-                )
-        first = [worker.ask("first")["seconds"] for worker in contestants]
-        for worker in contestants:
-            worker.ask(f"run {min(WARM_UP, seconds)}")
-        rates: tuple[list[float], list[float]] = ([], [])
+    where = f"{case.name}, {counted(setting.threads, 'thread')}"
+    tell(f"{where}: {case.particles:,} particles, {case.cells}^{case.dimension} cells, against {case.peer}")
+    with ExitStack() as stack:
+        sides = []
+        for name in who:
+            side = Side(name, case)
+            try:
+                side.begin(stack, setting, start, min(WARM_UP, seconds))
+            except RunError as error:
+                if name in ("ours", "peer"):
+                    raise
+                tell(f"{where}: {name} is left out. {error}")
+            else:
+                sides.append(side)
         for block in range(blocks):
-            for worker, found in zip(contestants, rates, strict=True):
-                answer = worker.ask(f"run {seconds}")
-                found.append(case.particles * answer["steps"] / answer["seconds"])
-            tell(
-                f"{case.name}: block {block + 1} of {blocks}, {rates[0][-1] / 1e6:.2f} against "
-                f"{rates[1][-1] / 1e6:.2f} million particle-steps/s"
+            for side in sides:
+                side.measure(seconds)
+            last = " against ".join(f"{side.rates[-1] / 1e6:.2f}" for side in sides)
+            tell(f"{where}: block {block + 1} of {blocks}, {last} million particle-steps/s")
+        found = {side.who: side.finish() for side in sides}
+    main = {name: found.pop(name, None) for name in ("ours", "peer", "yardstick")}
+    return CaseResult(case, setting.threads, **main, others=found)
+
+
+class Side:
+    """One contestant at one case, and the process that runs it.
+
+    Attributes:
+        who: see `start_worker`.
+        rates: particle-steps/s of each block so far, by processor time on one thread, and else by wall time.
+    """
+
+    worker: Worker
+    clock: str
+    first_seconds: float
+
+    def __init__(self, who: str, case: BenchCase) -> None:
+        self.who, self.case = who, case
+        self.rates: list[float] = []
+
+    def begin(
+        self,
+        stack: ExitStack,
+        setting: Setting,
+        start: Callable[[str, BenchCase, Setting], Worker],
+        warm_up: float = WARM_UP,
+    ) -> None:
+        """Start, compile, and take a block that is not measured.
+
+        Raises:
+            RunError: it could not start, or runs another number of particles.
+        """
+        self.worker = stack.enter_context(start(self.who, self.case, setting))
+        # The processor time of one thread excludes that of other processes.
+        self.clock = "processor_seconds" if setting.threads == 1 and setting.arch == "cpu" else "seconds"
+        if self.worker.ready["particles"] != self.case.particles:
+            name = {"ours": "mpmcli", "peer": self.case.peer}.get(self.who, self.who)
+            raise RunError(
+                f"{name} runs {self.worker.ready['particles']} particles instead of {self.case.particles}: "
+                "they would not solve the same problem."
             )
-        sides = [
-            _contestant_result(worker, rate, once) for worker, rate, once in zip(contestants, rates, first, strict=True)
-        ]
-    return CaseResult(case, ours=sides[0], peer=sides[1])
+        self.first_seconds = self.worker.ask("first")["seconds"]
+        self.worker.ask(f"run {warm_up}")
 
+    def measure(self, seconds: float) -> None:
+        """Measure one block."""
+        answer = self.worker.ask(f"run {seconds}")
+        self.rates.append(self.case.particles * answer["steps"] / answer[self.clock])
 
-def _contestant_result(worker: Worker, rates: list[float], first: float) -> ContestantResult:
-    end = worker.ask("finish")
-    typical = worker.ready["particles"] / statistics.median(rates)
-    return ContestantResult(
-        rates=tuple(rates),
-        start_seconds=worker.start_seconds,
-        # Time of the first step beyond that of a usual step.
-        compile_seconds=max(0.0, first - typical),
-        peak_memory=end["peak_memory"],
-        bytes_per_particle=worker.ready["bytes_per_particle"],
-        threads=worker.ready["threads"],
-        smallest_step=end["smallest_step"],
-        sound=end["sound"],
-    )
+    def finish(self) -> ContestantResult:
+        """Return the result, and end the process."""
+        end, ready = self.worker.ask("finish"), self.worker.ready
+        return ContestantResult(
+            rates=tuple(self.rates),
+            start_seconds=self.worker.start_seconds,
+            # Time of the first step beyond that of a usual step.
+            compile_seconds=max(0.0, self.first_seconds - self.case.particles / statistics.median(self.rates)),
+            peak_memory=end["peak_memory"],
+            bytes_per_particle=ready["bytes_per_particle"],
+            threads=ready["threads"],
+            smallest_step=end["smallest_step"],
+            sound=end["sound"],
+        )

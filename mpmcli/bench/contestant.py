@@ -1,13 +1,14 @@
 """Process of one contestant, controlled by commands on stdin, one per line.
 
-    python -m mpmcli.bench.contestant ours|peer|LAW,LAW,...|FEATURE --dimension 3 --cells 128 --particles 524288
-                                  --step 8e-5 [--threads 2] [--precision f32] [--arch cpu]
+    python -m mpmcli.bench.contestant ours|peer|mpm128|yardstick|LAW,LAW,...|profile:LAW|FEATURE
+        --dimension 3 --cells 128 --particles 524288 --step 8e-5 [--threads 2] [--precision f32] [--arch cpu]
 
 It answers on stdout, one JSON object per line, and waits for commands on stdin without using the processor:
 
     (start)        {"particles": 524288, "bytes_per_particle": 88 or null, "threads": 2}     ready to step
     first          {"seconds": 2.9}                                            one step, kernels compiled
-    run SECONDS    {"steps": 31, "seconds": 1.02}                              steps for about that long
+    run SECONDS    {"steps": 31, "seconds": 1.02, "processor_seconds": 1.01}   steps for about that long
+    phases         {"p2g": 0.4, "g2p": 0.5}                                    time in each since the last such command
     finish         {"sound": true, "smallest_step": 8e-5, "peak_memory": 219152384}    and ends
 
 For laws, the contestant is the column of `mpmcli.bench.materials`, which has three more commands:
@@ -17,7 +18,9 @@ For laws, the contestant is the column of `mpmcli.bench.materials`, which has th
                                                      takes STEPS steps from that state, repeated until the time is up
     flowing                 {"share": 0.93}          of the particles
 
-For a feature, a scene of `mpmcli.bench.features`, `repeat` goes on from where the scene is.
+With "profile:" before the name of a law, the contestant is the column of `mpmcli.bench.profiled_column`, which answers
+to `phases`, as the yardstick does. For a feature, a scene of `mpmcli.bench.features`, `repeat` goes on from where the
+scene is.
 
 A failure is answered by {"error": "a sentence"} and ends the process with status 1.
 """
@@ -138,8 +141,9 @@ def serve(start: Callable[[], Contestant], commands: Iterable[str], answers: IO[
                     contestant.sync()
                     answer(seconds=time.perf_counter() - begin)
                 case ["run", seconds]:
+                    busy = time.process_time()
                     steps, elapsed = run_block(contestant, float(seconds))
-                    answer(steps=steps, seconds=elapsed)
+                    answer(steps=steps, seconds=elapsed, processor_seconds=time.process_time() - busy)
                 case ["keep", steps]:
                     contestant.advance(int(steps))
                     contestant.sync()
@@ -149,6 +153,8 @@ def serve(start: Callable[[], Contestant], commands: Iterable[str], answers: IO[
                     answer(**repeat_stretch(contestant, int(stretch), float(seconds)))
                 case ["flowing"]:
                     answer(share=contestant.flowing())
+                case ["phases"]:
+                    answer(**contestant.phases())
                 case ["finish"]:
                     answer(
                         sound=contestant.is_sound(),
@@ -163,17 +169,24 @@ def serve(start: Callable[[], Contestant], commands: Iterable[str], answers: IO[
 
 
 def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
-    if who == "peer":
+    if who in ("peer", *case.other_peers):
         from mpmcli.bench.peers import Peer
 
-        return Peer(case, **options)
+        return Peer(case, None if who == "peer" else who, **options)
+    if who == "yardstick":
+        from mpmcli.bench.yardstick import falling_block as block_in_c
+
+        return block_in_c(case, **options)
     if who == "ours":
         from mpmcli.bench.ours import falling_block
 
         return falling_block(case, **options)
     from mpmcli.bench.features import FEATURES, Pool
     from mpmcli.bench.materials import Column
+    from mpmcli.bench.profiled_column import PROFILE, ProfiledColumn
 
+    if who.startswith(PROFILE):
+        return ProfiledColumn(who.removeprefix(PROFILE), case, **options)
     if who in {feature.name for feature in FEATURES}:
         return Pool(who, case, **options)
     return Column(who.split(","), case, **options)
@@ -181,7 +194,7 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m mpmcli.bench.contestant")
-    parser.add_argument("who", help="ours, peer, the names of laws, with commas between them, or a feature")
+    parser.add_argument("who", help="see above")
     parser.add_argument("--dimension", type=int, choices=[2, 3], required=True)
     parser.add_argument("--cells", type=int, required=True)
     parser.add_argument("--particles", type=int, required=True)

@@ -256,7 +256,7 @@ class CostReport:
             "watch: share of the time that went into measuring the state, which the next steps follow.",
         ]
         return "\n\n".join(
-            filter(None, [heading(self.machine, "cpu", self.threads, self.precision), *parts, "\n".join(notes)])
+            filter(None, [heading(self.machine, "cpu", [self.threads], self.precision), *parts, "\n".join(notes)])
         ) + "".join(f"\nBeware: {warning}" for warning in [*self._warnings(), *self.flaws])
 
     def _warnings(self) -> Iterator[str]:

@@ -127,7 +127,7 @@ class FeatureReport:
             "ratio: of blocks measured in the same round, median; fastest: of the fastest block of each.\n"
             "The plain scene is there twice: its ratio shows the noise."
         )
-        threads = max((result.threads for result in self.results), default=1)
+        threads = sorted({result.threads for result in self.results}) or [1]
         top = heading(self.machine, "cpu", threads, self.precision)
         warnings = "".join(f"\nBeware: {warning}" for warning in [*self._warnings(), *self.flaws])
         return f"{top}\n\n{text_table(head, rows, left={0, 2, 3})}\n\n{notes}{warnings}"

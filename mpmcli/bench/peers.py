@@ -8,23 +8,88 @@ package is noticed rather than measured wrongly.
 import importlib.util
 import linecache
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
-from mpmcli.bench.cases import BenchCase
+from mpmcli.bench.cases import BULK_MODULUS, GRAVITY, BenchCase
 from mpmcli.errors import RunError
 
-_INIT = "ti.init(arch=ti.gpu)"
-_SIZES = {
-    "mpm3d": ("dim, n_grid, steps, dt = 3, 32, 25, 4e-4", "n_particles = n_grid**dim // 2 ** (dim - 1)"),
-    "mpm88": ("n_particles = 8192", "n_grid = 128", "dt = 2e-4"),
+_SHAPE = "n_particles, n_grid = 9000 * quality**2, 128 * quality"
+_QUALITY_STEP = "dt = 1e-4 / quality"
+_STIFFNESS = ", 0.2  # Young's modulus and Poisson's ratio"
+_HINT = (
+    'print("[Hint] Use WSAD/arrow keys to control gravity. Use left/right mouse buttons to attract/repel. '
+    'Press R to reset.")'
+)
+# Poisson's ratio of both examples with several laws, and Young's modulus with which lambda is that of the fluid.
+_NU = 0.2
+_YOUNGS = BULK_MODULUS * (1 + _NU) * (1 - 2 * _NU) / _NU
+
+
+@dataclass(frozen=True)
+class Example:
+    """How an example is adapted.
+
+    Attributes:
+        changes: lines, and what replaces them; fields of a case in braces.
+        drawing: first line of what is left out: everything from here on draws.
+        begin: name of the function that places the particles; position, velocity: of its fields.
+    """
+
+    changes: dict[str, str]
+    drawing: str
+    begin: str = "init"
+    position: str = "x"
+    velocity: str = "v"
+
+
+EXAMPLES = {
+    "mpm3d": Example(
+        {
+            "dim, n_grid, steps, dt = 3, 32, 25, 4e-4": "dim, n_grid, steps, dt = 3, {cells}, 25, {step!r}",
+            "n_particles = n_grid**dim // 2 ** (dim - 1)": "n_particles = {particles}",
+        },
+        "def T(a):",
+        position="F_x",
+        velocity="F_v",
+    ),
+    "mpm88": Example(
+        {
+            "n_particles = 8192": "n_particles = {particles}",
+            "n_grid = 128": "n_grid = {cells}",
+            "dt = 2e-4": "dt = {step!r}",
+        },
+        "init()",
+    ),
+    "mpm99": Example(
+        {
+            _SHAPE: "n_particles, n_grid = {particles}, {cells}",
+            _QUALITY_STEP: "dt = {step!r}",
+            f"E, nu = 0.1e4{_STIFFNESS}": f"E, nu = {_YOUNGS}, {_NU}",
+            "            grid_v[i, j][1] -= dt * 50  # gravity": f"            grid_v[i, j][1] -= dt * {GRAVITY}",
+        },
+        "def main():",
+        begin="initialize",
+    ),
+    "mpm128": Example(
+        {
+            _SHAPE: "n_particles, n_grid = {particles}, {cells}",
+            _QUALITY_STEP: "dt = {step!r}",
+            f"E, nu = 5e3{_STIFFNESS}": f"E, nu = {_YOUNGS}, {_NU}",
+            "            grid_v[i, j] += dt * gravity[None] * 30  # gravity": (
+                f"            grid_v[i, j] += dt * ti.Vector([0, -{GRAVITY}])"
+            ),
+        },
+        _HINT,
+        begin="reset",
+    ),
 }
-# First line of what is left out: everything from here on draws.
-_DRAWING = {"mpm3d": "def T(a):", "mpm88": "init()"}
-_VELOCITY = {"mpm3d": "F_v", "mpm88": "v"}
-_POSITION = {"mpm3d": "F_x", "mpm88": "x"}
+_INIT = "ti.init(arch=ti.gpu)"
+# The same line with a comment, as two examples have it.
+_INITS = (_INIT, f"{_INIT}  # Try to run on GPU")
 
 
 def example_path(name: str) -> Path:
@@ -42,28 +107,21 @@ def example_path(name: str) -> Path:
     return path
 
 
-def adapted_source(text: str, case: BenchCase, *, threads: int, precision: str, arch: str) -> str:
+def adapted_source(text: str, case: BenchCase, name: str, *, threads: int, precision: str, arch: str) -> str:
     """Return the source of an example with its settings replaced and its drawing removed.
 
-    `text` is the example's own source, `precision` "f32" or "f64", `arch` a name in taichi like "cpu".
+    `text` is the source of the example `name`, `precision` "f32" or "f64", `arch` a name in taichi like "cpu".
 
     Raises:
         RunError: a line that has to change is not there exactly once.
     """
-    name = case.peer
-    sizes = {
-        "mpm3d": (
-            f"dim, n_grid, steps, dt = 3, {case.cells}, 25, {case.step!r}",
-            f"n_particles = {case.particles}",
-        ),
-        "mpm88": (f"n_particles = {case.particles}", f"n_grid = {case.cells}", f"dt = {case.step!r}"),
-    }
+    example = EXAMPLES[name]
     options = f"arch=ti.{arch}, default_fp=ti.{precision}, cpu_max_num_threads={threads}, offline_cache=False"
-    changes = {_INIT: f"ti.init({options})", **dict(zip(_SIZES[name], sizes[name], strict=True))}
     lines = text.splitlines()
-    for old, new in changes.items():
-        lines[_only_line(lines, old, name)] = new
-    return "\n".join(lines[: _only_line(lines, _DRAWING[name], name)]) + "\n"
+    init = next((line for line in _INITS if line in lines), _INIT)
+    for old, new in {init: f"ti.init({options})", **example.changes}.items():
+        lines[_only_line(lines, old, name)] = new if old == init else new.format(**vars(case))
+    return "\n".join(lines[: _only_line(lines, example.drawing, name)]) + "\n"
 
 
 def _only_line(lines: list[str], wanted: str, name: str) -> int:
@@ -81,19 +139,26 @@ class Peer:
 
     bytes_per_particle = None
 
-    def __init__(self, case: BenchCase, *, threads: int, precision: str, arch: str) -> None:
-        path = example_path(case.peer)
-        source = adapted_source(path.read_text(encoding="utf-8"), case, threads=threads, precision=precision, arch=arch)
-        module = _run_source(source, f"<{case.peer} of taichi, adapted>")
+    def __init__(self, case: BenchCase, name: str | None = None, *, threads: int, precision: str, arch: str) -> None:
+        """Load an example; by default the one that the case is compared with."""
+        name = name or case.peer
+        text = example_path(name).read_text(encoding="utf-8")
+        source = adapted_source(text, case, name, threads=threads, precision=precision, arch=arch)
+        module = _run_source(source, f"<{name} of taichi, adapted>")
+        example = EXAMPLES[name]
         self.particles: int = module.n_particles
         self.smallest_step = case.step
         self.threads = threads
         self._step: Callable[[], None] = module.substep
         self._sync: Callable[[], None] = module.ti.sync
-        self._position = getattr(module, _POSITION[case.peer])
-        module.init()
+        self._position = getattr(module, example.position)
+        getattr(module, example.begin)()
         self._position.from_numpy(case.positions().astype(np.float32 if precision == "f32" else np.float64))
-        getattr(module, _VELOCITY[case.peer]).fill(module.ti.Vector(case.velocity().tolist()))
+        self._velocity = getattr(module, example.velocity)
+        self._velocity.fill(module.ti.Vector(case.velocity().tolist()))
+        if hasattr(module, "material"):
+            # Of several laws the fluid.
+            module.material.fill(0)
         self._sync()
 
     def advance(self, count: int) -> int:

@@ -18,6 +18,7 @@ from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.ordering import CHUNK, TileOrder, share_start
 from mpmcli.solver.particle_update import NOT_LOST, ParticleUpdate
 from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.phase_times import profiles
 from mpmcli.solver.state_bounds import (
     NOTHING,
     StateBounds,
@@ -56,8 +57,9 @@ def build_cpu_step(
 ) -> Callable[[float, float, float], StepResult]:
     """Build the kernels of a step (dt, kick, relaxed) for these groups and nothing else."""
     threads = orders[0].threads
-    # One thread runs loops itself: the hand-over to a pool of one would take most of a step of few particles.
-    alone = threads == 1
+    # One thread runs loops itself: a hand-over to a pool of one would take most of a step of few particles. A profiler
+    # times only what is handed over.
+    alone = threads == 1 and not profiles()
     pairs = tuple(zip(range(len(groups)), groups, orders, strict=True))
     # Colours written out in one kernel: four would double the compile time of 3D scenes, two that of what scatters
     # more than is usual.
