@@ -182,7 +182,8 @@ def _has(arch: str) -> bool:
     if arch == "cpu":
         return True
     # Taichi loads CUDA wherever the driver's library is present, and ends the process without a device.
-    if arch == "cuda" and not (os.path.exists("/dev/nvidia0") or os.path.exists("/dev/dxg")):
+    # A container may hold any one of the devices of its machine.
+    if arch == "cuda" and not (any(Path("/dev").glob("nvidia[0-9]*")) or os.path.exists("/dev/dxg")):
         return False
     return bool(ti.lang.misc.is_arch_supported(getattr(ti, arch)))
 

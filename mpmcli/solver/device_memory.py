@@ -1,6 +1,40 @@
-"""Recognises that a device has no memory left, of which Taichi and the drivers tell in words alone."""
+"""Memory of a device: how much is free, and errors that tell in words alone that none is left."""
 
+import ctypes
+import sys
+
+CUDA_LIBRARIES = {"linux": "libcuda.so.1", "win32": "nvcuda.dll"}
 WORDS = ("out of memory", "out_of_memory", "failed to allocate", "out_of_device_memory", "bad_alloc")
+
+
+def free_memory(arch: str) -> int | None:
+    """Return the bytes that are free on the device that Taichi takes; None where it has none of its own, or no answer.
+
+    The memory of a CPU, and of software Vulkan, is that of the machine.
+    """
+    if arch != "cuda":
+        return None
+    try:
+        return _free_cuda_memory(ctypes.CDLL(CUDA_LIBRARIES[sys.platform]))
+    except (OSError, KeyError, AttributeError):
+        return None
+
+
+def _free_cuda_memory(driver: ctypes.CDLL) -> int | None:
+    """Ask the driver for the first device's; the context is the one that Taichi will use."""
+    device, context, free, total = ctypes.c_int(), ctypes.c_void_p(), ctypes.c_size_t(), ctypes.c_size_t()
+    if driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0):
+        return None
+    if driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), device):
+        return None
+    try:
+        if driver.cuCtxPushCurrent_v2(context):
+            return None
+        failed = driver.cuMemGetInfo_v2(ctypes.byref(free), ctypes.byref(total))
+        driver.cuCtxPopCurrent_v2(ctypes.byref(context))
+        return None if failed else free.value
+    finally:
+        driver.cuDevicePrimaryCtxRelease_v2(device)
 
 
 def is_out_of_memory(error: BaseException) -> bool:
