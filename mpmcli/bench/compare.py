@@ -112,7 +112,7 @@ class Setting:
 
 
 def start_worker(who: str, case: BenchCase, setting: Setting) -> Worker:
-    """Start "ours", "peer" or the column of some laws for a case, and wait until it can step."""
+    """Start one of BLOCKS, "peer" or the column of some laws for a case, and wait until it can step."""
     sizes = {"dimension": case.dimension, "cells": case.cells, "particles": case.particles, "step": case.step}
     values = {**sizes, **vars(setting)}
     return Worker([who, *(text for key, value in values.items() for text in (f"--{key}", f"{value}"))])

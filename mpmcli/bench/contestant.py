@@ -1,7 +1,7 @@
 """Process of one contestant, controlled by commands on stdin, one per line.
 
-    python -m mpmcli.bench.contestant ours|peer|LAW,LAW,...|FEATURE --dimension 3 --cells 128 --particles 524288
-                                  --step 8e-5 [--threads 2] [--precision f32] [--arch cpu]
+    python -m mpmcli.bench.contestant ours|solid|deterministic|peer|LAW,LAW,...|FEATURE --dimension 3 --cells 128
+                                  --particles 524288 --step 8e-5 [--threads 2] [--precision f32] [--arch cpu]
 
 It answers on stdout, one JSON object per line, and waits for commands on stdin without using the processor:
 
@@ -31,7 +31,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import IO, Protocol
 
-from mpmcli.bench.cases import BenchCase
+from mpmcli.bench.cases import BLOCKS, BenchCase
 from mpmcli.errors import MpmcliError
 
 
@@ -167,10 +167,10 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
         from mpmcli.bench.peers import Peer
 
         return Peer(case, **options)
-    if who == "ours":
+    if who in BLOCKS:
         from mpmcli.bench.ours import falling_block
 
-        return falling_block(case, **options)
+        return falling_block(case, who, **options)
     from mpmcli.bench.features import FEATURES, Pool
     from mpmcli.bench.materials import Column
 
@@ -181,7 +181,9 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m mpmcli.bench.contestant")
-    parser.add_argument("who", help="ours, peer, the names of laws, with commas between them, or a feature")
+    parser.add_argument(
+        "who", help="ours, solid, deterministic, peer, the names of laws, with commas between them, or a feature"
+    )
     parser.add_argument("--dimension", type=int, choices=[2, 3], required=True)
     parser.add_argument("--cells", type=int, required=True)
     parser.add_argument("--particles", type=int, required=True)
