@@ -11,6 +11,7 @@ from solver_state import scene_of, with_colliders
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
 from mpmcli.scene import Scene
+from mpmcli.solver.device_memory import has_cuda_device
 from mpmcli.solver.ordering import entry_count
 from mpmcli.solver.plan import LawPlan, Plan, make_plan, require_room
 from mpmcli.solver.solver import Solver
@@ -157,6 +158,10 @@ class FakeDriver:
     def cuInit(self, flags: int) -> int:
         return 0 if self.present else 100
 
+    def cuDeviceGetCount(self, count: object) -> int:
+        count._obj.value = 1
+        return 0
+
     def cuDeviceGet(self, device: object, number: int) -> int:
         return 0
 
@@ -194,3 +199,13 @@ def test_a_run_on_cuda_needs_the_memory_of_the_device(monkeypatch: pytest.Monkey
         require_room(replace(plan, arch="cpu"))
     monkeypatch.setattr("mpmcli.solver.device_memory.ctypes.CDLL", lambda name: FakeDriver(0, present=False))
     require_room(plan)
+
+
+def test_a_device_is_there_if_the_driver_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mpmcli.solver.device_memory.Path", lambda name: SimpleNamespace(glob=lambda pattern: []))
+    monkeypatch.setattr("mpmcli.solver.device_memory.os.path.exists", lambda name: False)
+    for present in (True, False):
+        monkeypatch.setattr(
+            "mpmcli.solver.device_memory.ctypes.CDLL", lambda name, present=present: FakeDriver(1, present=present)
+        )
+        assert has_cuda_device() is present

@@ -1,10 +1,24 @@
-"""Memory of a device: how much is free, and errors that tell in words alone that none is left."""
+"""What the driver of CUDA says of its first device and its memory, and errors that say that no memory is left."""
 
 import ctypes
+import os
 import sys
+from pathlib import Path
 
 CUDA_LIBRARIES = {"linux": "libcuda.so.1", "win32": "nvcuda.dll"}
 WORDS = ("out of memory", "out_of_memory", "failed to allocate", "out_of_device_memory", "bad_alloc")
+
+
+def has_cuda_device() -> bool:
+    """Return whether there is a device: a file in /dev, any one of those of its machine in a container, or as told."""
+    if any(Path("/dev").glob("nvidia[0-9]*")) or os.path.exists("/dev/dxg"):
+        return True
+    count = ctypes.c_int()
+    try:
+        driver = ctypes.CDLL(CUDA_LIBRARIES[sys.platform])
+        return not driver.cuInit(0) and not driver.cuDeviceGetCount(ctypes.byref(count)) and count.value > 0
+    except (OSError, KeyError, AttributeError):
+        return False
 
 
 def free_memory(arch: str) -> int | None:
