@@ -26,10 +26,13 @@ def run(name: str, setup: Setup, seconds: float, last: str, done: Collection[str
         answers.flush()
 
     part = next(part for part in PARTS if part.name == name)
-    for task in sorted(part.tasks(setup), key=lambda task: task.key == last):
-        if task.key not in done:
-            answer({"begin": task.key})
-            answer({"key": task.key, "row": task.measure(end - time.monotonic())})
+    waiting = [task for task in part.tasks(setup) if task.key not in done]
+    waiting.sort(key=lambda task: task.key == last)
+    for task in waiting:
+        task.prepare()
+    for task in waiting:
+        answer({"begin": task.key})
+        answer({"key": task.key, "row": task.measure(end - time.monotonic())})
 
 
 def main() -> None:

@@ -53,7 +53,6 @@ TINY = (Size(3, 300, 16, 8e-4, ("ours", "peer")),)
 SMALL = (
     Size(3, 10_000, 32, 4e-4, ("ours", "solid", "deterministic", "peer")),
     Size(2, 10_000, 128, 2e-4, ("ours", "peer")),
-    Size(3, 100_000, 64, 2e-4, ("ours", "solid", "deterministic", "peer")),
 )
 FULL = (
     Size(3, 1_000_000, 128, 8e-5, ("ours", "solid", "deterministic", "peer")),

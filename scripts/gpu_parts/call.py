@@ -14,9 +14,8 @@ from page_section import replace_section
 from gpu_parts.parts import PARTS, SCALES
 from gpu_parts.records import DONE
 from gpu_parts.report import NAME, write_report
-from gpu_parts.runner import Runner
+from gpu_parts.runner import BUDGET, Runner
 
-BUDGET = 540.0
 ARCHES = ("cuda", "vulkan", "cpu")
 
 

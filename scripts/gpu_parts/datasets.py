@@ -40,7 +40,7 @@ def together(count: int, frames: int, arch: str) -> dict:
     work = sum(recording.steps * recording.particles for recording in recordings)
     return {
         "runs": count,
-        "ended": len(recordings),
+        "completed": len(recordings),
         "stable": sum(recording.verdict == "stable" for recording in recordings),
         "frames": frames,
         "particles": recordings[0].particles,
@@ -71,7 +71,7 @@ def section(rows: dict[str, dict]) -> str:
     cells = [
         [
             key,
-            f"{row['ended']:,}, {row['stable']:,} stable",
+            f"{row['completed']:,}, {row['stable']:,} stable",
             f"{row['frames']} of {TRAJECTORY}",
             f"{row['steps']:,}",
             f"{row['first_pass_s']:.1f} + {row['seconds']:.1f}",
@@ -82,7 +82,7 @@ def section(rows: dict[str, dict]) -> str:
     ]
     head = [
         "runs",
-        "ended",
+        "completed",
         "frames",
         "steps of each",
         "first pass + measured, s",

@@ -8,7 +8,7 @@ from gpu_parts.parts import Setup, Task
 
 # Blocks are long enough for some steps of 1e8 particles.
 SECONDS = 2.0
-TINY, SMALL = Size(3, 600, 16, 8e-4, ()), Size(3, 500_000, 128, 8e-5, ())
+TINY, SMALL = Size(3, 600, 16, 8e-4, ()), Size(3, 100_000, 64, 2e-4, ())
 FULL = Size(3, 100_000_000, 512, 2e-5, ())
 
 

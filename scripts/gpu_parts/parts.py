@@ -32,10 +32,12 @@ class Task:
     Attributes:
         key: its name, unique in the part.
         measure: (seconds left) -> the row, which JSON can hold; {"skipped": "a reason"} where it cannot be measured.
+        prepare: begins what other processes can do meanwhile; called for all tasks before the first is measured.
     """
 
     key: str
     measure: Callable[[float], dict]
+    prepare: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True)

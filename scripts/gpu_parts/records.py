@@ -17,7 +17,7 @@ class Record:
         part: its name; arch, scale: what it was measured with.
         state: DONE, FAILED or UNFINISHED.
         seconds: that it took, over all calls.
-        rows: by key, in order.
+        rows: by key, in order; those with "ended": false are measured again.
         failures: by key of the task, or "process" outside of them: why its process ended.
         missing: key of the task that the time ended, "" for none.
     """
@@ -30,6 +30,11 @@ class Record:
     rows: dict[str, dict] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
     missing: str = ""
+
+    @property
+    def finished(self) -> list[str]:
+        """Keys of the rows that are complete."""
+        return [key for key, row in self.rows.items() if row.get("ended", True)]
 
     def write(self, folder: Path) -> None:
         """Replace the file of the part, whole or not at all."""

@@ -18,6 +18,8 @@ from gpu_parts.records import DONE, FAILED, UNFINISHED, Record, record_of
 from gpu_parts.report import write_report
 
 ROOT = Path(__file__).resolve().parent.parent.parent
+# Seconds of a call that the times of the parts are made for.
+BUDGET = 540.0
 # Time below which no process is started, s, and what a part leaves for ending and writing.
 LEAST, MARGIN = 3.0, 2.0
 # What is kept of the words of a process that failed.
@@ -45,28 +47,29 @@ class Runner:
         """Note when the call must end.
 
         Args:
-            budget: s, from now on.
+            budget: s, from now on; what exceeds BUDGET is shared among the parts in proportion to their times.
             tell: takes a line of text for each row.
             command: that starts the process of a part; tests replace it.
         """
         self.folder, self._arch, self._scale, self._tell, self._command = folder, arch, scale, tell, command
         self._end = time.monotonic() + budget
+        self._share = max(1.0, budget / BUDGET)
 
     def run(self, parts: Sequence[Part]) -> list[Record]:
-        """Run the parts that are not done, and once more, with the time that is left, those that ran out of theirs."""
+        """Run the parts that are not done, and again, while there is time, those that ran out of theirs."""
         self.folder.mkdir(parents=True, exist_ok=True)
         records = [record_of(self.folder, part.name, self._arch, self._scale) for part in parts]
-        for again in (False, True):
-            for part, record in zip(parts, records, strict=True):
+        waiting = [pair for pair in zip(parts, records, strict=True) if pair[1].state != DONE]
+        while waiting and self._end - time.monotonic() >= LEAST:
+            for part, record in waiting:
                 left = self._end - time.monotonic()
-                if record.state == DONE or (again and record.state == FAILED):
-                    continue
-                if left < LEAST:
-                    self._tell(f"{part.name}: no time is left; call again with the same --out.")
-                    record.write(self.folder)
-                else:
-                    self._run_part(record, left if again else min(part.seconds, left))
-                write_report(self.folder)
+                if left >= LEAST:
+                    self._run_part(record, min(self._share * part.seconds, left))
+                    write_report(self.folder)
+            waiting = [pair for pair in waiting if pair[1].state == UNFINISHED]
+        for part, record in waiting:
+            self._tell(f"{part.name}: no time is left; call again with the same --out.")
+            record.write(self.folder)
         return records
 
     def _run_part(self, record: Record, seconds: float) -> None:
@@ -85,7 +88,7 @@ class Runner:
     def _run_process(self, record: Record, seconds: float) -> bool:
         """Start the process of a part and keep its rows; set the record's state, and return whether a task failed."""
         end = time.monotonic() + seconds
-        left_out = [*record.rows, *record.failures]
+        left_out = [*record.finished, *record.failures]
         arguments = [record.part, record.arch, record.scale, f"{seconds:.0f}", record.missing, *left_out]
         with tempfile.TemporaryFile(mode="w+", encoding="utf-8", errors="replace") as words:
             process = subprocess.Popen(
@@ -105,7 +108,9 @@ class Runner:
             if not in_time:
                 record.state, record.missing = UNFINISHED, running
             elif process.returncode == 0:
-                record.state, record.missing = FAILED if record.failures else DONE, ""
+                unfinished = len(record.finished) < len(record.rows)
+                record.state = FAILED if record.failures else UNFINISHED if unfinished else DONE
+                record.missing = ""
             else:
                 record.state = FAILED
                 record.failures[running or OUTSIDE] = last_words(process.returncode, words)
