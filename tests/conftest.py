@@ -20,6 +20,9 @@ ROOT = Path(__file__).resolve().parent.parent
 settings.register_profile("mpmcli", deadline=None, max_examples=50, print_blob=True)
 settings.load_profile("mpmcli")
 
+# The backend of tests marked gpu; scripts/gpu sets it to that of the device.
+GPU = os.environ.get("MPMCLI_TEST_GPU", "vulkan")
+
 # Taichi's variable, and its value for few optimisations.
 FEW = ("TI_ADVANCED_OPTIMIZATION", "0")
 
@@ -121,11 +124,14 @@ def backend_of() -> "Iterator[Callable[..., Backend]]":
     builds its solvers on it, or keeps no solver from one test to the next.
 
     It compiles with few of Taichi's optimisations, as `few_optimisations` says; a `fully_optimised` one has all.
+
+    Vulkan stands for the GPU of the tests, see GPU.
     """
     from mpmcli.solver.backend import start_backend, stop_backend
 
     def start(precision: str, threads: int = 2, arch: str = "cpu", *, fully_optimised: bool = False) -> "Backend":
         stop_backend()
+        arch = GPU if arch == "vulkan" else arch
         if fully_optimised:
             return start_backend(arch, threads, precision)
         with pytest.MonkeyPatch.context() as patch:

@@ -95,6 +95,7 @@ def test_steps_match_plain_numpy(backend_of: Callable, dimension: int, knobs: di
     check_steps(scene, path_run.record_steps(prepare(scene, backend_of("f64", 2))), TOLERANCE["f64"])
 
 
+@pytest.mark.gpu
 @pytest.mark.parametrize(
     ("dimension", "knobs"), [(2, AFLIP | CUBIC | ZEROED), slowly(2, PIC), slowly(3, CUBIC)], ids=name_of
 )

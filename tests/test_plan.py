@@ -2,6 +2,8 @@
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from solver_state import scene_of, with_colliders
@@ -9,6 +11,7 @@ from solver_state import scene_of, with_colliders
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
 from mpmcli.scene import Scene
+from mpmcli.solver.device_memory import has_cuda_device
 from mpmcli.solver.ordering import entry_count
 from mpmcli.solver.plan import LawPlan, Plan, make_plan, require_room
 from mpmcli.solver.solver import Solver
@@ -144,3 +147,65 @@ def test_more_than_an_index_reaches_is_refused(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr("mpmcli.solver.plan.MEMORY_SHARE", 1e6)
     with pytest.raises(InputError, match="more than 32-bit indices can address"):
         require_room(Plan((LawPlan("fluid", 2**28, {"position": 140}),), 1000, 0, 16, 16000, 1, ()))
+
+
+class FakeDriver:
+    """A CUDA driver of a device with some free memory, which counts the uses of its context."""
+
+    def __init__(self, free: int, *, present: bool = True) -> None:
+        self.free, self.present, self.uses = free, present, 0
+
+    def cuInit(self, flags: int) -> int:
+        return 0 if self.present else 100
+
+    def cuDeviceGetCount(self, count: object) -> int:
+        count._obj.value = 1
+        return 0
+
+    def cuDeviceGet(self, device: object, number: int) -> int:
+        return 0
+
+    def cuDevicePrimaryCtxRetain(self, context: object, device: object) -> int:
+        self.uses += 1
+        return 0
+
+    def cuDevicePrimaryCtxRelease_v2(self, device: object) -> int:
+        self.uses -= 1
+        return 0
+
+    def cuCtxPushCurrent_v2(self, context: object) -> int:
+        return 0
+
+    def cuCtxPopCurrent_v2(self, context: object) -> int:
+        return 0
+
+    def cuMemGetInfo_v2(self, free: object, total: object) -> int:
+        free._obj.value, total._obj.value = self.free, 2 * self.free
+        return 0
+
+
+def test_a_run_on_cuda_needs_the_memory_of_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """10 GB on the device: not of 10 GB that are free there, nor of the 1 GB that this machine has."""
+    plan = Plan((LawPlan("fluid", 10**8, {"position": 100}),), 1000, 0, 16, 16000, 1, (), "cuda")
+    driver = FakeDriver(10 * 10**9)
+    monkeypatch.setattr("mpmcli.solver.device_memory.ctypes.CDLL", lambda name: driver)
+    monkeypatch.setattr("mpmcli.solver.plan.psutil.virtual_memory", lambda: SimpleNamespace(available=10**9))
+    with pytest.raises(InputError, match="10 GB of memory on the cuda device, and 8 GB may be used there"):
+        require_room(plan)
+    driver.free *= 2
+    require_room(plan)
+    assert driver.uses == 0
+    with pytest.raises(InputError, match="10 GB of memory, and 800 MB may be used here"):
+        require_room(replace(plan, arch="cpu"))
+    monkeypatch.setattr("mpmcli.solver.device_memory.ctypes.CDLL", lambda name: FakeDriver(0, present=False))
+    require_room(plan)
+
+
+def test_a_device_is_there_if_the_driver_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mpmcli.solver.device_memory.Path", lambda name: SimpleNamespace(glob=lambda pattern: []))
+    monkeypatch.setattr("mpmcli.solver.device_memory.os.path.exists", lambda name: False)
+    for present in (True, False):
+        monkeypatch.setattr(
+            "mpmcli.solver.device_memory.ctypes.CDLL", lambda name, present=present: FakeDriver(1, present=present)
+        )
+        assert has_cuda_device() is present

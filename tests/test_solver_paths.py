@@ -13,16 +13,16 @@ import mpm_reference as reference
 import numpy as np
 import path_run
 import pytest
-from conftest import PythonRun
+from conftest import GPU, PythonRun
 from path_reference import Arrays, check_nodes, reference_groups
 
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.splines import PAD
 
 CPU_THREADS = (1, 3)
-PATHS = [("cpu", threads) for threads in CPU_THREADS] + [("vulkan", 1)]
+PATHS = [("cpu", threads) for threads in CPU_THREADS] + [(GPU, 1)]
 # Compiled for twenty seconds by a software GPU; the same atomics add in 2D.
-SLOW = {("vulkan", 1, 3)}
+SLOW = {(GPU, 1, 3)}
 # Round-off of a step relative to the largest value of each array: sums of some ten terms, and products of
 # about ten factors.
 TOLERANCE = {"f32": 1e-6, "f64": 1e-12}
@@ -131,14 +131,15 @@ def test_bitwise_equal_for_any_number_of_threads(path_arrays: Callable, dimensio
     assert not different
 
 
+@pytest.mark.gpu
 @pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_vulkan_follows_the_cpu(path_arrays: Callable, dimension: int) -> None:
+def test_a_gpu_follows_the_cpu(path_arrays: Callable, dimension: int) -> None:
     """Atomics add in another order: round-off of 6e-8 per step and sum, which 60 steps may amplify tenfold."""
-    vulkan, cpu = path_arrays("vulkan", 1, dimension), path_arrays("cpu", 1, dimension)
+    gpu, cpu = path_arrays(GPU, 1, dimension), path_arrays("cpu", 1, dimension)
     for law in ("fluid", "neo_hookean"):
         for name, tolerance in (("x", 1e-5), ("v", 5e-5), ("C", 5e-5), ("deformation", 5e-5)):
             right = cpu[f"watched_{law}_{name}"]
-            error = np.abs(vulkan[f"watched_{law}_{name}"] - right).max() / np.abs(right).max()
+            error = np.abs(gpu[f"watched_{law}_{name}"] - right).max() / np.abs(right).max()
             assert error < tolerance, f"{law} {name}: {error:.2e}"
 
 

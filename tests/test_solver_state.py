@@ -3,11 +3,13 @@
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import state_run
+from scenes import block, scene
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
@@ -64,3 +66,18 @@ def test_the_numbers_are_plain(backend_of) -> None:
     saved = Solver(state_run.scene_named("fluid"), backend_of("f32")).state.save()
     assert json.loads(json.dumps(saved.numbers, allow_nan=True)).keys() == saved.numbers.keys()
     assert all(isinstance(array, np.ndarray) for array in saved.arrays.values())
+
+
+def test_particles_are_read_in_parts(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same, whether one launch reads all of them or each seven, as with more than 32-bit indices reach."""
+    jelly = {"law": "neo_hookean", "density": 800.0, "youngs_modulus": 6000.0}
+    body = block("jelly", jelly, (0.1, 0.1), (0.4, 0.3), velocity_gradient=[[0.0, 1.0], [0.5, 0.0]])
+    solver = Solver(scene((5, 5), 0.1, [body], 0.1), backend_of("f32", 1))
+    for _ in range(5):
+        solver.step(1e-3)
+    whole = solver.groups[0].to_numpy()
+    monkeypatch.setattr("mpmcli.solver.particle_exchange.MOST_READ", 7)
+    parts = solver.groups[0].to_numpy()
+    assert len(whole["id"]) > 14 and parts.keys() == whole.keys()
+    for name, values in whole.items():
+        assert np.array_equal(values, parts[name]), name

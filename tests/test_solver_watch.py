@@ -9,6 +9,7 @@ import fall_run
 import numpy as np
 import path_run
 import pytest
+from conftest import GPU
 from scenes import block, restart, scene
 
 from mpmcli.scene import sample_bodies
@@ -16,7 +17,7 @@ from mpmcli.solver.snapshot import read_group
 from mpmcli.solver.solver import Solver
 from mpmcli.stability.limits import COURANT
 
-ARCHES = ["cpu", "vulkan"]
+ARCHES = ["cpu", pytest.param(GPU, marks=pytest.mark.gpu)]
 
 
 @pytest.fixture(scope="module", params=ARCHES)

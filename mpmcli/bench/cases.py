@@ -10,6 +10,8 @@ BULK_MODULUS = 400.0
 GRAVITY = 9.8
 # Initial downward speed of mpm88, here of every block: particles change cells, and sorting is part of the step.
 SPEED = 1.0
+# Contestants of mpmcli: the fluid block, a solid in its place, and the fluid with sums in fixed point on a GPU.
+BLOCKS = ("ours", "solid", "deterministic")
 # Lower corner and edge of the block in the example mpm88; mpm3d starts at 0.15, with the same edge.
 CORNER = 0.2
 EDGE = 0.4

@@ -1,6 +1,6 @@
 """Process of one contestant, controlled by commands on stdin, one per line.
 
-    python -m mpmcli.bench.contestant ours|peer|mpm128|yardstick|LAW,LAW,...|profile:LAW|FEATURE
+    python -m mpmcli.bench.contestant ours|solid|deterministic|peer|mpm128|yardstick|LAW,LAW,...|profile:LAW|FEATURE
         --dimension 3 --cells 128 --particles 524288 --step 8e-5 [--threads 2] [--precision f32] [--arch cpu]
 
 It answers on stdout, one JSON object per line, and waits for commands on stdin without using the processor:
@@ -34,7 +34,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import IO, Protocol
 
-from mpmcli.bench.cases import BenchCase
+from mpmcli.bench.cases import BLOCKS, BenchCase
 from mpmcli.errors import MpmcliError
 
 
@@ -177,10 +177,10 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
         from mpmcli.bench.yardstick import falling_block as block_in_c
 
         return block_in_c(case, **options)
-    if who == "ours":
+    if who in BLOCKS:
         from mpmcli.bench.ours import falling_block
 
-        return falling_block(case, **options)
+        return falling_block(case, who, **options)
     from mpmcli.bench.features import FEATURES, Pool
     from mpmcli.bench.materials import Column
     from mpmcli.bench.profiled_column import PROFILE, ProfiledColumn

@@ -1,4 +1,4 @@
-"""The contestant of mpmcli: the same block, as a scene."""
+"""The contestants of mpmcli: the same block, as a scene, and a solid in its place."""
 
 from dataclasses import replace
 
@@ -8,10 +8,18 @@ from mpmcli.bench.cases import BULK_MODULUS, CORNER, DENSITY, EDGE, GRAVITY, Ben
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import BodyParticles, estimate_particles, parse_scene
 
+# Of the solid block, whose waves are as fast as those of the fluid.
+POISSONS_RATIO = 0.2
 
-def scene_of(case: BenchCase, precision: str) -> dict:
-    """Return a case as the dictionary of a scene file."""
+
+def scene_of(case: BenchCase, precision: str, block: str = "ours") -> dict:
+    """Return a case as the dictionary of a scene file; `block` is one of BLOCKS."""
     d = case.dimension
+    material = {"law": "fluid", "density": DENSITY, "bulk_modulus": BULK_MODULUS}
+    if block == "solid":
+        nu = POISSONS_RATIO
+        modulus = BULK_MODULUS * (1 + nu) * (1 - 2 * nu) / (1 - nu)
+        material = {"law": "neo_hookean", "density": DENSITY, "youngs_modulus": modulus, "poissons_ratio": nu}
     return {
         "title": f"Falling block, {case.name}",
         "domain": {
@@ -24,12 +32,12 @@ def scene_of(case: BenchCase, precision: str) -> dict:
         "bodies": [
             {
                 "name": "block",
-                "material": {"law": "fluid", "density": DENSITY, "bulk_modulus": BULK_MODULUS},
+                "material": material,
                 "shape": {"box": {"min": [CORNER] * d, "max": [CORNER + EDGE] * d}},
                 "velocity": case.velocity().tolist(),
             }
         ],
-        "solver": {"precision": precision},
+        "solver": {"precision": precision, "deterministic": block == "deterministic"},
     }
 
 
@@ -92,6 +100,7 @@ class Ours:
         start(backend)
         self.engine = build_engine(scene, backend, particles, batched=batched, force=force)
         self.threads = backend.threads
+        self._batched = batched
         self.smallest_step = step
         self.particles: int = self.engine.particle_count
         self.bytes_per_particle: int = make_plan(scene, backend).bytes_per_particle
@@ -116,12 +125,14 @@ class Ours:
         return self.engine.frame()[0].position
 
     def is_sound(self) -> bool:
-        """Whether every particle is in the domain."""
-        position = self.positions()
-        return bool(((position >= 0) & (position <= 1)).all())
+        """Whether every particle is in the domain, a unit square or cube whose origin is 0."""
+        # A frame of 1e8 particles takes minutes.
+        groups = [] if self._batched else self.engine.groups
+        places = [group.x.to_numpy() for group in groups] or [self.positions()]
+        return all(bool(((position >= 0) & (position <= 1)).all()) for position in places)
 
 
-def falling_block(case: BenchCase, *, threads: int, precision: str, arch: str) -> Ours:
-    """Return what `mpmcli simulate` computes with, on the block of the peer."""
-    data, particles = scene_of(case, precision), [particles_of(case)]
+def falling_block(case: BenchCase, block: str = "ours", *, threads: int, precision: str, arch: str) -> Ours:
+    """Return what `mpmcli simulate` computes with, on the block of the peer or another one of BLOCKS."""
+    data, particles = scene_of(case, precision, block), [particles_of(case)]
     return Ours(data, case.step, particles, threads=threads, precision=precision, arch=arch, batched=True, force=True)

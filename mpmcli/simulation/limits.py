@@ -41,7 +41,7 @@ class Limits:
         """
         if self.max_memory is None:
             return
-        need = resident_bytes() + plan.device_bytes + plan.host_bytes
+        need = resident_bytes() + plan.machine_bytes
         if need > self.max_memory:
             raise InputError(
                 f"the run needs {size_text(need)} of memory, and --max-memory is {size_text(self.max_memory)}: raise "

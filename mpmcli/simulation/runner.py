@@ -27,13 +27,22 @@ class Runner:
     a kind that needs more room than an earlier one, and for each scene with many particles.
     """
 
-    def __init__(self, arch: Arch = "auto", threads: int | None = 1, optimisation: Optimisation | None = None) -> None:
+    def __init__(
+        self,
+        arch: Arch = "auto",
+        threads: int | None = 1,
+        optimisation: Optimisation | None = None,
+        *,
+        most_runs: int = MOST_RUNS,
+    ) -> None:
         """Choose the backend; nothing starts.
 
         Args:
             threads: CPU threads of a scene with many particles; one with few takes a single thread.
+            most_runs: that advance at once on a GPU.
         """
         self._arch, self._threads, self._optimisation = arch, threads, optimisation
+        self._most_runs = most_runs
         self._backend: Backend | None = None
         self._batches: list[Batch] = []
 
@@ -94,7 +103,7 @@ class Runner:
             sampled[place] = particles
             kind = Kind.of(scene, particles)
             for i, (known, own) in enumerate(kinds):
-                if len(own) < MOST_RUNS and (joined := known.joined(kind)):
+                if len(own) < self._most_runs and (joined := known.joined(kind)):
                     kinds[i] = joined, [*own, place]
                     break
             else:

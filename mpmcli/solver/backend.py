@@ -22,6 +22,7 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.plain_text import counted
+from mpmcli.solver.device_memory import has_cuda_device
 
 # Taichi's optimisations: all, all but those across branches, or few. Those across branches take half to three quarters
 # of the time to compile for a CPU, and save nothing. Few halve the rest, and steps are 7 to 30 % slower.
@@ -182,7 +183,7 @@ def _has(arch: str) -> bool:
     if arch == "cpu":
         return True
     # Taichi loads CUDA wherever the driver's library is present, and ends the process without a device.
-    if arch == "cuda" and not (os.path.exists("/dev/nvidia0") or os.path.exists("/dev/dxg")):
+    if arch == "cuda" and not has_cuda_device():
         return False
     return bool(ti.lang.misc.is_arch_supported(getattr(ti, arch)))
 

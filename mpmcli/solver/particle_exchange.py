@@ -5,15 +5,20 @@ from collections.abc import Sequence
 import numpy as np
 import taichi as ti
 
+# Particles of a launch that reads them: with up to 27 numbers each, their entries stay within 32-bit indices, and a GPU
+# needs half a gigabyte for them.
+MOST_READ = 2**22
+
 
 @ti.data_oriented
 class ParticleExchange:
     """What `ParticleArrays` has to be read and written; the attributes are those documented there."""
 
     def read(self, first: int, count: int, bodies: Sequence[int], row: int = 0) -> dict[str, np.ndarray]:
-        """Return x, v, C, deformation, internal, (n, k), id and body, (n), of a range of particles, by one launch.
+        """Return x, v, C, deformation, internal, (n, k), id and body, (n), of a range of particles.
 
-        A launch per field would take most of the time of a frame of few particles.
+        One launch reads all fields of up to MOST_READ particles: a launch per field would take most of the time of a
+        frame of few particles.
 
         Args:
             bodies: index in the scene of each body of the group; row: of the first of them in the table.
@@ -21,7 +26,9 @@ class ParticleExchange:
         d = self.dimension
         widths = {"x": d, "v": d, "C": d * d, "deformation": self._deformation_width, "internal": len(self.internal)}
         reals, labels = np.empty((count, sum(widths.values())), self.real), np.empty((count, 3), np.int32)
-        self._read(first, reals, labels)
+        for begin in range(0, count, MOST_READ):
+            rows = slice(begin, begin + MOST_READ)
+            self._read(first + begin, reals[rows], labels[rows])
         found, end = {}, 0
         for name, width in widths.items():
             found[name] = reals[:, end : end + width]

@@ -16,6 +16,7 @@ from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
 from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.backend import Backend
+from mpmcli.solver.device_memory import free_memory
 from mpmcli.solver.fixed_point import FixedPoint
 from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import Grid, gradient_width, node_width, tile_edge
@@ -60,6 +61,7 @@ class Plan:
         grid_bytes: of all nodes, the tables of the sort, what is found at walls, and what colliders need.
         host_bytes: of the arrays of one frame and of the initial state.
         passes: the loops of a step in order; loops over particles name their law.
+        arch: the backend.
     """
 
     laws: tuple[LawPlan, ...]
@@ -69,6 +71,7 @@ class Plan:
     grid_bytes: int
     host_bytes: int
     passes: tuple[str, ...]
+    arch: str = "cpu"
 
     @property
     def particles(self) -> int:
@@ -85,6 +88,11 @@ class Plan:
         """Bytes on the device; the sort buffers hold the largest group."""
         state = sum(law.particles * sum(law.fields.values()) for law in self.laws)
         return state + max(law.particles for law in self.laws) * self.scratch_bytes + self.grid_bytes
+
+    @property
+    def machine_bytes(self) -> int:
+        """Bytes of the machine's own memory: all but those that a CUDA device has itself."""
+        return self.host_bytes + (0 if self.arch == "cuda" else self.device_bytes)
 
     def as_dict(self) -> dict:
         """Return all of it as JSON can hold it."""
@@ -212,7 +220,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
     host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)
     passes = passes_of(members, scene, deterministic=deterministic)
-    return Plan(groups, nodes, widest + 8, node_bytes, nodes * node_bytes + tables, host_bytes, passes)
+    return Plan(groups, nodes, widest + 8, node_bytes, nodes * node_bytes + tables, host_bytes, passes, backend.arch)
 
 
 def _separating_axes(scene: Scene) -> list[int]:
@@ -248,14 +256,20 @@ def require_room(plan: Plan) -> None:
     """Refuse a plan that does not fit this machine.
 
     Raises:
-        InputError: it takes more memory than this machine has free, or more than 32-bit indices reach.
+        InputError: it takes more memory than this machine or its device has free, or more than 32-bit indices reach.
     """
-    total = plan.device_bytes + plan.host_bytes
+    total = plan.machine_bytes
     free = MEMORY_SHARE * psutil.virtual_memory().available
+    on_device = free_memory(plan.arch)
     need = f"the scene needs {plan.particles:.3g} particles and {plan.nodes:.3g} grid nodes"
     cure = "a larger domain.spacing or fewer particles_per_cell needs less"
     if total > free:
         raise InputError(f"{need}, {size_text(total)} of memory, and {size_text(free)} may be used here; {cure}.")
+    if on_device is not None and plan.device_bytes > MEMORY_SHARE * on_device:
+        raise InputError(
+            f"{need}, {size_text(plan.device_bytes)} of memory on the {plan.arch} device, and "
+            f"{size_text(MEMORY_SHARE * on_device)} may be used there; {cure}."
+        )
     # The widest field of the sort is addressed by one index.
     if max(plan.nodes, plan.particles * WIDEST_FIELD) > LARGEST_INDEX:
         raise InputError(f"{need}, more than 32-bit indices can address; {cure}.")
