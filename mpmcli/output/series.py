@@ -23,7 +23,8 @@ from mpmcli.output.layout import POSITION, FrameLayout
 from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_csv
 from mpmcli.output.store import Store
 from mpmcli.output.sums_file import path_digest, read_sums, text_digest, write_sums
-from mpmcli.output.vtkhdf import FORMAT, OVERHEAD_BYTES
+from mpmcli.output.vtkhdf import FORMAT
+from mpmcli.output.vtkhdf_parts import OVERHEAD_BYTES
 
 SERIES = "particles.pvd"
 SERIES_HEADER = "particles.json"

@@ -262,6 +262,8 @@ def _run(
                 rows.append(row)
             with clock.adding("output_s"):
                 store.write(frame, row)
+            # The next one is made of memory that this one gives back.
+            del frame
             report()
             halt.wrote(store.bytes_written, store.seconds)
     except BaseException:

@@ -135,12 +135,15 @@ class RunConstants:
         if whole and self._all is not None:
             return self._all
         body, material = self.body[rows], self.material[rows]
-        mass, volume = self._table[body].T
+        if len(self._table) == 1:
+            mass, volume, flows = (np.broadcast_to(value, body.shape) for value in (*self._table[0], self._flows[0]))
+        else:
+            (mass, volume), flows = self._table[body].T, self._flows[material]
         members = tuple(
             (law, slice(None) if len(self._laws) == 1 else np.flatnonzero(material == g))
             for g, law in enumerate(self._laws)
         )
-        found = ParticleConstants(mass, volume, self._flows[material], members)
+        found = ParticleConstants(mass, volume, flows, members)
         if whole:
             self._all = found
         return found

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mpmcli.solver.frame_arrays import parts_of
+
 # Fewest cells inside the material that say anything: the edge of what is inside is sharp to a particle or so.
 FEWEST = 64
 # Cells that are looked at at once. Of a larger domain only those that particles occupy are.
@@ -34,9 +36,9 @@ class FilledCells:
         self._spacing, self._cells, self._periodic = spacing, tuple(cells), periodic
         self._low, self._high = [0] * len(cells), [n - 1 for n in cells]
         if math.prod(cells) > WHOLE:
+            lower, upper = _bounds(x)
             for a in range(len(cells)):
-                bounds = np.array([x[..., a].min(), x[..., a].max()])
-                self._low[a], self._high[a] = np.maximum(self._cell(bounds, a), 0).tolist()
+                self._low[a], self._high[a] = (max(0, int(self._cell(bound[a], a))) for bound in (lower, upper))
         # One cell more on each side: a wall asks for nothing, the void is empty.
         self._shape = [len(x)] + [last - first + 3 for first, last in zip(self._low, self._high, strict=True)]
         self._held = np.zeros(math.prod(self._shape))
@@ -89,6 +91,13 @@ class FilledCells:
         # In one order, whatever the number of times.
         filled = np.where(inside, within, 0.0).sum(axis=1)
         return np.where(enough, counts * self._spacing ** len(self._cells) / np.where(enough, filled, 1.0) - 1, 0.0)
+
+
+def _bounds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the largest coordinate along each axis, (d,), of places (T, n, d)."""
+    found = [[(x[:, rows, a].min(), x[:, rows, a].max()) for a in range(x.shape[2])] for rows in parts_of(x.shape[1])]
+    bounds = np.array(found, x.dtype)
+    return bounds[:, :, 0].min(axis=0), bounds[:, :, 1].max(axis=0)
 
 
 def times_at_once(cells: Sequence[int]) -> int:
