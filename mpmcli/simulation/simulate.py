@@ -228,7 +228,10 @@ def _run(
     kept = store.frames_written
 
     def after_step() -> bool:
-        store.seal_due()
+        with clock.adding("output_s"):
+            store.seal_due()
+        if store.frames_written > max(kept, summary.frames):
+            report()
         ends = halt()
         if ends or checkpoints.due():
             checkpoints.take()
