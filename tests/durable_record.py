@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import RLock
 
 import pytest
 
@@ -109,22 +110,26 @@ def recorded(root: Path, label: Callable[[], int]) -> Iterator[DurableRecord]:
     root = root.resolve()
     record = DurableRecord(root, label)
     sync = os.fsync
+    # Frames are sealed by a thread: what it does and what is noted of it are one.
+    lock = RLock()
 
     def watched_sync(descriptor: int) -> None:
-        sync(descriptor)
-        path = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
-        if path.is_relative_to(root):
-            record.synced(descriptor)
-            record.cut(f"the sync of {path.relative_to(root)}")
+        with lock:
+            sync(descriptor)
+            path = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+            if path.is_relative_to(root):
+                record.synced(descriptor)
+                record.cut(f"the sync of {path.relative_to(root)}")
 
     def watched(name: str) -> Callable[..., None]:
         act = getattr(os, name)
 
         def call(*arguments: object, **more: object) -> None:
-            act(*arguments, **more)
-            path = Path(arguments[1] if name in ("replace", "rename") else arguments[0]).absolute()
-            if path.is_relative_to(root):
-                record.cut(f"{name} of {path.relative_to(root)}")
+            with lock:
+                act(*arguments, **more)
+                path = Path(arguments[1] if name in ("replace", "rename") else arguments[0]).absolute()
+                if path.is_relative_to(root):
+                    record.cut(f"{name} of {path.relative_to(root)}")
 
         return call
 

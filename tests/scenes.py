@@ -7,9 +7,10 @@ import numpy as np
 from solver_state import scene_of
 
 from mpmcli.scene import BodyParticles, Scene
-from mpmcli.solver.frame_arrays import FrameArrays, ParticleConstants
+from mpmcli.solver.frame_arrays import FrameArrays, RunConstants
 from mpmcli.solver.solver import Solver
 from mpmcli.solver.sums import ledger_sums
+from mpmcli.solver.volume_error import FilledCells
 
 GRAVITY = 9.81
 
@@ -86,9 +87,12 @@ def sums(solver: Solver) -> dict:
     arrays = FrameArrays(columns, np.empty((1, solver.particle_count, columns.count), solver.groups[0].real))
     # As on a GPU: in numpy.
     found = solver._observe(arrays)
-    constants = ParticleConstants.of(solver.groups, [len(b.position) for b in solver._particles])
+    everything = slice(0, solver.particle_count)
+    constants = RunConstants(solver.groups, [len(b.position) for b in solver._particles]).of_rows(everything)
     gravity, dt = np.array([solver.scene.domain.gravity]), np.array([solver.last_step])
-    result = ledger_sums(found, constants.volume_ratios(arrays), gravity, solver.spacing, dt)
+    ratios = constants.volume_ratios(arrays)
+    result = ledger_sums(found, gravity, solver.spacing, dt)
+    result |= {"volume_ratio_min": ratios.min(axis=1), "volume_ratio_max": ratios.max(axis=1)}
     return {name: values[0] for name, values in result.items()}
 
 
@@ -96,3 +100,20 @@ def total_energy(solver: Solver) -> float:
     """Return the total energy as the ledger gives it, J."""
     found = sums(solver)
     return found["kinetic"] + found["elastic"] + found["potential"]
+
+
+def volume_errors(
+    x: np.ndarray,
+    volume: np.ndarray,
+    flows: np.ndarray,
+    spacing: float,
+    cells: Sequence[int],
+    periodic: Sequence[bool],
+) -> np.ndarray:
+    """Return the volume errors of (T, n, d) places, the particles added in two parts, which change no bit."""
+    halves, whole = (FilledCells(x, spacing, cells, periodic) for _ in range(2))
+    for rows in (slice(0, len(flows) // 3), slice(len(flows) // 3, None)):
+        halves.add(x[:, rows], volume[:, rows], flows[rows])
+    whole.add(x, volume, flows)
+    assert np.array_equal(halves.errors(), whole.errors())
+    return whole.errors()

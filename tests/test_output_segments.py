@@ -1,5 +1,6 @@
 """The VTKHDF store: what it writes is read back bit for bit, and survives crashes and full disks."""
 
+import errno
 import math
 import os
 import shutil
@@ -9,6 +10,7 @@ import sys
 from collections import namedtuple
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from threading import Event
 
 import h5py
 import numpy as np
@@ -22,6 +24,7 @@ from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from mpmcli.errors import InputError, RunError
 from mpmcli.output import SegmentStore, open_result, prepare_directory
+from mpmcli.output import durable as durable_module
 from mpmcli.output import pack as pack_module
 from mpmcli.output import store as store_module
 from mpmcli.output.layout import FrameLayout
@@ -177,6 +180,48 @@ def test_frames_wait_for_the_time_or_the_size_that_seals_them(tmp_path, monkeypa
     assert store.frames_written == 9
     names = [path.name for path in sealed_segments(tmp_path)]
     assert names == [f"frame_{k:06d}.vtkhdf" for k in (0, 4, 6, 7)]
+
+
+@pytest.fixture
+def slow_disk(monkeypatch) -> Event:
+    """Let threads seal every frame, and a file be synced only when the event is set, or fail at a third one then."""
+    monkeypatch.setattr(store_module, "ASIDE", 0)
+    ready, synced, sync = Event(), [], durable_module.sync_file
+
+    def slow(path: Path) -> None:
+        assert ready.wait(60)
+        synced.append(path)
+        if len(synced) == 3:
+            raise OSError(errno.EIO, "the disk is gone")
+        sync(path)
+
+    monkeypatch.setattr(durable_module, "sync_file", slow)
+    return ready
+
+
+def test_a_frame_that_a_thread_seals_counts_when_it_is_durable(tmp_path, slow_disk):
+    store = SegmentStore(tmp_path, HEADER)
+    store.write(make_frame(0, 10, 2), make_row(0, 2))
+    store.seal_due()
+    assert (store.frames_written, sealed_segments(tmp_path)) == (0, [])
+    slow_disk.set()
+    store.seal()
+    assert (store.frames_written, len(sealed_segments(tmp_path))) == (1, 1)
+    store.write(make_frame(1, 10, 2), make_row(1, 2))
+    # The next write waits for the one before.
+    store.write(make_frame(2, 10, 2), make_row(2, 2))
+    assert store.frames_written == 2
+
+
+def test_a_failure_of_the_thread_is_told_at_the_next_frame_which_is_not_written(tmp_path, slow_disk):
+    store = SegmentStore(tmp_path, HEADER)
+    slow_disk.set()
+    for k in range(3):
+        store.write(make_frame(k, 10, 2), make_row(k, 2))
+    with pytest.raises(RunError, match=r"^frame 2 could not be written .*disk is gone.*2 frames before it are kept"):
+        store.write(make_frame(3, 10, 2), make_row(3, 2))
+    store.seal()
+    assert (store.frames_written, len(sealed_segments(tmp_path))) == (2, 2)
 
 
 def test_a_disk_that_is_full_at_a_seal_loses_the_waiting_frames_and_says_so(tmp_path, monkeypatch):

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import CONFIGS, run_here
+from scenes import volume_errors
 from solver_state import scene_of
 
 from mpmcli.check.distance import close_pairs
 from mpmcli.check.flight import arrivals
 from mpmcli.dataset.statistics import motion_statistics
 from mpmcli.scene import Scene, scene_bounds
-from mpmcli.solver.volume_error import volume_errors
 
 JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5, "poissons_ratio": 0.3}
 

@@ -8,7 +8,7 @@ from durable_record import DurableRecord, Image, make_copy, recorded
 
 from mpmcli.frames.frame import Frame
 from mpmcli.materials.registry import parameter_models
-from mpmcli.output import open_result
+from mpmcli.output import open_result, store
 from mpmcli.scene import LoadedScene, parse_scene
 from mpmcli.simulation import stored_run
 from mpmcli.simulation.settings import RunSettings
@@ -49,11 +49,12 @@ def run(
 
 @pytest.fixture(scope="module")
 def at_once() -> object:
-    """Seal each frame at once and launch a few steps at a time, so that a short run has many files."""
+    """Seal each frame at once, in a thread, and launch a few steps at a time, so that a short run has many files."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(launch_budget, "FIRST", PARTICLES * STEPS)
         patch.setattr(launch_budget.LaunchBudget, "took", lambda *_: None)
         patch.setattr(stored_run, "HOLD", 0.0)
+        patch.setattr(store, "ASIDE", 0)
         yield
 
 

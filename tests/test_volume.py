@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 from made_result import made_row
-from scenes import block, scene
+from scenes import block, scene, volume_errors
 
 from mpmcli.materials.fluid import RELAXATION
 from mpmcli.materials.registry import parameter_models
@@ -19,7 +19,6 @@ from mpmcli.scene import Scene, parse_scene
 from mpmcli.solver.plan import make_plan
 from mpmcli.solver.solver import Solver
 from mpmcli.solver.splines import PAD
-from mpmcli.solver.volume_error import volume_errors
 from mpmcli.solver.volume_relaxation import INTERVAL
 from mpmcli.validation.carry_out import scene_of
 from mpmcli.validation.cases import all_cases

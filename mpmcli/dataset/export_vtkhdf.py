@@ -11,7 +11,8 @@ from mpmcli.dataset.thinned import ThinnedTrajectory
 from mpmcli.errors import InputError
 from mpmcli.output.durable import ask_for
 from mpmcli.output.layout import POSITION
-from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
+from mpmcli.output.vtkhdf import VtkhdfWriter
+from mpmcli.output.vtkhdf_parts import file_size
 
 
 def check(trajectories: Sequence[ThinnedTrajectory]) -> None:
@@ -51,13 +52,11 @@ def _write_trajectory(path: Path, trajectory: ThinnedTrajectory) -> None:
     with VtkhdfWriter(path, layout, [n] * frames) as writer:
         for name, array in layout.arrays.items():
             if name in fixed:
-                for k in range(frames):
-                    writer.write_array(k, name, array.pad(fixed[name]))
+                for _ in range(frames):
+                    writer.append(name, array.pad(fixed[name]))
                 continue
-            k = 0
             for block in trajectory.blocks("position" if name == POSITION else name):
                 joined = block.reshape(len(block) * n, *block.shape[2:])
-                writer.write_array(k, name, array.pad(joined), frames=len(block))
-                k += len(block)
+                writer.append(name, array.pad(joined))
         header = trajectory.source.header.stored
         writer.finish(trajectory.times, trajectory.frames, trajectory.steps, trajectory.ledger(), header)

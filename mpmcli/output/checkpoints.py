@@ -49,7 +49,7 @@ class Checkpoint:
     Attributes:
         frame: number of the first frame that it had not stored; step: steps taken; time: s.
         backend: "arch" and "precision"; forced: whether time.step was taken as it was.
-        numbers: of the state, as JSON can hold them; arrays: by name.
+        numbers: of the state, as JSON can hold them; arrays: by name, asked for one at a time and once.
         version: of mpmcli that wrote it.
     """
 
@@ -63,8 +63,11 @@ class Checkpoint:
     version: str = __version__
 
 
-def write_checkpoint(directory: Path, checkpoint: Checkpoint) -> Path:
+def write_checkpoint(directory: Path, checkpoint: Checkpoint, size: int) -> Path:
     """Seal a checkpoint of the run in `directory`, and remove those before the last one.
+
+    Args:
+        size: bytes of its arrays.
 
     Raises:
         RunError, OSError: the disk cannot hold it; earlier ones are kept.
@@ -72,14 +75,16 @@ def write_checkpoint(directory: Path, checkpoint: Checkpoint) -> Path:
     folder = directory / CHECKPOINTS
     facts = {name: value for name, value in vars(checkpoint).items() if name != "arrays"}
     text = np.frombuffer(json.dumps({"format": FORMAT, **facts}).encode("utf-8"), np.uint8)
-    size = sum(array.nbytes for array in checkpoint.arrays.values()) + text.nbytes + 1024 * (1 + len(checkpoint.arrays))
+    size += text.nbytes + 1024 * (1 + len(checkpoint.arrays))
     require_free_space(directory, size, "a checkpoint", "the frames are kept")
     if not folder.is_dir():
         folder.mkdir()
         sync_directory(directory)
     path = folder / f"step_{checkpoint.step:09d}.npz"
-    with sealed(path, size) as temporary, open(temporary, "wb") as file:
-        np.savez(file, **{FACTS: text, **{f"state/{name}": array for name, array in checkpoint.arrays.items()}})
+    with sealed(path, size) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        _add(archive, FACTS, text)
+        for name in checkpoint.arrays:
+            _add(archive, f"state/{name}", checkpoint.arrays[name])
     for older in _paths(directory)[KEPT:]:
         older.unlink(missing_ok=True)
     return path
@@ -104,6 +109,12 @@ def remove_checkpoints(directory: Path, *, but: int = 0) -> None:
             path.unlink(missing_ok=True)
     with suppress(OSError):
         folder.rmdir()
+
+
+def _add(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
+    """Write an array as `numpy.savez` does."""
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array(member, array, allow_pickle=False)
 
 
 def _paths(directory: Path) -> list[Path]:

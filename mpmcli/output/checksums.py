@@ -20,9 +20,9 @@ NAME = "checksums"
 _LIST, _OWN = "list", "checksum"
 
 
-def checksum(array: np.ndarray) -> int:
-    """Return the CRC-32 of the bytes of an array."""
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+def checksum(array: np.ndarray, before: int = 0) -> int:
+    """Return the CRC-32 of the bytes of an array, after those whose CRC-32 is `before`."""
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8), before)
 
 
 def damaged(path: str, what: str) -> DamageError:

@@ -57,19 +57,42 @@ def sealed(path: Path, size: int = 0) -> Iterator[Path]:
     Raises:
         OSError: the system does not grant them: disk full, quota, limit on the size of a file.
     """
-    temporary = path.with_name(path.name + TEMPORARY_SUFFIX)
-    try:
-        if size:
-            ask_for(temporary, size)
+    file = Unsealed(path)
+    with file.written(size) as temporary:
         yield temporary
-        sync_file(temporary)
-        os.replace(temporary, path)
-    except BaseException:
-        # The error under way is what the user must see, not a failed clean-up.
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
-    sync_directory(path.parent)
+    file.seal()
+
+
+class Unsealed:
+    """A file that is first written, and then put at its path in one durable step, by another thread maybe."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._temporary = path, path.with_name(path.name + TEMPORARY_SUFFIX)
+
+    @contextmanager
+    def written(self, size: int = 0) -> Iterator[Path]:
+        """Give a temporary path to write and close; see `sealed`."""
+        with self._removed_on_error():
+            if size:
+                ask_for(self._temporary, size)
+            yield self._temporary
+
+    def seal(self) -> None:
+        """Put the file at its path; where that fails, the temporary one is removed."""
+        with self._removed_on_error():
+            sync_file(self._temporary)
+            os.replace(self._temporary, self._path)
+        sync_directory(self._path.parent)
+
+    @contextmanager
+    def _removed_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            # The error under way is what the user must see, not a failed clean-up.
+            with suppress(OSError):
+                self._temporary.unlink(missing_ok=True)
+            raise
 
 
 def ask_for(path: Path, size: int) -> None:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from mpmcli.errors import InputError, NoRoomError, RunError
@@ -13,8 +14,12 @@ from mpmcli.output.checksums import damaged
 from mpmcli.output.durable import is_full, require_free_space, sealed, sync_file
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.hdf5_items import DamageError
-from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, read_array, read_index
-from mpmcli.output.vtkhdf_parts import part_tables
+from mpmcli.output.vtkhdf import VtkhdfWriter
+from mpmcli.output.vtkhdf_parts import CONNECTIVITY, file_size, part_tables
+from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_blocks, read_index
+
+# Numbers that are compared at once.
+PART = 2**17
 
 
 def pack_segments(
@@ -24,11 +29,12 @@ def pack_segments(
     compress: bool = False,
     frames: int | None = None,
     header: Mapping[str, Any] | None = None,
+    known: bool = False,
     stop: Callable[[], bool] = lambda: False,
 ) -> None:
     """Write all frames of `segments` into `target`, compare every number, then give it its name.
 
-    Memory is that of one array of one segment. The segments are left as they are.
+    Memory is that of a block of one array. The segments are left as they are.
 
     Args:
         segments: sealed VTKHDF files of one run, in order.
@@ -36,7 +42,8 @@ def pack_segments(
         compress: gzip-1 with shuffle.
         frames: how many to take, all if None.
         header: of the packed file, that of the segments by default; "scene" may differ, as a resumed run may end later.
-        stop: called for each array; True ends the packing.
+        known: whether this process has written or verified the segments.
+        stop: called for each block of an array; True ends the packing.
 
     Raises:
         KeyboardInterrupt: `stop` returned True; no `target` is made then.
@@ -44,7 +51,7 @@ def pack_segments(
             packed file does not read back bit for bit. No `target` is made then.
     """
     try:
-        indices = [_read_index(segment) for segment in segments]
+        indices = [_read_index(segment, known=known) for segment in segments]
     except InputError as error:
         raise RunError(f"{error} The frames in {segments[0].parent} were left unpacked.") from error
     first = indices[0]
@@ -88,15 +95,13 @@ def _copy(
     """Copy all arrays of all segments, segment by segment, or array by array, which opens each segment more often."""
     names = list(indices[0].layout.arrays)
     for group in [[name] for name in names] if by_name else [names]:
-        k = 0
         for segment, index in zip(segments, indices, strict=True):
-            frames, rows = len(index.counts), int(index.counts.sum())
-            with closing(open_vtkhdf(segment)) as source:
+            with closing(open_vtkhdf(segment, known=True)) as source:
                 for name in group:
-                    if stop():
-                        raise KeyboardInterrupt
-                    writer.write_array(k, name, read_array(source, name, 0, rows), frames=frames)
-            k += frames
+                    for block in read_blocks(source, name, 0, int(index.counts.sum())):
+                        if stop():
+                            raise KeyboardInterrupt
+                        writer.append(name, block)
 
 
 def _require_unchanged(
@@ -145,7 +150,7 @@ def find_difference(
     Raises:
         KeyboardInterrupt: `stop` returned True.
     """
-    with closing(open_vtkhdf(packed)) as file:
+    with closing(open_vtkhdf(packed, known=True)) as file:
         try:
             index = read_index(file)
         except DamageError as error:
@@ -162,24 +167,35 @@ def find_difference(
         for name, table in part_tables(expected.counts).items():
             if not _same(root[name][...], table):
                 return name
+        if not _counts_up(root[CONNECTIVITY], int(expected.counts.max())):
+            return CONNECTIVITY
         if root["Steps"].attrs["NSteps"] != len(expected.counts):
             return "NSteps"
-        first = 0
+        before = 0
         for segment, rows in zip(segments, rows_of, strict=True):
-            with closing(open_vtkhdf(segment)) as source:
+            with closing(open_vtkhdf(segment, known=True)) as source:
                 for name in expected.layout.arrays:
-                    if stop():
-                        raise KeyboardInterrupt
-                    written, stored = read_array(file, name, first, rows), read_array(source, name, 0, rows)
-                    if not _same(written, stored):
-                        return f"{name} of the frames of {segment.name}"
-            first += rows
+                    pairs = zip(read_blocks(file, name, before, rows), read_blocks(source, name, 0, rows), strict=True)
+                    for written, stored in pairs:
+                        if stop():
+                            raise KeyboardInterrupt
+                        if not _same(written, stored):
+                            return f"{name} of the frames of {segment.name}"
+            before += rows
     return ""
 
 
-def _read_index(segment: Path) -> FrameIndex:
-    with closing(open_vtkhdf(segment)) as file:
+def _read_index(segment: Path, *, known: bool) -> FrameIndex:
+    with closing(open_vtkhdf(segment, known=known)) as file:
         return read_index(file)
+
+
+def _counts_up(data: h5py.Dataset, n: int) -> bool:
+    """Return whether a data set holds the numbers from 0 to n - 1 as int64."""
+    firsts = range(0, n, PART)
+    return data.shape == (n,) and all(
+        _same(data[k : k + PART], np.arange(k, min(k + PART, n), dtype=np.int64)) for k in firsts
+    )
 
 
 def _same(a: np.ndarray, b: np.ndarray) -> bool:

@@ -19,7 +19,7 @@ from mpmcli.output.run_record import RECORD, read_record
 from mpmcli.output.segments import DAMAGED, PACKED, REPAIRED, SEGMENTS, remove_segments, sealed_segments
 from mpmcli.output.series import SERIES
 from mpmcli.output.verify import SCENE, FileVerdict, verify_file, verify_result
-from mpmcli.output.vtkhdf import open_vtkhdf, read_index
+from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_index
 from mpmcli.plain_text import counted
 
 

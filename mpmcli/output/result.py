@@ -24,7 +24,7 @@ from mpmcli.output.run_status import run_status
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.series import SERIES, read_vtu
 from mpmcli.output.series_index import read_series
-from mpmcli.output.vtkhdf import open_vtkhdf, read_array, read_index
+from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_array, read_index
 from mpmcli.scene.colliders import Collider
 
 Kind = Literal["packed", "segments", "series"]

@@ -11,12 +11,14 @@ from mpmcli.errors import RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.collider_files import write_collider_files
-from mpmcli.output.durable import TEMPORARY_SUFFIX, sealed, sync_directory
+from mpmcli.output.durable import TEMPORARY_SUFFIX, Unsealed, sync_directory
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.pack import pack_segments
 from mpmcli.output.store import Store
-from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, open_vtkhdf, read_index
+from mpmcli.output.vtkhdf import VtkhdfWriter
+from mpmcli.output.vtkhdf_parts import file_size
+from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_index
 
 PACKED = "particles.vtkhdf"
 # What `mpmcli repair` calls a damaged one, and the new one before it takes its name.
@@ -81,9 +83,10 @@ class SegmentStore(Store):
             os.replace(segments[0], packed)
             sync_directory(self._directory)
         else:
-            pack_segments(segments, packed, compress=self._compress, header=self._header, stop=stop)
+            # Those of an earlier process were verified when the run was resumed.
+            pack_segments(segments, packed, compress=self._compress, header=self._header, known=True, stop=stop)
         if self._colliders:
-            with closing(open_vtkhdf(packed)) as file:
+            with closing(open_vtkhdf(packed, known=True)) as file:
                 times = read_index(file).times.tolist()
             write_collider_files(self._directory, self._header, times, self._colliders)
         # The result is complete; a segment that somebody holds open may stay beside it.
@@ -112,17 +115,23 @@ class SegmentStore(Store):
     def _joined_size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
         return file_size(layout, [*self._counts, *counts])
 
-    def _write(self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int) -> None:
-        with (
-            sealed(self.place / segment_name(frames[0].index), size) as temporary,
-            VtkhdfWriter(temporary, layout, [len(frame.position) for frame in frames]) as writer,
-        ):
+    def _write(
+        self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int
+    ) -> Callable[[], None]:
+        path, counts = self.place / segment_name(frames[0].index), [len(frame.position) for frame in frames]
+        file = Unsealed(path)
+        with file.written(size) as temporary, VtkhdfWriter(temporary, layout, counts) as writer:
             for name, arrays in layout.stored_together(frames):
-                writer.write_array(0, name, arrays, frames=len(frames))
+                writer.append(name, arrays)
             tables = zip(*((frame.time, frame.index, frame.step) for frame in frames), strict=True)
             writer.finish(*tables, rows, self._header)
-        self._sealed.add(segment_name(frames[0].index))
-        self._counts += [len(frame.position) for frame in frames]
+
+        def seal() -> None:
+            file.seal()
+            self._sealed.add(path.name)
+            self._counts += counts
+
+        return seal
 
 
 def remove_segments(directory: Path) -> None:

@@ -6,6 +6,7 @@ Every ParaView and VTK reads it, at the price of more and larger files; VTKHDF i
 import json
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -23,7 +24,8 @@ from mpmcli.output.layout import POSITION, FrameLayout
 from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_csv
 from mpmcli.output.store import Store
 from mpmcli.output.sums_file import path_digest, read_sums, text_digest, write_sums
-from mpmcli.output.vtkhdf import FORMAT, OVERHEAD_BYTES
+from mpmcli.output.vtkhdf import FORMAT
+from mpmcli.output.vtkhdf_parts import OVERHEAD_BYTES
 
 SERIES = "particles.pvd"
 SERIES_HEADER = "particles.json"
@@ -85,7 +87,12 @@ class VtkSeriesStore(Store):
         # Base64 makes 4 bytes of 3; each particle is a cell of its own: number, offset and type.
         return sum(counts) * (layout.bytes_per_particle + 24) * 4 // 3 + OVERHEAD_BYTES * len(counts)
 
-    def _write(self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int) -> None:
+    def _write(
+        self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int
+    ) -> Callable[[], None]:
+        return partial(self._write_all, layout, frames, rows)
+
+    def _write_all(self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow]) -> None:
         for frame in frames:
             with sealed(self._directory / series_frame_name(frame.index)) as temporary:
                 _write_vtu(temporary, dict(layout.stored(frame)), compress=self._compress)

@@ -4,6 +4,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 from mpmcli.errors import InputError, NoRoomError, RunError
@@ -17,6 +18,8 @@ from mpmcli.scene.colliders import Collider
 
 # Bytes of waiting frames above which they are sealed.
 MOST_WAITING = 32 * 1024 * 1024
+# Bytes of frames that a thread seals beside the run; fewer are sealed sooner than a thread is begun.
+ASIDE = 4 * 1024 * 1024
 # Longest time between the computation of a frame of a run and its seal, s, unless a single step takes longer.
 HOLD = 1.0
 
@@ -25,7 +28,9 @@ class Store(ABC):
     """Writes the frames of one run.
 
     Frames are sealed in groups, since a durable file costs about 10 ms however small it is. Only sealed frames count as
-    written.
+    written. Large groups are sealed by a thread while the run goes on, one at a time: they lie in the memory of the
+    system then, and it is the disk that takes its time. Taichi holds Python's lock during a launch, so that a thread
+    could do little more.
 
     Args:
         directory: the output directory, made by `prepare_directory`.
@@ -60,6 +65,7 @@ class Store(ABC):
         self._layout: FrameLayout | None = None
         self._waiting: list[tuple[Frame, LedgerRow]] = []
         self._waiting_since = 0.0
+        self._sealing: _Sealing | None = None
         self.frames_written = self.bytes_written = 0
         self.seconds = 0.0
         # Frames that an earlier process has written.
@@ -83,7 +89,7 @@ class Store(ABC):
         """
         if frame.index < self._kept:
             return
-        following = self.frames_written + len(self._waiting)
+        following = self.frames_written + len(self._waiting) + (self._sealing.frames if self._sealing else 0)
         if frame.index != following:
             raise ValueError(f"frame {frame.index} was given where frame {following} comes next")
         layout = FrameLayout.of(frame)
@@ -99,7 +105,7 @@ class Store(ABC):
         self._waiting.append((frame, row))
         size = self._size(layout, [len(waiting.position) for waiting, _ in self._waiting])
         if size >= MOST_WAITING:
-            self.seal()
+            self._begin_seal()
         self.seal_due()
 
     def seal_due(self) -> None:
@@ -108,8 +114,10 @@ class Store(ABC):
         Raises:
             RunError: as `seal`.
         """
+        if self._sealing is not None and self._sealing.done:
+            self._end_seal()
         if self._waiting and time.monotonic() - self._waiting_since >= self._hold:
-            self.seal()
+            self._begin_seal()
 
     def seal(self) -> None:
         """Write all waiting frames durably.
@@ -117,6 +125,12 @@ class Store(ABC):
         Raises:
             RunError: the disk is full or refuses; all frames before the waiting ones are kept.
         """
+        self._begin_seal()
+        self._end_seal()
+
+    def _begin_seal(self) -> None:
+        """Write all waiting frames, and begin to make them durable; those before are sealed then."""
+        self._end_seal()
         if not self._waiting:
             return
         frames, rows = zip(*self._waiting, strict=True)
@@ -127,18 +141,37 @@ class Store(ABC):
         try:
             joined = self._joined_size(self._layout, counts)
             require_free_space(self._directory, size, purpose, kept, joined=joined, several=self.several)
-            self._write(self._layout, frames, rows, size)
+            seal = self._write(self._layout, frames, rows, size)
         except (OSError, RuntimeError, RunError) as error:
-            self._waiting.clear()
-            if isinstance(error, RunError):
-                raise
-            reason = getattr(error, "strerror", None) or error
-            kind = NoRoomError if is_full(error) else RunError
-            raise kind(f"{purpose} could not be written to {self.place} ({reason}); {kept}.") from error
-        self.frames_written += len(frames)
-        self.bytes_written += size
-        self.seconds += time.perf_counter() - began
+            raise self._failure(error, purpose) from error
         self._waiting.clear()
+        # Files of a series are made by Python, which a thread does not get beside a launch.
+        aside = size >= ASIDE and not self.several
+        self._sealing = _Sealing(seal, purpose, len(frames), size, began, aside=aside)
+        if not aside:
+            self._end_seal()
+
+    def _end_seal(self) -> None:
+        """Wait until the frames that were written are durable."""
+        if self._sealing is None:
+            return
+        sealing = self._sealing
+        error = sealing.wait()
+        self._sealing = None
+        if error is not None:
+            raise self._failure(error, sealing.purpose) from error
+        self.frames_written += sealing.frames
+        self.bytes_written += sealing.size
+        self.seconds += sealing.seconds
+
+    def _failure(self, error: Exception, purpose: str) -> Exception:
+        """Give up the waiting frames, and return the error of frames that could not be written."""
+        self._waiting.clear()
+        if isinstance(error, RunError) or not isinstance(error, OSError | RuntimeError):
+            return error
+        reason = getattr(error, "strerror", None) or error
+        kind, kept = NoRoomError if is_full(error) else RunError, _frames_kept(self.frames_written)
+        return kind(f"{purpose} could not be written to {self.place} ({reason}); {kept}.")
 
     @abstractmethod
     def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
@@ -169,8 +202,50 @@ class Store(ABC):
         return 0
 
     @abstractmethod
-    def _write(self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int) -> None:
-        """Write frames, durably."""
+    def _write(
+        self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int
+    ) -> Callable[[], None]:
+        """Write frames, and return what makes them durable."""
+
+
+class _Sealing:
+    """Frames that become durable.
+
+    Attributes:
+        purpose: what they are, in words; frames: their number; size: bytes.
+        seconds: wall time from the beginning of their write until they were durable.
+    """
+
+    def __init__(
+        self, seal: Callable[[], None], purpose: str, frames: int, size: int, began: float, *, aside: bool
+    ) -> None:
+        """Begin to seal: in a thread where it is done `aside`, else at once; `began` is when their write did."""
+        self.purpose, self.frames, self.size, self.seconds = purpose, frames, size, 0.0
+        self._seal, self._began = seal, began
+        self._error: Exception | None = None
+        self._thread = Thread(target=self._run, name="seal") if aside else None
+        if self._thread is None:
+            self._run()
+        else:
+            self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self._seal()
+        except Exception as error:
+            self._error = error
+        self.seconds = time.perf_counter() - self._began
+
+    @property
+    def done(self) -> bool:
+        """Whether `wait` returns at once."""
+        return self._thread is None or not self._thread.is_alive()
+
+    def wait(self) -> Exception | None:
+        """Wait for the end, and return the error of what failed."""
+        if self._thread is not None:
+            self._thread.join()
+        return self._error
 
 
 def _frames_kept(count: int) -> str:

@@ -18,7 +18,7 @@ from mpmcli.output.run_record import read_record
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.series import SERIES
 from mpmcli.output.sums_file import SUMS, sums_faults
-from mpmcli.output.vtkhdf import open_vtkhdf, read_array, read_index
+from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_array, read_index
 from mpmcli.plain_text import counted
 
 # What h5py raises on damaged files.

@@ -18,41 +18,24 @@ import h5py
 import numpy as np
 
 from mpmcli import __version__
-from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import (
-    Checksums,
     attribute_checksum,
     checksum,
     kind_checksum,
-    load_checksums,
     store_checksums,
     table_checksum,
 )
 from mpmcli.output.file_checksum import append_checksum, gaps_of
-from mpmcli.output.frame_index import FrameIndex
-from mpmcli.output.guarded_read import read_rows, read_whole
-from mpmcli.output.hdf5_heaps import require_sound_heaps
-from mpmcli.output.hdf5_items import held
-from mpmcli.output.layout import POSITION, FrameLayout
-from mpmcli.output.ledger_table import ledger_columns, read_ledger
-from mpmcli.output.vtkhdf_parts import CONNECTIVITY, part_tables
+from mpmcli.output.layout import FrameLayout
+from mpmcli.output.ledger_table import ledger_columns
+from mpmcli.output.vtkhdf_parts import BLOCK_BYTES, CONNECTIVITY, array_path, part_tables
 
 # A newer upper bound makes files that no VTK can open ("bad version number for layout message").
 LIBVER = ("v110", "v110")
 # 1 has no checksums.
 FORMAT = 2
-OLDEST = 1
 CHUNK_BYTES = 2**20
-# Size without the particles: headers, tables of the steps, ledger. Used to reserve disk space.
-OVERHEAD_BYTES = 64 * 1024
-OVERHEAD_BYTES_PER_FRAME = 1024
-
-
-def file_size(layout: FrameLayout, counts: Sequence[int]) -> int:
-    """Bytes of an uncompressed file with frames of `counts` particles, rounded up."""
-    particles = sum(counts) * layout.bytes_per_particle + 8 * max(counts, default=0)
-    return particles + OVERHEAD_BYTES + OVERHEAD_BYTES_PER_FRAME * len(counts)
 
 
 class VtkhdfWriter:
@@ -72,6 +55,8 @@ class VtkhdfWriter:
         self._compress = compress
         self._checksums = np.zeros((len(counts), len(layout.arrays)), np.uint32)
         self._columns = {name: column for column, name in enumerate(layout.arrays)}
+        # Rows of each array that were written, and the frame of the next one.
+        self._rows, self._frames = dict.fromkeys(layout.arrays, 0), dict.fromkeys(layout.arrays, 0)
         # Of compressed arrays, rows that do not fill a chunk yet.
         self._waiting: dict[str, np.ndarray] = {}
         self._path, self._finished = path, False
@@ -87,11 +72,11 @@ class VtkhdfWriter:
         for name, array in layout.arrays.items():
             shape = array.stored_shape(int(self._offsets[-1]))
             options = self._storage(shape, array.bytes_per_particle)
-            self._datasets[name] = root.create_dataset(_path(name), shape, array.dtype, **options)
-            self._items[f"VTKHDF/{_path(name)}"] = kind_checksum(np.dtype(array.dtype), shape)
+            self._datasets[name] = root.create_dataset(array_path(name), shape, array.dtype, **options)
+            self._items[f"VTKHDF/{array_path(name)}"] = kind_checksum(np.dtype(array.dtype), shape)
         for name, table in part_tables(self._counts).items():
-            options = self._storage(table.shape, table.itemsize) if name == CONNECTIVITY else {}
-            self._put(f"VTKHDF/{name}", table, **options)
+            self._put(f"VTKHDF/{name}", table)
+        self._put_connectivity(int(self._counts.max()))
 
     def __enter__(self) -> "VtkhdfWriter":
         return self
@@ -102,17 +87,24 @@ class VtkhdfWriter:
         if self._finished:
             append_checksum(self._path, gaps)
 
-    def write_array(self, k: int, name: str, stored: np.ndarray, frames: int = 1) -> None:
-        """Write one array of `frames` frames from the k-th on, in the form of the file (see `ArrayLayout.pad`)."""
-        data, first = self._datasets[name], self._offsets[k]
+    def append(self, name: str, stored: np.ndarray) -> None:
+        """Write the next rows of an array, of parts of a frame or of several, as `ArrayLayout.pad` gives them."""
+        data, first, column = self._datasets[name], self._rows[name], self._columns[name]
         rows = np.ascontiguousarray(stored, data.dtype)
-        for j in range(k, k + frames):
-            frame = rows[self._offsets[j] - first : self._offsets[j + 1] - first]
-            self._checksums[j, self._columns[name]] = checksum(frame)
+        self._rows[name] = end = first + len(rows)
+        while True:
+            k = self._frames[name]
+            own = rows[max(0, self._offsets[k] - first) : max(0, self._offsets[k + 1] - first)]
+            self._checksums[k, column] = checksum(own, int(self._checksums[k, column]))
+            if end < self._offsets[k + 1] or k + 1 == len(self._counts):
+                break
+            self._frames[name] = k + 1
+            if end == self._offsets[k + 1]:
+                break
         if data.chunks is None:
-            data[first : self._offsets[k + frames]] = rows
+            data[first:end] = rows
         else:
-            self._write_chunks(name, rows, int(self._offsets[k + frames]))
+            self._write_chunks(name, rows, end)
 
     @property
     def checksums(self) -> np.ndarray:
@@ -163,13 +155,23 @@ class VtkhdfWriter:
             self._put_attribute("mpmcli", name, value)
         self._put("VTKHDF/Steps/Values", np.asarray(times, dtype=np.float64))
         self._put_attribute("VTKHDF/Steps", "NSteps", np.int64(len(self._counts)))
-        arrays = [f"VTKHDF/{_path(name)}" for name in self._columns]
+        arrays = [f"VTKHDF/{array_path(name)}" for name in self._columns]
         store_checksums(self._file, "mpmcli", arrays, self._checksums, self._items)
         self._finished = True
 
-    def _put(self, path: str, table: np.ndarray, **options: Any) -> None:
-        self._file.create_dataset(path, data=table, **options)
+    def _put(self, path: str, table: np.ndarray) -> None:
+        self._file.create_dataset(path, data=table)
         self._items[path] = table_checksum(table)
+
+    def _put_connectivity(self, n: int) -> None:
+        """Write the numbers of the n particles, all at once where they are compressed, as chunks may not be divided."""
+        path, size = f"VTKHDF/{CONNECTIVITY}", n if self._compress else BLOCK_BYTES // 8
+        data = self._file.create_dataset(path, (n,), np.int64, **self._storage((n,), 8))
+        self._items[path] = kind_checksum(data.dtype, data.shape)
+        for first in range(0, n, max(1, size)):
+            numbers = np.arange(first, min(first + size, n), dtype=np.int64)
+            data[first : first + size] = numbers
+            self._items[path] = checksum(numbers, self._items[path])
 
     def _put_attribute(self, path: str, name: str, value: Any) -> None:
         if isinstance(value, str):
@@ -190,96 +192,3 @@ class VtkhdfWriter:
             "compression_opts": 1,
             "shuffle": True,
         }
-
-
-def open_vtkhdf(path: Path) -> h5py.File:
-    """Open a sealed file for reading; it never changes again, so no lock is taken.
-
-    Raises:
-        InputError: the file is missing, damaged, or was not written by mpmcli.
-    """
-    try:
-        require_sound_heaps(path)
-        try:
-            file = h5py.File(path, "r", locking=False)
-        except OSError:
-            # This process has the file open with locking; HDF5 requires one setting for all handles.
-            file = h5py.File(path, "r")
-    except OSError as error:
-        reason = "is not an HDF5 file, or a damaged one" if path.exists() else "does not exist"
-        raise InputError(f"{path} {reason}; give a particles.vtkhdf of mpmcli or its directory.") from error
-    try:
-        form = _format(file)
-    except BaseException:
-        file.close()
-        raise
-    if form is not None and OLDEST <= form <= FORMAT:
-        return file
-    file.close()
-    if form is not None and form > FORMAT:
-        raise InputError(f"{path} was written by a newer version of mpmcli; update mpmcli to read it.")
-    raise InputError(f"{path} is an HDF5 file, but mpmcli did not write it: its group /mpmcli is missing.")
-
-
-def _format(file: h5py.File) -> int | None:
-    """Return the format of a file, None where it is not of mpmcli."""
-    try:
-        form = held(file, "mpmcli").attrs["format"]
-        ours = isinstance(form, np.integer) and isinstance(held(file, "VTKHDF"), h5py.Group)
-        return int(form) if ours else None
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError):
-        return None
-
-
-def read_index(file: h5py.File) -> FrameIndex:
-    """Read everything but the particles.
-
-    Raises:
-        DamageError: it has changed since it was written.
-        InputError: a link in the file leads elsewhere.
-        Exception: what h5py, numpy and JSON raise, and ValueError, where the file contradicts itself.
-    """
-    checksums = load_checksums(file, "mpmcli") if _format(file) > 1 else None
-
-    def table(path: str, kinds: str = "iu") -> np.ndarray:
-        found = read_whole(file, path, kinds)
-        if checksums is not None:
-            checksums.require(path, table_checksum(found))
-        return found
-
-    def attribute(name: str) -> str:
-        found = group.attrs[name]
-        if checksums is not None:
-            checksums.require(f"mpmcli@{name}", attribute_checksum(found))
-        return found
-
-    group = held(file, "mpmcli")
-    header = dict(json.loads(attribute("header")))
-    if "scene" in group.attrs:
-        header["scene"] = attribute("scene")
-    layout = FrameLayout.from_dict(json.loads(attribute("layout")))
-    return FrameIndex(
-        layout=layout,
-        header=header,
-        times=table("VTKHDF/Steps/Values", "f"),
-        frames=table("mpmcli/frame"),
-        steps=table("mpmcli/step"),
-        offsets=table("VTKHDF/Steps/PointOffsets"),
-        counts=table("VTKHDF/NumberOfPoints"),
-        ledger=read_ledger(held(file, "ledger"), lambda name, kinds: table(f"ledger/{name}", kinds)),
-        checksums=checksums and _columns_of(checksums, layout),
-    ).checked()
-
-
-def _columns_of(checksums: Checksums, layout: FrameLayout) -> np.ndarray:
-    """Return the checksums of the frames, (T, A) uint32, in the order of the arrays of the layout."""
-    return checksums.table[:, [checksums.arrays.index(f"VTKHDF/{_path(name)}") for name in layout.arrays]]
-
-
-def read_array(file: h5py.File, name: str, offset: int, count: int) -> np.ndarray:
-    """Read one array of one frame, in the form of the file; its checksum is not compared."""
-    return read_rows(file, f"VTKHDF/{_path(name)}", offset, count)
-
-
-def _path(name: str) -> str:
-    return name if name == POSITION else f"PointData/{name}"

@@ -40,7 +40,7 @@ def initial_motion(body: Body, position: np.ndarray) -> tuple[np.ndarray, np.nda
         if body.velocity_gradient is not None:
             affine = np.array(body.velocity_gradient)
             velocity = velocity + _offset(body, position) @ affine.T
-        return np.ascontiguousarray(velocity), np.broadcast_to(affine, (n, d, d))
+        return velocity, np.broadcast_to(affine, (n, d, d))
     velocity = entries_at(body.velocity, position)
     if replaces_gradient(body):
         return velocity, matrix_at(body.velocity_gradient, position)

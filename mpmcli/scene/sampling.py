@@ -18,7 +18,7 @@ from mpmcli.scene.schema import Body, Scene
 from mpmcli.scene.sheets import sheets_of
 
 # Lattice points that are looked at together; bounds the memory that sampling needs beyond its result.
-_POINTS_AT_ONCE = 1_000_000
+_POINTS_AT_ONCE = 2**16
 # Particles of which a body with random ones gets some.
 _SURE = 100
 
@@ -30,7 +30,7 @@ class BodyParticles:
     Attributes:
         name: name of the body.
         position: (n, d) float64, m, in the coordinates of the scene.
-        velocity: (n, d) float64, m/s.
+        velocity: (n, d) float64, m/s; one read-only row where all have the same.
         affine: (n, d, d) float64, initial velocity gradient, 1/s; one read-only matrix where all have the same.
         volume: of each particle, m^3 (m^2 in 2D): that of the shape divided by n.
         mass: of each particle, kg (kg per metre of depth in 2D).

@@ -74,7 +74,7 @@ class Checkpointer:
                 numbers=numbers,
                 arrays=saved.arrays,
             )
-            write_checkpoint(self._directory, point)
+            write_checkpoint(self._directory, point, saved.arrays.nbytes)
             self.taken += 1
         self._last = time.monotonic()
         self._cost = self._last - sealed

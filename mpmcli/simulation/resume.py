@@ -22,7 +22,7 @@ from mpmcli.output.result import open_result
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments, segment_name
 from mpmcli.output.series import SERIES
 from mpmcli.output.verify import verify_file
-from mpmcli.output.vtkhdf import open_vtkhdf, read_index
+from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_index
 from mpmcli.plain_text import counted
 from mpmcli.scene import LoadedScene, scene_to_toml
 from mpmcli.solver.backend import Backend

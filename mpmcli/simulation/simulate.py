@@ -228,7 +228,10 @@ def _run(
     kept = store.frames_written
 
     def after_step() -> bool:
-        store.seal_due()
+        with clock.adding("output_s"):
+            store.seal_due()
+        if store.frames_written > max(kept, summary.frames):
+            report()
         ends = halt()
         if ends or checkpoints.due():
             checkpoints.take()
@@ -262,6 +265,8 @@ def _run(
                 rows.append(row)
             with clock.adding("output_s"):
                 store.write(frame, row)
+            # The next one is made of memory that this one gives back.
+            del frame
             report()
             halt.wrote(store.bytes_written, store.seconds)
     except BaseException:

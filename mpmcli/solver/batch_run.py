@@ -75,6 +75,7 @@ class BatchRun(Run):
         write_constants(batch, slot, scene, self._particles)
         self._row.set(horizon=-math.inf if self._means else math.inf, collider=self._collider_bound)
         self._row.set_counts(status=MEASURE, forced=self._forced)
+        self._forget_particles()
 
     def _measurement(self, g: int) -> Measurement:
         first = self._real.maxima[g]
@@ -133,7 +134,7 @@ class BatchRun(Run):
         """Wait until the device has taken every step; each launch waits."""
 
     def save(self) -> SavedState:
-        """Copy the state of the only run of a batch to the host, between two launches."""
+        """Return the state of the only run of a batch; see `Engine.save`."""
         numbers = {name: getattr(self.state, name) for name in Progress.NUMBERS}
         numbers["step_control"] = self.state.step_control.save()
         numbers["external_forces"] = self.state.external_forces.save()

@@ -1,6 +1,7 @@
 """The complete state of the only run of a batch on the CPU, saved and loaded as one; see `state.State`."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import taichi as ti
@@ -8,19 +9,18 @@ import taichi as ti
 from mpmcli.errors import InputError
 from mpmcli.solver.batch import Batch
 from mpmcli.solver.batch_layout import Row
-from mpmcli.solver.state import shape_of
+from mpmcli.solver.state import ArraysOnDevice, shape_of
 
 # Columns that the scene sets, and that one which goes on for longer sets otherwise.
 OF_SCENE = ("end", "until"), ("frames", "sheets")
 
 
-def read_batch(batch: Batch) -> dict[str, np.ndarray]:
-    """Return what a batch of one run has on the device and tells its kernel, by name."""
-    found = {name: field.to_numpy() for name, field in _fields(batch).items()}
-    return found | {"numbers": batch.numbers[0].copy(), "counts": batch.counts[0].copy()}
+def read_batch(batch: Batch) -> ArraysOnDevice:
+    """Return what a batch of one run has on the device and tells its kernel, by name, until the next launch."""
+    return ArraysOnDevice(_fields(batch), {"numbers": batch.numbers[0], "counts": batch.counts[0]})
 
 
-def write_batch(batch: Batch, arrays: dict[str, np.ndarray]) -> None:
+def write_batch(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
     """Replace what a batch of one run has by what was read of one of the same scene, or of one that ended earlier.
 
     Raises:

@@ -63,7 +63,10 @@ class Engine(Protocol):
         """
 
     def save(self) -> SavedState:
-        """Return the state, where `stop` of `frames` is called."""
+        """Return the state, where `stop` of `frames` is called.
+
+        Its arrays are copied from the device one by one as they are asked for, which is over when the next step begins.
+        """
 
     def load(self, saved: SavedState) -> None:
         """Go on from a saved state of the same scene, or of one that ends earlier, with the frames that follow.

@@ -1,6 +1,6 @@
 """What the particles show at output times, row i being particle i, and the fields of frames made of it."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,8 @@ from mpmcli.solver.particle_arrays import MASS, VOLUME
 
 # Fields that need the stress of every particle.
 STRESSES = ("stress", "pressure")
+# Particles of which arrays are computed at once, which bounds the memory and suits the cache.
+PART = 2**15
 # Rows and columns of the entries of a symmetric 3 x 3 matrix; 2D leaves out those that vanish.
 ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
@@ -17,6 +19,12 @@ ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 def stress_entries(dimension: int) -> tuple[tuple[int, int], ...]:
     """Return row and column of each stored entry of tau."""
     return ENTRIES if dimension == 3 else ENTRIES[:4]
+
+
+def parts_of(count: int) -> Iterator[slice]:
+    """Yield the rows of `count` particles, PART at a time."""
+    for first in range(0, count, PART):
+        yield slice(first, min(first + PART, count))
 
 
 class FrameColumns:
@@ -79,48 +87,82 @@ class FrameArrays:
             return self.reals[..., first]
         return self.reals[..., first : first + self.columns.widths[name]]
 
+    def of_rows(self, rows: slice) -> "FrameArrays":
+        """Return a view of some particles."""
+        return FrameArrays(self.columns, self.reals[:, rows])
 
-@dataclass(frozen=True)
-class ParticleConstants:
+
+class RunConstants:
     """What never changes of the particles of a run, n in all, row i being particle i.
 
     Attributes:
-        body, material: (n,) int32, index into the scene's bodies and into the run's laws.
-        mass, volume: (n,) float64, kg and m^3 at rest.
-        flows: (n,) bool, whether the law is a liquid or grains.
-        members: of each law, itself and the rows of its particles.
+        body, material: (n,) int32, read-only, index into the scene's bodies and into the run's laws.
     """
 
-    body: np.ndarray
-    material: np.ndarray
-    mass: np.ndarray
-    volume: np.ndarray
-    flows: np.ndarray
-    members: tuple[tuple[Law, slice | np.ndarray], ...]
-
-    @staticmethod
-    def of(groups: Sequence, counts: Sequence[int]) -> "ParticleConstants":
-        """Return those of a run.
+    def __init__(self, groups: Sequence, counts: Sequence[int]) -> None:
+        """Keep what the bodies have.
 
         Args:
             groups: particles of each law, with `law`, `bodies` and `rows` as `ParticleGroup` has them.
             counts: particles of each body of the scene.
         """
-        per_body = np.zeros((len(counts), 3))
+        self._laws = [group.law for group in groups]
+        # Of each body: its law, and the mass and the volume of a particle.
+        self._law_of = np.zeros(len(counts), np.int32)
+        self._table = np.zeros((len(counts), 2))
         for g, group in enumerate(groups):
-            per_body[list(group.bodies)] = np.column_stack(
-                [np.full(len(group.bodies), g), group.rows[:, [MASS, VOLUME]]]
-            )
-        body = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-        material, mass, volume = per_body[body].T
-        material = material.astype(np.int32)
-        rows = [slice(None)] if len(groups) == 1 else [np.flatnonzero(material == g) for g in range(len(groups))]
+            self._law_of[list(group.bodies)] = g
+            self._table[list(group.bodies)] = group.rows[:, [MASS, VOLUME]]
+        self._flows = np.array([law.flows for law in self._laws])
+        if len(counts) == 1:
+            self.body = self.material = np.broadcast_to(np.int32(0), counts[0])
+        else:
+            self.body = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+            self.material = self._law_of[self.body]
         # Every frame shares them.
-        for array in (body, material):
+        for array in (self.body, self.material):
             array.flags.writeable = False
-        members = tuple((group.law, own) for group, own in zip(groups, rows, strict=True))
-        flows = np.array([group.law.flows for group in groups])[material]
-        return ParticleConstants(body, material, mass, volume, flows, members)
+        self._all: ParticleConstants | None = None
+
+    @property
+    def masses(self) -> np.ndarray:
+        """Mass of a particle of each body, kg."""
+        return self._table[:, 0]
+
+    def of_rows(self, rows: slice) -> "ParticleConstants":
+        """Return those of some rows."""
+        whole = rows.stop - rows.start == len(self.body)
+        if whole and self._all is not None:
+            return self._all
+        body, material = self.body[rows], self.material[rows]
+        if len(self._table) == 1:
+            mass, volume, flows = (np.broadcast_to(value, body.shape) for value in (*self._table[0], self._flows[0]))
+        else:
+            (mass, volume), flows = self._table[body].T, self._flows[material]
+        members = tuple(
+            (law, slice(None) if len(self._laws) == 1 else np.flatnonzero(material == g))
+            for g, law in enumerate(self._laws)
+        )
+        found = ParticleConstants(mass, volume, flows, members)
+        if whole:
+            self._all = found
+        return found
+
+
+@dataclass(frozen=True)
+class ParticleConstants:
+    """What never changes of some particles of a run, n of them.
+
+    Attributes:
+        mass, volume: (n,) float64, kg and m^3 at rest.
+        flows: (n,) bool, whether the law is a liquid or grains.
+        members: of each law, itself and the rows of its particles.
+    """
+
+    mass: np.ndarray
+    volume: np.ndarray
+    flows: np.ndarray
+    members: tuple[tuple[Law, slice | np.ndarray], ...]
 
     def volume_ratios(self, arrays: FrameArrays) -> np.ndarray:
         """Return volume over volume at rest, (T, n)."""
@@ -142,7 +184,7 @@ class ParticleConstants:
             names: of output fields, other than the velocity and the initial position.
         """
         real = arrays.reals.dtype
-        return {name: np.ascontiguousarray(self._field(name, arrays, ratios), real) for name in names}
+        return {name: np.asarray(self._field(name, arrays, ratios), real) for name in names}
 
     def _field(self, name: str, arrays: FrameArrays, ratios: np.ndarray) -> np.ndarray:
         match name:

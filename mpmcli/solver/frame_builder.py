@@ -8,10 +8,10 @@ import numpy as np
 from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
-from mpmcli.solver.frame_arrays import FrameArrays, FrameColumns, ParticleConstants
+from mpmcli.solver.frame_arrays import FrameArrays, FrameColumns, ParticleConstants, RunConstants, parts_of
 from mpmcli.solver.ordering import ACTIVE, RETIRED, WAITING
 from mpmcli.solver.sums import StepsTaken, Sums, ledger_rows, ledger_sums
-from mpmcli.solver.volume_error import volume_errors
+from mpmcli.solver.volume_error import FilledCells, times_at_once
 from mpmcli.stability.transfer_factors import affine_moment
 
 # Largest rounding of a stored position, in cells.
@@ -49,14 +49,15 @@ class FrameBuilder:
         """Keep what never changes.
 
         Args:
-            groups: the particles of each law, see `ParticleConstants.of`.
+            groups: the particles of each law, see `RunConstants`.
         """
         self._scene = scene
-        self._constants = ParticleConstants.of(groups, [len(b.position) for b in particles])
+        self._constants = RunConstants(groups, [len(b.position) for b in particles])
+        self._flows = any(group.law.flows for group in groups)
         self._names = [name for name in scene.output.fields if name not in ("velocity", "initial_position")]
         internal = max(len(group.law.internal) for group in groups)
         self.columns = FrameColumns(scene.dimension, internal, self._names, comes_and_goes=scene.comes_and_goes)
-        self._waits = np.repeat([b.waits for b in particles], [len(b.position) for b in particles])
+        self._waits = np.array([b.waits for b in particles])
         self._origin = np.array(scene.domain.origin)
         # Far from zero single precision cannot tell neighbours apart, though the solver, which counts from the
         # origin of the domain, can.
@@ -78,13 +79,24 @@ class FrameBuilder:
             moments: T of them; arrays: of the particles at each; sums: of each law at each.
         """
         scene, constants = self._scene, self._constants
-        ratios = constants.volume_ratios(arrays)
-        fields = constants.fields(arrays, ratios, self._names)
+        (times, n), d = arrays.reals.shape[:2], scene.dimension
+        position = np.empty((times, n, d), self._position_type)
+        velocity = np.empty((times, n, d), arrays.reals.dtype)
+        status = np.empty((times, n), np.int8) if scene.comes_and_goes else None
+        fields: dict[str, np.ndarray] = {}
+        totals = _Totals(scene, arrays["x"], times, self._waits, flows=self._flows)
+        for rows in parts_of(n):
+            own, same = arrays.of_rows(rows), constants.of_rows(rows)
+            ratios = same.volume_ratios(own)
+            position[:, rows], velocity[:, rows] = own["x"] + self._origin, own["v"]
+            for name, values in same.fields(own, ratios, self._names).items():
+                whole = fields.setdefault(name, np.empty((times, n, *values.shape[2:]), values.dtype))
+                whole[:, rows] = values
+            if status is not None:
+                status[:, rows] = own["activity"]
+            totals.add(own["x"], ratios, same, constants.body[rows], None if status is None else status[:, rows])
         if self._initial is not None:
-            fields["initial_position"] = np.broadcast_to(self._initial, arrays["x"].shape)
-        position = (arrays["x"] + self._origin).astype(self._position_type)
-        velocity = np.ascontiguousarray(arrays["v"])
-        status = arrays["activity"].astype(np.int8) if scene.comes_and_goes else None
+            fields["initial_position"] = np.broadcast_to(self._initial, position.shape)
         frames = [
             Frame(
                 index=moment.index,
@@ -104,18 +116,10 @@ class FrameBuilder:
         gravity = np.array([scene.domain.gravity_at(moment.time) for moment in moments])
         last_steps = np.array([moment.last_step for moment in moments])
         spacing = scene.domain.spacing
-        conserved = ledger_sums(sums, ratios, gravity, spacing, last_steps, affine_moment(scene.solver))
-        if status is None:
-            conserved["volume_error"] = volume_errors(
-                arrays["x"],
-                ratios * constants.volume,
-                constants.flows,
-                spacing,
-                scene.domain.cells,
-                scene.domain.periodic,
-            )
-        else:
-            conserved |= self._of_active(moments, arrays["x"], ratios, status)
+        conserved = ledger_sums(sums, gravity, spacing, last_steps, affine_moment(scene.solver))
+        conserved |= totals.entries(constants.masses)
+        if status is not None:
+            conserved["blocked"] = np.array([moment.blocked for moment in moments])
         if scene.colliders:
             conserved["collider_force"], conserved["collider_torque"] = self._collider_loads(moments)
         times, taken = [moment.time for moment in moments], [moment.taken for moment in moments]
@@ -131,34 +135,73 @@ class FrameBuilder:
         loads = np.array(found)
         return loads[..., :d], loads[..., d:]
 
-    def _of_active(
-        self, moments: Sequence[Moment], x: np.ndarray, ratios: np.ndarray, status: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """Return the entries of the ledger that count only particles that take part, and those on the others, (T,).
+
+class _Totals:
+    """Entries of the ledger over all particles at T times, which are added a part after another."""
+
+    def __init__(self, scene: Scene, x: np.ndarray, times: int, waits: np.ndarray, *, flows: bool) -> None:
+        """Begin.
 
         Args:
-            x: (T, n, d), m; ratios, status: (T, n).
+            x: of all particles, (T, n, d), m.
+            waits: whether the particles of each body belong to an emitter.
+            flows: whether any material does.
         """
-        constants, scene = self._constants, self._scene
-        extent = np.array(scene.domain.size)
-        names = ("volume_error", "volume_ratio_min", "volume_ratio_max")
-        found: dict[str, list] = {name: [] for name in (*names, "emitted", "emitted_mass", "retired", "retired_mass")}
-        for place, J, state in zip(x, ratios, status, strict=True):
+        domain = scene.domain
+        self._extent, self._waits = np.array(domain.size), waits
+        self._low, self._high = np.full(times, np.inf), np.full(times, -np.inf)
+        # Particles of each body that have been let in, and that have left.
+        self._entered, self._retired = (np.zeros((times, len(waits)), np.int64) for _ in range(2))
+        self._comes_and_goes = scene.comes_and_goes
+        at_once = 1 if scene.comes_and_goes else times_at_once(domain.cells)
+        self._filled = [
+            (own, FilledCells(x[own], domain.spacing, domain.cells, domain.periodic))
+            for own in (slice(t, t + at_once) for t in range(0, times, at_once) if flows)
+        ]
+
+    def add(
+        self,
+        x: np.ndarray,
+        ratios: np.ndarray,
+        constants: ParticleConstants,
+        body: np.ndarray,
+        status: np.ndarray | None,
+    ) -> None:
+        """Add particles: x, (T, k, d), m, ratios and status, (T, k), body, (k,)."""
+        if status is not None:
+            self._add_active(x, ratios, constants, body, status)
+            return
+        self._low = np.minimum(self._low, ratios.min(axis=1))
+        self._high = np.maximum(self._high, ratios.max(axis=1))
+        for own, filled in self._filled:
+            filled.add(x[own], ratios[own] * constants.volume, constants.flows)
+
+    def _add_active(
+        self, x: np.ndarray, ratios: np.ndarray, constants: ParticleConstants, body: np.ndarray, status: np.ndarray
+    ) -> None:
+        """Add particles of which only some take part; they alone count."""
+        for t, (place, J, state) in enumerate(zip(x, ratios, status, strict=True)):
             active = state == ACTIVE
+            self._low[t] = J[active].min(initial=self._low[t])
+            self._high[t] = J[active].max(initial=self._high[t])
             # Beyond an open face there are no cells to look at.
-            seen = active & ((place >= 0) & (place <= extent)).all(axis=1)
-            found["volume_error"] += volume_errors(
-                place[None, seen],
-                (J * constants.volume)[None, seen],
-                constants.flows[seen],
-                scene.domain.spacing,
-                scene.domain.cells,
-                scene.domain.periodic,
-            ).tolist()
-            found["volume_ratio_min"].append(J[active].min(initial=np.inf) if active.any() else 1.0)
-            found["volume_ratio_max"].append(J[active].max(initial=0.0) if active.any() else 1.0)
-            for name, own in (("emitted", self._waits & (state != WAITING)), ("retired", state == RETIRED)):
-                found[name].append(int(own.sum()))
-                found[f"{name}_mass"].append(float(constants.mass[own].sum()))
-        found["blocked"] = [moment.blocked for moment in moments]
-        return {name: np.array(values) for name, values in found.items()}
+            seen = active & ((place >= 0) & (place <= self._extent)).all(axis=1)
+            for _, filled in self._filled[t : t + 1]:
+                filled.add(place[None, seen], (J * constants.volume)[None, seen], constants.flows[seen])
+            for counts, own in ((self._entered, state != WAITING), (self._retired, state == RETIRED)):
+                counts[t] += np.bincount(body[own], minlength=len(self._waits))
+
+    def entries(self, masses: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the entries of `LedgerRow` by name, (T,); `masses` of a particle of each body, kg."""
+        # Where no particle takes part, none has changed its volume.
+        none = self._low > self._high
+        errors = [filled.errors() for _, filled in self._filled]
+        found = {
+            "volume_ratio_min": np.where(none, 1.0, self._low),
+            "volume_ratio_max": np.where(none, 1.0, self._high),
+            "volume_error": np.concatenate(errors) if errors else np.zeros(len(none)),
+        }
+        if self._comes_and_goes:
+            for name, counts in (("emitted", self._entered * self._waits), ("retired", self._retired)):
+                found[name], found[f"{name}_mass"] = counts.sum(axis=1), counts @ masses
+        return found

@@ -10,7 +10,7 @@ from mpmcli.scene import BodyParticles
 from mpmcli.solver.particle_arrays import ParticleArrays
 
 # Particles that the device takes at once.
-PART = 2**18
+PART = 2**15
 
 
 def table_of(law: Law, particles: Sequence[BodyParticles]) -> np.ndarray:

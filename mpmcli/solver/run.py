@@ -188,6 +188,11 @@ class Run:
     def _builder(self) -> FrameBuilder:
         return FrameBuilder(self.scene, self._particles, self.groups)
 
+    def _forget_particles(self) -> None:
+        """Give back the memory of the particles at the start, which are on the device; frames keep what they show."""
+        _ = self._builder
+        self._particles = []
+
     def _read(self, arrays: FrameArrays) -> list[Sums]:
         """Fill all rows of a frame on the CPU; return the sums of each group.
 

@@ -79,8 +79,8 @@ class Solver(Run):
         """Take the bounds of time 0; done when the device was filled."""
 
     def save(self) -> SavedState:
-        """Copy the state, and the place among the frames, to the host; between steps."""
-        saved = self.state.save()
+        """Return the state, and the place among the frames; its arrays are copied when asked for, before a step."""
+        saved = self.state.on_device()
         saved.numbers["frames"] = [self._next, asdict(self._taken), self._builder.before]
         return saved
 

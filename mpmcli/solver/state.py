@@ -1,9 +1,10 @@
 """The complete state of a run: everything that its next step depends on, saved and loaded as one."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 import taichi as ti
@@ -17,6 +18,9 @@ from mpmcli.solver.schedule import Schedule
 from mpmcli.solver.step_control import StepControl
 from mpmcli.solver.volume_relaxation import INTERVAL
 
+# Bytes of a number on the device.
+SIZES = {ti.f32: 4, ti.f64: 8, ti.i32: 4}
+
 
 @dataclass(frozen=True)
 class SavedState:
@@ -28,7 +32,31 @@ class SavedState:
     """
 
     numbers: dict[str, object]
-    arrays: dict[str, np.ndarray]
+    arrays: Mapping[str, np.ndarray]
+
+
+class ArraysOnDevice(Mapping[str, np.ndarray]):
+    """Arrays of a state that are copied one by one, as they are asked for, before the next step.
+
+    Attributes:
+        nbytes: of all of them.
+    """
+
+    def __init__(self, fields: Mapping[str, ti.Field], others: Mapping[str, np.ndarray] = MappingProxyType({})) -> None:
+        """Name the arrays: those of fields, and others, which are on the host."""
+        self._fields, self._others = fields, others
+        entries = sum(math.prod(shape_of(field)) * SIZES[field.dtype] for field in fields.values())
+        self.nbytes = entries + sum(array.nbytes for array in others.values())
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self._others[name].copy() if name in self._others else self._fields[name].to_numpy()
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self._fields
+        yield from self._others
+
+    def __len__(self) -> int:
+        return len(self._fields) + len(self._others)
 
 
 class Progress:
@@ -111,6 +139,11 @@ class State(Progress):
 
     def save(self) -> SavedState:
         """Copy the state to the host."""
+        saved = self.on_device()
+        return SavedState(saved.numbers, dict(saved.arrays))
+
+    def on_device(self) -> SavedState:
+        """Return the state, whose arrays are copied as they are asked for, before the next step."""
         numbers = {name: getattr(self, name) for name in self.NUMBERS}
         numbers["step_control"] = self.step_control.save()
         numbers["external_forces"] = self.external_forces.save()
@@ -118,7 +151,7 @@ class State(Progress):
             numbers["schedule"] = {name: copy(getattr(self._schedule, name)) for name in self._schedule.STATE}
         if self._groups[0].comes_and_goes:
             numbers["active"] = [group.active for group in self._groups]
-        return SavedState(numbers, {name: field.to_numpy() for name, field in self._fields().items()})
+        return SavedState(numbers, ArraysOnDevice(self._fields()))
 
     def load(self, saved: SavedState) -> None:
         """Replace the state by one that was saved, of a solver of the same scene.

@@ -63,7 +63,6 @@ def axis_pairs(dimension: int) -> tuple[tuple[int, int], ...]:
 
 def ledger_sums(
     sums: Sequence[Sums],
-    volume_ratios: np.ndarray,
     gravity: np.ndarray,
     spacing: float,
     dt: np.ndarray,
@@ -76,7 +75,7 @@ def ledger_sums(
     the positions as they are it would swing by v dt/2 times the force.
 
     Args:
-        sums: of each law; volume_ratios: of each particle, (T, n).
+        sums: of each law.
         gravity: m/s^2, (T, d); dt: the last step, s, (T,).
         moment: D / h^2, see `stability.transfer_factors.affine_moment`.
     """
@@ -91,8 +90,6 @@ def ledger_sums(
         "linear_momentum": momentum,
         "angular_momentum": sum(one.turning + inertia * one.spin for one in sums),
         "speed_max": np.sqrt(np.max([one.speed_squared for one in sums], axis=0)),
-        "volume_ratio_min": volume_ratios.min(axis=1),
-        "volume_ratio_max": volume_ratios.max(axis=1),
     }
 
 

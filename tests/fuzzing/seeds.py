@@ -210,7 +210,7 @@ def checkpoints() -> tuple[Files, ...]:
         for step in (3, 7):
             arrays = {"fluid.x": np.full((20, 3), step, np.float32), "numbers": np.arange(40.0), "counts": np.arange(9)}
             numbers = {"time": 0.1, "drift": np.inf, "frames": [1, {"smallest": [0.1, "wave"]}, 0.0]}
-            write_checkpoint(Path(place), Checkpoint(1, step, 0.1, backend, False, numbers, arrays))
+            write_checkpoint(Path(place), Checkpoint(1, step, 0.1, backend, False, numbers, arrays), 1000)
         return (_files_in(Path(place), "run"),)
 
 
