@@ -2,9 +2,9 @@
 
 No number depends on who does a part: parts of a phase write disjoint memory, and maxima know no order.
 
-Each phase is a function of its own in Taichi's code as well (`ti.real_func`), because the time to compile a function
-grows with the square of its length. Such a function knows nothing of its caller but its arguments, so that each asks
-for the numbers of the run anew.
+The time to compile a function grows with the square of its length. Each kind of part is therefore in a function of its
+own for Taichi as well (`ti.real_func`). Such a function knows nothing of its caller but its arguments, so that each one
+asks for the numbers of the run anew.
 """
 
 import taichi as ti
@@ -30,55 +30,73 @@ class BatchParts:
 
     Attributes:
         phases: their numbers.
+        kinds: of the parts: name, number of the group, first phase, and the phase after the last.
     """
 
     def __init__(self, phases: BatchPhases) -> None:
         self.phases, self.device, self.dimension = phases, phases.device, phases.dimension
         self.members, self.count, self.real = phases.members, phases.count, phases.real
         self.shared, self.places, self.values = phases.shared, phases.places, phases.values
+        numbers = range(len(phases.members))
+        laws, nodes = [group.law for _, group in phases.members], phases.device.nodes
+        kinds = [("clear", 0, 0, 1)]
+        kinds += [("average", g, begin, begin + phases.passes) for g, begin in phases.averages.items()]
+        kinds += [("scatter", g, begin, begin + phases.passes) for g, begin in phases.scatters.items()]
+        kinds += [("relax", g, phases.relaxing, phases.relaxing + 1) for g in numbers if laws[g].relaxes]
+        kinds += [("find contact", 0, phases.contact, phases.contact + 1)] * nodes.needs_contact
+        kinds += [("find friction", 0, phases.friction, phases.friction + 1)] * nodes.needs_friction
+        kinds += [("update", 0, phases.updating, phases.updating + 1)]
+        kinds += [("advance", g, phases.last_of_step, phases.last_of_step + 1) for g in numbers]
+        kinds += [("sort", g, phases.sorts_of[g], phases.sorts_of[g] + phases.sort_length[g]) for g in numbers]
+        kinds += [("average shown", g, phases.before_showing, phases.before_showing + 1) for g in phases.averages]
+        kinds += [("show", g, phases.showing, phases.showing + 1) for g in numbers]
+        self.kinds = tuple(kinds)
 
-    @ti.func
+    @ti.real_func
     def do(
         self,
+        k: ti.template(),
         w: int,
         phase: int,
         region: int,
         part: int,
-        numbers: ti.template(),
-        counts: ti.template(),
-        shown: ti.template(),
+        numbers: Numbers,
+        counts: Counts,
+        shown: Shown,
     ):
-        """Do a part of a phase in a region."""
-        if phase == 0:
-            self.clear(w, region, part, numbers, counts)
-        for g, begin in ti.static(self.phases.coloured):
-            if phase >= begin and phase < begin + self.phases.passes:
-                if ti.static(begin == self.phases.scatters[g]):
-                    self.scatter(g, w, phase - begin, region, part, numbers, counts)
-                else:
-                    self.average(g, w, phase - begin, region, part, numbers, counts)
-        for g, group in ti.static(self.members):
-            if ti.static(group.law.relaxes):
-                if phase == self.phases.relaxing:
-                    self.relax(g, w, region, part, numbers, counts)
-        if ti.static(self.device.nodes.needs_contact):
-            if phase == self.phases.contact:
-                self.find_contact(w, region, part, numbers, counts)
-        if ti.static(self.device.nodes.needs_friction):
-            if phase == self.phases.friction:
-                self.find_friction(w, region, part, numbers, counts)
-        if phase == self.phases.updating:
-            self.update(w, region, part, numbers, counts)
-        for g, group in ti.static(self.members):
-            if phase == self.phases.last_of_step:
-                self.advance(g, w, region, part, numbers, counts)
-            if phase >= self.phases.sorts_of[g] and phase < self.phases.sorts_of[g] + self.phases.sort_length[g]:
-                self.sort(g, w, phase, region, numbers, counts)
-            if ti.static(group.averaged):
-                if phase == self.phases.before_showing and region == 0:
-                    self.average_shown(g, w, numbers, counts)
-            if phase == self.phases.showing:
-                self.show(g, w, region, part, numbers, counts, shown)
+        """Do a part of a phase in a region, if it belongs to the k-th of the `kinds` or to a later one.
+
+        A function calls the next one: of several that it calls, Taichi 1.7.4 puts the code into the key of its cache in
+        the order of their addresses, so that the next process would find nothing.
+        """
+        what, g, first, after = ti.static(self.kinds[k])
+        if phase >= first and phase < after:
+            h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
+            run = ti.static(views(self.device, w, h, inverse, scale, box, last, extent))
+            if ti.static(what == "clear"):
+                self.clear(run, region, part)
+            if ti.static(what == "average"):
+                self.average(run, g, w, phase - first, region, part, counts)
+            if ti.static(what == "scatter"):
+                self.scatter(run, g, w, phase - first, region, part, counts)
+            if ti.static(what == "relax"):
+                self.relax(run, g, w, region, part, counts)
+            if ti.static(what == "find contact"):
+                self.find_contact(run, w, region, part)
+            if ti.static(what == "find friction"):
+                self.find_friction(run, w, region, part)
+            if ti.static(what == "update"):
+                self.update(run, w, region, part)
+            if ti.static(what == "advance"):
+                self.advance(run, g, w, region, part, counts)
+            if ti.static(what == "sort"):
+                self.sort(run, g, w, phase - first, region, counts)
+            if ti.static(what == "average shown"):
+                self.average_shown(run, g, w, region, counts)
+            if ti.static(what == "show"):
+                self.show(run, g, w, region, part, numbers, counts, shown)
+        if ti.static(k + 1 < len(self.kinds)):
+            self.do(ti.static(k + 1), w, phase, region, part, numbers, counts, shown)
 
     @ti.func
     def gravity_step(self, w: int):
@@ -88,22 +106,20 @@ class BatchParts:
             result[a] = self.values[w, VECTORS + a]
         return result
 
-    @ti.real_func
-    def clear(self, w: int, region: int, part: int, numbers: Numbers, counts: Counts):
+    @ti.func
+    def clear(self, run: ti.template(), region: int, part: int):
         """Clear nodes."""
-        h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
-        grid, _nodes, _particles, _orders, _seen = ti.static(
-            views(self.device, w, h, inverse, scale, box, last, extent)
-        )
+        grid, _nodes, _particles, _orders, _seen = ti.static(run)
         first, after = self.places.rows_of(grid, region)
         first, after = self.phases.share(first, after, part)
         clear_rows(grid, first, after)
 
-    @ti.real_func
-    def average(self, g: ti.template(), w: int, colour: int, region: int, part: int, numbers: Numbers, counts: Counts):
+    @ti.func
+    def average(
+        self, run: ti.template(), g: ti.template(), w: int, colour: int, region: int, part: int, counts: ti.template()
+    ):
         """Add particles of the g-th group to the averages of their cells."""
-        h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
-        grid, _nodes, _particles, orders, seen = ti.static(views(self.device, w, h, inverse, scale, box, last, extent))
+        grid, _nodes, _particles, orders, seen = ti.static(run)
         if colour < self.phases.colours:
             first, after = self.pencils(orders[g], colour, region, part)
             average_pencils(grid, g, seen[g], orders[g], colour, first, after)
@@ -111,11 +127,12 @@ class BatchParts:
             first, after = self.come_in(g, orders[g], w, counts)
             average_range(grid, g, seen[g], first, after)
 
-    @ti.real_func
-    def scatter(self, g: ti.template(), w: int, colour: int, region: int, part: int, numbers: Numbers, counts: Counts):
+    @ti.func
+    def scatter(
+        self, run: ti.template(), g: ti.template(), w: int, colour: int, region: int, part: int, counts: ti.template()
+    ):
         """Scatter particles of the g-th group."""
-        h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
-        _grid, _nodes, particles, orders, seen = ti.static(views(self.device, w, h, inverse, scale, box, last, extent))
+        _grid, _nodes, particles, orders, seen = ti.static(run)
         kick, relaxed = self.values[w, KICK], self.values[w, RELAXED]
         if colour < self.phases.colours:
             first, after = self.pencils(orders[g], colour, region, part)
@@ -140,13 +157,10 @@ class BatchParts:
         first = order.start[order.first_tile + order.tiles]
         return first, w * ti.static(self.device.room[g]) + counts[w, self.count.particles[g]]
 
-    @ti.real_func
-    def relax(self, g: ti.template(), w: int, region: int, part: int, numbers: Numbers, counts: Counts):
+    @ti.func
+    def relax(self, run: ti.template(), g: ti.template(), w: int, region: int, part: int, counts: ti.template()):
         """Relax the volumes of particles of the g-th group, in the steps that do."""
-        h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
-        _grid, _nodes, particles, _orders, _seen = ti.static(
-            views(self.device, w, h, inverse, scale, box, last, extent)
-        )
+        _grid, _nodes, particles, _orders, _seen = ti.static(run)
         relaxed = self.values[w, RELAXED]
         if relaxed > 0.0:
             first, after = self.places.particles_of(g, w, region, counts[w, self.count.particles[g]])
@@ -156,64 +170,65 @@ class BatchParts:
                 change = ti.max(change, particles.relax(self.device.groups[g], p, relaxed))
             ti.atomic_max(self.values[w, self.phases.rates + 2 * g + 1], change)
 
-    @ti.real_func
-    def find_contact(self, w: int, region: int, part: int, numbers: Numbers, counts: Counts):
+    @ti.func
+    def find_contact(self, run: ti.template(), w: int, region: int, part: int):
         """Find where walls that let go are pressed."""
-        h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
-        grid, nodes, _particles, _orders, _seen = ti.static(views(self.device, w, h, inverse, scale, box, last, extent))
+        grid, nodes, _particles, _orders, _seen = ti.static(run)
         gravity_step = self.gravity_step(w)
         first, after = self.places.even_part(nodes.images.plane_nodes(grid), region)
         first, after = self.phases.share(first, after, part)
         for q in range(first, after):
             nodes.images.find_contact(grid, q, gravity_step)
 
-    @ti.real_func
-    def find_friction(self, w: int, region: int, part: int, numbers: Numbers, counts: Counts):
+    @ti.func
+    def find_friction(self, run: ti.template(), w: int, region: int, part: int):
         """Find the friction of walls."""
-        h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
-        grid, nodes, _particles, _orders, _seen = ti.static(views(self.device, w, h, inverse, scale, box, last, extent))
+        grid, nodes, _particles, _orders, _seen = ti.static(run)
         gravity_step = self.gravity_step(w)
         first, after = self.places.even_part(nodes.images.plane_nodes(grid), region)
         first, after = self.phases.share(first, after, part)
         for q in range(first, after):
             find_friction(nodes.images, grid, q, gravity_step)
 
-    @ti.real_func
-    def update(self, w: int, region: int, part: int, numbers: Numbers, counts: Counts):
+    @ti.func
+    def update(self, run: ti.template(), w: int, region: int, part: int):
         """Turn the momentum of nodes into velocity."""
-        h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
-        grid, nodes, _particles, _orders, _seen = ti.static(views(self.device, w, h, inverse, scale, box, last, extent))
+        grid, nodes, _particles, _orders, _seen = ti.static(run)
         first, after = self.places.rows_of(grid, region)
         first, after = self.phases.share(first, after, part)
         ti.atomic_max(self.values[w, SPEED], update_rows(grid, nodes, first, after, self.gravity_step(w)))
 
-    @ti.real_func
-    def advance(self, g: ti.template(), w: int, region: int, part: int, numbers: Numbers, counts: Counts):
+    @ti.func
+    def advance(self, run: ti.template(), g: ti.template(), w: int, region: int, part: int, counts: ti.template()):
         """Gather and move particles of the g-th group."""
-        h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
-        _grid, _nodes, particles, _orders, _seen = ti.static(
-            views(self.device, w, h, inverse, scale, box, last, extent)
-        )
+        _grid, _nodes, particles, _orders, _seen = ti.static(run)
         first, after = self.places.particles_of(g, w, region, counts[w, self.count.particles[g]])
         first, after = self.phases.share(first, after, part)
         sharpest = advance_range(particles, g, self.device.groups[g], first, after, self.values[w, MOVED])
         ti.atomic_max(self.values[w, self.phases.rates + 2 * g], sharpest)
 
-    @ti.real_func
-    def average_shown(self, g: ti.template(), w: int, numbers: Numbers, counts: Counts):
+    @ti.func
+    def average_shown(self, run: ti.template(), g: ti.template(), w: int, region: int, counts: ti.template()):
         """Average the volumes of the g-th group for a frame."""
-        h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
-        grid, _nodes, _particles, _orders, seen = ti.static(views(self.device, w, h, inverse, scale, box, last, extent))
-        first = w * ti.static(self.device.room[g])
-        average_for_frame(grid, g, seen[g], first, first + counts[w, self.count.particles[g]])
+        grid, _nodes, _particles, _orders, seen = ti.static(run)
+        if region == 0:
+            first = w * ti.static(self.device.room[g])
+            average_for_frame(grid, g, seen[g], first, first + counts[w, self.count.particles[g]])
 
-    @ti.real_func
-    def show(self, g: ti.template(), w: int, region: int, part: int, numbers: Numbers, counts: Counts, shown: Shown):
+    @ti.func
+    def show(
+        self,
+        run: ti.template(),
+        g: ti.template(),
+        w: int,
+        region: int,
+        part: int,
+        numbers: ti.template(),
+        counts: ti.template(),
+        shown: ti.template(),
+    ):
         """Write what particles of the g-th group show."""
-        h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
-        _grid, _nodes, _particles, _orders, seen = ti.static(
-            views(self.device, w, h, inverse, scale, box, last, extent)
-        )
+        _grid, _nodes, _particles, _orders, seen = ti.static(run)
         first, after = self.places.particles_of(g, w, region, counts[w, self.count.particles[g]])
         if ti.static(self.device.comes_and_goes):
             # All of them, those that wait and those that left included.
@@ -226,18 +241,14 @@ class BatchParts:
         tau, activity = counts[w, self.count.tau], counts[w, self.count.activity]
         show_range(seen[g], first, after - first, last_step, row, affine, gradient, tau, activity, shown)
 
-    @ti.real_func
-    def sort(self, g: ti.template(), w: int, phase: int, region: int, numbers: Numbers, counts: Counts):
+    @ti.func
+    def sort(self, run: ti.template(), g: ti.template(), w: int, turn: int, region: int, counts: ti.template()):
         """Do the share of a region in a phase of the sort of the g-th group."""
-        h, inverse, scale, box, last, extent = self.phases.place(w, numbers, counts)
-        _grid, _nodes, _particles, orders, _seen = ti.static(
-            views(self.device, w, h, inverse, scale, box, last, extent)
-        )
+        _grid, _nodes, _particles, orders, _seen = ti.static(run)
         first = w * ti.static(self.device.room[g])
         begin, end = self.places.even_part(counts[w, self.count.capacity[g]], region)
         # Other runs may be at other groups, which begin elsewhere: the scratch memory of a run is that of no other.
         own = w * ti.static(self.device.orders[g].buffers.room)
-        turn = phase - ti.static(self.phases.sorts_of[g])
         if turn == 0:
             count_tiles(orders[g], w, region, first, begin, end)
         if turn == 1:
