@@ -49,6 +49,7 @@ class MirrorImages:
         grid: ti.template(),
         field: ti.template(),
         node: ti.template(),
+        place: ti.template(),
         gravity_step: ti.template(),
         rubbed: ti.template(),
     ):
@@ -59,18 +60,18 @@ class MirrorImages:
 
         Args:
             field: of the nodes: momentum and mass, or momentum alone, which gravity does not pull.
+            place: depth, mirror and upper as `Walls.place` returns them, the walls that act, and those that hold, see
+                `Walls.holding` with the same `rubbed`.
             gravity_step: change of velocity by gravity in this step, m/s.
             rubbed: whether friction acts.
         """
-        depth, mirror, upper = self.walls.place(node)
-        acts = self.walls.acting(node, depth, mirror, upper)
+        depth, mirror, upper, acts, holds = ti.static(place)
         owned = True
         for a in ti.static(range(self.dimension)):
             if acts[a] == 1 and depth[a] < 0:
                 owned = False
         total = ti.Vector.zero(float, grid.width)
         if owned:
-            holds = self.walls.holding(node, depth, upper, rubbed)
             total = self.image_sum(grid, field, node, mirror, acts, depth, holds, upper, gravity_step)
             if ti.static(rubbed):
                 for r, _number, axis, side in ti.static(self.walls.rough):
@@ -92,13 +93,11 @@ class MirrorImages:
         grid: ti.template(),
         field: ti.template(),
         node: ti.template(),
+        place: ti.template(),
         value: ti.template(),
-        rubbed: ti.template(),
     ):
-        """Write a velocity to a node near a wall, and mirrored to its images."""
-        depth, mirror, upper = self.walls.place(node)
-        acts = self.walls.acting(node, depth, mirror, upper)
-        holds = self.walls.holding(node, depth, upper, rubbed)
+        """Write a velocity to a node near a wall, and mirrored to its images; `place` as of `fold`."""
+        depth, mirror, upper, acts, holds = ti.static(place)
         for images in range(ti.static(2**self.dimension)):
             if self.has_image(images, acts, depth):
                 mirrored = self.mirrored_value(value, images, holds, upper, 1.0)

@@ -112,15 +112,29 @@ class Walls:
             depth, mirror, upper = self.place(node)
             acts = self.acting(node, depth, mirror, upper)
             holds = self.holding(node, depth, upper, True)
-            for a in ti.static(range(self.dimension)):
-                if acts[a] == 1 and depth[a] == 0:
-                    result = self.stopped(result, a, holds, upper, 1.0)
-                elif depth[a] <= 0:
-                    inward = result[a] if upper[a] == 0 else -result[a]
-                    if inward < 0:
-                        result[a] = 0.0
-            if ti.static(self.moves):
-                result = self.closed(result, acts, depth)
+            result = self.constrained(result, depth, upper, acts, holds)
+        return result
+
+    @ti.func
+    def constrained(
+        self,
+        velocity: ti.template(),
+        depth: ti.template(),
+        upper: ti.template(),
+        acts: ti.template(),
+        holds: ti.template(),
+    ):
+        """Return what `constrain` does, of a node whose place, walls that act and that hold are known."""
+        result = velocity
+        for a in ti.static(range(self.dimension)):
+            if acts[a] == 1 and depth[a] == 0:
+                result = self.stopped(result, a, holds, upper, 1.0)
+            elif depth[a] <= 0:
+                inward = result[a] if upper[a] == 0 else -result[a]
+                if inward < 0:
+                    result[a] = 0.0
+        if ti.static(self.moves):
+            result = self.closed(result, acts, depth)
         return result
 
     @ti.func

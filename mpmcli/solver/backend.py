@@ -18,6 +18,7 @@ from typing import Literal
 
 import taichi as ti
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+from taichi.lang.kernel_impl import Kernel
 
 from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
@@ -208,6 +209,15 @@ def _source(code: CodeType) -> tuple[list[str], int]:
     return inspect.getsourcelines(code)
 
 
+def _builder(kernel: Kernel) -> object:
+    """Return what collects the statements of the function that is being compiled.
+
+    Where a real function calls one that is inlined, Taichi's own method returns that of the kernel, and a loop in there
+    ends the process.
+    """
+    return ti.lang.impl.get_runtime().compiling_callable.ast_builder()
+
+
 def _initialise(backend: Backend) -> None:
     if not _has(backend.arch):
         raise InputError(f"--arch {backend.arch} needs a device that this machine does not have; use --arch cpu.")
@@ -216,6 +226,7 @@ def _initialise(backend: Backend) -> None:
     os.environ.pop("TI_ARCH", None)
     _settle_cache()
     ASTTransformerContext.get_pos_info = _position
+    Kernel.ast_builder = _builder
     ti.lang.kernel_impl.getsourcelines = lambda function: _source(function.__code__)
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
@@ -225,6 +236,8 @@ def _initialise(backend: Backend) -> None:
             offline_cache=backend.compile_cache,
             # Strict arithmetic is as fast on the CPU, and a NaN stays a NaN in every comparison.
             fast_math=False,
+            # It keeps what a serial loop finds in memory, and takes no note of what real functions write there.
+            cache_loop_invariant_global_vars=not backend.on_cpu,
             log_level=ti.ERROR,
             **OPTIMISATION[backend.optimisation],
         )

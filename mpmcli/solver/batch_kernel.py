@@ -13,6 +13,7 @@ import taichi as ti
 from mpmcli.solver.batch_device import Device, views
 from mpmcli.solver.batch_emission import BatchEmission
 from mpmcli.solver.batch_layout import ATTEND, GOING, LOST, MEASURE, NOTES, Layout
+from mpmcli.solver.batch_parts import BatchParts, Counts, Numbers, Shown
 from mpmcli.solver.batch_phases import BatchPhases
 from mpmcli.solver.batch_steps import BatchSteps
 from mpmcli.solver.batch_threads import PATIENCE, BatchThreads
@@ -38,7 +39,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> tuple[Callable[..., No
     drifts = device.particles.touches or not all(group.total for group in groups)
     steps = BatchSteps(layout, [group.law for group in groups], device.values, drifts=drifts)
     phases = BatchPhases(device, layout)
-    team = BatchThreads(phases, device.runs)
+    team = BatchThreads(BatchParts(phases), device.runs)
     noted = tuple((k, getattr(real, name)) for k, name in enumerate(NOTES) if hasattr(real, name))
     counted = tuple((k, getattr(count, name)) for k, name in enumerate(NOTES) if hasattr(count, name))
     alone, collides = threads == 1, device.colliders is not None
@@ -206,9 +207,9 @@ def build_batch_kernel(device: Device, layout: Layout) -> tuple[Callable[..., No
 
     @ti.kernel
     def launch(
-        numbers: ti.types.ndarray(ti.f64, 2),
-        counts: ti.types.ndarray(ti.i32, 2),
-        shown: ti.types.ndarray(ndim=2),
+        numbers: Numbers,
+        counts: Counts,
+        shown: Shown,
         notes: ti.types.ndarray(ti.f64, 3),
     ):
         ti.loop_config(serialize=True)
@@ -229,7 +230,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> tuple[Callable[..., No
                         w = ti.atomic_add(next_run[None], 1)
 
     @ti.kernel
-    def share_work(counts: ti.types.ndarray(ti.i32, 2)):
+    def share_work(counts: Counts):
         ti.loop_config(serialize=True)
         for w in range(device.runs):
             if ti.static(phases.shared):

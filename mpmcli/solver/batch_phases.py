@@ -1,24 +1,17 @@
-"""What the kernel of a batch does on the CPU between two decisions, in phases: a step, a sort, and a frame.
+"""The phases of the kernel of a batch on the CPU: of a step, a sort, and a frame.
 
-A phase has parts that any thread may do. No number depends on who does one: parts of a phase write disjoint memory, and
-maxima know no order.
+What is done in them, part by part, is in `batch_parts`.
 """
 
 import taichi as ti
 
-from mpmcli.boundaries.wall_friction import find_friction
-from mpmcli.solver.batch_device import Device, views
+from mpmcli.solver.batch_device import Device
 from mpmcli.solver.batch_layout import Layout
 from mpmcli.solver.batch_regions import BatchRegions
-from mpmcli.solver.cpu_loops import average_pencils, clear_rows, scatter_pencils, update_rows
-from mpmcli.solver.frame_reader import show_range
-from mpmcli.solver.lanes import advance_range, scatter_range
 from mpmcli.solver.ordering import share_start
 from mpmcli.solver.particle_update import NOT_LOST
-from mpmcli.solver.sorting import count_tiles, keep, place_particles, take
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import NOTHING
-from mpmcli.solver.volume_average import average_for_frame, average_range
 
 # Parts of a loop over the particles or the nodes of a region.
 SHARES = 4
@@ -34,6 +27,7 @@ class BatchPhases:
         shared: whether several threads work on one run; regions: of each run, one for each of them.
         places: of the regions in the particles and the nodes.
         last_of_step, sorts, last_of_sort, showing: places of phases. A step begins with phase 0, a sort with `sorts`.
+        coloured: (group, first phase) of the phases that go over the pencils of a group, of which there are `passes`.
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
@@ -49,14 +43,13 @@ class BatchPhases:
         self.colours = device.orders[0].colours
         self.moves = device.motion is not None
         # What has come in since the sort follows all colours, on one thread.
-        passes = self.colours + device.comes_and_goes
+        self.passes = passes = self.colours + device.comes_and_goes
         self.relaxes = any(group.law.relaxes for group in device.groups)
         # The first of the phases that average the volumes of a group, and of those that scatter it.
         averaged = [g for g, group in self.members if group.averaged]
         self.averages = {g: 1 + n * passes for n, g in enumerate(averaged)}
         begun = 1 + len(averaged) * passes
         self.scatters = {g: begun + g * passes for g, _ in self.members}
-        # (group, first phase) of all phases that go over its pencils, colour by colour.
         self.coloured = (*self.averages.items(), *self.scatters.items())
         self.relaxing = begun + len(device.groups) * passes
         self.contact = self.relaxing + self.relaxes
@@ -66,9 +59,10 @@ class BatchPhases:
         # Of each group: count, place, and for each of its fields keep and take.
         self.moved = tuple((*group.state, *group.labels) for group in device.groups)
         self.sorts = self.last_of_step + 1
+        self.sort_length = tuple(2 + 2 * len(fields) for fields in self.moved)
         firsts = [self.sorts]
-        for fields in self.moved:
-            firsts.append(firsts[-1] + 2 + 2 * len(fields))
+        for length in self.sort_length:
+            firsts.append(firsts[-1] + length)
         self.sorts_of, self.last_of_sort = tuple(firsts[:-1]), firsts[-1] - 1
         # Before a frame is shown volumes are averaged once more.
         self.before_showing = firsts[-1]
@@ -146,109 +140,3 @@ class BatchPhases:
         """Return the part of a range."""
         size, shares = after - first, ti.static(SHARES if self.shared else 1)
         return first + share_start(size, part, shares), first + share_start(size, part + 1, shares)
-
-    @ti.func
-    def do(
-        self,
-        w: int,
-        phase: int,
-        region: int,
-        part: int,
-        numbers: ti.template(),
-        counts: ti.template(),
-        shown: ti.template(),
-    ):
-        """Do a part of a phase in a region."""
-        h, inverse, scale, box, last, extent = self.place(w, numbers, counts)
-        grid, nodes, particles, orders, seen = ti.static(views(self.device, w, h, inverse, scale, box, last, extent))
-        kick, relaxed = self.values[w, KICK], self.values[w, RELAXED]
-        gravity_step = ti.Vector.zero(float, ti.static(self.dimension))
-        for a in ti.static(range(self.dimension)):
-            gravity_step[a] = self.values[w, VECTORS + a]
-        if phase == 0 or phase == self.updating:
-            first, after = self.places.rows_of(grid, region)
-            first, after = self.share(first, after, part)
-            if phase == 0:
-                clear_rows(grid, first, after)
-            else:
-                ti.atomic_max(self.values[w, SPEED], update_rows(grid, nodes, first, after, gravity_step))
-        for g, begin in ti.static(self.coloured):
-            colour = phase - begin
-            if colour >= 0 and colour < self.colours:
-                first, after = 0, orders[g].pencil_count(colour)
-                if ti.static(self.shared):
-                    first = orders[g].work[colour, region] + part
-                    after = first + 1
-                if ti.static(begin == self.scatters[g]):
-                    scatter_pencils(particles, g, seen[g], orders[g], colour, first, after, kick, relaxed)
-                else:
-                    average_pencils(grid, g, seen[g], orders[g], colour, first, after)
-            if ti.static(self.device.comes_and_goes):
-                if colour == self.colours and region == 0 and part == 0:
-                    first = orders[g].start[orders[g].first_tile + orders[g].tiles]
-                    after = w * ti.static(self.device.room[g]) + counts[w, self.count.particles[g]]
-                    if ti.static(begin == self.scatters[g]):
-                        scatter_range(particles, g, seen[g], first, after, kick, relaxed)
-                    else:
-                        average_range(grid, g, seen[g], first, after)
-        for g in ti.static(tuple(self.averages)):
-            if phase == self.before_showing and region == 0:
-                first = w * ti.static(self.device.room[g])
-                average_for_frame(grid, g, seen[g], first, first + counts[w, self.count.particles[g]])
-        if ti.static(nodes.needs_contact):
-            if phase == self.contact:
-                first, after = self.places.even_part(nodes.images.plane_nodes(grid), region)
-                first, after = self.share(first, after, part)
-                for q in range(first, after):
-                    nodes.images.find_contact(grid, q, gravity_step)
-        if ti.static(nodes.needs_friction):
-            if phase == self.friction:
-                first, after = self.places.even_part(nodes.images.plane_nodes(grid), region)
-                first, after = self.share(first, after, part)
-                for q in range(first, after):
-                    find_friction(nodes.images, grid, q, gravity_step)
-        for g, group in ti.static(self.members):
-            first, after = self.places.particles_of(g, w, region, counts[w, self.count.particles[g]])
-            first, after = self.share(first, after, part)
-            if ti.static(group.law.relaxes):
-                if phase == self.relaxing and relaxed > 0.0:
-                    change = 0.0
-                    for p in range(first, after):
-                        change = ti.max(change, particles.relax(group, p, relaxed))
-                    ti.atomic_max(self.values[w, self.rates + 2 * g + 1], change)
-            if phase == self.last_of_step:
-                sharpest = advance_range(particles, g, group, first, after, self.values[w, MOVED])
-                ti.atomic_max(self.values[w, self.rates + 2 * g], sharpest)
-            if phase == self.showing:
-                if ti.static(self.device.comes_and_goes):
-                    # All of them, those that wait and those that left included.
-                    first, after = self.places.even_part(counts[w, self.count.capacity[g]], region)
-                    first += w * ti.static(self.device.room[g])
-                    after += w * ti.static(self.device.room[g])
-                    first, after = self.share(first, after, part)
-                row, last_step = counts[w, self.count.row], ti.cast(numbers[w, self.real.last_step], float)
-                affine, gradient = counts[w, self.count.affine], counts[w, self.count.gradient]
-                tau, activity = counts[w, self.count.tau], counts[w, self.count.activity]
-                show_range(seen[g], first, after - first, last_step, row, affine, gradient, tau, activity, shown)
-        if phase >= self.sorts and phase <= self.last_of_sort:
-            self.do_sort(orders, w, phase, region, counts)
-
-    @ti.func
-    def do_sort(self, orders: ti.template(), w: int, phase: int, region: int, counts: ti.template()):
-        """Do the share of a region in a phase of the sort."""
-        for g, group in ti.static(self.members):
-            first, count = w * ti.static(self.device.room[g]), counts[w, self.count.capacity[g]]
-            begin, end = self.places.even_part(count, region)
-            # Other runs may be at other groups, which begin elsewhere: the scratch memory of a run is that of no other.
-            own = w * ti.static(self.device.orders[g].buffers.room)
-            if phase == ti.static(self.sorts_of[g]):
-                count_tiles(orders[g], w, region, first, begin, end)
-            if phase == ti.static(self.sorts_of[g] + 1):
-                place_particles(orders[g], w, region, first, begin, end)
-            for i, field in ti.static(enumerate(self.moved[g])):
-                if phase == ti.static(self.sorts_of[g] + 2 + 2 * i):
-                    for q in range(begin, end):
-                        keep(orders[g].buffers, field, own, q, orders[g].buffers.order[own + q])
-                if phase == ti.static(self.sorts_of[g] + 3 + 2 * i):
-                    for q in range(begin, end):
-                        take(orders[g].buffers, field, own, q, first + q)

@@ -7,7 +7,7 @@ delays the others by the part at most that it has claimed.
 
 import taichi as ti
 
-from mpmcli.solver.batch_phases import BatchPhases
+from mpmcli.solver.batch_parts import BatchParts
 
 # Words that threads share, of 4 bytes: what is published, the number of a phase, its kind and its parts; then, each on
 # a cache line of its own, the parts done, whether the launch is over with the number of threads that work, and of each
@@ -29,12 +29,12 @@ class BatchThreads:
     """What threads tell each other.
 
     Attributes:
-        phases: what they work on.
+        parts: what they work on; phases: of these.
         regions: of a run, one for each thread that shares it.
     """
 
-    def __init__(self, phases: BatchPhases, runs: int) -> None:
-        self.phases, self.regions = phases, phases.regions
+    def __init__(self, parts: BatchParts, runs: int) -> None:
+        self.parts, self.phases, self.regions = parts, parts.phases, parts.phases.regions
         self.stride = CLAIMED + LINE * self.regions
         self.words = ti.field(int, shape=runs * self.stride)
 
@@ -120,7 +120,7 @@ class BatchThreads:
                     part = claimed & MASK
             turn += 1
         if found == 1:
-            self.phases.do(w, self.words[word + PHASE], region, part, numbers, counts, shown)
+            self.parts.do(0, w, self.words[word + PHASE], region, part, numbers, counts, shown)
             ti.atomic_add(self.words[word + DONE], 1)
         elif ti.atomic_add(self.words[word + OVER], 0) == 1:
             found = -1

@@ -7,6 +7,7 @@ import taichi as ti
 
 from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.walls import REACH
 from mpmcli.solver.grid import Grid
 
 
@@ -47,6 +48,10 @@ class NodeUpdate:
         self.boundaries = tuple(boundaries)
         self.collides, self.colliders = colliders is not None, colliders
 
+    def is_mirror(self, boundary: Boundary) -> bool:
+        """Return whether a boundary is the walls that mirror nodes."""
+        return self.mirrors and boundary is self.images.walls
+
     @ti.func
     def update(self, node: ti.template(), index: int, gravity_step: ti.template()):
         """Update a node and its images; return the square of its velocity, 0 at an image and where there is no mass.
@@ -72,12 +77,22 @@ class NodeUpdate:
         pull = gravity_step
         mirrored = False
         speed_squared = 0.0
+        # Asked for once: what follows from them is most of the code of this loop.
+        depth, mirror, upper = ti.Vector([REACH + 1] * d), node, ti.Vector.zero(int, d)
+        acts, holds = ti.Vector.zero(int, d), ti.Vector.zero(int, d)
+        place = ti.static((depth, mirror, upper, acts, holds))
 
         # Fold.
         if ti.static(self.mirrors):
             mirrored = self.images.near(node)
             if mirrored:
-                total = self.images.fold(self.grid, self.grid.nodes, node, gravity_step, True)
+                found_depth, found_mirror, found_upper = self.images.walls.place(node)
+                found_acts = self.images.walls.acting(node, found_depth, found_mirror, found_upper)
+                found_holds = self.images.walls.holding(node, found_depth, found_upper, True)
+                for a in ti.static(range(d)):
+                    depth[a], mirror[a], upper[a] = found_depth[a], found_mirror[a], found_upper[a]
+                    acts[a], holds[a] = found_acts[a], found_holds[a]
+                total = self.images.fold(self.grid, self.grid.nodes, node, place, gravity_step, True)
                 # Entry by entry here and below: Taichi loses vectors that are assigned as a whole in static blocks.
                 for c in ti.static(range(self.grid.width)):
                     value[c] = total[c]
@@ -92,9 +107,15 @@ class NodeUpdate:
 
             # Constrain.
             for boundary in ti.static(self.boundaries):
-                constrained = boundary.constrain(node, velocity)
-                for c in ti.static(range(d)):
-                    velocity[c] = constrained[c]
+                if ti.static(self.is_mirror(boundary)):
+                    if mirrored:
+                        constrained = boundary.constrained(velocity, depth, upper, acts, holds)
+                        for c in ti.static(range(d)):
+                            velocity[c] = constrained[c]
+                else:
+                    constrained = boundary.constrain(node, velocity)
+                    for c in ti.static(range(d)):
+                        velocity[c] = constrained[c]
 
             if ti.static(self.collides):
                 met = self.colliders.constrain(node, velocity, value[d])
@@ -102,15 +123,15 @@ class NodeUpdate:
                     velocity[c] = met[c]
 
             # Unfold.
-            self.write(self.grid.nodes, node, index, mirrored, velocity, True)
+            self.write(self.grid.nodes, node, index, mirrored, place, velocity)
             if ti.static(self.grid.scheme.keeps_before):
-                self.update_before(node, index, mirrored, value[d])
+                self.update_before(node, index, mirrored, place, value[d])
             for a in ti.static(range(d)):
                 speed_squared += velocity[a] ** 2
         return speed_squared
 
     @ti.func
-    def update_before(self, node: ti.template(), index: int, mirrored: bool, mass: float):
+    def update_before(self, node: ti.template(), index: int, mirrored: bool, place: ti.template(), mass: float):
         """Turn the momentum from before stress and forces into velocity: fold and unfold, without any boundary.
 
         Mirror images have it too, so that a wall that acts changes nothing but what stress does. Friction does not act
@@ -119,14 +140,18 @@ class NodeUpdate:
         before = self.grid.before[index]
         if ti.static(self.mirrors):
             if mirrored:
+                depth, _mirror, upper, _acts, holds = ti.static(place)
+                by_word = self.images.walls.holding(node, depth, upper, False)
+                for a in ti.static(range(self.dimension)):
+                    holds[a] = by_word[a]
                 total = self.images.fold(
-                    self.grid, self.grid.before, node, ti.Vector.zero(float, ti.static(self.dimension)), False
+                    self.grid, self.grid.before, node, place, ti.Vector.zero(float, ti.static(self.dimension)), False
                 )
                 for c in ti.static(range(self.grid.width)):
                     before[c] = total[c]
         for a in ti.static(range(self.dimension)):
             before[a] /= mass
-        self.write(self.grid.before, node, index, mirrored, before, False)
+        self.write(self.grid.before, node, index, mirrored, place, before)
 
     @ti.func
     def write(
@@ -135,13 +160,13 @@ class NodeUpdate:
         node: ti.template(),
         index: int,
         mirrored: bool,
+        place: ti.template(),
         value: ti.template(),
-        rubbed: ti.template(),
     ):
         """Write the velocity of a node, and of its images."""
         if ti.static(self.mirrors):
             if mirrored:
-                self.images.unfold(self.grid, field, node, value, rubbed)
+                self.images.unfold(self.grid, field, node, place, value)
             else:
                 field[index] = value
         else:

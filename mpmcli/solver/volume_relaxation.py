@@ -95,12 +95,17 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
         # All numbers of a node at once, which the compiler turns into vector instructions.
         total = ti.Vector.zero(float, grid.width)
         smallest = grid.holding[first]
-        for o, line_node in ti.static(grid.lines):
-            line_weight = 1.0
+        # Lines of nodes in a loop: few steps relax, and copies would take a tenth of the compile time of a 3D scene.
+        for line in range(ti.static(grid.scheme.spline.nodes ** (d - 1))):
+            node, line_weight = first, 1.0
             for a in ti.static(range(d - 1)):
-                line_weight *= w[o[a], a]
+                place = line // ti.static(grid.scheme.spline.nodes ** (d - 2 - a)) % ti.static(grid.scheme.spline.nodes)
+                node += place * ti.static(grid.strides[a])
+                for k in ti.static(range(grid.scheme.spline.nodes)):
+                    if place == k:
+                        line_weight *= w[k, a]
             for k in ti.static(range(grid.scheme.spline.nodes)):
-                held = grid.holding[first + line_node + k]
+                held = grid.holding[node + k]
                 total += held * (line_weight * w[k, d - 1])
                 smallest = ti.min(smallest, held)
         mean = total[d]
