@@ -7,14 +7,15 @@ maxima know no order.
 import taichi as ti
 
 from mpmcli.boundaries.wall_friction import find_friction
+from mpmcli.solver.advance_range import advance_range
 from mpmcli.solver.batch_device import Device, views
 from mpmcli.solver.batch_layout import Layout
 from mpmcli.solver.batch_regions import BatchRegions
 from mpmcli.solver.cpu_loops import average_pencils, clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.frame_reader import show_range
-from mpmcli.solver.lanes import advance_range, scatter_range
 from mpmcli.solver.ordering import share_start
 from mpmcli.solver.particle_update import NOT_LOST
+from mpmcli.solver.scatter_range import scatter_range
 from mpmcli.solver.sorting import count_tiles, keep, place_particles, take
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import NOTHING

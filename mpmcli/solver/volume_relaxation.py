@@ -13,6 +13,7 @@ from mpmcli.scene import Scene
 from mpmcli.solver.particle_arrays import MASS, VOLUME
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import volume_ratio
+from mpmcli.solver.stencils import bounded
 
 # Steps from one relaxation to the next.
 INTERVAL = 50
@@ -94,15 +95,20 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
     else:
         # All numbers of a node at once, which the compiler turns into vector instructions.
         total = ti.Vector.zero(float, grid.width)
+        origin = bounded(first, grid)
         smallest = grid.holding[first]
-        for o, line_node in ti.static(grid.lines):
-            line_weight = 1.0
-            for a in ti.static(range(d - 1)):
-                line_weight *= w[o[a], a]
-            for k in ti.static(range(grid.scheme.spline.nodes)):
-                held = grid.holding[first + line_node + k]
-                total += held * (line_weight * w[k, d - 1])
-                smallest = ti.min(smallest, held)
+        for i in ti.static(range(grid.planes)):
+            plane = ti.Vector.zero(float, grid.width)
+            for j in ti.static(range(grid.scheme.spline.nodes)):
+                line = ti.Vector.zero(float, grid.width)
+                for k in ti.static(range(grid.scheme.spline.nodes)):
+                    held = grid.holding[origin + ti.static(grid.line_node(i, j)) + k]
+                    line += held * w[k, d - 1]
+                    smallest = ti.min(smallest, held)
+                plane += line * w[j, d - 2]
+            if ti.static(d == 3):
+                plane *= w[i, 0]
+            total += plane
         mean = total[d]
         least = smallest[d]
     return mean, least
