@@ -70,7 +70,7 @@ DRIVES = (
         ("result[a] = kick * node", "result[a] = 1.05 * kick * node", "column_static"),
     ),
     *_of(
-        "solver/lanes.py",
+        "solver/scatter_range.py",
         ("own += kick * vector_of(pushes", "own += 1.05 * kick * vector_of(pushes", "mms_1d"),
         (
             "C[c, a] += kick *",

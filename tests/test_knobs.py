@@ -45,7 +45,7 @@ def test_a_scene_that_chooses_nothing_has_nothing_of_it(backend_of: Callable) ->
     )
     solver = Solver(small_scene(), backend_of("f32", 1))
     assert solver.grid.before is None and solver.grid.tile == 6
-    assert len(solver.grid.lines) == 3 and solver.grid.nodes.n == 4
+    assert solver.grid.scheme.spline.nodes == 3 and solver.grid.nodes.n == 4
 
 
 def test_flip_belongs_to_aflip() -> None:

@@ -71,7 +71,7 @@ PLANTS = (
     ),
     Plant(
         "gradient transposed",
-        "solver/lanes.py",
+        "solver/advance_range.py",
         "C = gradient.transpose()",
         "C = gradient",
         ("homogeneous",),

@@ -174,8 +174,6 @@ class Batch:
                 d,
                 runs * room,
                 (runs * bodies, CONSTANTS + len(law.constants(law.members[0]))),
-                width if on_cpu else d,
-                ti.Layout.AOS if on_cpu else ti.Layout.SOA,
                 # Forces of a batch select the particles of their body.
                 several=runs > 1 or bodies > 1 or bool(forces.terms),
                 serial=on_cpu and backend.threads == 1,

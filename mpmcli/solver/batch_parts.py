@@ -10,11 +10,12 @@ asks for the numbers of the run anew.
 import taichi as ti
 
 from mpmcli.boundaries.wall_friction import find_friction
+from mpmcli.solver.advance_range import advance_range
 from mpmcli.solver.batch_device import views
 from mpmcli.solver.batch_phases import KICK, MOVED, RELAXED, SPEED, VECTORS, BatchPhases
 from mpmcli.solver.cpu_loops import average_pencils, clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.frame_reader import show_range
-from mpmcli.solver.lanes import advance_range, scatter_range
+from mpmcli.solver.scatter_range import scatter_range
 from mpmcli.solver.sorting import count_tiles, keep, place_particles, take
 from mpmcli.solver.volume_average import average_for_frame, average_range
 

@@ -2,7 +2,7 @@
 
 import taichi as ti
 
-from mpmcli.solver.lanes import scatter_range
+from mpmcli.solver.scatter_range import scatter_range
 from mpmcli.solver.volume_average import average_range
 
 

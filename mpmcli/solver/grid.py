@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from itertools import product
 
 import numpy as np
 import taichi as ti
@@ -38,11 +37,6 @@ def node_width(dimension: int, *, on_cpu: bool) -> int:
     return 4 if on_cpu else dimension + 1
 
 
-def gradient_width(width: int, dimension: int, precision: str) -> int:
-    """Return the numbers in a row of `ParticleArrays.gradient`, where the velocity has `width` of them."""
-    return max(width, dimension + (precision == "f32"))
-
-
 @ti.data_oriented
 class Grid:
     """A dense grid of nodes over the domain and its ghost margin, addressed by one linear index.
@@ -58,7 +52,7 @@ class Grid:
         shape: nodes per axis, margins included, a multiple of `tile`.
         tiles: tiles per axis.
         strides: of the linear node index, per axis; first_node: the linear index of node 0.
-        lines: of a stencil's lines of nodes along the last axis: (offsets along the other axes, linear offset).
+        planes: of a stencil, normal to the first axis, 1 in 2D; runs: whose nodes it has, one after the other.
         width: numbers per node, at least d + 1.
         nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update.
         before: Vector(width) field: momentum, later velocity, without stress and forces of this step; None in schemes
@@ -110,10 +104,8 @@ class Grid:
         self.tiles = self.tile_counts(cells, tile)
         self.shape = tuple(self.tile * n for n in self.tiles)
         self.strides = tuple(int(np.prod(self.shape[a + 1 :])) for a in range(dimension))
-        self.lines = tuple(
-            (o, sum(n * stride for n, stride in zip(o, self.strides, strict=False)))
-            for o in product(range(scheme.spline.nodes), repeat=dimension - 1)
-        )
+        self.planes = scheme.spline.nodes if dimension == 3 else 1
+        self.runs = runs
         self.opens = tuple(opens)
         self.first_node = 0
         self.node_count = int(np.prod(self.shape))
@@ -131,6 +123,10 @@ class Grid:
         self.weighs_before = walls_move and scheme.keeps_before
         self.deterministic, self.fixed = deterministic, None
         self.box = ti.field(int, shape=(2 * runs, dimension))
+
+    def line_node(self, plane: int, line: int) -> int:
+        """Return the linear offset of the first node of a line along the last axis in a plane of a stencil."""
+        return line * self.strides[-2] + (plane * self.strides[0] if self.dimension == 3 else 0)
 
     @staticmethod
     def tile_counts(cells: Sequence[int], tile: int) -> tuple[int, ...]:

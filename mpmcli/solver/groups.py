@@ -1,7 +1,6 @@
 """Puts the particles of a scene on the device, one group for each law."""
 
 import numpy as np
-import taichi as ti
 
 from mpmcli.boundaries.rough_faces import rough_faces
 from mpmcli.errors import InputError
@@ -9,7 +8,6 @@ from mpmcli.materials.registry import laws
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.forces import needs_initial
-from mpmcli.solver.grid import node_width
 from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.plan import members_of
@@ -29,7 +27,6 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
     require_inside(scene, particles)
     origin = np.array(scene.domain.origin)
     first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
-    layout = ti.Layout.AOS if backend.on_cpu else ti.Layout.SOA
     groups = []
     for name in sorted({body.material.law for body in scene.sources}):
         members = members_of(scene, name)
@@ -41,8 +38,6 @@ def build_groups(scene: Scene, backend: Backend, particles: list[BodyParticles])
                 [particles[i] for i in members],
                 [int(first_ids[i]) for i in members],
                 origin,
-                node_width(scene.dimension, on_cpu=True) if backend.on_cpu else scene.dimension,
-                layout,
                 serial=backend.on_cpu and backend.threads == 1,
                 keeps_initial=needs_initial(scene, members),
                 total=scene.solver.solids == "total",

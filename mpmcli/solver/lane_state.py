@@ -3,7 +3,8 @@
 A loop over lanes becomes vector instructions, branches included, where it reads and writes local arrays alone and calls
 nothing. One that stores to fields does not, as Taichi reads the address of a field anew after every store. Therefore
 particles are copied to local arrays with a row for each quantity and a column for each lane. Every lane computes what
-it would compute alone.
+it would compute alone. Lanes beyond the last particle of a range hold those that follow in memory, and what they
+compute is not used.
 """
 
 import taichi as ti
@@ -11,6 +12,14 @@ import taichi as ti
 from mpmcli.solver.particle_arrays import CONSTANTS
 
 LANES = 8
+# The highest number of a particle to which that of a lane can be added without overflow.
+LOW_BITS = 2**30 - 1
+
+
+@ti.func
+def bounded(begin: int):
+    """Return the number of a particle, which a compiler then knows not to overflow: those of lanes are neighbours."""
+    return begin & LOW_BITS
 
 
 @ti.func
@@ -33,21 +42,21 @@ def internal_entries(group: object) -> int:
 def load_lanes(
     group: ti.template(),
     begin: int,
-    count: int,
     affine: ti.template(),
     deformation: ti.template(),
     internal: ti.template(),
     rows: ti.template(),
 ):
-    """Copy `count` particles from `begin` on; lanes beyond the last one repeat it.
+    """Copy particles from `begin` on.
 
     Args:
         affine: takes C, d^2; deformation: F - I, d^2, or J - 1; internal: the internal variables.
         rows: takes the row of the table.
     """
     d = ti.static(group.dimension)
+    origin = bounded(begin)
     for lane in range(LANES):
-        p = begin + ti.min(lane, count - 1)
+        p = origin + lane
         for c, a in ti.static(ti.ndrange(d, d)):
             affine[c * d + a, lane] = group.gradient[p][a, c]
         load_deformation(group, p, lane, deformation)
@@ -101,3 +110,23 @@ def stored_of(group: ti.template(), deformation: ti.template(), lane: int):
 def constants_of(rows: ti.template(), lane: int):
     """Return the constants of the law in a lane."""
     return vector_of(rows, CONSTANTS, ti.static(rows.n - CONSTANTS), lane)
+
+
+@ti.func
+def node_rows_of(lanes: ti.template(), d: ti.template(), width: ti.template(), columns: ti.template(), lane: int):
+    """Return the d rows, each as wide as a node, that a lane has one after another; of each the first `columns`."""
+    result = ti.Matrix.zero(float, d, columns)
+    for c in ti.static(range(columns)):
+        for a in ti.static(range(d)):
+            result[a, c] = lanes[lane, a * width + c]
+    return result
+
+
+@ti.func
+def weights_of(weights: ti.template(), nodes: ti.template(), d: ti.template(), lane: int):
+    """Return the weights of a lane as a spline returns them."""
+    w = ti.Matrix.zero(float, nodes, d)
+    for k in ti.static(range(nodes)):
+        for a in ti.static(range(d)):
+            w[k, a] = weights[k * d + a, lane]
+    return w

@@ -44,7 +44,7 @@ class SortBuffers:
     """
 
     def __init__(self, groups: Sequence[ParticleArrays], runs: int = 1) -> None:
-        n = max(group.x.shape[0] for group in groups)
+        n = max(group.capacity for group in groups)
         self.room = n // runs
         self.widest = max(entry_count(field) for group in groups for field in group.state)
         self.order = ti.field(int, shape=n)

@@ -7,27 +7,44 @@ import taichi as ti
 
 from mpmcli.materials.elementary import exp
 from mpmcli.materials.law import Law
-from mpmcli.solver.grid import gradient_width
 from mpmcli.solver.particle_exchange import ParticleExchange
 from mpmcli.solver.period import Period
 
 # Entries of the per-body table that come before the constants of the law.
 MASS, VOLUME, CONSTANTS = 0, 1, 2
+# Places behind the last particle, of every field.
+SPARE = 16
+
+
+def gradient_width(dimension: int, precision: str) -> int:
+    """Return the numbers in a row of `ParticleArrays.gradient`."""
+    return dimension + (precision == "f32")
+
+
+def _vectors(n: int, shape: int) -> ti.MatrixField:
+    return ti.Vector.field(n, float, shape=shape, layout=ti.Layout.SOA)
+
+
+def _matrices(rows: int, columns: int, shape: int) -> ti.MatrixField:
+    return ti.Matrix.field(rows, columns, float, shape=shape, layout=ti.Layout.SOA)
 
 
 @ti.data_oriented
 class ParticleArrays(ParticleExchange):
     """Fields of particles of one law, of one run or of several, each of which has a contiguous range.
 
+    The same entry of neighbouring particles lies together in memory, so that a CPU loads and stores as many at once as
+    a vector register holds, and a GPU those of neighbouring threads. Behind the last particle SPARE places may be read.
+
     Attributes:
-        law: the constitutive law.
+        law: the constitutive law; capacity: particles n.
         dimension: d.
         x: position relative to the origin of the domain, (n) Vector(d), m.
-        v: velocity, (n) Vector, m/s, as wide as a node of the grid; the first d entries count.
-        gradient: of the velocity, (n) matrix of d rows as wide, 1/s: row a holds dv/dx_a, the transpose of C, and then
-            the remainder of x along a, m, where the group `carries` one.
+        v: velocity, (n) Vector(d), m/s.
+        gradient: of the velocity, (n) matrix of d rows, 1/s: row a holds dv/dx_a, the transpose of C, and then the
+            remainder of x along a, m, where the group `carries` one.
         carries: whether particles carry what rounding takes from x, see `ParticleUpdate.moved`: in single precision.
-        displacement_gradient: F - I, (n) matrix of d rows, each as wide as a node; None where the law keeps J.
+        displacement_gradient: F - I, (n) matrix d x d; None where the law keeps J.
         J_minus_1: J - 1, (n); None where the law keeps F. Both are stored as the difference from rest: a step adds
             strains of 1e-6 and less, which single precision would round off next to 1.
         internal: the law's internal variables, (n) each.
@@ -55,8 +72,6 @@ class ParticleArrays(ParticleExchange):
         dimension: int,
         count: int,
         table: tuple[int, int],
-        width: int,
-        layout: ti.Layout,
         *,
         several: bool,
         serial: bool,
@@ -70,33 +85,33 @@ class ParticleArrays(ParticleExchange):
 
         Args:
             count: particles n; table: rows and columns of the table.
-            width: numbers per node of the grid.
         """
         self.law = law
         self.dimension = d = dimension
-        self.x = ti.Vector.field(d, float, shape=count, layout=layout)
-        self.v = ti.Vector.field(width, float, shape=count, layout=layout)
+        self.capacity = count
+        shape = count + SPARE
+        self.x = _vectors(d, shape)
+        self.v = _vectors(d, shape)
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.carries = self.real == np.float32
-        across = gradient_width(width, d, "f32" if self.carries else "f64")
-        self.gradient = ti.Matrix.field(d, across, float, shape=count, layout=layout)
+        self.gradient = _matrices(d, d + self.carries, shape)
         keeps_F = law.deformation == "F"
-        self.displacement_gradient = ti.Matrix.field(d, width, float, shape=count, layout=layout) if keeps_F else None
-        self.J_minus_1 = None if keeps_F else ti.field(float, shape=count)
-        self.internal = tuple(ti.field(float, shape=count) for _ in law.internal)
-        self.id = ti.field(int, shape=count)
+        self.displacement_gradient = _matrices(d, d, shape) if keeps_F else None
+        self.J_minus_1 = None if keeps_F else ti.field(float, shape=shape)
+        self.internal = tuple(ti.field(float, shape=shape) for _ in law.internal)
+        self.id = ti.field(int, shape=shape)
         self.several = several
         self.serial = serial
-        self.body = ti.field(int, shape=count) if several else None
+        self.body = ti.field(int, shape=shape) if several else None
         self.total = total
         self.keeps_initial = keeps_initial or total
-        self.initial = ti.Vector.field(d, float, shape=count, layout=layout) if self.keeps_initial else None
+        self.initial = _vectors(d, shape) if self.keeps_initial else None
         self.averaged = averaged
-        self.cell, self.to_mean = (ti.field(kind, shape=count) if averaged else None for kind in (int, float))
+        self.cell, self.to_mean = (ti.field(kind, shape=shape) if averaged else None for kind in (int, float))
         self.slips = slips
-        self.slip = ti.Vector.field(d, float, shape=count, layout=layout) if slips else None
+        self.slip = _vectors(d, shape) if slips else None
         self.comes_and_goes = comes_and_goes
-        self.activity = ti.field(int, shape=count) if comes_and_goes else None
+        self.activity = ti.field(int, shape=shape) if comes_and_goes else None
         self.pushed = False
         self.force = None
         self.period: Period | None = None

@@ -25,7 +25,7 @@ BEYOND = 1.99
 
 @ti.data_oriented
 class ParticleUpdate:
-    """Both halves of a step of a particle, as a GPU takes them; `lanes` takes them on the CPU.
+    """Both halves of a step of a particle, as a GPU takes them; `scatter_range` and `advance_range` do on the CPU.
 
     Attributes:
         extent: size of the domain, m; last: node of the upper walls, per axis; faces: words of the walls, per axis.

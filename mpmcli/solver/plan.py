@@ -19,8 +19,9 @@ from mpmcli.solver.backend import Backend
 from mpmcli.solver.device_memory import free_memory
 from mpmcli.solver.fixed_point import FixedPoint
 from mpmcli.solver.forces import forces_on, needs_initial
-from mpmcli.solver.grid import Grid, gradient_width, node_width, tile_edge
+from mpmcli.solver.grid import Grid, node_width, tile_edge
 from mpmcli.solver.ordering import TileOrder
+from mpmcli.solver.particle_arrays import gradient_width
 from mpmcli.solver.particle_contact import ParticleContact
 from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.transfer_scheme import scheme_of
@@ -120,10 +121,9 @@ def fields_of(
 ) -> dict[str, int]:
     """Return the bytes of each field of one particle of a law, by name."""
     real = 8 if backend.precision == "f64" else 4
-    width = node_width(dimension, on_cpu=True) if backend.on_cpu else dimension
-    matrix = dimension * width * real
-    fields = {"position": dimension * real, "velocity": width * real}
-    fields["velocity_gradient"] = dimension * real * gradient_width(width, dimension, backend.precision)
+    matrix = dimension * dimension * real
+    fields = {"position": dimension * real, "velocity": dimension * real}
+    fields["velocity_gradient"] = dimension * real * gradient_width(dimension, backend.precision)
     if law.deformation == "F":
         fields["deformation_gradient"] = matrix
     else:

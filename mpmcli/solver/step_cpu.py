@@ -10,15 +10,16 @@ from dataclasses import dataclass
 import taichi as ti
 
 from mpmcli.boundaries.wall_friction import find_friction
+from mpmcli.solver.advance_range import advance_range
 from mpmcli.solver.cpu_loops import average_pencils, clear_rows, scatter_pencils, update_rows
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.grid import Grid
-from mpmcli.solver.lanes import advance_range, scatter_range
 from mpmcli.solver.nodes import NodeUpdate
 from mpmcli.solver.ordering import CHUNK, TileOrder, share_start
 from mpmcli.solver.particle_update import NOT_LOST, ParticleUpdate
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.phase_times import profiles
+from mpmcli.solver.scatter_range import scatter_range
 from mpmcli.solver.state_bounds import (
     NOTHING,
     StateBounds,

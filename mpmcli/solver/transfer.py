@@ -1,18 +1,14 @@
-"""Particle to grid and back: MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015), PIC or AFLIP (docs/theory.md, 2).
+"""Particle to grid and back: MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015), PIC or AFLIP.
 
-Both transfers walk the stencil in lines of three nodes along the last axis and measure positions from its
-middle node, so that its nodes lie at -1, 0 and 1: moments are then differences of sums that are at hand.
-A cubic stencil has one node more, at 2.
-On the CPU every node and every row below is four numbers wide, which the compiler turns into vector
-instructions; that halves the time of the gather in 3D.
+See docs/theory.md, 2.
 """
 
 import taichi as ti
 
-from mpmcli.solver.fixed_sums import FixedSums
 from mpmcli.solver.particle_arrays import MASS, VOLUME
 from mpmcli.solver.particle_friction import friction_of_walls
 from mpmcli.solver.reference_grid import pulled_back, push_of_walls
+from mpmcli.solver.stencils import add_linear, gather_linear
 from mpmcli.solver.volume_average import missing_to_mean, stretch_to
 
 
@@ -167,61 +163,6 @@ def add_fixed(
 
 
 @ti.func
-def add_linear(
-    field: ti.template(),
-    grid: ti.template(),
-    first: int,
-    w: ti.template(),
-    middle: ti.template(),
-    change: ti.template(),
-    atomic: ti.template(),
-):
-    """Add to the nodes of a stencil a quantity that varies linearly over it, weighted by the spline.
-
-    Without `atomic` no other thread may write those nodes.
-
-    Args:
-        field: of the nodes, or sums in fixed point, to which the rest is scaled.
-        first: linear index of the first node.
-        middle: the quantity at the middle node; change: its change per cell, a row for each axis.
-    """
-    d = ti.static(grid.dimension)
-    for o, line_node in ti.static(grid.lines):
-        line_weight = 1.0
-        line = middle
-        step = ti.Vector.zero(float, grid.width)
-        for a in ti.static(range(d - 1)):
-            line_weight *= w[o[a], a]
-        for c in ti.static(range(grid.width)):
-            for a in ti.static(range(d - 1)):
-                if ti.static(o[a] == 0):
-                    line[c] -= change[a, c]
-                if ti.static(o[a] == 2):
-                    line[c] += change[a, c]
-                if ti.static(o[a] == 3):
-                    line[c] += 2.0 * change[a, c]
-            line[c] *= line_weight
-            step[c] = line_weight * change[d - 1, c]
-        node = first + line_node
-        add(field, node, (line - step) * w[0, d - 1], atomic)
-        add(field, node + 1, line * w[1, d - 1], atomic)
-        add(field, node + 2, (line + step) * w[2, d - 1], atomic)
-        if ti.static(grid.scheme.spline.nodes == 4):
-            add(field, node + 3, (line + 2.0 * step) * w[3, d - 1], atomic)
-
-
-@ti.func
-def add(field: ti.template(), node: int, share: ti.template(), atomic: ti.template()):
-    """Add a share of momentum and mass to a node."""
-    if ti.static(isinstance(field, FixedSums)):
-        field.add(node, share)
-    elif ti.static(atomic):
-        ti.atomic_add(field[node], share)
-    else:
-        field[node] = field[node] + share
-
-
-@ti.func
 def gather(x: ti.template(), grid: ti.template(), field: ti.template()):
     """Return the velocity at a point and its gradient, sum w_i (x_i - x) v_i^T / D, of a field of the nodes.
 
@@ -242,40 +183,3 @@ def centred(grid: ti.template(), distance: ti.template(), velocity: ti.template(
         for c in ti.static(range(moment.m)):
             gradient[a, c] = (moment[a, c] - velocity[c] * (distance[a] - 1.0)) * grid.gradient_scale
     return gradient
-
-
-@ti.func
-def gather_linear(field: ti.template(), grid: ti.template(), first: int, w: ti.template()):
-    """Return the weighted sums over a stencil of what nodes hold, and of that times the cells from the middle node.
-
-    Args:
-        field: of the nodes; first: linear index of the first node.
-    """
-    d = ti.static(grid.dimension)
-    velocity = ti.Vector.zero(float, grid.width)
-    moment = ti.Matrix.zero(float, d, grid.width)
-    for o, line_node in ti.static(grid.lines):
-        line_weight = 1.0
-        for a in ti.static(range(d - 1)):
-            line_weight *= w[o[a], a]
-        node = first + line_node
-        low = field[node] * (w[0, d - 1] * line_weight)
-        mid = field[node + 1] * (w[1, d - 1] * line_weight)
-        high = field[node + 2] * (w[2, d - 1] * line_weight)
-        total = (low + high) + mid
-        if ti.static(grid.scheme.spline.nodes == 4):
-            far = field[node + 3] * (w[3, d - 1] * line_weight)
-            total += far
-            for c in ti.static(range(grid.width)):
-                moment[d - 1, c] += 2.0 * far[c]
-        velocity += total
-        for c in ti.static(range(grid.width)):
-            for a in ti.static(range(d - 1)):
-                if ti.static(o[a] == 0):
-                    moment[a, c] -= total[c]
-                if ti.static(o[a] == 2):
-                    moment[a, c] += total[c]
-                if ti.static(o[a] == 3):
-                    moment[a, c] += 2.0 * total[c]
-            moment[d - 1, c] += high[c] - low[c]
-    return velocity, moment

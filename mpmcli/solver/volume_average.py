@@ -14,7 +14,7 @@ from mpmcli.materials.law import SMALLEST, Law
 from mpmcli.materials.tensors import volume_strain
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.grid import Grid
-from mpmcli.solver.lane_state import LANES, load_deformation, matrix_of, vector_of, zero_lanes
+from mpmcli.solver.lane_state import LANES, bounded, load_deformation, matrix_of, vector_of, zero_lanes
 from mpmcli.solver.particle_arrays import VOLUME, ParticleArrays
 from mpmcli.solver.splines import PAD
 
@@ -55,7 +55,7 @@ def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), f
     while begin < last:
         count = ti.min(LANES, last - begin)
         for lane in range(LANES):
-            p = begin + ti.min(lane, count - 1)
+            p = bounded(begin) + lane
             load_deformation(group, p, lane, deformation)
             at = group.on_grid(p)
             for a in ti.static(range(d)):
