@@ -1,8 +1,10 @@
 """The memory that a scene is said to take is the memory that its fields take."""
 
+import tracemalloc
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -10,8 +12,11 @@ from solver_state import scene_of, with_colliders
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
+from mpmcli.output import SegmentStore
 from mpmcli.scene import Scene
+from mpmcli.solver.backend import choose_backend, start, stop_backend
 from mpmcli.solver.device_memory import has_cuda_device
+from mpmcli.solver.engine import build_engine
 from mpmcli.solver.ordering import entry_count
 from mpmcli.solver.plan import LawPlan, Plan, make_plan, require_room
 from mpmcli.solver.solver import Solver
@@ -58,6 +63,41 @@ def test_the_plan_counts_every_field(
     assert plan.bytes_per_node == real * solver.grid.nodes.n
     if (dimension, material, bodies, precision) == (3, "fluid", 1, "f32"):
         assert plan.bytes_per_particle <= 160
+
+
+@pytest.mark.parametrize("fields", [["density"], ["stress", "pressure", "initial_position"]])
+def test_the_plan_counts_what_the_host_holds(tmp_path: Path, fields: list[str]) -> None:
+    """The most that numpy holds from the first particle to the last frame, beside 4 MB of parts and tables."""
+    h = 1 / 800
+    scene = scene_of(
+        domain={"size": [1.0, 1.0], "spacing": h, "gravity": [0.0, -9.81]},
+        time={"end": 4e-6, "frames": 2, "step": 2e-6},
+        solver={"precision": "f32"},
+        bodies=[
+            {
+                "name": "block",
+                "material": MATERIALS["fluid"],
+                "shape": {"box": {"min": [0.2, 0.2], "max": [0.6, 0.6]}},
+            }
+        ],
+        output={"fields": fields},
+    )
+    stop_backend()
+    backend = replace(choose_backend("cpu", 1, "f32"), optimisation="few")
+    plan = make_plan(scene, start(backend))
+    assert plan.particles == 409_600
+    tracemalloc.start()
+    try:
+        engine = build_engine(scene, backend, batched=True)
+        store = SegmentStore(tmp_path, {"scene": "", "bodies": [], "materials": []})
+        for frame, row in engine.frames(lambda: False):
+            store.write(frame, row)
+            del frame
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+        stop_backend()
+    assert 0.8 * plan.host_bytes < peak < plan.host_bytes + 4e6
 
 
 def scene_with(*materials: str, dimension: int = 2) -> Scene:

@@ -46,7 +46,7 @@ class Forecast:
         compile_seconds: part of it for the compilation of kernels, None without a probe.
         step_seconds: wall time of a step, None without a probe.
         device_bytes: size of all fields on the device.
-        host_bytes: size of the arrays of one frame and of the initial state.
+        host_bytes: size of a frame and of what it is made of, or of the initial state.
         file_bytes: size of the packed file without compression.
         vtk_bytes: size of the series of --format vtk.
         dissipation: share of energy per second lost by a wave twice as long as the thinnest body, 1/s.

@@ -227,7 +227,8 @@ def _forecast(check: SceneCheck) -> str:
         took = f", {_time(forecast.seconds)} here, {forecast.compile_seconds:.2g} s of it compilation"
     return (
         f"{steps}, {forecast.frames:,} frames{took}\n"
-        f"{size_text(forecast.device_bytes)} on the device, {size_text(forecast.file_bytes)} on the disk before "
+        f"{size_text(forecast.device_bytes)} on the device, {size_text(forecast.host_bytes)} for frames beside it, "
+        f"{size_text(forecast.file_bytes)} on the disk before "
         f"compression ({size_text(forecast.vtk_bytes)} as .vtu series)"
     )
 

@@ -123,6 +123,8 @@ class SegmentStore(Store):
         with file.written(size) as temporary, VtkhdfWriter(temporary, layout, counts) as writer:
             for name, arrays in layout.stored_together(frames):
                 writer.append(name, arrays)
+                # Before the next one is made.
+                del arrays
             tables = zip(*((frame.time, frame.index, frame.step) for frame in frames), strict=True)
             writer.finish(*tables, rows, self._header)
 

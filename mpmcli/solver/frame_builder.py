@@ -90,8 +90,9 @@ class FrameBuilder:
             ratios = same.volume_ratios(own)
             position[:, rows], velocity[:, rows] = own["x"] + self._origin, own["v"]
             for name, values in same.fields(own, ratios, self._names).items():
-                whole = fields.setdefault(name, np.empty((times, n, *values.shape[2:]), values.dtype))
-                whole[:, rows] = values
+                if name not in fields:
+                    fields[name] = np.empty((times, n, *values.shape[2:]), values.dtype)
+                fields[name][:, rows] = values
             if status is not None:
                 status[:, rows] = own["activity"]
             totals.add(own["x"], ratios, same, constants.body[rows], None if status is None else status[:, rows])

@@ -20,6 +20,7 @@ from mpmcli.solver.device_memory import free_memory
 from mpmcli.solver.fixed_point import FixedPoint
 from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import Grid, node_width, tile_edge
+from mpmcli.solver.host_memory import host_bytes_of
 from mpmcli.solver.ordering import TileOrder
 from mpmcli.solver.particle_arrays import gradient_width
 from mpmcli.solver.particle_contact import ParticleContact
@@ -60,7 +61,7 @@ class Plan:
         scratch_bytes: per particle, of the sort buffers.
         bytes_per_node: of the grid.
         grid_bytes: of all nodes, the tables of the sort, what is found at walls, and what colliders need.
-        host_bytes: of the arrays of one frame and of the initial state.
+        host_bytes: of a frame and what it is made of, or of the initial state, see `host_bytes_of`.
         passes: the loops of a step in order; loops over particles name their law.
         arch: the backend.
     """
@@ -217,8 +218,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     tables += ColliderKind.of(scene).bytes_needed(dimension, nodes // (tile * Grid.tile_counts(cells, tile)[-1]))
     if deterministic:
         tables += nodes * len(scene.colliders) * dimension * real
-    # Twice a particle's state in double precision: the initial state, and a frame with what it is made from.
-    host_bytes = 2 * sum(counts.values()) * 8 * (2 * dimension + dimension**2)
+    host_bytes = host_bytes_of(scene, members, sum(counts.values()), real, on_cpu=backend.on_cpu)
     passes = passes_of(members, scene, deterministic=deterministic)
     return Plan(groups, nodes, widest + 8, node_bytes, nodes * node_bytes + tables, host_bytes, passes, backend.arch)
 
