@@ -236,7 +236,7 @@ def _initialise(backend: Backend) -> None:
             offline_cache=backend.compile_cache,
             # Strict arithmetic is as fast on the CPU, and a NaN stays a NaN in every comparison.
             fast_math=False,
-            # It keeps what a serial loop finds in memory, and takes no note of what real functions write there.
+            # Real functions may write what a serial loop would keep in variables; steps are as fast without.
             cache_loop_invariant_global_vars=not backend.on_cpu,
             log_level=ti.ERROR,
             **OPTIMISATION[backend.optimisation],
