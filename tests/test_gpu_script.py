@@ -292,7 +292,24 @@ def test_the_output_of_pytest_is_read(parts: Callable) -> None:
 def test_every_file_with_tests_of_a_gpu_is_found(parts: Callable) -> None:
     files = parts("tests").gpu_files()
     assert "tests/test_batch_gpu.py" in files and "tests/test_solver_paths.py" in files
-    assert "tests/test_plan.py" not in files
+    assert "tests/test_plan.py" not in files and "tests/test_gpu_script.py" not in files
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arch", ["cpu", pytest.param(GPU, marks=pytest.mark.gpu)])
+def test_every_part_measures(arch: str, tmp_path: Path) -> None:
+    """All parts at the smallest size, the shell script included."""
+    folder = tmp_path / "out"
+    command = [ROOT / "scripts" / "gpu", "--arch", arch, "--scale", "tiny", "--out", folder, "--budget", "900"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == (folder / "report.md").read_text() and "not measured" not in done.stdout.lower()
+    records = {path.stem: json.loads(path.read_text()) for path in folder.glob("*.json")}
+    assert len(records) == 7 and all(record["state"] == "done" for record in records.values())
+    assert records["tests"]["rows"]["quick"]["counts"] == {"passed": 1}
+    for part in ("bench", "largest"):
+        for row in records[part]["rows"].values():
+            assert all(one["sound"] and min(one["rates"]) > 0 for one in row["contestants"].values())
 
 
 @pytest.mark.gpu

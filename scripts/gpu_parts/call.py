@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None, output: IO[str]) -> int:
     records = runner.run([part for part in PARTS if part.name in options.parts])
     write_report(folder)
     report = (folder / NAME).read_text(encoding="utf-8")
-    print(report, file=output)
+    output.write(report)
     if options.write:
         replace_section("gpu", report)
     return 0 if all(record.state == DONE for record in records) else 1
