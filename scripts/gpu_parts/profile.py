@@ -48,9 +48,9 @@ def measure(arch: str, who: str, dimension: int, particles: int, cells: int, ste
     run.advance(STEPS)
     run.sync()
     profiler.query_info("")
-    found = profiler._statistical_results.values()
     launches = [
-        {"name": one.name, "launches": one.counter / STEPS, "us": 1e3 * one.total_time / STEPS} for one in found
+        {"name": one.name, "launches": one.counter / STEPS, "us": 1e3 * one.total_time / STEPS}
+        for one in profiler._statistical_results.values()
     ]
     launches.sort(key=lambda one: -one["us"])
     return {"us": sum(one["us"] for one in launches), "launches": launches[:MOST]}
