@@ -243,6 +243,12 @@ def test_contestants_are_measured_though_one_fails(
     assert "out of memory" in lines[3] and "`mpm3d`" in lines[4]
 
 
+def test_launches_are_told_by_their_share(parts: Callable) -> None:
+    launches = [{"name": "step_2", "launches": 1.0, "us": 90.0}, {"name": "sort", "launches": 0.1, "us": 1.0}]
+    text = parts("bench").section({"profile 3D 300 ours": {"us": 91.0, "launches": launches}})
+    assert text.endswith("| profile 3D 300 ours | `step_2` | 1 | 90.0 | 99% |")
+
+
 def test_a_size_without_room_is_left_out(parts: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = parts("bench")
     size = bench.Size(3, 100_000_000, 512, 2e-5, ("ours",))
@@ -308,7 +314,10 @@ def test_every_part_measures(arch: str, tmp_path: Path) -> None:
     assert len(records) == 7 and all(record["state"] == "done" for record in records.values())
     assert records["tests"]["rows"]["quick"]["counts"] == {"passed": 1}
     for part in ("bench", "largest"):
-        for row in records[part]["rows"].values():
+        for key, row in records[part]["rows"].items():
+            if key.startswith("profile"):
+                assert row["us"] > 0 and row["launches"]
+                continue
             assert all(one["sound"] and min(one["rates"]) > 0 for one in row["contestants"].values())
 
 

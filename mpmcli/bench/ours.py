@@ -87,15 +87,15 @@ class Ours:
         """
         # Imported here, so that a scene can be described without importing Taichi.
         from mpmcli.solver.backend import choose_backend, start
-        from mpmcli.solver.engine import build_engine, suits_batch, useful_threads
+        from mpmcli.solver.engine import build_engine, useful_threads
         from mpmcli.solver.plan import make_plan
 
         scene = parse_scene(data, laws=parameter_models(), source=data["title"], directory=directory).scene
         backend = choose_backend(arch, threads, precision, compile_cache=False)
         count = sum(body.count for body in particles) if particles else estimate_particles(scene)
-        alone = scene.comes_and_goes or scene.solver.deterministic
-        batched = batched and suits_batch(count, backend) and (backend.on_cpu or not alone)
-        if batched and backend.on_cpu:
+        # On a GPU a batch is for many runs: a launch of it takes 32 steps or none.
+        batched = batched and backend.on_cpu
+        if batched:
             backend = replace(backend, threads=useful_threads(count, threads))
         start(backend)
         self.engine = build_engine(scene, backend, particles, batched=batched, force=force)

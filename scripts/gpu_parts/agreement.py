@@ -24,8 +24,8 @@ LAWS = ("fluid", "neo_hookean", "snow", "sand")
 CELLS, SECONDS = {2: 48, 3: 24}, 0.045
 STEP = {2: 1.0e-4, 3: 2.0e-4}
 # Differences that count as rounding: of positions, m, in a box of 1 m, and of energies, relative to the kinetic energy
-# at the start. Software Vulkan differs by up to 3.3e-7 m and 1.8e-6.
-POSITION, ENERGY = {"f32": 1e-5, "f64": 1e-12}, {"f32": 2e-5, "f64": 1e-12}
+# at the start. Software Vulkan differs by up to 4.8e-7 m and 1.1e-5, both with sand in 2D.
+POSITION, ENERGY = {"f32": 1e-5, "f64": 1e-12}, {"f32": 1e-4, "f64": 1e-12}
 MOST_PROCESSES = 8
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from page_section import markdown_table
 
+from gpu_parts import profile
 from gpu_parts.parts import Setup, Task
 from gpu_parts.report import measured
 from mpmcli.bench.cases import BenchCase
@@ -17,6 +18,8 @@ from mpmcli.solver.device_memory import free_memory
 
 # Blocks of each contestant, and their length, s; the first one is not measured.
 BLOCKS, SECONDS = 3, 0.7
+# Contestants whose launches are timed.
+PROFILED = ("ours", "solid")
 # Share of the free memory of the device that a run may take, and bytes of a particle that the plan does not know.
 SHARE, PEER_BYTES = 0.9, 80
 # Bytes of a particle on the host: its initial state in double precision, and a copy.
@@ -65,10 +68,18 @@ FULL = (
 
 
 def tasks(setup: Setup) -> Sequence[Task]:
-    """Return a task for each size."""
+    """Return a task for each size, and after the first one where its time goes."""
     sizes = setup.sized(TINY, SMALL, FULL)
     seconds = setup.sized(0.1, 0.4, SECONDS)
-    return [Task(size.key, lambda left, s=size: compare(s, setup.arch, seconds)) for size in sizes]
+    first, *others = [Task(size.key, lambda left, s=size: compare(s, setup.arch, seconds)) for size in sizes]
+    profiled = [who for who in sizes[0].who if who in PROFILED and setup.arch != "vulkan"]
+    return [first, *(profiling(sizes[0], who, setup.arch) for who in profiled), *others]
+
+
+def profiling(size: Size, who: str, arch: str) -> Task:
+    """Return the task that profiles a contestant."""
+    numbers = (size.dimension, size.particles, size.cells, size.step)
+    return Task(f"profile {size.key} {who}", lambda left: profile.profile(arch, who, *numbers))
 
 
 def compare(size: Size, arch: str, seconds: float) -> dict:
@@ -168,12 +179,15 @@ def section(rows: dict[str, dict]) -> str:
     """Return a line for each contestant, with its ratio to the example of the taichi package."""
     head = ["size", "cells", "who", "M particle-steps/s", "range", "times the example"]
     head += ["bytes/particle: planned, measured", "start + first step, s", "sound"]
+    compared = {key: row for key, row in measured(rows).items() if "contestants" in row}
+    profiles = {key: row for key, row in measured(rows).items() if "launches" in row}
     cells = []
-    for key, row in measured(rows).items():
+    for key, row in compared.items():
         peer = row["contestants"].get("peer", {}).get("rates")
         for who, found in row["contestants"].items():
             cells.append([key, f"{row['cells']}", name_of(who, key), *figures(found, key, peer)])
-    return markdown_table(head, cells, {1, 3})
+    tables = [markdown_table(head, cells, {1, 3}), *([profile.section(profiles)] if profiles else [])]
+    return "\n\n".join(tables)
 
 
 def name_of(who: str, key: str) -> str:

@@ -18,7 +18,7 @@ SMALLEST, LARGEST = 25.0, 40.0
 
 def tasks(setup: Setup) -> Sequence[Task]:
     """Return a task for each number of runs."""
-    counts, frames = setup.sized((2,), (1, 32), COUNTS), setup.sized(1, 10, FRAMES)
+    counts, frames = setup.sized((2,), (1, 8), COUNTS), setup.sized(1, 5, FRAMES)
     return [Task(f"{count:,} at once", lambda left, n=count: together(n, frames, setup.arch)) for count in counts]
 
 

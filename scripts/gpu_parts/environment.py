@@ -51,7 +51,7 @@ def machine() -> dict:
         "processor": describe_machine()["processor"],
         "cores": available_cores(),
         "memory_bytes": psutil.virtual_memory().total,
-        "system": platform.platform(),
+        "system": f"{platform.system()} {platform.machine()}",
         "python": sys.version.split()[0],
         "mpmcli": __version__,
         "commit": said(["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]),
