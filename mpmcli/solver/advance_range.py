@@ -54,7 +54,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                     remainders[c, lane] = group.gradient[p][c, d]
             load_deformation(group, p, lane, deformation)
             if ti.static(group.law.grows_by_constants):
-                row = group.row(p)
+                row = group.row(begin + ti.min(lane, count - 1))
                 for k in ti.static(range(row.n)):
                     rows[k, lane] = row[k]
 

@@ -71,7 +71,7 @@ def show_range(
     begin = first
     while begin < first + count:
         own = ti.min(LANES, first + count - begin)
-        load_lanes(group, begin, affine, deformation, internal, rows)
+        load_lanes(group, begin, own, affine, deformation, internal, rows)
         if ti.static(group.averaged):
             for lane in range(own):
                 missing[lane] = group.to_mean[begin + lane]

@@ -42,12 +42,13 @@ def internal_entries(group: object) -> int:
 def load_lanes(
     group: ti.template(),
     begin: int,
+    count: int,
     affine: ti.template(),
     deformation: ti.template(),
     internal: ti.template(),
     rows: ti.template(),
 ):
-    """Copy particles from `begin` on.
+    """Copy `count` particles from `begin` on.
 
     Args:
         affine: takes C, d^2; deformation: F - I, d^2, or J - 1; internal: the internal variables.
@@ -62,7 +63,8 @@ def load_lanes(
         load_deformation(group, p, lane, deformation)
         for i in ti.static(range(len(group.internal))):
             internal[i, lane] = group.internal[i][p]
-        row = group.row(p)
+        # What lies beyond the last particle is no row of the table.
+        row = group.row(begin + ti.min(lane, count - 1))
         for k in ti.static(range(row.n)):
             rows[k, lane] = row[k]
 

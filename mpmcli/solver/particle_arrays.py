@@ -12,7 +12,7 @@ from mpmcli.solver.period import Period
 
 # Entries of the per-body table that come before the constants of the law.
 MASS, VOLUME, CONSTANTS = 0, 1, 2
-# Places behind the last particle, of every field.
+# Numbers behind the last field.
 SPARE = 16
 
 
@@ -21,12 +21,12 @@ def gradient_width(dimension: int, precision: str) -> int:
     return dimension + (precision == "f32")
 
 
-def _vectors(n: int, shape: int) -> ti.MatrixField:
-    return ti.Vector.field(n, float, shape=shape, layout=ti.Layout.SOA)
+def _vectors(n: int, count: int) -> ti.MatrixField:
+    return ti.Vector.field(n, float, shape=count, layout=ti.Layout.SOA)
 
 
-def _matrices(rows: int, columns: int, shape: int) -> ti.MatrixField:
-    return ti.Matrix.field(rows, columns, float, shape=shape, layout=ti.Layout.SOA)
+def _matrices(rows: int, columns: int, count: int) -> ti.MatrixField:
+    return ti.Matrix.field(rows, columns, float, shape=count, layout=ti.Layout.SOA)
 
 
 @ti.data_oriented
@@ -34,7 +34,7 @@ class ParticleArrays(ParticleExchange):
     """Fields of particles of one law, of one run or of several, each of which has a contiguous range.
 
     The same entry of neighbouring particles lies together in memory, so that a CPU loads and stores as many at once as
-    a vector register holds, and a GPU those of neighbouring threads. Behind the last particle SPARE places may be read.
+    a vector register holds, and a GPU those of neighbouring threads. A few places behind the last particle may be read.
 
     Attributes:
         law: the constitutive law; capacity: particles n.
@@ -89,35 +89,36 @@ class ParticleArrays(ParticleExchange):
         self.law = law
         self.dimension = d = dimension
         self.capacity = count
-        shape = count + SPARE
-        self.x = _vectors(d, shape)
-        self.v = _vectors(d, shape)
+        self.x = _vectors(d, count)
+        self.v = _vectors(d, count)
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.carries = self.real == np.float32
-        self.gradient = _matrices(d, d + self.carries, shape)
+        self.gradient = _matrices(d, d + self.carries, count)
         keeps_F = law.deformation == "F"
-        self.displacement_gradient = _matrices(d, d, shape) if keeps_F else None
-        self.J_minus_1 = None if keeps_F else ti.field(float, shape=shape)
-        self.internal = tuple(ti.field(float, shape=shape) for _ in law.internal)
-        self.id = ti.field(int, shape=shape)
+        self.displacement_gradient = _matrices(d, d, count) if keeps_F else None
+        self.J_minus_1 = None if keeps_F else ti.field(float, shape=count)
+        self.internal = tuple(ti.field(float, shape=count) for _ in law.internal)
+        self.id = ti.field(int, shape=count)
         self.several = several
         self.serial = serial
-        self.body = ti.field(int, shape=shape) if several else None
+        self.body = ti.field(int, shape=count) if several else None
         self.total = total
         self.keeps_initial = keeps_initial or total
-        self.initial = _vectors(d, shape) if self.keeps_initial else None
+        self.initial = _vectors(d, count) if self.keeps_initial else None
         self.averaged = averaged
-        self.cell, self.to_mean = (ti.field(kind, shape=shape) if averaged else None for kind in (int, float))
+        self.cell, self.to_mean = (ti.field(kind, shape=count) if averaged else None for kind in (int, float))
         self.slips = slips
-        self.slip = _vectors(d, shape) if slips else None
+        self.slip = _vectors(d, count) if slips else None
         self.comes_and_goes = comes_and_goes
-        self.activity = ti.field(int, shape=shape) if comes_and_goes else None
+        self.activity = ti.field(int, shape=count) if comes_and_goes else None
         self.pushed = False
         self.force = None
         self.period: Period | None = None
         self.repeats = False
         self.run = 0
         self.table = ti.Vector.field(table[1], float, shape=table[0])
+        # Taichi lays fields out one after the other: what is read beyond the last particle lies in the next ones.
+        self.spare = ti.field(float, shape=SPARE)
 
     def push_by(self, force: object) -> None:
         """Let a force act on the particles, see `forces.GroupForce`."""

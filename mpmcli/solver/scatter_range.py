@@ -55,7 +55,7 @@ def scatter_range(
     begin = first
     while begin < last:
         count = ti.min(LANES, last - begin)
-        load_lanes(group, begin, affine, deformation, internal, rows)
+        load_lanes(group, begin, count, affine, deformation, internal, rows)
         origin = bounded(begin)
         for lane in range(LANES):
             at = group.on_grid(origin + lane)
