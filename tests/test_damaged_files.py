@@ -143,7 +143,7 @@ def test_how_deep_tables_may_be() -> None:
     for _ in range(59):
         tree = [tree]
     assert not too_deep(tree) and not too_deep({}) and too_deep([[tree]])
-    with pytest.raises(InputError, match="too deep"):
+    with pytest.raises(InputError, match="lies so deep"):
         apply_overrides({"title": 1}, ["a" + ".a" * 100 + "=1"])
 
 
