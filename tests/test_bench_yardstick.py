@@ -45,7 +45,7 @@ def states(run_python: Callable, tmp_path: Path) -> Callable[..., tuple[np.ndarr
 def in_c(states: Callable, case: BenchCase) -> tuple[np.ndarray, np.ndarray]:
     """Return what the yardstick computes, on one thread and on three.
 
-    In a process of its own, since -ffast-math changes the arithmetic of a process.
+    In a process of its own, as Taichi starts once.
     """
     return states(
         case,
@@ -130,3 +130,10 @@ class TestWhereItCannotBe:
     def test_other_precisions_and_devices_are_refused(self, precision: str, arch: str) -> None:
         with pytest.raises(RunError, match=f"not in {precision} on {arch}"):
             yardstick.falling_block(CASES[0], threads=1, precision=precision, arch=arch)
+
+
+@needs_gcc
+def test_denormal_numbers_stay() -> None:
+    """A library linked with -ffast-math would flush them to zero in all of the process."""
+    yardstick.load_yardstick(2)
+    assert np.array([5e-324])[0] * 1.0 > 0.0

@@ -2,7 +2,7 @@
 
    Quadratic B-splines, APIC, walls that slip, as mpmcli with `walls = "zeroed"`, and a fluid of linear pressure,
    tau = K (J - 1), where J is multiplied by det(I + dt C). The first velocity is that of the first step's start
-   (symplectic Euler). Compile with -DD=2 or -DD=3, -O3 -march=native -ffast-math -fopenmp.
+   (symplectic Euler). Compile with -DD=2 or -DD=3, the flags of `yardstick.py`.
 
    A node is one vector: momentum in the first D numbers, mass in the last. Particles are sorted by cell whenever one may
    have moved by a cell. Tiles of TILE cells across all axes but the last one are scattered in colours: those of one
