@@ -12,7 +12,7 @@ from mpmcli.bench.cases import BULK_MODULUS, DENSITY, EDGE, GRAVITY, BenchCase
 from mpmcli.errors import RunError
 
 SOURCE = Path(__file__).with_suffix(".c")
-# Those of -ffast-math but without it: a library linked with that flushes denormal numbers of all of the process to zero.
+# Those of -ffast-math but without it: a library linked with that flushes denormal numbers of its process to zero.
 FAST_MATH = (
     *("-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math", "-freciprocal-math"),
     "-ffinite-math-only",
