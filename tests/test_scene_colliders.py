@@ -95,8 +95,8 @@ def test_a_container_has_its_material_inside() -> None:
         ({"shape": {"plane": {"point": [0, 0], "normal": [0, 0]}}}, "must have a direction"),
         ({"shape": {"ball": {"center": [50.0, 0.5], "radius": 10.0}}}, '"c0" (20 x 20 m) lies outside of the domain'),
         (
-            {"shape": {"polygon": {"points": [[0, -1e6], [0.1, -1e6], [0.1, 0.1]]}}},
-            '"c0" spans 1.56e+09 cells, and 1e+08 is the most',
+            {"shape": {"polygon": {"vertices": [[0, -1e9], [0.1, -1e9], [0.1, 0.1]]}}},
+            '"c0" spans 6e+10 cells, and 1e+08 is the most',
         ),
         ({"shape": {"ball": {"center": [0.0, 0.0], "radius": 0.08}}}, 'body "a" overlaps collider "c0" at the start'),
         ({"speed": 1.0}, "colliders[0].speed"),
