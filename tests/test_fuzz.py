@@ -10,8 +10,8 @@ import pytest
 import tomli_w
 from conftest import ROOT
 from fuzzing.corpus import corpus
+from fuzzing.file_mutation import hdf5_mutant, sqlite_mutant
 from fuzzing.from_schema import scene_of
-from fuzzing.mutation import hdf5_mutant, sqlite_mutant
 from fuzzing.outcome import fault_of
 from fuzzing.seeds import datasets, results
 from fuzzing.targets import TARGETS

@@ -4,11 +4,11 @@ import taichi as ti
 
 from mpmcli.solver.lane_state import (
     LANES,
-    bounded,
     constants_of,
     load_deformation,
     matrix_of,
     node_rows_of,
+    repeat_first,
     stored_entries,
     vector_of,
     weights_of,
@@ -16,6 +16,7 @@ from mpmcli.solver.lane_state import (
 )
 from mpmcli.solver.particle_arrays import CONSTANTS
 from mpmcli.solver.particle_update import deformed_gradient
+from mpmcli.solver.splines import bounded
 from mpmcli.solver.state_bounds import NOTHING, deformation_rate, volume_growth
 from mpmcli.solver.stencils import gather_linear
 from mpmcli.solver.transfer import centred
@@ -57,6 +58,10 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 row = group.row(begin + ti.min(lane, count - 1))
                 for k in ti.static(range(row.n)):
                     rows[k, lane] = row[k]
+        if count < LANES:
+            repeat_first(x, count)
+            repeat_first(here, count)
+            repeat_first(deformation, count)
 
         for lane in range(LANES):
             base, distance = grid.scheme.spline.stencil(vector_of(x, 0, d, lane), grid.inverse_spacing)

@@ -88,37 +88,14 @@ def build_device_kernels(places: int, *, on_cpu: bool) -> DeviceKernels:
             place = index[i]
             table[place] = table[place] + 1.0
 
-    @ti.kernel
-    def launch_1():
-        for i in few:
-            few[i] = few[i] + 1.0
+    def launch_of(loops: int) -> Callable[[], None]:
+        @ti.kernel
+        def launch():
+            for _ in ti.static(range(loops)):
+                for i in few:
+                    few[i] = few[i] + 1.0
 
-    @ti.kernel
-    def launch_2():
-        for i in few:
-            few[i] = few[i] + 1.0
-        for i in few:
-            few[i] = few[i] + 1.0
-
-    @ti.kernel
-    def launch_3():
-        for i in few:
-            few[i] = few[i] + 1.0
-        for i in few:
-            few[i] = few[i] + 1.0
-        for i in few:
-            few[i] = few[i] + 1.0
-
-    @ti.kernel
-    def launch_4():
-        for i in few:
-            few[i] = few[i] + 1.0
-        for i in few:
-            few[i] = few[i] + 1.0
-        for i in few:
-            few[i] = few[i] + 1.0
-        for i in few:
-            few[i] = few[i] + 1.0
+        return launch
 
     @ti.kernel
     def launch_with_argument(value: ti.f32):
@@ -132,7 +109,7 @@ def build_device_kernels(places: int, *, on_cpu: bool) -> DeviceKernels:
         read=read,
         add=add,
         add_plainly=add_plainly if on_cpu else None,
-        launches={1: launch_1, 2: launch_2, 3: launch_3, 4: launch_4},
+        launches={loops: launch_of(loops) for loops in range(1, 5)},
         launch_with_argument=launch_with_argument,
         wait=ti.sync,
         free=tree.destroy,

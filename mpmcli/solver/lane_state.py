@@ -3,23 +3,24 @@
 A loop over lanes becomes vector instructions, branches included, where it reads and writes local arrays alone and calls
 nothing. One that stores to fields does not, as Taichi reads the address of a field anew after every store. Therefore
 particles are copied to local arrays with a row for each quantity and a column for each lane. Every lane computes what
-it would compute alone. Lanes beyond the last particle of a range hold those that follow in memory, and what they
-compute is not used.
+it would compute alone. Lanes beyond the last particle of a range repeat the first one: what they compute is not used,
+but laws may loop until they converge.
 """
 
 import taichi as ti
 
 from mpmcli.solver.particle_arrays import CONSTANTS
+from mpmcli.solver.splines import bounded
 
 LANES = 8
-# The highest number of a particle to which that of a lane can be added without overflow.
-LOW_BITS = 2**30 - 1
 
 
 @ti.func
-def bounded(begin: int):
-    """Return the number of a particle, which a compiler then knows not to overflow: those of lanes are neighbours."""
-    return begin & LOW_BITS
+def repeat_first(lanes: ti.template(), count: int):
+    """Copy lane 0 to the lanes from `count` on, which were loaded from what follows in memory."""
+    for lane in range(count, LANES):
+        for k in ti.static(range(lanes.n)):
+            lanes[k, lane] = lanes[k, 0]
 
 
 @ti.func
@@ -67,6 +68,10 @@ def load_lanes(
         row = group.row(begin + ti.min(lane, count - 1))
         for k in ti.static(range(row.n)):
             rows[k, lane] = row[k]
+    if count < LANES:
+        repeat_first(affine, count)
+        repeat_first(deformation, count)
+        repeat_first(internal, count)
 
 
 @ti.func

@@ -93,7 +93,7 @@ class ParticleArrays(ParticleExchange):
         self.v = _vectors(d, count)
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.carries = self.real == np.float32
-        self.gradient = _matrices(d, d + self.carries, count)
+        self.gradient = _matrices(d, gradient_width(d, "f32" if self.carries else "f64"), count)
         keeps_F = law.deformation == "F"
         self.displacement_gradient = _matrices(d, d, count) if keeps_F else None
         self.J_minus_1 = None if keeps_F else ti.field(float, shape=count)

@@ -7,12 +7,12 @@ import taichi as ti
 
 from mpmcli.solver.lane_state import (
     LANES,
-    bounded,
     constants_of,
     internal_entries,
     load_lanes,
     matrix_of,
     node_rows_of,
+    repeat_first,
     stored_entries,
     stored_of,
     vector_of,
@@ -23,6 +23,7 @@ from mpmcli.solver.particle_arrays import MASS, VOLUME
 from mpmcli.solver.particle_friction import friction_of_walls
 from mpmcli.solver.particle_update import SMALLEST_J
 from mpmcli.solver.reference_grid import pulled_back, push_of_walls
+from mpmcli.solver.splines import bounded
 from mpmcli.solver.state_bounds import volume_ratio
 from mpmcli.solver.stencils import add_linear
 from mpmcli.solver.transfer import momentum, scatter_before, scatter_volume
@@ -64,6 +65,10 @@ def scatter_range(
                 v[c, lane] = group.v[origin + lane][c]
                 if ti.static(group.total):
                     here[c, lane] = group.x[origin + lane][c]
+        if count < LANES:
+            repeat_first(x, count)
+            repeat_first(v, count)
+            repeat_first(here, count)
         more = ti.static(group.averaged or particles.touches or group.slips or group.pushed)
         for lane in range(ti.static(LANES * more)):
             # What reads more than arrays: lanes beyond the last particle repeat it.

@@ -6,6 +6,18 @@ from mpmcli.stability.transfer_factors import INVERSE_MOMENT
 
 # Nodes beyond each wall: ghost nodes that the wall folds, and the reach of a stencil.
 PAD = 3
+# The highest index to which others can be added without overflow.
+LOW_BITS = 2**30 - 1
+
+
+@ti.func
+def bounded(index: int):
+    """Return an index of at most LOW_BITS, which a compiler then knows not to overflow when another is added.
+
+    A CPU's compiler can then add constants to one address, which takes a third fewer instructions in 3D, and knows that
+    the particles of lanes are neighbours.
+    """
+    return index & LOW_BITS
 
 
 @ti.data_oriented

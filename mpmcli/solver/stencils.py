@@ -9,9 +9,7 @@ instructions.
 import taichi as ti
 
 from mpmcli.solver.fixed_sums import FixedSums
-
-# The highest linear index of a node to which others of its stencil can be added without overflow.
-LOW_BITS = 2**30 - 1
+from mpmcli.solver.splines import LOW_BITS, bounded
 
 
 @ti.func
@@ -34,7 +32,7 @@ def add_linear(
         middle: the quantity at the middle node; change: its change per cell, a row for each axis.
     """
     d = ti.static(grid.dimension)
-    origin = bounded(first, grid)
+    origin = origin_of(first, grid)
     for i in ti.static(range(grid.planes)):
         # At the middle of a plane, weighted along the first axis, and the changes along the others.
         plane, across, along = middle, ti.Vector.zero(float, grid.width), ti.Vector.zero(float, grid.width)
@@ -60,13 +58,10 @@ def add_linear(
 
 
 @ti.func
-def bounded(first: int, grid: ti.template()):
-    """Return the linear index of a node, which a compiler then knows not to overflow.
-
-    A CPU's compiler can then add the distances to other nodes to one address: a third fewer instructions in 3D.
-    """
+def origin_of(first: int, grid: ti.template()):
+    """Return the linear index of the first node of a stencil, `bounded` where the grid has few enough nodes."""
     if ti.static(grid.runs * grid.node_count <= LOW_BITS):
-        return first & LOW_BITS
+        return bounded(first)
     else:
         return first
 
@@ -111,7 +106,7 @@ def gather_linear(field: ti.template(), grid: ti.template(), first: int, w: ti.t
         field: of the nodes; first: linear index of the first node.
     """
     d = ti.static(grid.dimension)
-    origin = bounded(first, grid)
+    origin = origin_of(first, grid)
     velocity = ti.Vector.zero(float, grid.width)
     moment = ti.Matrix.zero(float, d, grid.width)
     for i in ti.static(range(grid.planes)):

@@ -14,9 +14,9 @@ from mpmcli.materials.law import SMALLEST, Law
 from mpmcli.materials.tensors import volume_strain
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.grid import Grid
-from mpmcli.solver.lane_state import LANES, bounded, load_deformation, matrix_of, vector_of, zero_lanes
+from mpmcli.solver.lane_state import LANES, load_deformation, matrix_of, vector_of, zero_lanes
 from mpmcli.solver.particle_arrays import VOLUME, ParticleArrays
-from mpmcli.solver.splines import PAD
+from mpmcli.solver.splines import PAD, bounded
 
 
 def averages_volume(settings: SolverSettings, law: Law) -> bool:

@@ -8,17 +8,9 @@ from random import Random
 import tomli_w
 
 from fuzzing import seeds
+from fuzzing.file_mutation import hdf5_mutant, npz_mutant, sqlite_mutant
 from fuzzing.from_schema import revised, scene_of
-from fuzzing.mutation import (
-    bytes_mutant,
-    hdf5_mutant,
-    json_mutant,
-    npz_mutant,
-    sqlite_mutant,
-    text_mutant,
-    tree_mutant,
-    value_mutant,
-)
+from fuzzing.mutation import bytes_mutant, json_mutant, text_mutant, tree_mutant, value_mutant
 from fuzzing.new_checksums import with_new_checksums
 from fuzzing.seeds import Files
 
