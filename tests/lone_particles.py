@@ -10,7 +10,8 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.batch import Batch, Kind
+from mpmcli.solver.batch import Batch
+from mpmcli.solver.batch_kind import Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.diagnosis import UnstableRunError
 

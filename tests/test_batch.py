@@ -13,7 +13,8 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene, sample_bodies
 from mpmcli.solver import launch_budget
-from mpmcli.solver.batch import Batch, Kind
+from mpmcli.solver.batch import Batch
+from mpmcli.solver.batch_kind import Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.solver import Solver

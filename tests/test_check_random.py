@@ -7,7 +7,8 @@ from random_drives import LAWS, random_scene
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.batch import Batch, Kind
+from mpmcli.solver.batch import Batch
+from mpmcli.solver.batch_kind import Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.engine import build_engine
 

@@ -16,7 +16,8 @@ from mpmcli.errors import InputError
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.simulation.runner import _keeps
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.batch import Batch, Kind
+from mpmcli.solver.batch import Batch
+from mpmcli.solver.batch_kind import Kind
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.fixed_point import DENSEST
 from mpmcli.solver.fixed_sums import FixedSums

@@ -15,7 +15,8 @@ from mpmcli.errors import InputError
 from mpmcli.output import open_result
 from mpmcli.scene import Scene, sample_bodies, scene_to_toml
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.batch import Batch, Kind
+from mpmcli.solver.batch import Batch
+from mpmcli.solver.batch_kind import Kind
 from mpmcli.solver.solver import Solver
 
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}

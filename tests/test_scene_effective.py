@@ -172,6 +172,7 @@ transfer = "apic"
 solids = "updated"
 f_bar = "auto"
 walls = "folded"
+grid = "auto"
 deterministic = false
 """
     )

@@ -13,7 +13,7 @@ from mpmcli.dataset.placement import room_before
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.scene.colliders import Collider
 from mpmcli.simulation.runner import Runner
-from mpmcli.solver.batch import Kind
+from mpmcli.solver.batch_kind import Kind
 
 pytestmark = pytest.mark.usefixtures("few_optimisations")
 

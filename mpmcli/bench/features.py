@@ -53,6 +53,7 @@ FEATURES = (
     Feature("periodic faces", "plain"),
     Feature("force", "plain"),
     Feature("force with exp", "plain"),
+    Feature("sparse grid", "plain", 1.30),
     Feature("jet", None),
     Feature("emitter", "jet", 1.03),
     Feature("jelly", None),
@@ -118,6 +119,8 @@ def scene_of(name: str, case: BenchCase, precision: str) -> dict:
                 "box": {"min": [0.5 - half, 0.8, 0.5 - half][:d], "max": [0.5 + half, 0.8 + height, 0.5 + half][:d]}
             }
             data["bodies"].append(body | {"name": "jet", "shape": form, "velocity": down})
+    elif name == "sparse grid":
+        data["solver"]["grid"] = "sparse"
     elif law != "fluid":
         data["solver"]["f_bar"] = name == "f_bar"
     if displaced:

@@ -80,6 +80,14 @@ class SolverSettings(Table):
             "the velocity of nodes on and behind them to zero, as is usual: first-order, to compare with."
         ),
     ] = "folded"
+    grid: Annotated[
+        Literal["auto", "dense", "sparse"],
+        Field(
+            description='Nodes of the background grid. "dense": all of the domain. "sparse": those near particles, in '
+            'blocks, on the CPU; for large domains that are nearly empty. "auto": sparse where a domain has at least '
+            "8 million cells and material fills at most a twentieth of them."
+        ),
+    ] = "auto"
     deterministic: Annotated[
         Flag,
         Field(

@@ -8,11 +8,13 @@ from mpmcli.errors import MpmcliError
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.simulation.recording import Recorder, Recording, record
 from mpmcli.solver.backend import Arch, Backend, Optimisation, choose_backend, start, stop_backend
-from mpmcli.solver.batch import Batch, Kind
+from mpmcli.solver.batch import Batch
+from mpmcli.solver.batch_kind import Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.diagnosis import UnstableRunError
 from mpmcli.solver.engine import build_engine, suits_batch
 from mpmcli.solver.plan import make_plan, require_room
+from mpmcli.solver.sparse_choice import wants_sparse
 
 # Kinds whose kernels are kept at once, and particles below which a scene is computed by kernels that are kept.
 MOST_KINDS, FEW_PARTICLES = 8, 20_000
@@ -179,6 +181,8 @@ class Runner:
 def _keeps(scene: Scene, particles: Sequence[BodyParticles], backend: Backend) -> bool:
     """Return whether a scene with these particles is computed by kernels that are kept for others."""
     count = sum(len(body.position) for body in particles)
+    if wants_sparse(scene) and backend.on_cpu:
+        return False
     if (scene.comes_and_goes or scene.solver.deterministic) and not backend.on_cpu:
         # There a batch does not sort, and does not add in fixed point.
         return False

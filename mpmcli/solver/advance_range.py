@@ -25,7 +25,7 @@ from mpmcli.solver.transfer import centred
 @ti.func
 def advance_range(particles: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int, dt: float):
     """Gather and move particles first to last - 1 of the g-th group; return their largest rate of deformation, 1/s."""
-    grid = particles.grid
+    grid, near = ti.static((particles.grid, particles.near))
     d = ti.static(group.dimension)
     width = ti.static(grid.width)
     nodes = ti.static(grid.scheme.spline.nodes)
@@ -65,7 +65,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
 
         for lane in range(LANES):
             base, distance = grid.scheme.spline.stencil(vector_of(x, 0, d, lane), grid.inverse_spacing)
-            first_node[lane] = grid.linear_index(base)
+            first_node[lane] = near.linear_index(base)
             w = grid.scheme.spline.weights(distance)
             for a in ti.static(range(d)):
                 distances[a, lane] = distance[a]
@@ -74,7 +74,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
 
         for lane in range(count):
             w = weights_of(weights, nodes, d, lane)
-            velocity, moment = gather_linear(grid.nodes, grid, first_node[lane], w)
+            velocity, moment = gather_linear(near.nodes, near, first_node[lane], w)
             for c in ti.static(range(width)):
                 velocities[lane, c] = velocity[c]
                 for a in ti.static(range(d)):

@@ -1,31 +1,28 @@
-"""Many small runs in one process: what they share on the device, and what kinds of runs may share it."""
+"""Many small runs in one process: what they share on the device."""
 
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import replace
 
 import numpy as np
 import taichi as ti
 
 from mpmcli.boundaries.build_walls import build_walls
-from mpmcli.boundaries.collider_kind import ColliderKind
 from mpmcli.boundaries.collider_motion import ColliderMotion
 from mpmcli.boundaries.colliders import Colliders
-from mpmcli.boundaries.moving_faces import MovingFaces, moving_faces
-from mpmcli.boundaries.rough_faces import RoughFaces, rough_faces
+from mpmcli.boundaries.moving_faces import MovingFaces
+from mpmcli.boundaries.rough_faces import RoughFaces
 from mpmcli.errors import InputError
-from mpmcli.materials.law import Law
-from mpmcli.materials.registry import laws
-from mpmcli.scene import BodyParticles, Scene
-from mpmcli.scene.schema import SolverSettings
-from mpmcli.solver.activity import Comings, Emission
+from mpmcli.solver.activity import Emission
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.batch_device import Device
 from mpmcli.solver.batch_gpu import build_gpu_launch
 from mpmcli.solver.batch_kernel import build_batch_kernel
+from mpmcli.solver.batch_kind import Kind
 from mpmcli.solver.batch_layout import MOST_FRAMES, NOTES, Layout
-from mpmcli.solver.batch_values import BatchValues, Drives
+from mpmcli.solver.batch_values import BatchValues
 from mpmcli.solver.external_forces import push_on
 from mpmcli.solver.forces import Gravity
 from mpmcli.solver.frame_reader import sum_entries
@@ -39,87 +36,15 @@ from mpmcli.solver.particle_contact import DRIFT, contact_between
 from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.particle_update import ParticleUpdate
 from mpmcli.solver.period import Period
-from mpmcli.solver.plan import members_of
+from mpmcli.solver.sparse_choice import require_cpu_if_sparse
+from mpmcli.solver.sparse_grid import BlockOrder, SparseGrid, room_for_blocks
 from mpmcli.solver.splines import PAD
+from mpmcli.solver.tile_reach import tiles_reached
 from mpmcli.solver.transfer_scheme import scheme_of
 from mpmcli.solver.volume_average import averages_volume
-from mpmcli.solver.volume_relaxation import needs_filling
 
-
-@dataclass(frozen=True)
-class Kind:
-    """What is compiled for a run. Everything else is data, and runs of one kind share kernels and the device.
-
-    Attributes:
-        dimension: 2 or 3; precision: "f32" or "f64".
-        settings: of the solver.
-        faces: words of the walls, per axis; rough, moving: (axis, side) of those with friction, and that move.
-        flags: of each law in the order of their names, the name and the terms that it has.
-        cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
-        keeps_filling: whether nodes keep the volume scattered to them.
-        colliders: their forms, and which of them move.
-        drives: gravity that varies, forces, and motions of colliders.
-        comings: what lets particles come and go.
-        members: the laws.
-    """
-
-    dimension: int
-    precision: str
-    settings: SolverSettings
-    faces: tuple[tuple[str, str], ...]
-    rough: tuple[tuple[int, int], ...]
-    moving: tuple[tuple[int, int], ...]
-    flags: tuple[tuple, ...]
-    cells: tuple[int, ...]
-    particles: tuple[int, ...]
-    bodies: tuple[int, ...]
-    keeps_filling: bool
-    colliders: ColliderKind
-    drives: Drives
-    comings: Comings
-    members: tuple[Law, ...] = field(compare=False, repr=False)
-
-    @staticmethod
-    def of(scene: Scene, particles: Sequence[BodyParticles]) -> "Kind":
-        """Return the kind of a scene with these particles, one entry per body."""
-        names = sorted({body.material.law for body in scene.sources})
-        places = [members_of(scene, name) for name in names]
-        members = tuple(
-            laws()[name]([scene.sources[i].material for i in own], scene.dimension)
-            for name, own in zip(names, places, strict=True)
-        )
-        return Kind(
-            scene.dimension,
-            scene.solver.precision,
-            scene.solver,
-            tuple(tuple(pair) for pair in scene.domain.walls.faces(scene.dimension)),
-            rough_faces(scene),
-            moving_faces(scene),
-            tuple((law.name, law.terms) for law in members),
-            tuple(scene.domain.cells),
-            tuple(sum(len(particles[i].position) for i in own) for own in places),
-            tuple(len(own) for own in places),
-            needs_filling(scene, members),
-            ColliderKind.of(scene),
-            Drives.of(scene, places)[0],
-            Comings.of(scene, names),
-            members,
-        )
-
-    def joined(self, other: "Kind") -> "Kind | None":
-        """Return the kind that has room for both, None where they need other kernels."""
-        if (self.dimension, self.flags) != (other.dimension, other.flags):
-            return None
-        room = {
-            name: tuple(map(max, getattr(self, name), getattr(other, name)))
-            for name in ("cells", "particles", "bodies")
-        }
-        room["colliders"] = self.colliders.joined(other.colliders)
-        if room["colliders"] is None:
-            return None
-        cells = max(self.comings.cells, other.comings.cells)
-        wide, fits = (replace(one, comings=replace(one.comings, cells=cells), **room) for one in (self, other))
-        return wide if fits == wide else None
+# Room for blocks of a sparse grid, of those that particles reach, when there are more of them than fit.
+GROWTH = 2
 
 
 class Batch:
@@ -148,26 +73,11 @@ class Batch:
             raise InputError("a batch on a GPU knows no emitters and no open faces; run these scenes one by one.")
         if kind.settings.deterministic and not on_cpu:
             raise InputError("a batch on a GPU adds in any order; run deterministic scenes one by one.")
-        width = node_width(d, on_cpu=on_cpu)
+        require_cpu_if_sparse(kind.settings, backend)
         scheme = scheme_of(kind.settings)
-        stencil = scheme.spline.nodes
-        tile = tile_edge(stencil, d, on_cpu=on_cpu)
         averaged = [averages_volume(kind.settings, law) for law in kind.members]
         period = Period(kind.faces, runs, at_once=not on_cpu)
-        grid = Grid(
-            d,
-            1.0,
-            kind.cells,
-            width,
-            scheme,
-            runs,
-            tile=tile,
-            keeps_filling=kind.keeps_filling,
-            averaged=averaged,
-            period=period,
-            walls_move=len(kind.moving) > 0,
-            opens=kind.comings.opens,
-        )
+        grid = self._make_grid(period, room_for_blocks(sum(kind.particles)))
         groups = [
             ParticleArrays(
                 law,
@@ -198,11 +108,8 @@ class Batch:
         walls, images = build_walls(
             kind.faces, kind.settings, PAD, grid.cells, grid.shape, scheme.spline.on_node, friction, moving, runs
         )
-        orders = []
-        if on_cpu:
-            buffers = SortBuffers(groups, runs)
-            sharing = backend.threads if runs == 1 else 1
-            orders = [TileOrder(group, grid, buffers, sharing, True, runs) for group in groups]
+        self._buffers = SortBuffers(groups, runs) if on_cpu else None
+        orders = self._make_orders(groups, grid) if on_cpu else []
         contact = contact_between(groups, kind.bodies, grid, backend, runs)
         colliders = motion = None
         if kind.colliders.count:
@@ -230,7 +137,7 @@ class Batch:
         self.layout = Layout(d, [len(law.internal) for law in kind.members], len(kind.comings.groups))
         self.numbers = np.zeros((runs, self.layout.reals))
         self.counts = np.zeros((runs, self.layout.counts), np.int32)
-        constants = {"drift_allowed": DRIFT if contact else drift_allowed(tile, stencil)}
+        constants = {"drift_allowed": DRIFT if contact else drift_allowed(grid.tile, scheme.spline.nodes)}
         constants |= {"hold": HOLD, "rise": RISE, "slack": 1e-6, "infinity": math.inf}
         for name, value in constants.items():
             self.numbers[:, getattr(self.layout.real, name)] = value
@@ -244,6 +151,55 @@ class Batch:
             self._launch, self.share_work = build_batch_kernel(self.device, self.layout)
         else:
             self._launch = build_gpu_launch(self.device, self.layout)
+
+    def _make_grid(self, period: Period, blocks: int) -> Grid:
+        """Return the grid; on a sparse one there is room for so many blocks."""
+        kind, on_cpu = self.kind, self.backend.on_cpu
+        scheme = scheme_of(kind.settings)
+        tile = tile_edge(scheme.spline.nodes, kind.dimension, on_cpu=on_cpu)
+        sparse = {"blocks": blocks, "threads": self.backend.threads} if kind.sparse and on_cpu else {}
+        return (SparseGrid if sparse else Grid)(
+            kind.dimension,
+            1.0,
+            kind.cells,
+            node_width(kind.dimension, on_cpu=on_cpu),
+            scheme,
+            self.runs,
+            tile=tile,
+            keeps_filling=kind.keeps_filling,
+            averaged=[averages_volume(kind.settings, law) for law in kind.members],
+            period=period,
+            walls_move=len(kind.moving) > 0,
+            opens=kind.comings.opens,
+            **sparse,
+        )
+
+    def _make_orders(self, groups: Sequence[ParticleArrays], grid: Grid) -> list[TileOrder]:
+        """Return the tile order of each group."""
+        kind = BlockOrder if grid.sparse else TileOrder
+        sharing = self.backend.threads if self.runs == 1 else 1
+        return [kind(group, grid, self._buffers, sharing, True, self.runs) for group in groups]
+
+    def occupy(self, first_nodes: np.ndarray) -> None:
+        """Let a sparse grid have the nodes that particles reach whose stencils begin at these, (n, d) int."""
+        grid = self.device.grid
+        tiles = tiles_reached(first_nodes, grid.tile, grid.reach)
+        if len(tiles) >= grid.tile_count:
+            self.grow(len(tiles) + 1)
+        self.device.grid.occupy(tiles)
+
+    def grow(self, blocks: int) -> None:
+        """Make room for GROWTH times so many blocks of a sparse grid. Their numbers are lost: a sort must follow.
+
+        What the grid had stays allocated until the backend stops.
+        """
+        device = self.device
+        grid = self._make_grid(device.grid.period, GROWTH * blocks)
+        nodes, particles = copy(device.nodes), copy(device.particles)
+        nodes.grid = particles.grid = particles.near = grid
+        orders = self._make_orders(device.groups, grid)
+        self.device = replace(device, grid=grid, orders=orders, nodes=nodes, particles=particles)
+        self._launch, self.share_work = build_batch_kernel(self.device, self.layout)
 
     def make_room(self, rows: int, columns: int) -> None:
         """Let each run have so many rows of `shown` from the next launch on."""

@@ -104,6 +104,7 @@ def views(
     particles = _changed(
         device.particles,
         grid=grid,
+        near=grid,
         extent=extent,
         last=last,
         first_lost=w * len(device.groups),

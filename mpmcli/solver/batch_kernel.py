@@ -12,7 +12,7 @@ import taichi as ti
 
 from mpmcli.solver.batch_device import Device, views
 from mpmcli.solver.batch_emission import BatchEmission
-from mpmcli.solver.batch_layout import ATTEND, GOING, LOST, MEASURE, NOTES, Layout
+from mpmcli.solver.batch_layout import ATTEND, CROWDED, GOING, LOST, MEASURE, NOTES, Layout
 from mpmcli.solver.batch_parts import BatchParts, Counts, Numbers, Shown
 from mpmcli.solver.batch_phases import BatchPhases
 from mpmcli.solver.batch_steps import BatchSteps
@@ -92,13 +92,22 @@ def build_batch_kernel(device: Device, layout: Layout) -> tuple[Callable[..., No
         if numbers[w, real.due] <= numbers[w, real.time]:
             h, inverse, scale, box, last, extent = phases.place(w, numbers, counts)
             _grid, _nodes, _particles, orders, _all = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+            before = numbers[w, real.due]
             emission.enter(orders, w, numbers, counts)
+            if ti.static(device.grid.sparse):
+                # What has come in may reach tiles without a number.
+                if numbers[w, real.due] != before:
+                    numbers[w, real.drift] = numbers[w, real.drift_allowed]
 
     @ti.func
     def sort_on(w: int, phase: int, numbers: ti.template(), counts: ti.template()):
         """Do what follows on a phase of a sort before the next one."""
         h, inverse, scale, box, last, extent = phases.place(w, numbers, counts)
-        _grid, _nodes, _particles, orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        grid, _nodes, _particles, orders, _groups = ti.static(views(device, w, h, inverse, scale, box, last, extent))
+        if ti.static(grid.sparse):
+            if phase == phases.marking:
+                if not grid.number():
+                    counts[w, count.status] = CROWDED
         for g in ti.static(range(len(groups))):
             if phase == ti.static(phases.sorts_of[g]):
                 find_places(orders[g], w, w * room[g])
@@ -112,7 +121,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> tuple[Callable[..., No
             first, last = box_of(device.grid, a, stencils[w * 2, a], stencils[w * 2 + 1, a], drift, last_wall)
             device.grid.box[w * 2, a] = first
             device.grid.box[w * 2 + 1, a] = last - first + 1
-        if ti.static(phases.shared):
+        if ti.static(phases.shared and not device.grid.sparse):
             phases.places.divide_rows()
 
     @ti.func
@@ -169,7 +178,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> tuple[Callable[..., No
                     recorded = True
                 elif phase >= phases.sorts:
                     sort_on(w, phase, numbers, counts)
-                inside = phase >= 0 and phase != phases.showing
+                inside = phase >= 0 and phase != phases.showing and counts[w, count.status] != CROWDED
                 if inside and phase != phases.last_of_step and phase != phases.last_of_sort:
                     phase += 1
                 else:

@@ -9,8 +9,8 @@ from mpmcli.solver.state_bounds import ENTRIES
 
 # Status of a run: free, or waiting for the host; to be measured; advancing; measured, as a bound on its step requires,
 # at its target, or with no room for frames left; with lost particles; with a stable step that collapsed; before a kick
-# that ends beyond its time tables.
-IDLE, MEASURE, GOING, ATTEND, LOST, COLLAPSED, BEYOND = range(7)
+# that ends beyond its time tables; before a sort after which particles reach more blocks of nodes than fit.
+IDLE, MEASURE, GOING, ATTEND, LOST, COLLAPSED, BEYOND, CROWDED = range(8)
 # Bounds on the step by their code; of equal ones the lower code counts, as in a comparison of `Limit`s.
 LIMITS = ("", "collider", "deformation", "force", "forced", "maximum", "speed", "viscosity", "wave")
 

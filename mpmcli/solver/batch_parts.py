@@ -9,14 +9,16 @@ asks for the numbers of the run anew.
 
 import taichi as ti
 
-from mpmcli.boundaries.wall_friction import find_friction
 from mpmcli.solver.advance_range import advance_range
 from mpmcli.solver.batch_device import views
-from mpmcli.solver.batch_phases import KICK, MOVED, RELAXED, SPEED, VECTORS, BatchPhases
-from mpmcli.solver.cpu_loops import average_pencils, clear_rows, scatter_pencils, update_rows
+from mpmcli.solver.batch_nodes import NodeParts
+from mpmcli.solver.batch_phases import KICK, MOVED, RELAXED, BatchPhases
+from mpmcli.solver.block_loops import advance_tiles, scatter_tiles
+from mpmcli.solver.cpu_loops import average_pencils, scatter_pencils
 from mpmcli.solver.frame_reader import show_range
 from mpmcli.solver.scatter_range import scatter_range
 from mpmcli.solver.sorting import count_tiles, keep, place_particles, take
+from mpmcli.solver.sparse_grid import BLOCKS
 from mpmcli.solver.volume_average import average_for_frame, average_range
 
 # Of all runs: numbers, counts and what particles show, see `Batch`.
@@ -26,7 +28,7 @@ Shown = ti.types.ndarray(ndim=2)
 
 
 @ti.data_oriented
-class BatchParts:
+class BatchParts(NodeParts):
     """The parts of the phases, w being the number of a run, region and part those of the part.
 
     Attributes:
@@ -35,9 +37,9 @@ class BatchParts:
     """
 
     def __init__(self, phases: BatchPhases) -> None:
-        self.phases, self.device, self.dimension = phases, phases.device, phases.dimension
+        super().__init__(phases)
+        self.device, self.shared = phases.device, phases.shared
         self.members, self.count, self.real = phases.members, phases.count, phases.real
-        self.shared, self.places, self.values = phases.shared, phases.places, phases.values
         numbers = range(len(phases.members))
         laws, nodes = [group.law for _, group in phases.members], phases.device.nodes
         kinds = [("clear", 0, 0, 1)]
@@ -48,6 +50,8 @@ class BatchParts:
         kinds += [("find friction", 0, phases.friction, phases.friction + 1)] * nodes.needs_friction
         kinds += [("update", 0, phases.updating, phases.updating + 1)]
         kinds += [("advance", g, phases.last_of_step, phases.last_of_step + 1) for g in numbers]
+        kinds += [("forget", 0, phases.sorts, phases.sorts + 1)] * phases.numbers_tiles
+        kinds += [("mark", g, phases.marking, phases.marking + 1) for g in numbers if phases.numbers_tiles]
         kinds += [("sort", g, phases.sorts_of[g], phases.sorts_of[g] + phases.sort_length[g]) for g in numbers]
         kinds += [("average shown", g, phases.before_showing, phases.before_showing + 1) for g in phases.averages]
         kinds += [("show", g, phases.showing, phases.showing + 1) for g in numbers]
@@ -61,11 +65,12 @@ class BatchParts:
         phase: int,
         region: int,
         part: int,
+        t: int,
         numbers: Numbers,
         counts: Counts,
         shown: Shown,
     ):
-        """Do a part of a phase in a region, if it belongs to the k-th of the `kinds` or to a later one.
+        """Do a part of a phase in a region as thread t, if it belongs to the k-th of the `kinds` or to a later one.
 
         A function calls the next one: of several that it calls, Taichi 1.7.4 puts the code into the key of its cache in
         the order of their addresses, so that the next process would find nothing.
@@ -79,7 +84,7 @@ class BatchParts:
             if ti.static(what == "average"):
                 self.average(run, g, w, phase - first, region, part, counts)
             if ti.static(what == "scatter"):
-                self.scatter(run, g, w, phase - first, region, part, counts)
+                self.scatter(run, g, w, phase - first, region, part, t, counts)
             if ti.static(what == "relax"):
                 self.relax(run, g, w, region, part, counts)
             if ti.static(what == "find contact"):
@@ -89,7 +94,11 @@ class BatchParts:
             if ti.static(what == "update"):
                 self.update(run, w, region, part)
             if ti.static(what == "advance"):
-                self.advance(run, g, w, region, part, counts)
+                self.advance(run, g, w, region, part, t, counts)
+            if ti.static(what == "forget"):
+                self.forget(run, region)
+            if ti.static(what == "mark"):
+                self.mark(run, g, w, region, counts)
             if ti.static(what == "sort"):
                 self.sort(run, g, w, phase - first, region, counts)
             if ti.static(what == "average shown"):
@@ -97,23 +106,7 @@ class BatchParts:
             if ti.static(what == "show"):
                 self.show(run, g, w, region, part, numbers, counts, shown)
         if ti.static(k + 1 < len(self.kinds)):
-            self.do(ti.static(k + 1), w, phase, region, part, numbers, counts, shown)
-
-    @ti.func
-    def gravity_step(self, w: int):
-        """Return by how much gravity changes velocities in this step, m/s."""
-        result = ti.Vector.zero(float, self.dimension)
-        for a in ti.static(range(self.dimension)):
-            result[a] = self.values[w, VECTORS + a]
-        return result
-
-    @ti.func
-    def clear(self, run: ti.template(), region: int, part: int):
-        """Clear nodes."""
-        grid, _nodes, _particles, _orders, _seen = ti.static(run)
-        first, after = self.places.rows_of(grid, region)
-        first, after = self.phases.share(first, after, part)
-        clear_rows(grid, first, after)
+            self.do(ti.static(k + 1), w, phase, region, part, t, numbers, counts, shown)
 
     @ti.func
     def average(
@@ -130,15 +123,30 @@ class BatchParts:
 
     @ti.func
     def scatter(
-        self, run: ti.template(), g: ti.template(), w: int, colour: int, region: int, part: int, counts: ti.template()
+        self,
+        run: ti.template(),
+        g: ti.template(),
+        w: int,
+        colour: int,
+        region: int,
+        part: int,
+        t: int,
+        counts: ti.template(),
     ):
         """Scatter particles of the g-th group."""
-        _grid, _nodes, particles, orders, seen = ti.static(run)
+        grid, _nodes, particles, orders, seen = ti.static(run)
         kick, relaxed = self.values[w, KICK], self.values[w, RELAXED]
         if colour < self.phases.colours:
             first, after = self.pencils(orders[g], colour, region, part)
-            scatter_pencils(particles, g, seen[g], orders[g], colour, first, after, kick, relaxed)
-        if ti.static(self.device.comes_and_goes):
+            if ti.static(grid.sparse):
+                for q in range(first, after):
+                    pencil = orders[g].pencil_of(colour, q)
+                    begin, end = orders[g].first_tile_of(pencil), orders[g].first_tile_of(pencil + 1)
+                    scatter_tiles(particles, g, seen[g], orders[g], begin, end, t, kick, relaxed)
+            else:
+                scatter_pencils(particles, g, seen[g], orders[g], colour, first, after, kick, relaxed)
+        # On a sparse grid a sort follows on what comes in.
+        if ti.static(self.device.comes_and_goes and not grid.sparse):
             if colour == self.phases.colours and region == 0 and part == 0:
                 first, after = self.come_in(g, orders[g], w, counts)
                 scatter_range(particles, g, seen[g], first, after, kick, relaxed)
@@ -172,41 +180,37 @@ class BatchParts:
             ti.atomic_max(self.values[w, self.phases.rates + 2 * g + 1], change)
 
     @ti.func
-    def find_contact(self, run: ti.template(), w: int, region: int, part: int):
-        """Find where walls that let go are pressed."""
-        grid, nodes, _particles, _orders, _seen = ti.static(run)
-        gravity_step = self.gravity_step(w)
-        first, after = self.places.even_part(nodes.images.plane_nodes(grid), region)
-        first, after = self.phases.share(first, after, part)
-        for q in range(first, after):
-            nodes.images.find_contact(grid, q, gravity_step)
-
-    @ti.func
-    def find_friction(self, run: ti.template(), w: int, region: int, part: int):
-        """Find the friction of walls."""
-        grid, nodes, _particles, _orders, _seen = ti.static(run)
-        gravity_step = self.gravity_step(w)
-        first, after = self.places.even_part(nodes.images.plane_nodes(grid), region)
-        first, after = self.phases.share(first, after, part)
-        for q in range(first, after):
-            find_friction(nodes.images, grid, q, gravity_step)
-
-    @ti.func
-    def update(self, run: ti.template(), w: int, region: int, part: int):
-        """Turn the momentum of nodes into velocity."""
-        grid, nodes, _particles, _orders, _seen = ti.static(run)
-        first, after = self.places.rows_of(grid, region)
-        first, after = self.phases.share(first, after, part)
-        ti.atomic_max(self.values[w, SPEED], update_rows(grid, nodes, first, after, self.gravity_step(w)))
-
-    @ti.func
-    def advance(self, run: ti.template(), g: ti.template(), w: int, region: int, part: int, counts: ti.template()):
+    def advance(
+        self, run: ti.template(), g: ti.template(), w: int, region: int, part: int, t: int, counts: ti.template()
+    ):
         """Gather and move particles of the g-th group."""
-        _grid, _nodes, particles, _orders, _seen = ti.static(run)
-        first, after = self.places.particles_of(g, w, region, counts[w, self.count.particles[g]])
-        first, after = self.phases.share(first, after, part)
-        sharpest = advance_range(particles, g, self.device.groups[g], first, after, self.values[w, MOVED])
-        ti.atomic_max(self.values[w, self.phases.rates + 2 * g], sharpest)
+        grid, _nodes, particles, orders, _seen = ti.static(run)
+        dt, rate = self.values[w, MOVED], self.phases.rates + 2 * g
+        if ti.static(grid.sparse):
+            first, after = self.places.pencils_of(g, region)
+            first, after = self.phases.share(first, after, part)
+            begin, end = orders[g].first_tile_of(first), orders[g].first_tile_of(after)
+            ti.atomic_max(
+                self.values[w, rate], advance_tiles(particles, g, self.device.groups[g], orders[g], begin, end, t, dt)
+            )
+        else:
+            first, after = self.places.particles_of(g, w, region, counts[w, self.count.particles[g]])
+            first, after = self.phases.share(first, after, part)
+            ti.atomic_max(self.values[w, rate], advance_range(particles, g, self.device.groups[g], first, after, dt))
+
+    @ti.func
+    def forget(self, run: ti.template(), region: int):
+        """Take the numbers of the share of a region in the tiles."""
+        grid, _nodes, _particles, _orders, _seen = ti.static(run)
+        first, after = self.places.even_part(grid.sizes[BLOCKS], region)
+        grid.forget(first, after)
+
+    @ti.func
+    def mark(self, run: ti.template(), g: ti.template(), w: int, region: int, counts: ti.template()):
+        """Mark the tiles of the share of a region in the particles of the g-th group."""
+        grid, _nodes, _particles, orders, _seen = ti.static(run)
+        first, after = self.places.even_part(counts[w, self.count.capacity[g]], region)
+        grid.mark(orders[g], first, after)
 
     @ti.func
     def average_shown(self, run: ti.template(), g: ti.template(), w: int, region: int, counts: ti.template()):

@@ -13,8 +13,8 @@ from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import NOTHING
 
-# Parts of a loop over the particles or the nodes of a region.
-SHARES = 4
+# Parts of a loop over the particles or the nodes of a region; on a sparse grid, where parts are whole pencils.
+SHARES, SPARSE_SHARES = 4, 16
 # Numbers of a step: its size and its kick, s, the time over which volumes relax, s, and the largest speed squared.
 MOVED, KICK, RELAXED, SPEED, VECTORS = range(5)
 
@@ -26,6 +26,7 @@ class BatchPhases:
     Attributes:
         shared: whether several threads work on one run; regions: of each run, one for each of them.
         places: of the regions in the particles and the nodes.
+        shares: parts of a loop over a region.
         last_of_step, sorts, last_of_sort, showing: places of phases. A step begins with phase 0, a sort with `sorts`.
         coloured: (group, first phase) of the phases that go over the pencils of a group, of which there are `passes`.
     """
@@ -34,6 +35,7 @@ class BatchPhases:
         self.device, self.dimension = device, device.grid.dimension
         self.members = tuple(enumerate(device.groups))
         self.real, self.count = layout.real, layout.count
+        self.shares = SPARSE_SHARES if device.grid.sparse else SHARES
         self.shared = device.runs == 1 and device.threads > 1
         self.regions = device.threads if self.shared else 1
         self.places = BatchRegions(device, self.regions)
@@ -59,8 +61,11 @@ class BatchPhases:
         # Of each group: count, place, and for each of its fields keep and take.
         self.moved = tuple((*group.state, *group.labels) for group in device.groups)
         self.sorts = self.last_of_step + 1
+        # Tiles are numbered before anything is sorted: old numbers are taken, then tiles that hold particles marked.
+        self.numbers_tiles = device.grid.sparse
+        self.marking = self.sorts + 1
         self.sort_length = tuple(2 + 2 * len(fields) for fields in self.moved)
-        firsts = [self.sorts]
+        firsts = [self.sorts + 2 * self.numbers_tiles]
         for length in self.sort_length:
             firsts.append(firsts[-1] + length)
         self.sorts_of, self.last_of_sort = tuple(firsts[:-1]), firsts[-1] - 1
@@ -127,7 +132,7 @@ class BatchPhases:
         parts = 1
         if ti.static(self.shared):
             if phase < self.sorts or phase == self.showing:
-                parts = SHARES
+                parts = self.shares
             for g, begin in ti.static(self.coloured):
                 colour = phase - begin
                 if colour >= 0 and colour < self.colours:
@@ -138,5 +143,5 @@ class BatchPhases:
     @ti.func
     def share(self, first: int, after: int, part: int):
         """Return the part of a range."""
-        size, shares = after - first, ti.static(SHARES if self.shared else 1)
+        size, shares = after - first, ti.static(self.shares if self.shared else 1)
         return first + share_start(size, part, shares), first + share_start(size, part + 1, shares)

@@ -44,19 +44,30 @@ class BatchRegions:
         after = first + count
         if ti.static(self.regions > 1):
             if region > 0:
-                first = self.device.orders[g].start[self.pencils[g][region - 1] * self.device.orders[g].pencil]
+                first = self.device.orders[g].first_particle_of(self.pencils[g][region - 1])
             if region < self.regions - 1:
-                after = self.device.orders[g].start[self.pencils[g][region] * self.device.orders[g].pencil]
+                after = self.device.orders[g].first_particle_of(self.pencils[g][region])
+        return first, after
+
+    @ti.func
+    def pencils_of(self, g: ti.template(), region: int):
+        """Return the first pencil of a region for the g-th group, and the first after it."""
+        first, after = 0, self.device.orders[g].pencils()
+        if ti.static(self.regions > 1):
+            if region > 0:
+                first = self.pencils[g][region - 1]
+            if region < self.regions - 1:
+                after = self.pencils[g][region]
         return first, after
 
     @ti.func
     def divide(self, g: ti.template(), count: int):
         """Divide the `count` particles of a group, which were sorted, with about as many in each region."""
-        pencils = ti.static(self.device.orders[g].tiles // self.device.orders[g].pencil)
+        pencils = self.device.orders[g].pencils()
         region = 0
         for r in range(pencils):
-            before = self.device.orders[g].start[r * self.device.orders[g].pencil]
-            size = self.device.orders[g].start[(r + 1) * self.device.orders[g].pencil] - before
+            before = self.device.orders[g].first_particle_of(r)
+            size = self.device.orders[g].first_particle_of(r + 1) - before
             # The border falls where more than half of the pencil lies beyond the share.
             while region < self.regions - 1 and before + size // 2 >= share_start(count, region + 1, self.regions):
                 self.pencils[g][region] = r
@@ -69,7 +80,7 @@ class BatchRegions:
             self.device.orders[g].work[colour, self.regions] = self.device.orders[g].pencil_count(colour)
             region = 0
             for q in range(self.device.orders[g].pencil_count(colour)):
-                pencil = self.device.orders[g].pencil_start(colour, q) // self.device.orders[g].pencil
+                pencil = self.device.orders[g].pencil_of(colour, q)
                 while region < self.regions - 1 and pencil >= self.pencils[g][region]:
                     self.device.orders[g].work[colour, region + 1] = q
                     region += 1

@@ -14,7 +14,7 @@ from mpmcli.solver.batch import Batch
 from mpmcli.solver.batch_constants import write_constants
 from mpmcli.solver.batch_exchange import Exchange
 from mpmcli.solver.batch_group import groups_of
-from mpmcli.solver.batch_layout import ATTEND, BEYOND, COLLAPSED, GOING, IDLE, LOST, MEASURE, Row
+from mpmcli.solver.batch_layout import ATTEND, BEYOND, COLLAPSED, CROWDED, GOING, IDLE, LOST, MEASURE, Row
 from mpmcli.solver.batch_recorder import BatchRecorder, steps_of
 from mpmcli.solver.batch_state import aim_on, read_batch, write_batch
 from mpmcli.solver.batch_values import Drives
@@ -26,10 +26,12 @@ from mpmcli.solver.launch_budget import LaunchBudget
 from mpmcli.solver.particle_update import NOT_LOST
 from mpmcli.solver.run import COLLAPSE, Run
 from mpmcli.solver.run_values import RunValues
+from mpmcli.solver.sparse_grid import WANTED
 from mpmcli.solver.state import Progress, SavedState
 from mpmcli.solver.state_bounds import Measurement, entries, state_bounds_of
 from mpmcli.solver.step_control import StepControl
 from mpmcli.solver.sums import Sums
+from mpmcli.solver.tile_reach import first_nodes_of
 
 
 class BatchRun(Run):
@@ -75,6 +77,8 @@ class BatchRun(Run):
         write_constants(batch, slot, scene, self._particles)
         self._row.set(horizon=-math.inf if self._means else math.inf, collider=self._collider_bound)
         self._row.set_counts(status=MEASURE, forced=self._forced)
+        if batch.device.grid.sparse:
+            batch.occupy(first_nodes_of(np.concatenate([body.position for body in self._particles]), scene))
         self._forget_particles()
 
     def _measurement(self, g: int) -> Measurement:
@@ -227,6 +231,8 @@ class BatchRun(Run):
             self._stop_collapsed(self.stable_step()[0])
         if status == BEYOND:
             self._fill_tables()
+        if status == CROWDED:
+            self.batch.grow(self.batch.device.grid.sizes[WANTED])
         if status == ATTEND:
             due = self.state.step_control.take_counters(self._exchange.counters(self.state.step_control))
             if due:

@@ -120,7 +120,7 @@ class BatchThreads:
                     part = claimed & MASK
             turn += 1
         if found == 1:
-            self.parts.do(0, w, self.words[word + PHASE], region, part, numbers, counts, shown)
+            self.parts.do(0, w, self.words[word + PHASE], region, part, t, numbers, counts, shown)
             ti.atomic_add(self.words[word + DONE], 1)
         elif ti.atomic_add(self.words[word + OVER], 0) == 1:
             found = -1

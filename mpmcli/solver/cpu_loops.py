@@ -27,8 +27,8 @@ def average_pencils(
 ):
     """Add the particles of the g-th group in pencils first to last - 1 of a colour to their cells."""
     for r in range(first, last):
-        tile = order.first_tile + order.pencil_start(colour, r)
-        average_range(grid, g, group, order.start[tile], order.start[tile + order.pencil])
+        pencil = order.pencil_of(colour, r)
+        average_range(grid, g, group, order.first_particle_of(pencil), order.first_particle_of(pencil + 1))
 
 
 @ti.func
@@ -45,8 +45,9 @@ def scatter_pencils(
 ):
     """Scatter the particles of the g-th group in pencils first to last - 1 of a colour."""
     for r in range(first, last):
-        tile = order.first_tile + order.pencil_start(colour, r)
-        scatter_range(particles, g, group, order.start[tile], order.start[tile + order.pencil], kick, relaxed)
+        pencil = order.pencil_of(colour, r)
+        begin, after = order.first_particle_of(pencil), order.first_particle_of(pencil + 1)
+        scatter_range(particles, g, group, begin, after, kick, relaxed)
 
 
 @ti.func

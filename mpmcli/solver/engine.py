@@ -8,7 +8,8 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene, estimate_particles, sample_bodies
 from mpmcli.solver.backend import Arch, Backend, choose_backend
-from mpmcli.solver.batch import Batch, Kind
+from mpmcli.solver.batch import Batch
+from mpmcli.solver.batch_kind import Kind
 from mpmcli.solver.batch_run import BatchRun
 from mpmcli.solver.solver import Solver
 from mpmcli.solver.state import SavedState

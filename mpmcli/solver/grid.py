@@ -38,7 +38,33 @@ def node_width(dimension: int, *, on_cpu: bool) -> int:
 
 
 @ti.data_oriented
-class Grid:
+class LinearNodes:
+    """Nodes of a box addressed by one linear index.
+
+    Attributes:
+        dimension: 2 or 3.
+        strides: of the linear index, per axis; first_node: the linear index of node 0.
+    """
+
+    dimension: int
+    strides: tuple[int, ...]
+    first_node: int
+
+    def line_node(self, plane: int, line: int) -> int:
+        """Return the linear offset of the first node of a line along the last axis in a plane of a stencil."""
+        return line * self.strides[-2] + (plane * self.strides[0] if self.dimension == 3 else 0)
+
+    @ti.func
+    def linear_index(self, base: ti.template()):
+        """Return the linear index of the node at the integer coordinates `base`."""
+        index = self.first_node
+        for a in ti.static(range(self.dimension)):
+            index += base[a] * self.strides[a]
+        return index
+
+
+@ti.data_oriented
+class Grid(LinearNodes):
     """A dense grid of nodes over the domain and its ghost margin, addressed by one linear index.
 
     Node index n along an axis lies at (n - PAD) h from the lower wall.
@@ -50,8 +76,8 @@ class Grid:
         scheme: constants of the transfers.
         tile: edge of a tile, cells.
         shape: nodes per axis, margins included, a multiple of `tile`.
-        tiles: tiles per axis.
-        strides: of the linear node index, per axis; first_node: the linear index of node 0.
+        tiles: tiles per axis; tile_count: of all of them.
+        sparse: whether nodes are there where particles are alone.
         planes: of a stencil, normal to the first axis, 1 in 2D; runs: whose nodes it has, one after the other.
         width: numbers per node, at least d + 1.
         nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update.
@@ -69,6 +95,8 @@ class Grid:
             deterministic: whether there are such sums; then there are no `means`.
         box: (2, d) ints: first node in use and number of nodes in use, per axis.
     """
+
+    sparse = False
 
     def __init__(
         self,
@@ -102,13 +130,14 @@ class Grid:
         self.scheme = scheme
         self.tile = tile
         self.tiles = self.tile_counts(cells, tile)
+        self.tile_count = math.prod(self.tiles)
         self.shape = tuple(self.tile * n for n in self.tiles)
         self.strides = tuple(int(np.prod(self.shape[a + 1 :])) for a in range(dimension))
         self.planes = scheme.spline.nodes if dimension == 3 else 1
         self.runs = runs
         self.opens = tuple(opens)
         self.first_node = 0
-        self.node_count = int(np.prod(self.shape))
+        self.node_count = self.stored_nodes()
         self.nodes = ti.Vector.field(width, float, shape=runs * self.node_count)
         self.before = ti.Vector.field(width, float, shape=runs * self.node_count) if scheme.keeps_before else None
         self.keeps_filling = keeps_filling
@@ -124,9 +153,9 @@ class Grid:
         self.deterministic, self.fixed = deterministic, None
         self.box = ti.field(int, shape=(2 * runs, dimension))
 
-    def line_node(self, plane: int, line: int) -> int:
-        """Return the linear offset of the first node of a line along the last axis in a plane of a stencil."""
-        return line * self.strides[-2] + (plane * self.strides[0] if self.dimension == 3 else 0)
+    def stored_nodes(self) -> int:
+        """Return the number of nodes of a run that memory is allocated for."""
+        return math.prod(self.shape)
 
     @staticmethod
     def tile_counts(cells: Sequence[int], tile: int) -> tuple[int, ...]:
@@ -153,12 +182,12 @@ class Grid:
                 means[node] = ti.Vector.zero(float, 2)
 
     @ti.func
-    def linear_index(self, base: ti.template()):
-        """Return the linear index of the node at the integer coordinates `base`."""
-        index = self.first_node
+    def tile_number(self, node: ti.template()):
+        """Return the number of the tile that holds the node at these integer coordinates."""
+        tile = 0
         for a in ti.static(range(self.dimension)):
-            index += base[a] * self.strides[a]
-        return index
+            tile = tile * ti.static(self.tiles[a]) + ti.raw_div(node[a], ti.static(self.tile))
+        return tile
 
     @ti.func
     def place_of(self, index: int):

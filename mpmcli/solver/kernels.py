@@ -21,6 +21,7 @@ from mpmcli.solver.particle_update import BEYOND, ParticleUpdate
 from mpmcli.solver.particles import ParticleGroup
 from mpmcli.solver.period import Period
 from mpmcli.solver.sorting import build_sort
+from mpmcli.solver.sparse_choice import require_cpu_if_sparse
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.step_cpu import build_cpu_step
 from mpmcli.solver.step_gpu import build_gpu_step
@@ -47,6 +48,7 @@ class Kernels:
     """
 
     def __init__(self, scene: Scene, backend: Backend, groups: Sequence[ParticleGroup], gravity: Gravity) -> None:
+        require_cpu_if_sparse(scene.solver, backend)
         width = node_width(scene.dimension, on_cpu=backend.on_cpu)
         scheme = scheme_of(scene.solver)
         stencil = scheme.spline.nodes

@@ -70,14 +70,11 @@ class TileOrder:
         self.buffers = buffers
         self.threads = threads
         self.on_cpu = on_cpu
-        self.tiles = 1
-        for n in grid.tiles:
-            self.tiles *= n
+        self.tiles = grid.tile_count
         # Behind the tiles, where particles come and go, one bin of those that wait and one of those that left.
         self.comes_and_goes = group.comes_and_goes
         self.bins = self.tiles + 2 * self.comes_and_goes
         self.extent = tuple(n * grid.spacing for n in grid.cells)
-        self.pencil = grid.tiles[-1]
         self.colours = 2 ** (grid.dimension - 1)
         self.spans = -(-self.bins // SPAN)
         self.first_tile = 0
@@ -87,11 +84,8 @@ class TileOrder:
         self.work = ti.field(int, shape=(self.colours, threads + 1))
 
     @staticmethod
-    def bytes_needed(cells: Sequence[int], tile: int, threads: int) -> int:
-        """Return the bytes that the tables of one group take."""
-        tiles = 1
-        for n in Grid.tile_counts(cells, tile):
-            tiles *= n
+    def bytes_needed(tiles: int, threads: int) -> int:
+        """Return the bytes that the tables of one group take for so many tiles."""
         return 4 * tiles * (threads + 1)
 
     @ti.func
@@ -108,17 +102,13 @@ class TileOrder:
 
     @ti.func
     def tile_of(self, p: int):
-        """Return the linear index of the tile that holds the stencil's first node of particle p."""
-        base = self.first_node_of(p)
-        tile = 0
-        for a in ti.static(range(self.grid.dimension)):
-            tile = tile * ti.static(self.grid.tiles[a]) + ti.raw_div(base[a], ti.static(self.grid.tile))
-        return tile
+        """Return the number of the tile that holds the stencil's first node of particle p."""
+        return self.grid.tile_number(self.first_node_of(p))
 
     @ti.func
-    def bin_of(self, p: int):
-        """Return the bin of particle p, its tile if it takes part; what lies beyond an open face is retired."""
-        place = 0
+    def status_of(self, p: int):
+        """Return the status of particle p; what lies beyond an open face is retired."""
+        status = ACTIVE
         if ti.static(self.comes_and_goes):
             status = self.group.activity[p]
             if status == ACTIVE:
@@ -135,6 +125,14 @@ class TileOrder:
                     self.group.activity[p] = RETIRED
                     for c in ti.static(range(self.group.v.n)):
                         self.group.v[p][c] = 0.0
+        return status
+
+    @ti.func
+    def bin_of(self, p: int):
+        """Return the bin of particle p, its tile if it takes part."""
+        place = 0
+        if ti.static(self.comes_and_goes):
+            status = self.status_of(p)
             if status == ACTIVE:
                 place = self.tile_of(p)
             else:
@@ -157,8 +155,8 @@ class TileOrder:
         return count
 
     @ti.func
-    def pencil_start(self, colour: int, q: int):
-        """Return the first tile of the q-th pencil of a colour."""
+    def pencil_of(self, colour: int, q: int):
+        """Return the number of the q-th pencil of a colour, among all pencils."""
         place = ti.Vector.zero(int, ti.static(self.grid.dimension - 1))
         rest = q
         for b in ti.static(range(self.grid.dimension - 1)):
@@ -166,7 +164,22 @@ class TileOrder:
             along = self.pencils_along(colour, a)
             place[a] = 2 * (rest % along) + (colour >> a & 1)
             rest = rest // along
-        tile = 0
+        pencil = 0
         for a in ti.static(range(self.grid.dimension - 1)):
-            tile = tile * ti.static(self.grid.tiles[a]) + place[a]
-        return tile * self.pencil
+            pencil = pencil * ti.static(self.grid.tiles[a]) + place[a]
+        return pencil
+
+    @ti.func
+    def pencils(self):
+        """Return the number of pencils."""
+        return ti.static(self.tiles // self.grid.tiles[-1])
+
+    @ti.func
+    def first_tile_of(self, pencil: int):
+        """Return the first tile of a pencil, or behind the last pencil the number of tiles."""
+        return pencil * ti.static(self.grid.tiles[-1])
+
+    @ti.func
+    def first_particle_of(self, pencil: int):
+        """Return the first particle of a pencil; behind the last pencil, the one after the last."""
+        return self.start[self.first_tile + self.first_tile_of(pencil)]

@@ -1,13 +1,14 @@
 """What a step does with one particle: scatter it to the nodes, and move it with them."""
 
 from collections.abc import Sequence
+from copy import copy
 
 import taichi as ti
 
 from mpmcli.boundaries.moving_faces import STILL, MovingFaces
 from mpmcli.boundaries.rough_faces import RoughFaces
 from mpmcli.boundaries.walls import SMOOTH
-from mpmcli.solver.grid import Grid
+from mpmcli.solver.grid import Grid, LinearNodes
 from mpmcli.solver.particle_arrays import VOLUME
 from mpmcli.solver.particle_contact import ParticleContact
 from mpmcli.solver.rounding import opaque
@@ -28,6 +29,7 @@ class ParticleUpdate:
     """Both halves of a step of a particle, as a GPU takes them; `scatter_range` and `advance_range` do on the CPU.
 
     Attributes:
+        near: the nodes that stencils find: those of the grid, or on a sparse one those of a window.
         extent: size of the domain, m; last: node of the upper walls, per axis; faces: words of the walls, per axis.
         contact: between elastic bodies that are `total`; touches: whether there is any.
         friction, moving: coefficients and velocities of the walls.
@@ -52,7 +54,7 @@ class ParticleUpdate:
         self.contact, self.touches = contact, contact is not None
         self.friction, self.moving = friction, moving
         self.run = 0
-        self.grid = grid
+        self.grid = self.near = grid
         self.faces = tuple(tuple(pair) for pair in faces)
         self.dimension = grid.dimension
         self.extent = tuple(n * grid.spacing for n in grid.cells)
@@ -61,6 +63,12 @@ class ParticleUpdate:
         self.lost = ti.field(int, shape=group_count)
         self.lost.fill(NOT_LOST)
         self.first_lost = 0
+
+    def beside(self, nodes: LinearNodes) -> "ParticleUpdate":
+        """Return an update whose stencils find these nodes."""
+        result = copy(self)
+        result.near = nodes
+        return result
 
     def any_lost(self) -> bool:
         """Return whether any particle is lost."""
@@ -212,7 +220,7 @@ class ParticleUpdate:
         docs/theory.md, 2.3). C, positions and deformations follow the nodes. As positions do, and not the particle's
         own velocity, angular momentum is kept to first order in the step only.
         """
-        before, _ = gather(group.on_grid(p), self.grid, self.grid.before)
+        before, _ = gather(group.on_grid(p), self.near, self.near.before)
         kept = ti.Vector.zero(float, self.dimension)
         for c in ti.static(range(self.dimension)):
             kept[c] = self.grid.scheme.flip * (group.v[p][c] - before[c])

@@ -25,6 +25,8 @@ from mpmcli.solver.ordering import TileOrder
 from mpmcli.solver.particle_arrays import gradient_width
 from mpmcli.solver.particle_contact import ParticleContact
 from mpmcli.solver.particle_friction import slips_in
+from mpmcli.solver.sparse_choice import require_cpu_if_sparse, wants_sparse
+from mpmcli.solver.sparse_grid import SparseGrid, room_for_blocks
 from mpmcli.solver.transfer_scheme import scheme_of
 from mpmcli.solver.volume_average import averages_volume
 from mpmcli.solver.volume_relaxation import needs_filling
@@ -57,7 +59,8 @@ class Plan:
 
     Attributes:
         laws: the particles, law by law.
-        nodes: number of grid nodes.
+        nodes: number of grid nodes, on a sparse grid those that there is memory for at first.
+        sparse: whether the grid is.
         scratch_bytes: per particle, of the sort buffers.
         bytes_per_node: of the grid.
         grid_bytes: of all nodes, the tables of the sort, what is found at walls, and what colliders need.
@@ -74,6 +77,7 @@ class Plan:
     host_bytes: int
     passes: tuple[str, ...]
     arch: str = "cpu"
+    sparse: bool = False
 
     @property
     def particles(self) -> int:
@@ -103,6 +107,7 @@ class Plan:
             "laws": {law.law: {"particles": law.particles, "bytes_per_particle": law.fields} for law in self.laws},
             "scratch_bytes_per_particle": self.scratch_bytes,
             "nodes": self.nodes,
+            "sparse": self.sparse,
             "bytes_per_node": self.bytes_per_node,
             "device_bytes": self.device_bytes,
             "passes": list(self.passes),
@@ -202,7 +207,12 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     widest = max(size for group in groups for size in group.fields.values())
     scheme = scheme_of(scene.solver)
     tile = tile_edge(scheme.spline.nodes, dimension, on_cpu=backend.on_cpu)
-    nodes = Grid.nodes_needed(cells, tile)
+    all_nodes = nodes = Grid.nodes_needed(cells, tile)
+    sparse = wants_sparse(scene) and backend.on_cpu
+    require_cpu_if_sparse(scene.solver, backend)
+    if sparse:
+        blocks = room_for_blocks(sum(counts.values()))
+        nodes = blocks * tile**dimension
     filling, deterministic = needs_filling(scene, members), scene.solver.deterministic and not backend.on_cpu
     node_bytes = real * (width * (1 + scheme.keeps_before + filling) + 2 * sum(averaged))
     if deterministic:
@@ -211,16 +221,20 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         )
         # In their place.
         node_bytes -= real * 2 * sum(averaged)
-    tables = len(groups) * TileOrder.bytes_needed(cells, tile, backend.threads)
-    tables += _contact_bytes(scene, nodes, tile, real)
+    all_tiles = all_nodes // tile**dimension
+    tables = len(groups) * TileOrder.bytes_needed(blocks if sparse else all_tiles, backend.threads)
+    if sparse:
+        tables += SparseGrid.table_bytes(all_tiles, blocks, dimension)
+    tables += _contact_bytes(scene, all_nodes, tile, real)
     if scene.solver.solids == "total" and len(scene.sources) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(counts.values()))
-    tables += ColliderKind.of(scene).bytes_needed(dimension, nodes // (tile * Grid.tile_counts(cells, tile)[-1]))
+    tables += ColliderKind.of(scene).bytes_needed(dimension, all_nodes // (tile * Grid.tile_counts(cells, tile)[-1]))
     if deterministic:
         tables += nodes * len(scene.colliders) * dimension * real
     host_bytes = host_bytes_of(scene, members, sum(counts.values()), real, on_cpu=backend.on_cpu)
     passes = passes_of(members, scene, deterministic=deterministic)
-    return Plan(groups, nodes, widest + 8, node_bytes, nodes * node_bytes + tables, host_bytes, passes, backend.arch)
+    grid_bytes = nodes * node_bytes + tables
+    return Plan(groups, nodes, widest + 8, node_bytes, grid_bytes, host_bytes, passes, backend.arch, sparse)
 
 
 def _separating_axes(scene: Scene) -> list[int]:

@@ -35,7 +35,7 @@ def scatter_range(
     particles: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int, kick: float, relaxed: float
 ):
     """Scatter particles first to last - 1 of the g-th group; no other thread may write their nodes."""
-    grid = particles.grid
+    grid, near = ti.static((particles.grid, particles.near))
     d = ti.static(group.dimension)
     width = ti.static(grid.width)
     nodes = ti.static(grid.scheme.spline.nodes)
@@ -127,7 +127,7 @@ def scatter_range(
                 C = C @ state
                 stress = pulled_back(stress, state)
             base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
-            first_node[lane] = grid.linear_index(base)
+            first_node[lane] = near.linear_index(base)
             w = grid.scheme.spline.weights(distance)
             for k in ti.static(range(nodes)):
                 for a in ti.static(range(d)):
@@ -155,13 +155,13 @@ def scatter_range(
                 for c in ti.static(range(width)):
                     middle[c] = middles[lane, c]
                 slope = node_rows_of(slopes, d, width, width, lane)
-                add_linear(grid.nodes, grid, first_node[lane], w, middle, slope, False)
+                add_linear(near.nodes, near, first_node[lane], w, middle, slope, False)
                 if ti.static(grid.scheme.keeps_before):
                     own_v, own_C = group.motion_on_grid(p)
-                    scatter_before(group.on_grid(p), group.row(p)[MASS], own_v, own_C, grid, False)
+                    scatter_before(group.on_grid(p), group.row(p)[MASS], own_v, own_C, near, False)
             else:
                 ti.atomic_min(particles.lost[particles.first_lost + g], p)
             if ti.static(grid.keeps_filling):
                 if relaxed > 0.0:
-                    scatter_volume(group.x[p], group.row(p)[VOLUME], grid, False)
+                    scatter_volume(group.x[p], group.row(p)[VOLUME], near, False)
         begin += LANES

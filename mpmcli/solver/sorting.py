@@ -178,14 +178,14 @@ def build_sort(order: TileOrder) -> Sort:
             for colour in range(order.colours):
                 total = 0
                 for q in range(order.pencil_count(colour)):
-                    first = order.pencil_start(colour, q)
-                    total += order.start[first + order.pencil] - order.start[first]
+                    pencil = order.pencil_of(colour, q)
+                    total += order.first_particle_of(pencil + 1) - order.first_particle_of(pencil)
                 done = 0
                 thread = 1
                 order.work[colour, 0] = 0
                 for q in range(order.pencil_count(colour)):
-                    first = order.pencil_start(colour, q)
-                    size = order.start[first + order.pencil] - order.start[first]
+                    pencil = order.pencil_of(colour, q)
+                    size = order.first_particle_of(pencil + 1) - order.first_particle_of(pencil)
                     # The boundary falls where more than half of the pencil lies beyond the share.
                     while thread < threads and done + size // 2 >= share_start(total, thread, threads):
                         order.work[colour, thread] = q

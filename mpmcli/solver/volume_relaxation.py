@@ -97,15 +97,20 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
         smallest = grid.holding[first]
         # Lines of nodes in a loop: few steps relax, and copies would take a tenth of the compile time of a 3D scene.
         for line in range(ti.static(grid.scheme.spline.nodes ** (d - 1))):
-            node, line_weight = first, 1.0
+            node, line_weight, at = first, 1.0, base
             for a in ti.static(range(d - 1)):
                 place = line // ti.static(grid.scheme.spline.nodes ** (d - 2 - a)) % ti.static(grid.scheme.spline.nodes)
                 node += place * ti.static(grid.strides[a])
+                at[a] += place
                 for k in ti.static(range(grid.scheme.spline.nodes)):
                     if place == k:
                         line_weight *= w[k, a]
             for k in ti.static(range(grid.scheme.spline.nodes)):
-                held = grid.holding[node + k]
+                index = node + k
+                if ti.static(grid.sparse):
+                    index = grid.linear_index(at)
+                    at[d - 1] += 1
+                held = grid.holding[index]
                 total += held * (line_weight * w[k, d - 1])
                 smallest = ti.min(smallest, held)
         mean = total[d]
