@@ -9,6 +9,7 @@ import taichi as ti
 from mpmcli.materials.elasticity import ElasticParameters
 from mpmcli.materials.law import Law, Mode, StateBound, principal
 from mpmcli.materials.polar import polar_rotation
+from mpmcli.materials.principal import from_principal, principal_stretches
 from mpmcli.materials.tensors import volume_strain
 
 # Places in the vector of constants.
@@ -66,11 +67,17 @@ class FixedCorotated(Law):
         self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
     ):
         F = deformation
-        # F^T = S R^T, so that R F^T is symmetric but for rounding.
-        stretched = (F - polar_rotation(F)) @ F.transpose()
         J = F.determinant()
         pressure_part = constants[LAMBDA] * (J - 1.0) * J
-        tau = constants[MU] * (stretched + stretched.transpose()) + pressure_part * ti.Matrix.identity(float, F.n)
+        tau = pressure_part * ti.Matrix.identity(float, F.n)
+        if ti.static(F.n == 2):
+            # F^T = S R^T, so that R F^T is symmetric but for rounding.
+            stretched = (F - polar_rotation(F)) @ F.transpose()
+            tau += constants[MU] * (stretched + stretched.transpose())
+        else:
+            # Without the iterations of R, which would keep the compiler from vector instructions.
+            Q, s = signed_stretches(F, J)
+            tau += from_principal(Q, 2.0 * constants[MU] * (s - 1.0) * s)
         # Out of plane F is 1 and R is 1.
         return tau, pressure_part, deformation, internal
 
@@ -81,6 +88,20 @@ class FixedCorotated(Law):
     @ti.func
     def wave_modulus(self, constants: ti.template()):
         return constants[LAMBDA] + 2.0 * constants[MU]
+
+
+@ti.func
+def signed_stretches(F: ti.template(), J: float):
+    """Return the eigenvectors and eigenvalues of S in F = S R in 3D: where J = det F < 0 the smallest is negative."""
+    Q, s = principal_stretches(F)
+    smallest = ti.min(s[0], ti.min(s[1], s[2]))
+    turned = J < 0.0
+    for i in ti.static(range(3)):
+        turns = turned and s[i] == smallest
+        # Of equal ones the first.
+        turned = turned and not turns
+        s[i] = ti.select(turns, -s[i], s[i])
+    return Q, s
 
 
 @ti.func

@@ -203,10 +203,10 @@ class Viscoplastic(Law):
 
 @ti.func
 def length_ratio(J: float, dimension: ti.template()):
-    """Return J^(1/d)."""
+    """Return J^(1/d), 1 where J is 1."""
     result = ti.sqrt(J)
     if ti.static(dimension == 3):
-        result = J ** (1.0 / 3.0)
+        result = exp(log(J) * ti.static(1 / 3))
     return result
 
 
@@ -224,16 +224,13 @@ def isochoric_mean(dev: ti.template(), above: float):
     square = 0.5 * (dev * dev).sum()
     m = ti.sqrt(1.0 + square)
     if ti.static(dev.n == 3):
-        # m^3 - square m + det dev = 1, convex above the root: Newton's method decreases to it.
-        m = above
+        # m^3 - square m + det dev = 1, convex above the root: Newton's method decreases to it. As det dev is at least
+        # -2 (square/3)^(3/2), the root is at most 2 (square/3)^(1/2) + 1. A loop that ended when it has converged would
+        # keep the compiler from vector instructions; it has, after so many, where particles are not flat.
+        m = ti.min(above, 2.0 * ti.sqrt(square * ti.static(1 / 3)) + 1.0)
         constant = dev.determinant() - 1.0
-        resolution = ti.static(4.0 * rounding())
-        step = above
-        count = 0
-        while step > resolution * m and count < ITERATIONS_MAX:
-            step = ((m * m - square) * m + constant) / (3.0 * m * m - square)
-            m -= step
-            count += 1
+        for _ in ti.static(range(12 if rounding() > 1e-10 else 15)):
+            m -= ((m * m - square) * m + constant) / (3.0 * m * m - square)
     return m
 
 

@@ -6,9 +6,13 @@ from mpmcli.solver.lane_state import (
     LANES,
     constants_of,
     load_deformation,
+    load_entry,
+    load_rows,
+    load_vectors,
     matrix_of,
     node_rows_of,
     repeat_first,
+    store_lanes,
     stored_entries,
     vector_of,
     weights_of,
@@ -40,24 +44,21 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
     remainders = zero_lanes(d)
     rows = zero_lanes(ti.static(group.table.n if group.law.grows_by_constants else CONSTANTS + 1))
     sharpest = NOTHING
+    if ti.static(group.law.grows_by_constants and not group.several):
+        load_rows(group, first, 1, rows)
     begin = first
     while begin < last:
         count = ti.min(LANES, last - begin)
         origin = bounded(begin)
-        for lane in range(LANES):
-            p = origin + lane
-            at = group.on_grid(p)
+        load_vectors(x, group.place_on_grid, origin)
+        if ti.static(group.total):
+            load_vectors(here, group.x, origin)
+        if ti.static(group.carries):
             for c in ti.static(range(d)):
-                x[c, lane] = at[c]
-                if ti.static(group.total):
-                    here[c, lane] = group.x[p][c]
-                if ti.static(group.carries):
-                    remainders[c, lane] = group.gradient[p][c, d]
-            load_deformation(group, p, lane, deformation)
-            if ti.static(group.law.grows_by_constants):
-                row = group.row(begin + ti.min(lane, count - 1))
-                for k in ti.static(range(row.n)):
-                    rows[k, lane] = row[k]
+                load_entry(remainders, c, group.gradient, (c, d), origin)
+        load_deformation(group, origin, deformation)
+        if ti.static(group.law.grows_by_constants and group.several):
+            load_rows(group, begin, count, rows)
         if count < LANES:
             repeat_first(x, count)
             repeat_first(here, count)
@@ -126,23 +127,17 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
         if count == LANES and sound == 0:
             # Entry by entry: those of neighbouring particles are stored at once.
             for c in ti.static(range(d)):
-                for lane in range(LANES):
-                    group.x[origin + lane][c] = moved[c, lane]
-                for lane in range(LANES):
-                    group.v[origin + lane][c] = speeds[c, lane]
+                store_lanes(group.x, (c,), origin, moved, c)
+                store_lanes(group.v, (c,), origin, speeds, c)
                 for a in ti.static(range(d)):
-                    for lane in range(LANES):
-                        group.gradient[origin + lane][a, c] = gradients[a * d + c, lane]
+                    store_lanes(group.gradient, (a, c), origin, gradients, a * d + c)
                 if ti.static(group.carries):
-                    for lane in range(LANES):
-                        group.gradient[origin + lane][c, d] = remainders[c, lane]
+                    store_lanes(group.gradient, (c, d), origin, remainders, c)
                 if ti.static(keeps_F):
                     for a in ti.static(range(d)):
-                        for lane in range(LANES):
-                            group.displacement_gradient[origin + lane][c, a] = after[c * d + a, lane]
+                        store_lanes(group.displacement_gradient, (c, a), origin, after, c * d + a)
             if ti.static(not keeps_F):
-                for lane in range(LANES):
-                    group.J_minus_1[origin + lane] = after[0, lane]
+                store_lanes(group.J_minus_1, (), origin, after, 0)
         else:
             for lane in range(count):
                 p = begin + lane

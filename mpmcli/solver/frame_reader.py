@@ -15,6 +15,7 @@ from mpmcli.solver.lane_state import (
     constants_of,
     internal_entries,
     load_lanes,
+    load_rows,
     matrix_of,
     stored_entries,
     stored_of,
@@ -71,7 +72,8 @@ def show_range(
     begin = first
     while begin < first + count:
         own = ti.min(LANES, first + count - begin)
-        load_lanes(group, begin, own, affine, deformation, internal, rows)
+        load_lanes(group, begin, own, affine, deformation, internal)
+        load_rows(group, begin, own, rows)
         if ti.static(group.averaged):
             for lane in range(own):
                 missing[lane] = group.to_mean[begin + lane]

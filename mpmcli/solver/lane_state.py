@@ -47,27 +47,19 @@ def load_lanes(
     affine: ti.template(),
     deformation: ti.template(),
     internal: ti.template(),
-    rows: ti.template(),
 ):
     """Copy `count` particles from `begin` on.
 
     Args:
         affine: takes C, d^2; deformation: F - I, d^2, or J - 1; internal: the internal variables.
-        rows: takes the row of the table.
     """
     d = ti.static(group.dimension)
     origin = bounded(begin)
-    for lane in range(LANES):
-        p = origin + lane
-        for c, a in ti.static(ti.ndrange(d, d)):
-            affine[c * d + a, lane] = group.gradient[p][a, c]
-        load_deformation(group, p, lane, deformation)
-        for i in ti.static(range(len(group.internal))):
-            internal[i, lane] = group.internal[i][p]
-        # What lies beyond the last particle is no row of the table.
-        row = group.row(begin + ti.min(lane, count - 1))
-        for k in ti.static(range(row.n)):
-            rows[k, lane] = row[k]
+    for c, a in ti.static(ti.ndrange(d, d)):
+        load_entry(affine, c * d + a, group.gradient, (a, c), origin)
+    load_deformation(group, origin, deformation)
+    for i in ti.static(range(len(group.internal))):
+        load_entry(internal, i, group.internal[i], (), origin)
     if count < LANES:
         repeat_first(affine, count)
         repeat_first(deformation, count)
@@ -75,14 +67,63 @@ def load_lanes(
 
 
 @ti.func
-def load_deformation(group: ti.template(), p: int, lane: int, deformation: ti.template()):
-    """Copy F - I or J - 1 of particle p to a lane."""
+def load_deformation(group: ti.template(), origin: int, deformation: ti.template()):
+    """Copy F - I or J - 1 of the particles from `origin` on."""
     d = ti.static(group.dimension)
     if ti.static(group.law.deformation == "F"):
         for i, j in ti.static(ti.ndrange(d, d)):
-            deformation[i * d + j, lane] = group.displacement_gradient[p][i, j]
+            load_entry(deformation, i * d + j, group.displacement_gradient, (i, j), origin)
     else:
-        deformation[0, lane] = group.J_minus_1[p]
+        load_entry(deformation, 0, group.J_minus_1, (), origin)
+
+
+@ti.func
+def load_vectors(lanes: ti.template(), field: ti.template(), origin: int):
+    """Copy the vectors of the particles from `origin` on, as many entries as there are rows."""
+    for c in ti.static(range(lanes.n)):
+        load_entry(lanes, c, field, (c,), origin)
+
+
+@ti.func
+def load_entry(lanes: ti.template(), k: ti.template(), field: ti.template(), entry: ti.template(), origin: int):
+    """Copy an entry of the particles from `origin` on to row k of an array: all are read before one is written.
+
+    A loop for each entry is short enough for the compiler to copy all lanes at once.
+    """
+    row = ti.Vector.zero(float, LANES)
+    for lane in range(LANES):
+        if ti.static(len(entry) == 0):
+            row[lane] = field[origin + lane]
+        else:
+            row[lane] = field[origin + lane][entry]
+    for lane in range(LANES):
+        lanes[k, lane] = row[lane]
+
+
+@ti.func
+def store_lanes(field: ti.template(), entry: ti.template(), origin: int, lanes: ti.template(), k: ti.template()):
+    """Store row k of an array of lanes as an entry of particles from `origin` on.
+
+    All lanes are read before the first is stored: the compiler then stores them at once.
+    """
+    row = ti.Vector.zero(float, LANES)
+    for lane in range(LANES):
+        row[lane] = lanes[k, lane]
+    for lane in range(LANES):
+        if ti.static(len(entry) == 0):
+            field[origin + lane] = row[lane]
+        else:
+            field[origin + lane][entry] = row[lane]
+
+
+@ti.func
+def load_rows(group: ti.template(), begin: int, count: int, rows: ti.template()):
+    """Copy the rows of the table that `count` particles from `begin` on read; of one body all lanes have the same."""
+    for lane in range(LANES):
+        # What lies beyond the last particle is no row of the table.
+        row = group.row(begin + ti.min(lane, count - 1))
+        for k in ti.static(range(row.n)):
+            rows[k, lane] = row[k]
 
 
 @ti.func

@@ -231,13 +231,15 @@ class ParticleArrays(ParticleExchange):
                 result[c] = inside[c]
         return result
 
+    @property
+    def place_on_grid(self) -> ti.Field:
+        """Where particles are on the grid, m."""
+        return self.initial if self.total else self.x
+
     @ti.func
     def on_grid(self, p: int):
         """Return where particle p is on the grid, m."""
-        if ti.static(self.total):
-            return self.initial[p]
-        else:
-            return self.x[p]
+        return self.place_on_grid[p]
 
     @ti.func
     def motion_on_grid(self, p: int):

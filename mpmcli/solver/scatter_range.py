@@ -10,9 +10,12 @@ from mpmcli.solver.lane_state import (
     constants_of,
     internal_entries,
     load_lanes,
+    load_rows,
+    load_vectors,
     matrix_of,
     node_rows_of,
     repeat_first,
+    store_lanes,
     stored_entries,
     stored_of,
     vector_of,
@@ -49,22 +52,23 @@ def scatter_range(
     deformation, internal = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
     rows = zero_lanes(ti.static(group.table.n))
     pushes = zero_lanes(ti.static(d + d * d if group.pushed else 1))
-    change, after = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
+    ratios = ti.Vector.zero(float, LANES)
     missing = ti.Vector.zero(float, LANES)
     first_node, weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(nodes * d))
     middles, slopes = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
+    if ti.static(not group.several):
+        load_rows(group, first, 1, rows)
     begin = first
     while begin < last:
         count = ti.min(LANES, last - begin)
-        load_lanes(group, begin, count, affine, deformation, internal, rows)
+        load_lanes(group, begin, count, affine, deformation, internal)
+        if ti.static(group.several):
+            load_rows(group, begin, count, rows)
         origin = bounded(begin)
-        for lane in range(LANES):
-            at = group.on_grid(origin + lane)
-            for c in ti.static(range(d)):
-                x[c, lane] = at[c]
-                v[c, lane] = group.v[origin + lane][c]
-                if ti.static(group.total):
-                    here[c, lane] = group.x[origin + lane][c]
+        load_vectors(x, group.place_on_grid, origin)
+        load_vectors(v, group.v, origin)
+        if ti.static(group.total):
+            load_vectors(here, group.x, origin)
         if count < LANES:
             repeat_first(x, count)
             repeat_first(v, count)
@@ -102,16 +106,18 @@ def scatter_range(
             stress, _, state_after, inner_after = group.law.respond(
                 seen, vector_of(internal, 0, inners, lane), C, kick, constants_of(rows, lane)
             )
-            difference = state_after - seen
-            if ti.static(group.averaged):
-                difference /= share
-            if ti.static(keeps_F):
-                for i, j in ti.static(ti.ndrange(d, d)):
-                    change[i * d + j, lane] = difference[i, j]
-            else:
-                change[0, lane] = difference
-            for i in ti.static(range(inners)):
-                after[i, lane] = inner_after[i]
+            ratios[lane] = volume_ratio(group, state)
+            if ti.static(group.law.projects):
+                difference = state_after - seen
+                if ti.static(group.averaged):
+                    difference /= share
+                if ti.static(keeps_F):
+                    for i, j in ti.static(ti.ndrange(d, d)):
+                        deformation[i * d + j, lane] += difference[i, j]
+                else:
+                    deformation[0, lane] += difference
+                for i in ti.static(range(inners)):
+                    internal[i, lane] = inner_after[i]
             if ti.static(group.pushed):
                 own += kick * vector_of(pushes, 0, d, lane)
                 for c, a in ti.static(ti.ndrange(d, d)):
@@ -138,18 +144,12 @@ def scatter_range(
                 for a in ti.static(range(d)):
                     slopes[lane, a * width + c] = slope[a, c]
 
+        if ti.static(group.law.projects):
+            store_projected(group, begin, count, deformation, internal, ratios)
         for lane in range(count):
             p = begin + lane
             # The stress of a particle that is crushed or inverted would spread NaN over the grid.
-            if volume_ratio(group, group.stored(p)) > SMALLEST_J:
-                if ti.static(group.law.projects):
-                    if ti.static(keeps_F):
-                        for i, j in ti.static(ti.ndrange(d, d)):
-                            group.displacement_gradient[p][i, j] += change[i * d + j, lane]
-                    else:
-                        group.J_minus_1[p] += change[0, lane]
-                    for i in ti.static(range(len(group.internal))):
-                        group.internal[i][p] = after[i, lane]
+            if ratios[lane] > SMALLEST_J:
                 w = weights_of(weights, nodes, d, lane)
                 middle = ti.Vector.zero(float, width)
                 for c in ti.static(range(width)):
@@ -165,3 +165,41 @@ def scatter_range(
                 if relaxed > 0.0:
                     scatter_volume(group.x[p], group.row(p)[VOLUME], near, False)
         begin += LANES
+
+
+@ti.func
+def store_projected(
+    group: ti.template(),
+    begin: int,
+    count: int,
+    deformation: ti.template(),
+    internal: ti.template(),
+    ratios: ti.template(),
+):
+    """Store the states that a law has projected, but not those of particles that are crushed or inverted."""
+    d = ti.static(group.dimension)
+    keeps_F = ti.static(group.law.deformation == "F")
+    sound = 0
+    for lane in range(LANES):
+        sound += ti.cast(ratios[lane] > SMALLEST_J, int)
+    if count == LANES and sound == LANES:
+        # Entry by entry: those of neighbouring particles are stored at once.
+        origin = bounded(begin)
+        if ti.static(keeps_F):
+            for i, j in ti.static(ti.ndrange(d, d)):
+                store_lanes(group.displacement_gradient, (i, j), origin, deformation, i * d + j)
+        else:
+            store_lanes(group.J_minus_1, (), origin, deformation, 0)
+        for i in ti.static(range(len(group.internal))):
+            store_lanes(group.internal[i], (), origin, internal, i)
+    else:
+        for lane in range(count):
+            p = begin + lane
+            if ratios[lane] > SMALLEST_J:
+                if ti.static(keeps_F):
+                    for i, j in ti.static(ti.ndrange(d, d)):
+                        group.displacement_gradient[p][i, j] = deformation[i * d + j, lane]
+                else:
+                    group.J_minus_1[p] = deformation[0, lane]
+                for i in ti.static(range(len(group.internal))):
+                    group.internal[i][p] = internal[i, lane]

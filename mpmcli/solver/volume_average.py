@@ -14,7 +14,7 @@ from mpmcli.materials.law import SMALLEST, Law
 from mpmcli.materials.tensors import volume_strain
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.grid import Grid
-from mpmcli.solver.lane_state import LANES, load_deformation, matrix_of, vector_of, zero_lanes
+from mpmcli.solver.lane_state import LANES, load_deformation, load_vectors, matrix_of, vector_of, zero_lanes
 from mpmcli.solver.particle_arrays import VOLUME, ParticleArrays
 from mpmcli.solver.splines import PAD, bounded
 
@@ -54,13 +54,11 @@ def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), f
     begin = first
     while begin < last:
         count = ti.min(LANES, last - begin)
+        load_deformation(group, bounded(begin), deformation)
+        load_vectors(x, group.place_on_grid, bounded(begin))
         for lane in range(LANES):
-            p = bounded(begin) + lane
-            load_deformation(group, p, lane, deformation)
-            at = group.on_grid(p)
-            for a in ti.static(range(d)):
-                x[a, lane] = at[a]
-            volumes[lane] = group.row(p)[VOLUME]
+            # What lies beyond the last particle is no row of the table.
+            volumes[lane] = group.row(begin + ti.min(lane, count - 1))[VOLUME]
         for lane in range(LANES):
             logs[lane] = log_volume(matrix_of(deformation, d, lane))
             cells[lane] = cell_of(grid, vector_of(x, 0, d, lane))
