@@ -99,15 +99,21 @@ def run_module() -> Callable[..., PythonRun]:
     return run
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session", autouse=True)
 def few_optimisations() -> Iterator[None]:
-    """Let the commands and processes of a module compile with few of Taichi's optimisations.
+    """Let all commands and processes compile with few of Taichi's optimisations.
 
     All of them take half of the time to compile or more, and leave the bytes as they are (test_optimisation.py).
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(*FEW)
         yield
+
+
+@pytest.fixture
+def usual_optimisations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a test compile with the optimisations that users have."""
+    monkeypatch.delenv(FEW[0], raising=False)
 
 
 @pytest.fixture
@@ -123,7 +129,7 @@ def backend_of() -> "Iterator[Callable[..., Backend]]":
     Taichi is global: whatever was built on the backend before dies with it, so a module starts one and
     builds its solvers on it, or keeps no solver from one test to the next.
 
-    It compiles with few of Taichi's optimisations, as `few_optimisations` says; a `fully_optimised` one has all.
+    It compiles with few of Taichi's optimisations, as all tests do; a `fully_optimised` one has all.
 
     Vulkan stands for the GPU of the tests, see GPU.
     """
@@ -132,10 +138,9 @@ def backend_of() -> "Iterator[Callable[..., Backend]]":
     def start(precision: str, threads: int = 2, arch: str = "cpu", *, fully_optimised: bool = False) -> "Backend":
         stop_backend()
         arch = GPU if arch == "vulkan" else arch
-        if fully_optimised:
-            return start_backend(arch, threads, precision)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv(*FEW)
+            if fully_optimised:
+                patch.delenv(FEW[0], raising=False)
             return start_backend(arch, threads, precision)
 
     yield start

@@ -17,7 +17,6 @@ from mpmcli.output import open_result
 LONG = SCENE.replace("end = 0.05", "end = 5000.0").replace("frames = 4", "frames = 20000")
 SEALS_BEFORE = 2
 PATIENCE = 120  # s
-pytestmark = pytest.mark.usefixtures("few_optimisations")
 
 
 def end_with(number: signal.Signals, directory: Path, *, ctrl_c_off: bool = False) -> tuple[int, str, str]:

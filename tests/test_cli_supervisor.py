@@ -129,7 +129,6 @@ def test_an_early_interrupt_leaves_no_directory(tmp_path: Path) -> None:
     assert process.returncode == 130 and sorted(tmp_path.iterdir()) == [tmp_path / "scene.toml"]
 
 
-@pytest.mark.usefixtures("few_optimisations")
 def test_a_second_writer_is_refused_and_spoils_nothing(tmp_path: Path) -> None:
     """The first one, as it goes on, does not notice."""
     from mpmcli.output import open_result

@@ -174,7 +174,7 @@ def failed(done: dict[str, subprocess.CompletedProcess]) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def commands(checkout, few_optimisations) -> dict[str, subprocess.CompletedProcess]:
+def commands(checkout) -> dict[str, subprocess.CompletedProcess]:
     """What came of every command but the slow ones."""
     return run_commands(checkout, slow=False)
 

@@ -29,9 +29,7 @@ TOLERANCE = {"f32": 1e-6, "f64": 1e-12}
 
 
 @pytest.fixture(scope="module")
-def path_arrays(
-    tmp_path_factory: pytest.TempPathFactory, run_module: Callable, few_optimisations: None
-) -> Iterator[Callable[..., Arrays]]:
+def path_arrays(tmp_path_factory: pytest.TempPathFactory, run_module: Callable) -> Iterator[Callable[..., Arrays]]:
     """Return `arrays(arch, threads, dimension)`: what a process of its own stored.
 
     Those that are always asked for start at once, two at a time: most of their time is compilation on one core.

@@ -37,7 +37,6 @@ from mpmcli.simulation.recording import Recording, record
 
 # A law that is stable by its own word, and in truth is not: its pressure pulls.
 WRONG_LAW = LAW.replace("spherical = constants[0]", "spherical = -constants[0]")
-pytestmark = pytest.mark.usefixtures("few_optimisations")
 
 
 @pytest.fixture(scope="module")
