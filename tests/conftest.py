@@ -1,5 +1,6 @@
 """Fixtures that every test may use."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -33,6 +34,12 @@ LONG = ("test_docs", "test_sweep_run", "test_solver_paths", "test_batch", "test_
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     places = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: places.get(item.path.stem, len(LONG)))
+
+
+def pytest_collection_finish() -> None:
+    """Leave modules and tests, which stay, out of collections of garbage: one comes with every restart of Taichi."""
+    gc.collect()
+    gc.freeze()
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ import numpy as np
 import psutil
 import pytest
 from command import ROOT, run_here, started
-from conftest import FEW
 from test_plugin import LAW
 from tiny_sweep import BASE, contents, small_shards, tiny_sweep, told, write_sweep
 
@@ -41,10 +40,9 @@ WRONG_LAW = LAW.replace("spherical = constants[0]", "spherical = -constants[0]")
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The dataset of the tiny sweep, in three shards, by two workers that have the optimisations of every sweep."""
+    """The dataset of the tiny sweep, in three shards, by two workers."""
     directory = tmp_path_factory.mktemp("truth")
     with pytest.MonkeyPatch.context() as patch:
-        patch.delenv(FEW[0], raising=False)
         small_shards(patch)
         state = run_sweep(tiny_sweep(directory), SweepSettings(directory / "dataset", workers=2))
     assert (state.status, state.done, state.accepted) == ("finished", 12, 12)
@@ -116,10 +114,14 @@ def test_a_dataset_that_is_being_written_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("usual_optimisations")
 def test_workers_of_a_running_scheduler_make_the_same_dataset(
     truth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A scheduler and two workers, each a process of its own, as a batch system starts them."""
+    """A scheduler and two workers, each a process of its own, as a batch system starts them.
+
+    They have the optimisations of every sweep.
+    """
     small_shards(monkeypatch)
     address = tmp_path / "address.json"
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": ROOT}
