@@ -28,7 +28,7 @@ GPU = os.environ.get("MPMCLI_TEST_GPU", "vulkan")
 FEW = ("TI_ADVANCED_OPTIMIZATION", "0")
 
 # Files that take longest, which begin first: at the end of a run one core would wait for the other.
-LONG = ("test_docs", "test_sweep_run", "test_solver_paths", "test_batch", "test_knobs", "test_validate_cli")
+LONG = ("test_docs", "test_configs", "test_sweep_run", "test_batch", "test_solver_paths", "test_hard_materials")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -70,7 +70,7 @@ np.savez("found.npz", x=found[0][0], v=found[0][1])
 
 
 @needs_gcc
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize("case", [pytest.param(CASES[0], marks=pytest.mark.slow), CASES[1]], ids=lambda case: case.name)
 def test_physics_is_that_of_mpmcli(states: Callable, case: BenchCase) -> None:
     """The same particles in f32 and f64.
 
