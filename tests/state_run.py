@@ -95,8 +95,9 @@ def differences(expected: SavedState, found: SavedState) -> list[str]:
 
 def outcome(name: str, threads: int) -> dict[str, list[str]]:
     """Return what a run that was loaded has otherwise than one that went on."""
-    backend = start_backend("cpu", threads)
-    solver = Solver(scene_named(name), backend)
+    # A fresh backend numbers its fields from 0, and finds the kernels that were compiled before.
+    stop_backend()
+    solver = Solver(scene_named(name), start_backend("cpu", threads))
     advance(solver, BEFORE)
     start = solver.state.save()
     advance(solver, AFTER)
@@ -105,7 +106,6 @@ def outcome(name: str, threads: int) -> dict[str, list[str]]:
     advance(solver, AFTER)
     found = {"same solver": differences(expected, solver.state.save())}
     if name in TWICE:
-        # A fresh backend numbers its fields from 0, and finds the kernels that were compiled before.
         stop_backend()
         other = Solver(scene_named(name), start_backend("cpu", threads))
         other.state.load(through_json(start))
