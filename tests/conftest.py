@@ -1,5 +1,6 @@
 """Fixtures that every test may use."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -27,12 +28,18 @@ GPU = os.environ.get("MPMCLI_TEST_GPU", "vulkan")
 FEW = ("TI_ADVANCED_OPTIMIZATION", "0")
 
 # Files that take longest, which begin first: at the end of a run one core would wait for the other.
-LONG = ("test_docs", "test_sweep_run", "test_solver_paths", "test_batch", "test_knobs", "test_validate_cli")
+LONG = ("test_docs", "test_configs", "test_sweep_run", "test_batch", "test_solver_paths", "test_hard_materials")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     places = {name: k for k, name in enumerate(LONG)}
     items.sort(key=lambda item: places.get(item.path.stem, len(LONG)))
+
+
+def pytest_collection_finish() -> None:
+    """Leave modules and tests, which stay, out of collections of garbage: one comes with every restart of Taichi."""
+    gc.collect()
+    gc.freeze()
 
 
 @dataclass(frozen=True)
@@ -99,15 +106,21 @@ def run_module() -> Callable[..., PythonRun]:
     return run
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session", autouse=True)
 def few_optimisations() -> Iterator[None]:
-    """Let the commands and processes of a module compile with few of Taichi's optimisations.
+    """Let all commands and processes compile with few of Taichi's optimisations.
 
     All of them take half of the time to compile or more, and leave the bytes as they are (test_optimisation.py).
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(*FEW)
         yield
+
+
+@pytest.fixture
+def usual_optimisations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a test compile with the optimisations that users have."""
+    monkeypatch.delenv(FEW[0], raising=False)
 
 
 @pytest.fixture
@@ -123,7 +136,7 @@ def backend_of() -> "Iterator[Callable[..., Backend]]":
     Taichi is global: whatever was built on the backend before dies with it, so a module starts one and
     builds its solvers on it, or keeps no solver from one test to the next.
 
-    It compiles with few of Taichi's optimisations, as `few_optimisations` says; a `fully_optimised` one has all.
+    It compiles with few of Taichi's optimisations, as all tests do; a `fully_optimised` one has all.
 
     Vulkan stands for the GPU of the tests, see GPU.
     """
@@ -132,10 +145,9 @@ def backend_of() -> "Iterator[Callable[..., Backend]]":
     def start(precision: str, threads: int = 2, arch: str = "cpu", *, fully_optimised: bool = False) -> "Backend":
         stop_backend()
         arch = GPU if arch == "vulkan" else arch
-        if fully_optimised:
-            return start_backend(arch, threads, precision)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv(*FEW)
+            if fully_optimised:
+                patch.delenv(FEW[0], raising=False)
             return start_backend(arch, threads, precision)
 
     yield start

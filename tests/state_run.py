@@ -5,7 +5,7 @@ import sys
 
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene
-from mpmcli.solver.backend import start_backend
+from mpmcli.solver.backend import start_backend, stop_backend
 from mpmcli.solver.solver import Solver
 from mpmcli.solver.state import SavedState
 
@@ -36,7 +36,7 @@ SCENES = {name: ((name,), 2, {}) for name in MATERIALS} | {
     "forces": (("fluid", "neo_hookean"), 2, {"forces": [{"acceleration": ["3*sin(20*t) - 5*x", "2*X"]}]}),
 }
 NAMES = tuple(SCENES)
-# Scenes that are loaded into another solver, too, whose kernels are compiled anew.
+# Scenes that are loaded into another solver, too.
 TWICE = ("snow", "several bodies, FLIP", "forces")
 
 
@@ -95,8 +95,9 @@ def differences(expected: SavedState, found: SavedState) -> list[str]:
 
 def outcome(name: str, threads: int) -> dict[str, list[str]]:
     """Return what a run that was loaded has otherwise than one that went on."""
-    backend = start_backend("cpu", threads)
-    solver = Solver(scene_named(name), backend)
+    # A fresh backend numbers its fields from 0, and finds the kernels that were compiled before.
+    stop_backend()
+    solver = Solver(scene_named(name), start_backend("cpu", threads))
     advance(solver, BEFORE)
     start = solver.state.save()
     advance(solver, AFTER)
@@ -105,7 +106,8 @@ def outcome(name: str, threads: int) -> dict[str, list[str]]:
     advance(solver, AFTER)
     found = {"same solver": differences(expected, solver.state.save())}
     if name in TWICE:
-        other = Solver(scene_named(name), backend)
+        stop_backend()
+        other = Solver(scene_named(name), start_backend("cpu", threads))
         other.state.load(through_json(start))
         advance(other, AFTER)
         found["other solver"] = differences(expected, other.state.save())

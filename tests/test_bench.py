@@ -84,7 +84,6 @@ class TestOurs:
         assert particles.count == case.particles
         assert particles.count * particles.mass == pytest.approx(DENSITY * EDGE**case.dimension)
 
-    @pytest.mark.usefixtures("few_optimisations")
     @pytest.mark.parametrize(
         "case", [SMALL_2D, pytest.param(SMALL_3D, marks=pytest.mark.slow)], ids=lambda case: case.peer
     )

@@ -56,7 +56,6 @@ def test_the_scene_is_that_of_the_generator(tmp_path) -> None:
         assert check_scene(loaded).forecast.steps == pytest.approx(3500, rel=0.05)
 
 
-@pytest.mark.usefixtures("few_optimisations")
 def test_every_block_is_a_sweep_that_is_stored() -> None:
     """Two rounds of two trajectories per worker, with three frames; mpm88 steps before each round."""
     asked: list[str] = []

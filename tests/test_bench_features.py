@@ -138,7 +138,6 @@ class TestRun:
         assert report.flaws[0] == '"plain" at 2d-16 could not be measured. It has no ball.'
         assert "Beware" in report.table()
 
-    @pytest.mark.usefixtures("few_optimisations")
     def test_a_scene_runs_in_its_own_process(self) -> None:
         """One block is as many steps on, from the time that the last one ended at."""
         with start_worker("friction of the ball", SMALL, Setting(threads=1)) as process:

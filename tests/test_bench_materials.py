@@ -150,7 +150,6 @@ class TestWorker:
             assert block["watch_seconds"] == pytest.approx(0.02 * 0.15 * times)
         assert flowing == {"share": 0.5}
 
-    @pytest.mark.usefixtures("few_optimisations")
     def test_a_column_runs_in_its_own_process(self) -> None:
         """Of two laws, and late enough that some sand flows: the same steps from the kept state let the same flow."""
         with start_worker("sand,neo_hookean", SMALL, Setting(threads=1)) as process:

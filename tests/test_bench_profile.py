@@ -35,7 +35,7 @@ def test_each_task_belongs_to_a_phase() -> None:
     assert sum(one.values()) == sum(two.values()) == sum(names.values())
 
 
-def test_a_law_and_the_yardstick_are_profiled(few_optimisations: None) -> None:
+def test_a_law_and_the_yardstick_are_profiled() -> None:
     report = run_profile([TINY], 1, 0.05, names=["fluid", "no_such_law"], blocks=2, yardstick=yardstick.is_here())
     assert len(report.flaws) == 1
     assert "no_such_law at 2d-32 could not be measured" in report.flaws[0]

@@ -70,8 +70,8 @@ np.savez("found.npz", x=found[0][0], v=found[0][1])
 
 
 @needs_gcc
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_physics_is_that_of_mpmcli(states: Callable, case: BenchCase, few_optimisations: None) -> None:
+@pytest.mark.parametrize("case", [pytest.param(CASES[0], marks=pytest.mark.slow), CASES[1]], ids=lambda case: case.name)
+def test_physics_is_that_of_mpmcli(states: Callable, case: BenchCase) -> None:
     """The same particles in f32 and f64.
 
     A position keeps 24 bits, 4e-6 cells here, in each of the steps. Momentum, kinetic energy and mean height are of all

@@ -162,7 +162,6 @@ def test_the_loss_is_that_of_the_law() -> None:
     assert wave_loss(2.0, 0.1, 1e-4) == pytest.approx(10 * wave_loss(2.0, 0.1, 1e-3))
 
 
-@pytest.mark.usefixtures("few_optimisations")
 def test_the_command_probes_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The time of a run is that of its steps, and more; where the probe breaks down there is none, and an error."""
     monkeypatch.chdir(tmp_path)

@@ -126,7 +126,10 @@ def test_the_longest_wave_of_a_flow(low: list[float], high: list[float], walls: 
     assert flow_width(facts, facts.bodies[0]) == pytest.approx(width)
 
 
-@pytest.mark.parametrize(("cells", "safety", "speed"), [(16, 0.8, 0.01), (16, 0.3, 0.01), (32, 0.8, 0.05)])
+@pytest.mark.parametrize(
+    ("cells", "safety", "speed"),
+    [(16, 0.8, 0.01), (16, 0.3, 0.01), pytest.param(32, 0.8, 0.05, marks=pytest.mark.slow)],
+)
 def test_an_impact_loses_what_was_foretold(backend_of: Callable, cells: int, safety: float, speed: float) -> None:
     """Bars that meet slowly: the share of the energy that is gone when they have parted, within a half."""
     scene = bars(cells, safety, speed)

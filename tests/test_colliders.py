@@ -171,7 +171,7 @@ SLOW = [pytest.param(tilt, offset, marks=pytest.mark.slow) for tilt in (0.0, 45.
 PLACES = [(0.0, 0.0), (17.0, 0.3), *SLOW]
 
 
-@pytest.mark.parametrize(("tilt", "offset"), PLACES)
+@pytest.mark.parametrize(("tilt", "offset"), [pytest.param(*PLACES[0], marks=pytest.mark.slow), *PLACES[1:]])
 def test_a_block_slides_down_a_slope(
     backend_of: Callable, tilt: float, offset: float, record_property: Callable
 ) -> None:
@@ -185,7 +185,7 @@ def test_a_block_slides_down_a_slope(
     assert found == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize(("tilt", "offset"), PLACES)
+@pytest.mark.parametrize(("tilt", "offset"), [PLACES[0], pytest.param(*PLACES[1], marks=pytest.mark.slow), *PLACES[2:]])
 def test_a_block_stays_on_a_slope(backend_of: Callable, tilt: float, offset: float, record_property: Callable) -> None:
     """mu = 0.7 > tan(30 degrees): it drifts by less than 1e-4 of its length in a second."""
     scene, down, _ = block_on_plane(30.0, tilt, 0.7, 1.6, offset=offset)

@@ -10,7 +10,7 @@ import pytest
 from cached_kernel import TOTAL
 
 KERNEL = Path(__file__).with_name("cached_kernel.py")
-PROCESSES = 8
+PROCESSES = 4
 
 
 def begun(cache: Path) -> subprocess.Popen:

@@ -91,7 +91,6 @@ def test_a_config_says_how_many_particles_it_has(path):
 @pytest.mark.parametrize(
     "path", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in SLOW)) for path in SCENES]
 )
-@pytest.mark.usefixtures("few_optimisations")
 def test_a_config_runs(path, tmp_path):
     """A few steps to the first frames, which land on their times; nothing is lost; only what moves makes energy."""
     scene = load_scene(path, laws=parameter_models()).scene

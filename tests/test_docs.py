@@ -67,9 +67,11 @@ SHORTER = {
 # scripts/test is what runs this test.
 NOT_RUN = {"scripts/test"}
 # These are run with -m slow: a minute of compiling each law, and more of features and of phases, the bar that
-# test_validate_cli.py validates, the benchmark of test_bench_dataset.py, and the parts that test_docs_datasets.py
-# computes and merges.
+# test_validate_cli.py validates, the benchmarks of test_bench_dataset.py and test_bench_device.py, and the parts that
+# test_docs_datasets.py computes and merges.
 SLOW = {
+    "mpmcli bench --device --json > results/device.json",
+    ".venv/bin/python scripts/bench_table results/device.json",
     "mpmcli bench --dataset --json > results/dataset.json",
     ".venv/bin/python scripts/bench_table results/dataset.json",
     "mpmcli bench --features --json > results/features.json",
@@ -174,7 +176,7 @@ def failed(done: dict[str, subprocess.CompletedProcess]) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def commands(checkout, few_optimisations) -> dict[str, subprocess.CompletedProcess]:
+def commands(checkout) -> dict[str, subprocess.CompletedProcess]:
     """What came of every command but the slow ones."""
     return run_commands(checkout, slow=False)
 

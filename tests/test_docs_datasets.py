@@ -87,7 +87,6 @@ def test_the_cluster_of_the_page_is_python():
     compile(block("py"), "cluster.py", "exec")
 
 
-@pytest.mark.usefixtures("few_optimisations")
 def test_the_commands_of_the_workflow_make_a_dataset(tmp_path):
     """Its run lines, in the order of its jobs; what it uploads and downloads lies in one place here."""
     jobs = yaml.safe_load(block("yaml"))["jobs"]

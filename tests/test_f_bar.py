@@ -160,7 +160,5 @@ def test_a_gpu_follows_the_cpu(backend_of: Callable, solids: str) -> None:
 def test_a_batch_has_the_bytes_of_a_solver(backend_of: Callable) -> None:
     """On any number of threads, frames included, which average once more."""
     scene = block(solver={"precision": "f32"}, end=0.05)
-    (expected,) = outputs_of(batch_of([scene], backend_of("f32", 1)), [scene])
-    assert list(same(expected, list(Solver(scene, backend_of("f32", 2)).frames()))) == []
     (found,) = outputs_of(batch_of([scene], backend_of("f32", 3)), [scene])
-    assert list(same(found, expected)) == []
+    assert list(same(found, list(Solver(scene, backend_of("f32", 2)).frames()))) == []

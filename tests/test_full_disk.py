@@ -14,7 +14,6 @@ from command import ROOT, SCENE, run_here
 
 from mpmcli.output import open_result
 
-pytestmark = pytest.mark.usefixtures("few_optimisations")
 # Each frame takes 14 kB.
 MANY = SCENE.replace("end = 0.05", "end = 0.5").replace("frames = 4", "frames = 40")
 
@@ -24,9 +23,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of 41 frames."""
     directory = tmp_path_factory.mktemp("whole")
     (directory / "scene.toml").write_text(MANY, encoding="utf-8")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TI_ADVANCED_OPTIMIZATION", "0")
-        assert run_here("simulate", directory / "scene.toml", "-o", directory / "run", "-q").status == 0
+    assert run_here("simulate", directory / "scene.toml", "-o", directory / "run", "-q").status == 0
     return directory
 
 

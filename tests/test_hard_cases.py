@@ -38,9 +38,7 @@ def test_the_page_has_a_row_for_every_case() -> None:
 
 
 @pytest.mark.parametrize("case", rows(slow=False))
-def test_a_hard_case(case: HardCase, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Less time to compile, and the same bytes (test_optimisation.py).
-    monkeypatch.setenv("TI_ADVANCED_OPTIMIZATION", "0")
+def test_a_hard_case(case: HardCase) -> None:
     outcome = carry_out(case)
     assert outcome.passed, f"{outcome.figure}; {outcome.detail}"
 

@@ -33,7 +33,13 @@ def measured(backend_of: Callable) -> Iterator[Callable[..., tuple[dict[str, flo
 
 
 @pytest.mark.parametrize(
-    "knobs", [{"transfer": "pic"}, {"kernel": "cubic"}, {"transfer": "pic", "kernel": "cubic"}], ids=str
+    "knobs",
+    [
+        {"transfer": "pic"},
+        {"kernel": "cubic"},
+        pytest.param({"transfer": "pic", "kernel": "cubic"}, marks=pytest.mark.slow),
+    ],
+    ids=str,
 )
 def test_a_wave_loses_what_the_spectrum_has(measured: Callable, knobs: dict) -> None:
     """Per step 0.25 (k h)^2 of the energy with PIC, 1/3 with cubic splines; 0.047 (k h)^4 with cubic ones and APIC."""

@@ -65,7 +65,9 @@ def test_the_plan_counts_every_field(
         assert plan.bytes_per_particle <= 160
 
 
-@pytest.mark.parametrize("fields", [["density"], ["stress", "pressure", "initial_position"]])
+@pytest.mark.parametrize(
+    "fields", [["stress", "pressure", "initial_position"], pytest.param(["density"], marks=pytest.mark.slow)]
+)
 def test_the_plan_counts_what_the_host_holds(tmp_path: Path, fields: list[str]) -> None:
     """The most that numpy holds from the first particle to the last frame, beside 4 MB of parts and tables."""
     h = 1 / 800

@@ -110,9 +110,7 @@ def test_remainders(backend_of: Callable) -> None:
         pytest.param("slip", {"walls": "zeroed"}, True, marks=pytest.mark.slow),
     ],
 )
-def test_folded_walls_hold_no_particle(
-    backend_of: Callable, few_optimisations: None, walls: str, settings: dict, holds: bool
-) -> None:
+def test_folded_walls_hold_no_particle(backend_of: Callable, walls: str, settings: dict, holds: bool) -> None:
     """A block of liquid splashes in a corner, at the whole of the stable step: none is put on a wall of its domain."""
     scene = scene_of(
         domain={"size": [1.0, 1.0], "cells": [32, 32], "gravity": [0.0, -10.0], "walls": walls},

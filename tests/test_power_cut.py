@@ -59,7 +59,7 @@ def at_once() -> object:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory, few_optimisations: None, at_once: object) -> dict:
+def whole(tmp_path_factory: pytest.TempPathFactory, at_once: object) -> dict:
     """A run from its first frame to its packed file, and all that a power cut in it could leave."""
     root = tmp_path_factory.mktemp("whole")
     reported = [0]

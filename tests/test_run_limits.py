@@ -14,8 +14,7 @@ from mpmcli.simulation import limits
 from mpmcli.simulation.limits import Halt, Limits
 from mpmcli.solver.device_memory import is_out_of_memory
 
-pytestmark = pytest.mark.usefixtures("few_optimisations")
-LONG = SCENE.replace("end = 0.05", "end = 5000.0").replace("frames = 4", "frames = 20000")
+LONG = SCENE.replace("end = 0.05", "end = 5000.0").replace("frames = 4", "frames = 2000")
 
 
 @pytest.mark.parametrize(

@@ -178,7 +178,6 @@ def test_the_check_of_a_scene_takes_expressions(tmp_path):
     assert gradient.value == pytest.approx(0.5 / (0.1 * np.pi), rel=1e-3)
 
 
-@pytest.mark.usefixtures("few_optimisations")
 @pytest.mark.parametrize("form", ["vtkhdf", "vtk"])
 def test_a_driven_run_is_stored_and_not_blamed(tmp_path, form):
     """Row i of initial_position is where particle i started, in every frame; energy and momentum have a source."""

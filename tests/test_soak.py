@@ -43,7 +43,7 @@ def still(case: object, **more: float) -> tuple[list[Frame], list[LedgerRow]]:
     return frames, rows
 
 
-def test_a_short_soak_finds_nothing(few_optimisations: None) -> None:
+def test_a_short_soak_finds_nothing() -> None:
     """Two rounds of a scene that is kept and one that is stored: their laws hold, and their bytes are equal."""
     kernels: list[int] = []
 

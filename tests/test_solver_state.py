@@ -31,7 +31,6 @@ USUAL = ("total", "forces")
     ],
     ids=["3 threads", "all, 1 thread", "all, 3 threads"],
 )
-@pytest.mark.usefixtures("few_optimisations")
 def test_a_loaded_run_has_the_bytes_of_one_that_went_on(threads: int, names: tuple[str, ...]) -> None:
     """Save, 50 steps, load, 50 steps; and the same in another solver of the scene, by a route through JSON."""
     done = subprocess.run(

@@ -21,7 +21,7 @@ ARCHES = ["cpu", pytest.param(GPU, marks=pytest.mark.gpu)]
 
 
 @pytest.fixture(scope="module", params=ARCHES)
-def outcome(request: pytest.FixtureRequest, run_module: Callable, few_optimisations: None) -> dict:
+def outcome(request: pytest.FixtureRequest, run_module: Callable) -> dict:
     """Return what `fall_run.py` found on a backend, in a process of its own."""
     run = run_module(Path(fall_run.__file__), request.param)
     if run.status == path_run.NO_DEVICE or (request.param != "cpu" and run.status < 0):

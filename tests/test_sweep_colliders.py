@@ -15,8 +15,6 @@ from mpmcli.scene.colliders import Collider
 from mpmcli.simulation.runner import Runner
 from mpmcli.solver.batch_kind import Kind
 
-pytestmark = pytest.mark.usefixtures("few_optimisations")
-
 COLLIDERS = """\
 [[colliders]]
 name = "post"

@@ -61,7 +61,6 @@ def test_a_base_scene_says_what_it_is_and_passes_the_check(path):
     assert (outcome.status, outcome.stderr) == (0, "")
 
 
-@pytest.mark.usefixtures("few_optimisations")
 def test_a_shortened_sweep_runs(tmp_path):
     """Two trajectories of the drops of water, of three frames each, by the command's own workers."""
     path = CONFIGS / "sweeps" / "water_drop_2d.toml"

@@ -18,7 +18,6 @@ import numpy as np
 import psutil
 import pytest
 from command import ROOT, run_here, started
-from conftest import FEW
 from test_plugin import LAW
 from tiny_sweep import BASE, contents, small_shards, tiny_sweep, told, write_sweep
 
@@ -37,17 +36,15 @@ from mpmcli.simulation.recording import Recording, record
 
 # A law that is stable by its own word, and in truth is not: its pressure pulls.
 WRONG_LAW = LAW.replace("spherical = constants[0]", "spherical = -constants[0]")
-pytestmark = pytest.mark.usefixtures("few_optimisations")
 
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The dataset of the tiny sweep, in three shards, by two workers that have the optimisations of every sweep."""
+    """The dataset of the tiny sweep, in three shards, by one worker."""
     directory = tmp_path_factory.mktemp("truth")
     with pytest.MonkeyPatch.context() as patch:
-        patch.delenv(FEW[0], raising=False)
         small_shards(patch)
-        state = run_sweep(tiny_sweep(directory), SweepSettings(directory / "dataset", workers=2))
+        state = run_sweep(tiny_sweep(directory), SweepSettings(directory / "dataset", workers=1))
     assert (state.status, state.done, state.accepted) == ("finished", 12, 12)
     return directory / "dataset"
 
@@ -93,7 +90,7 @@ def test_parts_and_another_number_of_workers_make_the_same_dataset(
     sweep = tiny_sweep(tmp_path)
     parts = [tmp_path / "first", tmp_path / "second"]
     for i, part in enumerate(parts, 1):
-        state = run_sweep(sweep, SweepSettings(part, workers=1, part=(i, 2)))
+        state = run_sweep(sweep, SweepSettings(part, workers=3 - i, part=(i, 2)))
         assert (state.done, state.expected) == ([8, 4][i - 1],) * 2
     merge(parts[::-1], tmp_path / "whole")
     assert contents(tmp_path / "whole") == contents(truth)
@@ -117,10 +114,14 @@ def test_a_dataset_that_is_being_written_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("usual_optimisations")
 def test_workers_of_a_running_scheduler_make_the_same_dataset(
     truth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A scheduler and two workers, each a process of its own, as a batch system starts them."""
+    """A scheduler and two workers, each a process of its own, as a batch system starts them.
+
+    They have the optimisations of every sweep.
+    """
     small_shards(monkeypatch)
     address = tmp_path / "address.json"
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": ROOT}

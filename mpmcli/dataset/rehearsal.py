@@ -1,7 +1,7 @@
 """Rehearses a sweep: draws and checks every trajectory, and forecasts time and disk space, without a dataset."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +9,7 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.check.forecast import expected_steps
 from mpmcli.check.scene_check import check_scene
 from mpmcli.cores import available_cores
+from mpmcli.dataset.compute import LOOK_AHEAD
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.folder import Folder
 from mpmcli.dataset.sweep import Sweep
@@ -124,7 +125,7 @@ def rehearse(sweep: Sweep, settings: SweepSettings, stop: Callable[[], bool] = l
     """
     laws = load_plugins(settings.plugins)
     folder = Folder(settings.directory, sweep.count, shard_size(sweep, settings), settings.part)
-    found, sound = [], None
+    found, sound, first = [], None, []
     for number in (n for shard in folder.shards for n in folder.numbers(shard)):
         if stop():
             raise KeyboardInterrupt
@@ -140,16 +141,22 @@ def rehearse(sweep: Sweep, settings: SweepSettings, stop: Callable[[], bool] = l
             particles = estimate_particles(loaded.scene)
             steps, size = expected_steps(SceneFacts(loaded.scene)), trajectory_bytes(loaded.scene, particles)
             sound = loaded.scene if sound is None and not fault else sound
+            if number < LOOK_AHEAD and not fault:
+                first.append(loaded.scene)
         except InputError as error:
             fault, particles, steps, size = str(error), 0, 0, 0
         found.append(Rehearsed(number, drawn.split, drawn.values, particles, steps, size, fault))
-    rate = 0.0 if sound is None else _rate(sound, settings)
+    rate = 0.0 if sound is None else _rate(sound, first, settings)
     return Rehearsal(tuple(found), rate, settings.workers or available_cores())
 
 
-def _rate(scene: Scene, settings: SweepSettings) -> float:
-    """Return the particle-steps per second of one worker, frames included, compilation not."""
+def _rate(scene: Scene, first: Sequence[Scene], settings: SweepSettings) -> float:
+    """Return the particle-steps per second of one worker, frames included, compilation not.
+
+    The kernels have room for the first scenes, as those of a worker have, which finds them compiled.
+    """
     runner = Runner(settings.arch, settings.threads)
+    runner.expect(first)
     interval = scene.time.end / scene.time.frames
     # The first run compiles the kernels.
     frames, seconds, steps = 1, 0.0, 0

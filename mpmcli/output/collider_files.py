@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ class Things:
         """All surfaces as one."""
         return joined(list(self.surfaces), self.surfaces[0].points.shape[1])
 
-    @property
+    @cached_property
     def meshes(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         """Vertices and triangles of those that are read from files, which may be gone later, by number."""
         pairs = zip(self.numbers, map(triangles_of, self.colliders), strict=True)

@@ -228,6 +228,8 @@ def _initialise(backend: Backend) -> None:
     ASTTransformerContext.get_pos_info = _position
     Kernel.ast_builder = _builder
     ti.lang.kernel_impl.getsourcelines = lambda function: _source(function.__code__)
+    # Taichi would warn of each of its variables that `ti.init` overrides, before it reads `log_level`.
+    ti.set_logging_level(ti.ERROR)
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
             arch=arch,
