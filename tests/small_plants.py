@@ -130,7 +130,7 @@ ELASTIC = (
     ),
     *_of(
         "materials/fixed_corotated.py",
-        ("tau = constants[MU] * (", "tau = 1.05 * constants[MU] * (", "bar_fixed_fixed"),
+        ("tau += constants[MU] * (", "tau += 1.05 * constants[MU] * (", "bar_fixed_fixed"),
         (
             "= constants[LAMBDA] * (J - 1.0) * J",
             "= 1.05 * constants[LAMBDA] * (J - 1.0) * J",

@@ -189,6 +189,19 @@ def test_small_strain_keeps_its_digits(backend: Backend, d: int) -> None:
 
 
 @pytest.mark.parametrize("d", [2, 3])
+def test_small_shear_keeps_its_digits(backend: Backend, d: int) -> None:
+    """Of F = I + e, e off the diagonal, of any size: F is symmetric, so that S = F, and tau there is 2 mu (F^2 - F)."""
+    sizes = np.logspace(-8, -1, 200)
+    F = np.tile(np.eye(d), (len(sizes), 1, 1))
+    F[:, 0, 1] = F[:, 1, 0] = sizes.astype(backend.real)
+    exact = F.astype(np.float64)
+    answer = backend.law[d](F)
+    expected = 2 * MU * (exact @ exact - exact)
+    tolerance = {"f64": 1e-8, "f32": 3e-4}[backend.precision]
+    assert np.abs(answer.tau[:, 0, 1] / expected[:, 0, 1] - 1).max() < tolerance
+
+
+@pytest.mark.parametrize("d", [2, 3])
 def test_stiffness_bounds_every_state(backend: Backend, d: int) -> None:
     """`modes` is exact at rest, d lambda + 2 mu, and exact again where all stretches are the bound's largest.
 

@@ -207,8 +207,8 @@ PLANTS = (
     Plant(
         "mu of the corotated solid halved",
         "materials/fixed_corotated.py",
-        "tau = constants[MU] * (stretched + stretched.transpose())",
-        "tau = constants[MU] * stretched",
+        "tau += constants[MU] * (stretched + stretched.transpose())",
+        "tau += constants[MU] * stretched",
         ("homogeneous",),
     ),
     Plant(

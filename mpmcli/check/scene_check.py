@@ -213,7 +213,8 @@ def _plan(check: SceneCheck) -> str:
         f"({', '.join(law.fields)}, and {plan.scratch_bytes} bytes for the sort)"
         for law in plan.laws
     ]
-    lines.append(f"grid: {plan.nodes:,} nodes of {plan.bytes_per_node} bytes")
+    extent = ", sparse, with room for more" if plan.sparse else ""
+    lines.append(f"grid: {plan.nodes:,} nodes of {plan.bytes_per_node} bytes{extent}")
     lines.append(f"passes of a step: {', '.join(plan.passes)}")
     return "\n".join(lines)
 

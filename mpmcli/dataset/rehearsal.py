@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -153,10 +154,11 @@ def rehearse(sweep: Sweep, settings: SweepSettings, stop: Callable[[], bool] = l
 def _rate(scene: Scene, first: Sequence[Scene], settings: SweepSettings) -> float:
     """Return the particle-steps per second of one worker, frames included, compilation not.
 
-    The kernels have room for the first scenes, as those of a worker have, which finds them compiled.
+    The kernels have room for the first scenes, as those of a worker have, which then finds them compiled in most cases.
     """
     runner = Runner(settings.arch, settings.threads)
-    runner.expect(first)
+    with suppress(InputError):
+        runner.expect(first)
     interval = scene.time.end / scene.time.frames
     # The first run compiles the kernels.
     frames, seconds, steps = 1, 0.0, 0

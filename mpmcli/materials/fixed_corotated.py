@@ -8,12 +8,15 @@ import taichi as ti
 
 from mpmcli.materials.elasticity import ElasticParameters
 from mpmcli.materials.law import Law, Mode, StateBound, principal
-from mpmcli.materials.polar import polar_rotation
+from mpmcli.materials.polar import polar_rotation, rounding
 from mpmcli.materials.principal import from_principal, principal_stretches
 from mpmcli.materials.tensors import volume_strain
 
 # Places in the vector of constants.
 MU, LAMBDA = range(2)
+
+# Largest entry of F F^T - I for which its series has the digits of single and double precision.
+SMALL = 2e-3, 2e-6
 
 
 class FixedCorotatedParameters(ElasticParameters):
@@ -26,8 +29,8 @@ class FixedCorotatedParameters(ElasticParameters):
 class FixedCorotated(Law):
     """tau = 2 mu (F - R) F^T + lambda (J - 1) J I (Stomakhin et al. 2012; docs/theory.md, 5.4); plane strain in 2D.
 
-    R is the rotation nearest to F. It is defined for inverted states too, which are driven back (`polar_rotation`).
-    The energy of complete collapse is finite, and the stress vanishes as F approaches 0.
+    R is the rotation nearest to F. It is defined for inverted states too, which are driven back (`polar_rotation` in
+    2D, `signed_stretches` in 3D). The energy of complete collapse is finite, and the stress vanishes as F approaches 0.
     """
 
     name = "fixed_corotated"
@@ -77,7 +80,13 @@ class FixedCorotated(Law):
         else:
             # Without the iterations of R, which would keep the compiler from vector instructions.
             Q, s = signed_stretches(F, J)
-            tau += from_principal(Q, 2.0 * constants[MU] * (s - 1.0) * s)
+            # S^2 - S = B/2 + B^2/8 + O(B^3) with B = F F^T - I, whose digits F F^T would lose near rest.
+            H = F - ti.Matrix.identity(float, F.n)
+            B = H + H.transpose() + H @ H.transpose()
+            at_rest = ti.abs(B).max() < ti.static(SMALL[rounding() < 1e-10])
+            bent, near = from_principal(Q, (s - 1.0) * s), 0.5 * B + 0.125 * (B @ B)
+            for i, j in ti.static(ti.ndrange(3, 3)):
+                tau[i, j] += 2.0 * constants[MU] * ti.select(at_rest, near[i, j], bent[i, j])
         # Out of plane F is 1 and R is 1.
         return tau, pressure_part, deformation, internal
 

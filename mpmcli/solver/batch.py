@@ -14,7 +14,7 @@ from mpmcli.boundaries.collider_motion import ColliderMotion
 from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.moving_faces import MovingFaces
 from mpmcli.boundaries.rough_faces import RoughFaces
-from mpmcli.errors import InputError
+from mpmcli.errors import InputError, RunError
 from mpmcli.solver.activity import Emission
 from mpmcli.solver.backend import Backend
 from mpmcli.solver.batch_device import Device
@@ -37,7 +37,7 @@ from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.particle_update import ParticleUpdate
 from mpmcli.solver.period import Period
 from mpmcli.solver.sparse_choice import require_cpu_if_sparse
-from mpmcli.solver.sparse_grid import BlockOrder, SparseGrid, room_for_blocks
+from mpmcli.solver.sparse_grid import BlockOrder, SparseGrid, most_blocks, room_for_blocks
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.tile_reach import tiles_reached
 from mpmcli.solver.transfer_scheme import scheme_of
@@ -192,9 +192,18 @@ class Batch:
         """Make room for GROWTH times so many blocks of a sparse grid. Their numbers are lost: a sort must follow.
 
         What the grid had stays allocated until the backend stops.
+
+        Raises:
+            RunError: memory, or 32-bit indices, do not suffice for that.
         """
         device = self.device
-        grid = self._make_grid(device.grid.period, GROWTH * blocks)
+        room = most_blocks(device.grid)
+        if blocks > room:
+            raise RunError(
+                f"the material has spread over {blocks:,} blocks of the sparse grid, and there is memory for {room:,}; "
+                "a larger domain.spacing needs fewer."
+            )
+        grid = self._make_grid(device.grid.period, min(GROWTH * blocks, room))
         nodes, particles = copy(device.nodes), copy(device.particles)
         nodes.grid = particles.grid = particles.near = grid
         orders = self._make_orders(device.groups, grid)

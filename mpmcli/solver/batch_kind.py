@@ -28,7 +28,7 @@ class Kind:
         flags: of each law in the order of their names, the name and the terms that it has.
         cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
         keeps_filling: whether nodes keep the volume scattered to them.
-        sparse: whether nodes are there where particles are alone; such runs share nothing.
+        sparse: whether nodes are there where particles are alone, on the CPU, where such runs share nothing.
         colliders: their forms, and which of them move.
         drives: gravity that varies, forces, and motions of colliders.
         comings: what lets particles come and go.
@@ -82,7 +82,7 @@ class Kind:
 
     def joined(self, other: "Kind") -> "Kind | None":
         """Return the kind that has room for both, None where they need other kernels."""
-        if (self.dimension, self.flags) != (other.dimension, other.flags) or self.sparse or other.sparse:
+        if (self.dimension, self.flags) != (other.dimension, other.flags) or self.sparse != other.sparse:
             return None
         room = {
             name: tuple(map(max, getattr(self, name), getattr(other, name)))

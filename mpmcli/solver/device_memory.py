@@ -8,6 +8,11 @@ from pathlib import Path
 CUDA_LIBRARIES = {"linux": "libcuda.so.1", "win32": "nvcuda.dll"}
 WORDS = ("out of memory", "out_of_memory", "failed to allocate", "out_of_device_memory", "bad_alloc")
 
+# Taichi addresses fields with 32-bit integers.
+LARGEST_INDEX = 2**31 - 1
+# Share of the free memory that a run may plan for.
+MEMORY_SHARE = 0.8
+
 
 def has_cuda_device() -> bool:
     """Return whether there is a device: a file in /dev, any one of those of its machine in a container, or as told."""

@@ -1,5 +1,6 @@
 """Memory and passes that a scene needs, known before anything is allocated."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,14 +17,14 @@ from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
 from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.backend import Backend
-from mpmcli.solver.device_memory import free_memory
+from mpmcli.solver.device_memory import LARGEST_INDEX, MEMORY_SHARE, free_memory
 from mpmcli.solver.fixed_point import FixedPoint
 from mpmcli.solver.forces import forces_on, needs_initial
 from mpmcli.solver.grid import Grid, node_width, tile_edge
 from mpmcli.solver.host_memory import host_bytes_of
 from mpmcli.solver.ordering import TileOrder
 from mpmcli.solver.particle_arrays import gradient_width
-from mpmcli.solver.particle_contact import ParticleContact
+from mpmcli.solver.particle_contact import ParticleContact, bins_along
 from mpmcli.solver.particle_friction import slips_in
 from mpmcli.solver.sparse_choice import require_cpu_if_sparse, wants_sparse
 from mpmcli.solver.sparse_grid import SparseGrid, room_for_blocks
@@ -31,11 +32,8 @@ from mpmcli.solver.transfer_scheme import scheme_of
 from mpmcli.solver.volume_average import averages_volume
 from mpmcli.solver.volume_relaxation import needs_filling
 
-# Taichi addresses fields with 32-bit integers, and a particle has at most 3 x 4 numbers in one field.
-LARGEST_INDEX = 2**31 - 1
+# A particle has at most 3 x 4 numbers in one field.
 WIDEST_FIELD = 12
-# Share of the free memory that a run may plan for.
-MEMORY_SHARE = 0.8
 
 
 @dataclass(frozen=True)
@@ -61,6 +59,7 @@ class Plan:
         laws: the particles, law by law.
         nodes: number of grid nodes, on a sparse grid those that there is memory for at first.
         sparse: whether the grid is.
+        tiles: number of tiles of the domain, and of bins of bodies that meet.
         scratch_bytes: per particle, of the sort buffers.
         bytes_per_node: of the grid.
         grid_bytes: of all nodes, the tables of the sort, what is found at walls, and what colliders need.
@@ -78,6 +77,7 @@ class Plan:
     passes: tuple[str, ...]
     arch: str = "cpu"
     sparse: bool = False
+    tiles: int = 0
 
     @property
     def particles(self) -> int:
@@ -228,13 +228,14 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     tables += _contact_bytes(scene, all_nodes, tile, real)
     if scene.solver.solids == "total" and len(scene.sources) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(counts.values()))
+        all_tiles = max(all_tiles, 2 * math.prod(bins_along(cells)))
     tables += ColliderKind.of(scene).bytes_needed(dimension, all_nodes // (tile * Grid.tile_counts(cells, tile)[-1]))
     if deterministic:
         tables += nodes * len(scene.colliders) * dimension * real
     host_bytes = host_bytes_of(scene, members, sum(counts.values()), real, on_cpu=backend.on_cpu)
     passes = passes_of(members, scene, deterministic=deterministic)
     grid_bytes = nodes * node_bytes + tables
-    return Plan(groups, nodes, widest + 8, node_bytes, grid_bytes, host_bytes, passes, backend.arch, sparse)
+    return Plan(groups, nodes, widest + 8, node_bytes, grid_bytes, host_bytes, passes, backend.arch, sparse, all_tiles)
 
 
 def _separating_axes(scene: Scene) -> list[int]:
@@ -285,5 +286,5 @@ def require_room(plan: Plan) -> None:
             f"{size_text(MEMORY_SHARE * on_device)} may be used there; {cure}."
         )
     # The widest field of the sort is addressed by one index.
-    if max(plan.nodes, plan.particles * WIDEST_FIELD) > LARGEST_INDEX:
+    if max(plan.nodes, plan.particles * WIDEST_FIELD, plan.tiles) > LARGEST_INDEX:
         raise InputError(f"{need}, more than 32-bit indices can address; {cure}.")

@@ -10,7 +10,7 @@ from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.backend import Backend
 
 # Cells from which on a grid may be sparse by itself, and then the share of them that material fills at most.
-MANY_CELLS, FILLED = 2**23, 0.05
+MANY_CELLS, FILLED = 8_000_000, 0.05
 
 
 def wants_sparse(scene: Scene) -> bool:

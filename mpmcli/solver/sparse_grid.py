@@ -7,8 +7,10 @@ order, and a table has the number of every tile of the domain. Number 0 stands f
 import math
 
 import numpy as np
+import psutil
 import taichi as ti
 
+from mpmcli.solver.device_memory import LARGEST_INDEX, MEMORY_SHARE
 from mpmcli.solver.grid import Grid, drift_allowed
 from mpmcli.solver.ordering import ACTIVE, SPAN, TileOrder
 from mpmcli.solver.tile_reach import reach_along
@@ -25,6 +27,15 @@ BLOCKS, PENCILS, WANTED, COLOURS = range(4)
 def room_for_blocks(particles: int) -> int:
     """Return the number of blocks that memory is allocated for at first."""
     return particles // SHARED_BY + AT_LEAST
+
+
+def most_blocks(grid: "SparseGrid") -> int:
+    """Return the number of blocks that a larger grid may have in what memory is free, and indices reach."""
+    fields = [field for field in (grid.nodes, grid.before, grid.filling) if field is not None]
+    numbers = grid.width * len(fields) + 2 * len(grid.kept_means)
+    # And of the tables of a sort on some threads.
+    block = (4 if grid.nodes.dtype == ti.f32 else 8) * numbers * grid.block + 4 * 16
+    return int(min(MEMORY_SHARE * psutil.virtual_memory().available // block, LARGEST_INDEX // grid.block))
 
 
 @ti.data_oriented

@@ -56,13 +56,12 @@ def tiles_reached(first_nodes: np.ndarray, tile: int, reach: Sequence[np.ndarray
         reach: per axis what `reach_along` returns.
     """
     shape = tuple(len(table) for table in reach)
-    occupied = np.unique(np.ravel_multi_index(tuple((first_nodes // tile).T), shape))
-    places = np.unravel_index(occupied, shape)
-    found = np.zeros(len(occupied), np.int64)[:, None]
-    sound = np.ones(len(occupied), bool)[:, None]
-    for place, table in zip(places, reach, strict=True):
-        along = table[place]
-        # Every combination of what is reached along this axis and along those before.
-        found = (found[:, :, None] * len(table) + along[:, None, :]).reshape(len(occupied), -1)
-        sound = (sound[:, :, None] & (along >= 0)[:, None, :]).reshape(len(occupied), -1)
-    return np.unique(found[sound])
+    found = np.unique(np.ravel_multi_index(tuple((first_nodes // tile).T), shape))
+    # Along one axis after the other, which keeps few of them twice.
+    for axis, table in enumerate(reach):
+        places = list(np.unravel_index(found, shape))
+        along = table[places[axis]]
+        wide = [np.broadcast_to(place[:, None], along.shape)[along >= 0] for place in places]
+        wide[axis] = along[along >= 0]
+        found = np.unique(np.ravel_multi_index(tuple(wide), shape))
+    return found

@@ -14,7 +14,15 @@ from mpmcli.materials.law import SMALLEST, Law
 from mpmcli.materials.tensors import volume_strain
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.grid import Grid
-from mpmcli.solver.lane_state import LANES, load_deformation, load_vectors, matrix_of, vector_of, zero_lanes
+from mpmcli.solver.lane_state import (
+    LANES,
+    load_deformation,
+    load_vectors,
+    matrix_of,
+    repeat_first,
+    vector_of,
+    zero_lanes,
+)
 from mpmcli.solver.particle_arrays import VOLUME, ParticleArrays
 from mpmcli.solver.splines import PAD, bounded
 
@@ -56,6 +64,9 @@ def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), f
         count = ti.min(LANES, last - begin)
         load_deformation(group, bounded(begin), deformation)
         load_vectors(x, group.place_on_grid, bounded(begin))
+        if count < LANES:
+            repeat_first(deformation, count)
+            repeat_first(x, count)
         for lane in range(LANES):
             # What lies beyond the last particle is no row of the table.
             volumes[lane] = group.row(begin + ti.min(lane, count - 1))[VOLUME]
