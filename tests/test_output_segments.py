@@ -188,12 +188,12 @@ def slow_disk(monkeypatch) -> Event:
     monkeypatch.setattr(store_module, "ASIDE", 0)
     ready, synced, sync = Event(), [], durable_module.sync_file
 
-    def slow(path: Path) -> None:
+    def slow(path: Path, *, cached: bool = True) -> None:
         assert ready.wait(60)
         synced.append(path)
         if len(synced) == 3:
             raise OSError(errno.EIO, "the disk is gone")
-        sync(path)
+        sync(path, cached=cached)
 
     monkeypatch.setattr(durable_module, "sync_file", slow)
     return ready

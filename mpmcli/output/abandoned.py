@@ -5,10 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mpmcli.output.directory import TakenDirectory, has_frames
-from mpmcli.output.durable import write_text
+from mpmcli.output.durable import temporary_of, write_text
 from mpmcli.output.lock import take_lock
 from mpmcli.output.owner import time_now
 from mpmcli.output.run_record import RECORD, read_record
+from mpmcli.output.segments import PACKED
 
 
 def close_abandoned(directory: Path, made: Sequence[Path], pid: int, signal: str) -> None:
@@ -33,6 +34,8 @@ def close_abandoned(directory: Path, made: Sequence[Path], pid: int, signal: str
         if not has_frames(directory) and (ours or (record is None and made)):
             taken.undo()
         elif ours:
+            # The packed file that it wrote beside the segments.
+            temporary_of(directory / PACKED).unlink(missing_ok=True)
             message = f"the run was interrupted ({signal}) and ended by force; its frames were left unpacked"
             failure = {"message": message, "signal": signal}
             closed = {**record, "status": "interrupted", "ended": time_now(), "failure": failure}

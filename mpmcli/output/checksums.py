@@ -30,6 +30,33 @@ def damaged(path: str, what: str) -> DamageError:
     return DamageError(f"{path} is damaged: {what} does not have the checksum that it was written with.")
 
 
+class FrameChecksums:
+    """Checksums of arrays with frames, whose rows are given a part after another.
+
+    Attributes:
+        table: (T, A) uint32, those of what was given so far.
+    """
+
+    def __init__(self, names: Collection[str], counts: Sequence[int]) -> None:
+        """Begin with the first row of A arrays; `counts` of rows of each of the T frames."""
+        self.table = np.zeros((len(counts), len(names)), np.uint32)
+        self._ends = np.cumsum(np.asarray(counts, np.int64)).tolist()
+        self._columns = {name: column for column, name in enumerate(names)}
+        # Of each array: the frame of the next row, and the number of that row.
+        self._places = dict.fromkeys(names, (0, 0))
+
+    def add(self, name: str, rows: np.ndarray) -> None:
+        """Add the next rows of an array, of parts of a frame or of several."""
+        column, (k, row) = self._columns[name], self._places[name]
+        while len(rows):
+            while self._ends[k] == row:
+                k += 1
+            own = rows[: self._ends[k] - row]
+            self.table[k, column] = checksum(own, int(self.table[k, column]))
+            row, rows = row + len(own), rows[len(own) :]
+        self._places[name] = k, row
+
+
 @dataclass(frozen=True)
 class Checksums:
     """Checksums of the frames and of the other items of a group.

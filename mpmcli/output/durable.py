@@ -21,11 +21,18 @@ SPACE_MARGIN = 16 * 1024 * 1024
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-def sync_file(path: Path) -> None:
-    """Force the content of a closed file to the disk."""
+def temporary_of(path: Path) -> Path:
+    """Return where a file is written before it takes its name."""
+    return path.with_name(path.name + TEMPORARY_SUFFIX)
+
+
+def sync_file(path: Path, *, cached: bool = True) -> None:
+    """Force the content of a closed file to the disk; what is not to be read soon need not stay `cached`."""
     descriptor = os.open(path, os.O_RDWR)
     try:
         os.fsync(descriptor)
+        if not cached and hasattr(os, "posix_fadvise"):
+            os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
     finally:
         os.close(descriptor)
 
@@ -67,7 +74,7 @@ class Unsealed:
     """A file that is first written, and then put at its path in one durable step, by another thread maybe."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._temporary = path, path.with_name(path.name + TEMPORARY_SUFFIX)
+        self._path, self._temporary = path, temporary_of(path)
 
     @contextmanager
     def written(self, size: int = 0) -> Iterator[Path]:
@@ -77,10 +84,10 @@ class Unsealed:
                 ask_for(self._temporary, size)
             yield self._temporary
 
-    def seal(self) -> None:
-        """Put the file at its path; where that fails, the temporary one is removed."""
+    def seal(self, *, cached: bool = True) -> None:
+        """Put the file at its path; where that fails, the temporary one is removed; `cached` is as in `sync_file`."""
         with self._removed_on_error():
-            sync_file(self._temporary)
+            sync_file(self._temporary, cached=cached)
             os.replace(self._temporary, self._path)
         sync_directory(self._path.parent)
 

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from mpmcli.errors import InputError, NoRoomError, RunError
-from mpmcli.output.checksums import damaged
+from mpmcli.output.checksums import FrameChecksums, damaged
 from mpmcli.output.durable import is_full, require_free_space, sealed, sync_file
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.hdf5_items import DamageError
@@ -30,9 +30,10 @@ def pack_segments(
     frames: int | None = None,
     header: Mapping[str, Any] | None = None,
     known: bool = False,
+    begun: VtkhdfWriter | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Write all frames of `segments` into `target`, compare every number, then give it its name.
+    """Write all frames of `segments` into `target`, compare what it reads back, then give it its name.
 
     Memory is that of a block of one array. The segments are left as they are.
 
@@ -43,12 +44,13 @@ def pack_segments(
         frames: how many to take, all if None.
         header: of the packed file, that of the segments by default; "scene" may differ, as a resumed run may end later.
         known: whether this process has written or verified the segments.
+        begun: of the temporary file of `target`, with all arrays of all frames (`PackedBeside`); nothing is copied.
         stop: called for each block of an array; True ends the packing.
 
     Raises:
         KeyboardInterrupt: `stop` returned True; no `target` is made then.
         RunError: the disk cannot hold the packed file, the segments do not belong together, or the
-            packed file does not read back bit for bit. No `target` is made then.
+            packed file does not read back as it was written. No `target` is made then.
     """
     try:
         indices = [_read_index(segment, known=known) for segment in segments]
@@ -66,16 +68,19 @@ def pack_segments(
     counts = expected.counts.tolist()
     kept = f"the {len(counts)} frames written are kept in {segments[0].parent} and stay readable there"
     purpose = f"packing the frames into {target.name}"
-    size = file_size(first.layout, counts)
-    require_free_space(target.parent, size, purpose, kept)
+    size = 0
+    if begun is None:
+        size = file_size(first.layout, counts)
+        require_free_space(target.parent, size, purpose, kept)
     try:
         with sealed(target, size) as temporary:
-            with VtkhdfWriter(temporary, first.layout, counts, compress=compress) as writer:
-                _copy(segments, indices, writer, stop, by_name=compress)
+            with begun or VtkhdfWriter(temporary, first.layout, counts, compress=compress) as writer:
+                if begun is None:
+                    _copy(segments, indices, writer, stop, by_name=compress)
                 _require_unchanged(writer.checksums, expected, segments, indices)
                 writer.finish(expected.times, expected.frames, expected.steps, expected.ledger, header=expected.header)
             sync_file(temporary)
-            difference = find_difference(temporary, segments, expected, [int(i.counts.sum()) for i in indices], stop)
+            difference = find_difference(temporary, replace(expected, checksums=writer.checksums), stop)
             if difference:
                 raise RunError(f"{target.name} does not read back as it was written ({difference}); {kept}.")
     except (OSError, RuntimeError, InputError) as error:
@@ -132,17 +137,11 @@ def _first_frames(indices: Sequence[FrameIndex], frames: int) -> list[FrameIndex
     return found
 
 
-def find_difference(
-    packed: Path,
-    segments: Sequence[Path],
-    expected: FrameIndex,
-    rows_of: Sequence[int],
-    stop: Callable[[], bool] = lambda: False,
-) -> str:
-    """Compare a packed file with its segments, bit for bit.
+def find_difference(packed: Path, expected: FrameIndex, stop: Callable[[], bool] = lambda: False) -> str:
+    """Read a packed file, and compare it with what went into it.
 
     Args:
-        rows_of: rows of each segment that were packed.
+        expected: its index; of the arrays of the frames, their checksums.
 
     Returns:
         What differs first, in words; "" when nothing does.
@@ -155,7 +154,7 @@ def find_difference(
             index = read_index(file)
         except DamageError as error:
             return str(error).rstrip(".")
-        for table in ("times", "frames", "steps", "offsets", "counts"):
+        for table in ("times", "frames", "steps", "offsets", "counts", "checksums"):
             if not _same(getattr(index, table), getattr(expected, table)):
                 return f"the {table} of the frames"
         # The text form compares NaN with NaN as equal.
@@ -171,17 +170,14 @@ def find_difference(
             return CONNECTIVITY
         if root["Steps"].attrs["NSteps"] != len(expected.counts):
             return "NSteps"
-        before = 0
-        for segment, rows in zip(segments, rows_of, strict=True):
-            with closing(open_vtkhdf(segment, known=True)) as source:
-                for name in expected.layout.arrays:
-                    pairs = zip(read_blocks(file, name, before, rows), read_blocks(source, name, 0, rows), strict=True)
-                    for written, stored in pairs:
-                        if stop():
-                            raise KeyboardInterrupt
-                        if not _same(written, stored):
-                            return f"{name} of the frames of {segment.name}"
-            before += rows
+        found = FrameChecksums(expected.layout.arrays, expected.counts)
+        for column, name in enumerate(expected.layout.arrays):
+            for block in read_blocks(file, name, 0, int(expected.counts.sum())):
+                if stop():
+                    raise KeyboardInterrupt
+                found.add(name, block)
+            for frame in np.flatnonzero(found.table[:, column] != expected.checksums[:, column])[:1]:
+                return f"{name} of frame {expected.frames[frame]}"
     return ""
 
 

@@ -11,11 +11,12 @@ from mpmcli.errors import RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.collider_files import write_collider_files
-from mpmcli.output.durable import TEMPORARY_SUFFIX, Unsealed, sync_directory
+from mpmcli.output.durable import TEMPORARY_SUFFIX, Unsealed, sync_directory, temporary_of
 from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.pack import pack_segments
-from mpmcli.output.store import Store
+from mpmcli.output.packed_beside import PackedBeside
+from mpmcli.output.store import ASIDE, MOST_WAITING, Store
 from mpmcli.output.vtkhdf import VtkhdfWriter
 from mpmcli.output.vtkhdf_parts import file_size
 from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_index
@@ -46,14 +47,23 @@ class SegmentStore(Store):
 
     Each segment is a complete VTKHDF file that ParaView can open while the run goes on. Segments are
     not compressed, so that writing does not hold up the run; `compress` (gzip-1 with shuffle) applies to the packed
-    file.
+    file. The packed file of a large run is written beside the segments (`PackedBeside`).
     """
 
-    def __init__(self, directory: Path, header: dict[str, Any], **options: Any) -> None:
+    def __init__(
+        self, directory: Path, header: dict[str, Any], *, frames_expected: int | None = None, **options: Any
+    ) -> None:
+        """Begin; see `Store`.
+
+        Args:
+            frames_expected: of the run, if they have the same number of particles.
+        """
         super().__init__(directory, header, **options)
         self.place = self._directory / SEGMENTS
         self._sealed: set[str] = set()
         self._counts: list[int] = []
+        self._expected = frames_expected or 0
+        self._beside: PackedBeside | None = None
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
         """Seal the waiting frames, pack all segments, verify the packed file, and remove the segments.
@@ -68,7 +78,18 @@ class SegmentStore(Store):
             KeyboardInterrupt: `stop` returned True; the segments stay.
             RunError: the disk cannot hold the packed file or it does not read back; the segments stay.
         """
-        self.seal()
+        try:
+            self.seal()
+            if self._beside is not None and not self._beside.whole:
+                self._beside.give_up()
+            return self._pack(None if self._beside is None else self._beside.writer, stop)
+        finally:
+            if self._beside is not None:
+                self._beside.give_up()
+                self._beside = None
+
+    def _pack(self, begun: VtkhdfWriter | None, stop: Callable[[], bool]) -> Path | None:
+        """Pack all segments; `begun` is as `pack_segments` has it."""
         segments = sealed_segments(self._directory)
         # An interrupt may fall between the seal and the count; a sealed frame is never left behind.
         if missing := self._sealed - {path.name for path in segments}:
@@ -84,7 +105,8 @@ class SegmentStore(Store):
             sync_directory(self._directory)
         else:
             # Those of an earlier process were verified when the run was resumed.
-            pack_segments(segments, packed, compress=self._compress, header=self._header, known=True, stop=stop)
+            options = {"compress": self._compress, "header": self._header, "known": True, "begun": begun}
+            pack_segments(segments, packed, **options, stop=stop)
         if self._colliders:
             with closing(open_vtkhdf(packed, known=True)) as file:
                 times = read_index(file).times.tolist()
@@ -96,6 +118,8 @@ class SegmentStore(Store):
 
     def go_on_after(self, index: FrameIndex) -> None:
         super().go_on_after(index)
+        # A process that was killed may have left one.
+        temporary_of(self._directory / PACKED).unlink(missing_ok=True)
         self._sealed = {path.name for path in sealed_segments(self._directory)}
         self._counts = index.counts.tolist()
 
@@ -113,23 +137,35 @@ class SegmentStore(Store):
         return file_size(layout, counts)
 
     def _joined_size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
-        return file_size(layout, [*self._counts, *counts])
+        # What was written beside is no longer free.
+        before = self._counts if self._beside is None or self._beside.writer is None else []
+        return file_size(layout, [*before, *counts])
 
     def _write(
         self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int
     ) -> Callable[[], None]:
         path, counts = self.place / segment_name(frames[0].index), [len(frame.position) for frame in frames]
-        file = Unsealed(path)
+        whole = file_size(layout, [counts[0]] * self._expected) if self._expected > 1 else 0
+        if whole > MOST_WAITING and not (self._compress or self._sealed):
+            self._beside = PackedBeside(self._directory / PACKED, layout, self._expected, counts[0])
+        file, beside = Unsealed(path), self._beside
         with file.written(size) as temporary, VtkhdfWriter(temporary, layout, counts) as writer:
             for name, arrays in layout.stored_together(frames):
                 writer.append(name, arrays)
+                if beside is not None:
+                    beside.append(name, arrays)
                 # Before the next one is made.
                 del arrays
             tables = zip(*((frame.time, frame.index, frame.step) for frame in frames), strict=True)
             writer.finish(*tables, rows, self._header)
+        if beside is not None:
+            beside.count(len(frames))
 
         def seal() -> None:
-            file.seal()
+            # New frames find memory at once where the system need not look for it.
+            file.seal(cached=beside is None)
+            if beside is not None and size >= ASIDE:
+                beside.sync()
             self._sealed.add(path.name)
             self._counts += counts
 

@@ -20,6 +20,7 @@ import numpy as np
 from mpmcli import __version__
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import (
+    FrameChecksums,
     attribute_checksum,
     checksum,
     kind_checksum,
@@ -51,12 +52,10 @@ class VtkhdfWriter:
     def __init__(self, path: Path, layout: FrameLayout, counts: Sequence[int], *, compress: bool = False) -> None:
         self._layout = layout
         self._counts = np.asarray(counts, dtype=np.int64)
-        self._offsets = np.concatenate([[0], np.cumsum(self._counts)])
         self._compress = compress
-        self._checksums = np.zeros((len(counts), len(layout.arrays)), np.uint32)
-        self._columns = {name: column for column, name in enumerate(layout.arrays)}
-        # Rows of each array that were written, and the frame of the next one.
-        self._rows, self._frames = dict.fromkeys(layout.arrays, 0), dict.fromkeys(layout.arrays, 0)
+        self._checksums = FrameChecksums(layout.arrays, self._counts)
+        # Rows of each array that were written.
+        self._rows = dict.fromkeys(layout.arrays, 0)
         # Of compressed arrays, rows that do not fill a chunk yet.
         self._waiting: dict[str, np.ndarray] = {}
         self._path, self._finished = path, False
@@ -70,7 +69,7 @@ class VtkhdfWriter:
         # would be compressed and stored twice.
         self._datasets = {}
         for name, array in layout.arrays.items():
-            shape = array.stored_shape(int(self._offsets[-1]))
+            shape = array.stored_shape(int(self._counts.sum()))
             options = self._storage(shape, array.bytes_per_particle)
             self._datasets[name] = root.create_dataset(array_path(name), shape, array.dtype, **options)
             self._items[f"VTKHDF/{array_path(name)}"] = kind_checksum(np.dtype(array.dtype), shape)
@@ -82,6 +81,12 @@ class VtkhdfWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file; one that was not finished is of no use."""
+        if not self._file:
+            return
         gaps = gaps_of(list(self._datasets.values())) if self._finished else []
         self._file.close()
         if self._finished:
@@ -89,18 +94,10 @@ class VtkhdfWriter:
 
     def append(self, name: str, stored: np.ndarray) -> None:
         """Write the next rows of an array, of parts of a frame or of several, as `ArrayLayout.pad` gives them."""
-        data, first, column = self._datasets[name], self._rows[name], self._columns[name]
+        data, first = self._datasets[name], self._rows[name]
         rows = np.ascontiguousarray(stored, data.dtype)
         self._rows[name] = end = first + len(rows)
-        while True:
-            k = self._frames[name]
-            own = rows[max(0, self._offsets[k] - first) : max(0, self._offsets[k + 1] - first)]
-            self._checksums[k, column] = checksum(own, int(self._checksums[k, column]))
-            if end < self._offsets[k + 1] or k + 1 == len(self._counts):
-                break
-            self._frames[name] = k + 1
-            if end == self._offsets[k + 1]:
-                break
+        self._checksums.add(name, rows)
         if data.chunks is None:
             data[first:end] = rows
         else:
@@ -109,7 +106,7 @@ class VtkhdfWriter:
     @property
     def checksums(self) -> np.ndarray:
         """Those of the frames written so far, (T, arrays of the layout) uint32."""
-        return self._checksums
+        return self._checksums.table
 
     def _write_chunks(self, name: str, rows: np.ndarray, end: int) -> None:
         """Write whole chunks, each at once; those of the last rows of the array whole or not."""
@@ -155,8 +152,8 @@ class VtkhdfWriter:
             self._put_attribute("mpmcli", name, value)
         self._put("VTKHDF/Steps/Values", np.asarray(times, dtype=np.float64))
         self._put_attribute("VTKHDF/Steps", "NSteps", np.int64(len(self._counts)))
-        arrays = [f"VTKHDF/{array_path(name)}" for name in self._columns]
-        store_checksums(self._file, "mpmcli", arrays, self._checksums, self._items)
+        arrays = [f"VTKHDF/{array_path(name)}" for name in self._layout.arrays]
+        store_checksums(self._file, "mpmcli", arrays, self.checksums, self._items)
         self._finished = True
 
     def _put(self, path: str, table: np.ndarray) -> None:

@@ -40,9 +40,13 @@ def new_summary(
 
 def new_store(loaded: LoadedScene, settings: RunSettings, header: dict[str, Any], earlier: Resumption | None) -> Store:
     """Return the store of a run, which goes on after the frames that are there."""
-    kind = VtkSeriesStore if settings.form == "vtk" else SegmentStore
     scene = loaded.scene
-    store = kind(settings.directory, header, compress=scene.output.compress, hold=HOLD, colliders=scene.colliders)
+    options = {"compress": scene.output.compress, "hold": HOLD, "colliders": scene.colliders}
+    if settings.form == "vtk":
+        store = VtkSeriesStore(settings.directory, header, **options)
+    else:
+        frames = None if scene.output.drop_retired else scene.time.frames + 1
+        store = SegmentStore(settings.directory, header, frames_expected=frames, **options)
     if earlier is not None and earlier.index is not None:
         store.go_on_after(earlier.index)
     return store

@@ -8,12 +8,13 @@ import io
 import os
 import platform
 import tempfile
+import textwrap
 import time
 import weakref
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from types import CodeType
+from types import CodeType, SimpleNamespace
 from typing import Literal
 
 import taichi as ti
@@ -201,11 +202,7 @@ def _position(context: ASTTransformerContext, node: ast.AST) -> str:
 
 @cache
 def _source(code: CodeType) -> tuple[list[str], int]:
-    """Return the lines of a function and the number of the first.
-
-    Taichi searches the file of a function anew each time that it inlines it, which takes a tenth of the start of a run.
-    A code object, unlike a function, keeps no fields alive.
-    """
+    """Return the lines of a function and the number of the first; a code object keeps no fields alive."""
     return inspect.getsourcelines(code)
 
 
@@ -227,7 +224,11 @@ def _initialise(backend: Backend) -> None:
     _settle_cache()
     ASTTransformerContext.get_pos_info = _position
     Kernel.ast_builder = _builder
+    # Taichi asks for all of this anew each time that it inlines a function, and wraps lines at 9,999 columns: together
+    # a fifth of the work of its front end.
     ti.lang.kernel_impl.getsourcelines = lambda function: _source(function.__code__)
+    ti.lang.kernel_impl.getsourcefile = lambda function: function.__code__.co_filename
+    ti.lang.kernel_impl.textwrap = SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)
     # Taichi would warn of each of its variables that `ti.init` overrides, before it reads `log_level`.
     ti.set_logging_level(ti.ERROR)
     with contextlib.redirect_stdout(io.StringIO()):
