@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from mpmcli.check.finding import Finding, FrameFindings, Verdict, passes
+from mpmcli.check.frame_screen import screen
 from mpmcli.check.result_agreement import AgreementCheck
 from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, arrays_of, kept_entries, open_entries
 from mpmcli.check.result_ledger import check_ledger
@@ -179,7 +180,8 @@ def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindin
     momentum = MomentumCheck(header, findings, opened.entries[0].row)
     size = 0
     before: tuple[int, int] | None = None
-    for entry in opened.entries:
+    screened = None if stored else screen(header, opened.entries)
+    for k, entry in enumerate(opened.entries):
         number, row = entry.number, entry.row
         try:
             frame, ids = entry.read()
@@ -190,6 +192,11 @@ def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindin
             before = None
             continue
         size += sum(array.nbytes for array in arrays_of(frame, ids).values())
+        if screened is not None and screened.quiet[k]:
+            motion.passed(number, frame, float(screened.ratio[k]))
+            momentum.check(number, frame, row, (screened.lowest[k], screened.highest[k]))
+            stretch.check(number, frame)
+            continue
         # Values that are not finite have one finding, and must not cause others.
         with np.errstate(invalid="ignore", over="ignore"):
             sound = state.check(number, frame, ids, entry.count)

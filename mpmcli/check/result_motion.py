@@ -81,6 +81,11 @@ class MotionCheck:
         elif sound is None:
             self._outlier(number, frame, before.frame, row.time - before.frame.time, allowed)
 
+    def passed(self, number: int, frame: Frame, ratio: float) -> None:
+        """Note a frame that was looked at with others (`frame_screen`), and its displacement over the reach."""
+        self._before = _Moment(number, frame)
+        self.largest_ratio = max(self.largest_ratio, ratio)
+
     def forget(self) -> None:
         """Forget the previous frame, because a frame could not be read."""
         self._before = None
@@ -124,7 +129,7 @@ class MotionCheck:
         if h is None:
             return
         own = self._header.way(before.position, frame.position) - 0.5 * time * (before.velocity + frame.velocity)
-        threshold = OUTLIER_CELLS * h + OUTLIER_PART * allowed
+        threshold = outlier_threshold(h, allowed)
         squares = np.einsum("ij,ij->i", own, own)
         if squares.max() <= threshold**2:
             return
@@ -148,6 +153,11 @@ class MotionCheck:
                 )
                 self._findings.add("warning", "displaced", number, what, TOUCHED, value=apart / h, body=body)
                 return
+
+
+def outlier_threshold(spacing: float, allowed: float | np.ndarray) -> float | np.ndarray:
+    """Return how far a displacement may be from that of the velocities, m; `allowed` is the largest displacement, m."""
+    return OUTLIER_CELLS * spacing + OUTLIER_PART * allowed
 
 
 def reach(header: RunHeader, row: LedgerRow, stored: np.dtype) -> float | None:
@@ -194,8 +204,10 @@ class MomentumCheck:
         self.drift: float | None = None
         self.frames = 0
 
-    def check(self, number: int, frame: Frame, row: LedgerRow) -> None:
-        """Check the row of a frame; frames must come in order, without gaps."""
+    def check(
+        self, number: int, frame: Frame, row: LedgerRow, corners: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> None:
+        """Check the row of a frame; frames must come in order, without gaps. `corners` are those of `extent`."""
         header = self._header
         known = header.origin is not None and header.gravity is not None and header.sticking is not None
         if not known or header.driven or not self._free.any() or len(frame.position) == 0:
@@ -216,7 +228,7 @@ class MomentumCheck:
             # A wall with "stick" acts along its tangents too.
             if (touching & np.array(header.sticking)).any():
                 self._free[:] = False
-        lowest, highest = extent(frame.position)
+        lowest, highest = corners or extent(frame.position)
         self._distance = np.minimum(lowest - header.origin, header.upper - highest)
         self._distance[header.periodic] = np.inf
         if number > 0 and self._free.any():

@@ -15,6 +15,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -25,8 +26,13 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import NAME as CHECKSUMS
-from mpmcli.output.checksums import attribute_checksum, kind_checksum, store_checksums, table_checksum
-from mpmcli.output.checksums import checksum as checksum_of_frame
+from mpmcli.output.checksums import (
+    attribute_checksum,
+    frame_checksums,
+    kind_checksum,
+    store_checksums,
+    table_checksum,
+)
 from mpmcli.output.damage import DAMAGE
 from mpmcli.output.guarded_read import read_whole, require_stored
 from mpmcli.output.hdf5_heaps import require_sound_heaps
@@ -74,6 +80,15 @@ class TrajectoryData:
     ledger: Sequence[LedgerRow]
     fields: Mapping[str, np.ndarray] = field(default_factory=dict)
 
+    @cached_property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All arrays as they are stored, by their path in the group."""
+        arrays = {"position": self.position, "velocity": self.velocity, **self.fields}
+        arrays |= {name: np.asarray(getattr(self, name), np.int32) for name in LABELS}
+        for name, dtype in (("time", np.float64), ("step", np.int64), ("frame", np.int64)):
+            arrays[name] = np.asarray(getattr(self, name), dtype)
+        return arrays | {f"{LEDGER}/{name}": column for name, column in ledger_columns(self.ledger).items()}
+
 
 def group_name(number: int) -> str:
     """Return the name of a trajectory's group."""
@@ -97,7 +112,7 @@ def write_trajectory(file: h5py.File, data: TrajectoryData, *, compress: bool = 
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     # Fields keep their order.
     group = file.create_group(group_name(data.number), track_order=True)
-    attributes, arrays = _attributes(data), _arrays(data)
+    attributes, arrays = _attributes(data), data.arrays
     group.attrs.update(attributes)
     for name, array in arrays.items():
         moves = name in (*MOVING, *data.fields)
@@ -118,7 +133,7 @@ def add_checksums(group: h5py.Group) -> None:
 
 def _table(arrays: Sequence[np.ndarray]) -> np.ndarray:
     """Return the checksums of arrays of T frames, (T, A) uint32."""
-    columns = [[checksum_of_frame(rows) for rows in array] for array in arrays]
+    columns = [frame_checksums(array) for array in arrays]
     return np.array(columns, np.uint32).reshape(len(arrays), len(arrays[0])).T
 
 
@@ -132,25 +147,15 @@ def _attributes(data: TrajectoryData) -> dict[str, int | str]:
     return {"number": data.number, "split": data.split, "draws": draws, "header": header}
 
 
-def _arrays(data: TrajectoryData) -> dict[str, np.ndarray]:
-    """Return all arrays as they are stored, by their path in the group."""
-    arrays = {"position": data.position, "velocity": data.velocity, **data.fields}
-    arrays |= {name: np.asarray(getattr(data, name), np.int32) for name in LABELS}
-    for name, dtype in (("time", np.float64), ("step", np.int64), ("frame", np.int64)):
-        arrays[name] = np.asarray(getattr(data, name), dtype)
-    return arrays | {f"{LEDGER}/{name}": column for name, column in ledger_columns(data.ledger).items()}
-
-
 def stored_bytes(data: TrajectoryData) -> int:
     """Return the bytes of a shard that holds this trajectory alone, without compression, rounded up."""
     attributes = sum(len(str(value)) for value in _attributes(data).values())
-    return sum(array.nbytes + TABLE_BYTES for array in _arrays(data).values()) + attributes + GROUP_BYTES
+    return sum(array.nbytes + TABLE_BYTES for array in data.arrays.values()) + attributes + GROUP_BYTES
 
 
 def checksum_of(data: TrajectoryData) -> str:
     """Return the checksum that the group of a trajectory will have."""
-    arrays = _arrays(data)
-    return _checksum(_attributes(data), ((name, arrays[name]) for name in sorted(arrays)))
+    return _checksum(_attributes(data), sorted(data.arrays.items()))
 
 
 def checksum(group: h5py.Group) -> str:

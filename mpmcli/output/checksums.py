@@ -25,6 +25,12 @@ def checksum(array: np.ndarray, before: int = 0) -> int:
     return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8), before)
 
 
+def frame_checksums(array: np.ndarray) -> list[int]:
+    """Return the CRC-32 of each entry of an array along its first axis."""
+    rows = np.ascontiguousarray(array).reshape(len(array), -1).view(np.uint8)
+    return [zlib.crc32(row) for row in rows]
+
+
 def damaged(path: str, what: str) -> DamageError:
     """Return the error of something that has changed since it was written."""
     return DamageError(f"{path} is damaged: {what} does not have the checksum that it was written with.")
