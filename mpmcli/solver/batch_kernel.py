@@ -19,7 +19,7 @@ from mpmcli.solver.batch_steps import BatchSteps
 from mpmcli.solver.batch_threads import PATIENCE, BatchThreads
 from mpmcli.solver.box import box_of
 from mpmcli.solver.frame_reader import SOUND, sum_entries, sum_range
-from mpmcli.solver.ordering import CHUNK
+from mpmcli.solver.ordering import CHUNK, scratch_offset
 from mpmcli.solver.sorting import find_places
 from mpmcli.solver.splines import PAD
 from mpmcli.solver.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
@@ -125,12 +125,14 @@ def build_batch_kernel(device: Device, layout: Layout) -> tuple[Callable[..., No
             phases.places.divide_rows()
 
     @ti.func
-    def record(w: int, numbers: ti.template(), counts: ti.template(), shown: ti.template(), notes: ti.template()):
+    def record(w: int, numbers: ti.template(), counts: ti.template(), notes: ti.template()):
         """Note what belongs to a frame that is shown, and aim at the next one if there is one."""
-        frame, row = counts[w, count.recorded], counts[w, count.row]
+        frame = counts[w, count.recorded]
         sound = True
         for g, group in ti.static(members):
-            sums = sum_range(group, w * room[g], counts[w, count.particles[g]], row, shown)
+            scratch, seen = ti.static((device.orders[g].buffers, group.seen_from(w)))
+            offset = scratch_offset(scratch, g, w, room[g])
+            sums = sum_range(seen, w * room[g], counts[w, count.particles[g]], scratch.real, offset)
             for k in ti.static(range(sum_entries(d))):
                 notes[w, frame, ti.static(len(NOTES) + g * sum_entries(d)) + k] = sums[k]
             if sums[ti.static(SOUND)] == 0:
@@ -174,7 +176,7 @@ def build_batch_kernel(device: Device, layout: Layout) -> tuple[Callable[..., No
                 elif phase == phases.last_of_sort:
                     end_sort(w, numbers, counts)
                 elif phase == phases.showing:
-                    record(w, numbers, counts, shown, notes)
+                    record(w, numbers, counts, notes)
                     recorded = True
                 elif phase >= phases.sorts:
                     sort_on(w, phase, numbers, counts)

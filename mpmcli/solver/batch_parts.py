@@ -16,6 +16,7 @@ from mpmcli.solver.batch_phases import KICK, MOVED, RELAXED, BatchPhases
 from mpmcli.solver.block_loops import advance_tiles, scatter_tiles
 from mpmcli.solver.cpu_loops import average_pencils, scatter_pencils
 from mpmcli.solver.frame_reader import show_range
+from mpmcli.solver.ordering import scratch_offset
 from mpmcli.solver.scatter_range import scatter_range
 from mpmcli.solver.sorting import count_tiles, keep, place_particles, take
 from mpmcli.solver.sparse_grid import BLOCKS
@@ -244,7 +245,11 @@ class BatchParts(NodeParts):
         row, last_step = counts[w, self.count.row], ti.cast(numbers[w, self.real.last_step], float)
         affine, gradient = counts[w, self.count.affine], counts[w, self.count.gradient]
         tau, activity = counts[w, self.count.tau], counts[w, self.count.activity]
-        show_range(seen[g], first, after - first, last_step, row, affine, gradient, tau, activity, shown)
+        scratch, room = ti.static((self.device.orders[g].buffers, self.device.room[g]))
+        offset = scratch_offset(scratch, g, w, room)
+        show_range(
+            seen[g], first, after - first, last_step, row, affine, gradient, tau, activity, shown, scratch.real, offset
+        )
 
     @ti.func
     def sort(self, run: ti.template(), g: ti.template(), w: int, turn: int, region: int, counts: ti.template()):

@@ -47,14 +47,20 @@ def show_range(
     tau_at: int,
     activity_at: int,
     shown: ti.template(),
+    energies: ti.template(),
+    offset: int,
 ):
     """Write what some particles show, as `FrameColumns` has it, each to the row of its number after `row`.
+
+    Rows are far from each other, as particles are sorted. So that sums need not look there, their energies are written
+    in the order of the particles, too.
 
     Their state does not change: the next step applies the plastic flow that the frame shows.
 
     Args:
         dt: the last step, s.
         affine_at, gradient_at, tau_at, activity_at: columns, -1 where they are left out.
+        energies: (m) field, J/m^3; that of particle p goes to place `offset` + p.
     """
     d = ti.static(group.dimension)
     keeps_F = ti.static(group.law.deformation == "F")
@@ -108,6 +114,7 @@ def show_range(
         for lane in range(own):
             p = begin + lane
             r = row + group.id[p]
+            energies[offset + p] = found[0, lane]
             velocity, C = group.motion(p)
             place = group.place(p)
             for c in ti.static(range(d)):
@@ -141,8 +148,8 @@ def sum_entries(dimension: int) -> int:
 
 
 @ti.func
-def sum_range(group: ti.template(), first: int, count: int, row: int, shown: ti.template()):
-    """Return sums over some particles in one order, float64, see `sums_of`; `shown` has what they show after `row`."""
+def sum_range(group: ti.template(), first: int, count: int, energies: ti.template(), offset: int):
+    """Return sums over some particles in one order, float64, see `sums_of`; `energies` are those of `show_range`."""
     d = ti.static(group.dimension)
     pairs = ti.static(axis_pairs(group.dimension))
     turns = ti.static(len(axis_pairs(group.dimension)))
@@ -153,10 +160,7 @@ def sum_range(group: ti.template(), first: int, count: int, row: int, shown: ti.
         table = group.row(p)
         m = ti.cast(table[MASS], ti.f64)
         velocity, C = group.motion(p)
-        place = ti.cast(group.x[p], ti.f64)
-        if ti.static(group.repeats):
-            for c in ti.static(range(d)):
-                place[c] = ti.cast(shown[row + group.id[p], c], ti.f64)
+        place = ti.cast(group.place(p), ti.f64)
         speed = ti.cast(velocity, ti.f64)
         affine = ti.cast(C, ti.f64)
         total[0] += m
@@ -168,7 +172,7 @@ def sum_range(group: ti.template(), first: int, count: int, row: int, shown: ti.
             affine = affine @ F @ F.transpose()
         else:
             total[2] += m * affine.norm_sqr()
-        total[3] += ti.cast(table[VOLUME], ti.f64) * ti.cast(shown[row + group.id[p], 2 * d], ti.f64)
+        total[3] += ti.cast(table[VOLUME], ti.f64) * ti.cast(energies[offset + p], ti.f64)
         for c in ti.static(range(d)):
             total[6 + c] += m * place[c]
             total[6 + d + c] += m * speed[c]
@@ -195,8 +199,12 @@ def sums_of(found: np.ndarray, dimension: int) -> tuple[Sums, np.ndarray]:
     return Sums(mass, place, momentum, motion, affine, turning, spin, elastic, speed), sound > 0
 
 
-def build_frame_reader(group: ParticleArrays) -> Callable[[float, int, int, FrameArrays], tuple[Sums, bool]]:
+def build_frame_reader(
+    group: ParticleArrays, scratch: ti.Field
+) -> Callable[[float, int, int, FrameArrays], tuple[Sums, bool]]:
     """Return the reader of a range of particles: a function (dt, first, count, active, arrays).
+
+    It uses `scratch`, a number for each particle.
 
     Its `dt` is the last step, s. It fills the rows of those particles in `arrays`, which have one time, and returns the
     sums over those that take part, the first `active` ones, and whether each of these is sound.
@@ -220,10 +228,11 @@ def build_frame_reader(group: ParticleArrays) -> Callable[[float, int, int, Fram
         ti.loop_config(serialize=serial)
         for chunk in range((count + LANES - 1) // LANES):
             own = ti.min(LANES, count - chunk * LANES)
-            show_range(group, first + chunk * LANES, own, dt, 0, affine_at, gradient_at, tau_at, activity_at, shown)
+            begin = first + chunk * LANES
+            show_range(group, begin, own, dt, 0, affine_at, gradient_at, tau_at, activity_at, shown, scratch, 0)
         ti.loop_config(serialize=True)
         for _ in range(1):
-            total = sum_range(group, first, active, 0, shown)
+            total = sum_range(group, first, active, scratch, 0)
             for k in ti.static(range(width)):
                 sums[k] = total[k]
 

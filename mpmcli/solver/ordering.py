@@ -40,16 +40,27 @@ class SortBuffers:
         room: particles of the largest group of one run.
         order: (n) int, where the particle at each new place comes from.
         key: (n) int, tile of each particle; also the scratch of integer fields.
-        real: (n w) scratch of real fields; widest: w, the largest number of entries of a particle in one of them.
+        real: (n w) scratch of real fields; widest: w, the largest number of entries of a particle in one of them, or
+            that of groups: between sorts it holds a number of each particle.
     """
 
     def __init__(self, groups: Sequence[ParticleArrays], runs: int = 1) -> None:
         n = max(group.capacity for group in groups)
         self.room = n // runs
-        self.widest = max(entry_count(field) for group in groups for field in group.state)
+        self.widest = max(len(groups), *(entry_count(field) for group in groups for field in group.state))
         self.order = ti.field(int, shape=n)
         self.key = ti.field(int, shape=n)
         self.real = ti.field(float, shape=n * self.widest)
+
+
+@ti.func
+def scratch_offset(buffers: ti.template(), g: ti.template(), w: int, room: ti.template()):
+    """Return what to add to the number of a particle for a place in `SortBuffers.real` that no other has.
+
+    Args:
+        g: its group; w: its run; room: particles of a run in the group.
+    """
+    return w * ti.static(buffers.room * buffers.widest - room) + ti.static(g * buffers.room)
 
 
 @ti.data_oriented

@@ -61,7 +61,7 @@ class Solver(Run):
         self._drifts = self._kernels.particles.touches or not all(group.total for group in self.groups)
         self.grid = self._kernels.grid
         self._observations = [build_observation(group) for group in self.groups]
-        self._readers = [build_frame_reader(group) for group in self.groups]
+        self._readers = [build_frame_reader(order.group, order.buffers.real) for order in self._kernels.orders]
         measurements = [build_measurement(group, backend) for group in self.groups]
         step_control = StepControl(scene, self.groups, measurements, on_cpu=backend.on_cpu)
         self._emission = None
