@@ -1,5 +1,6 @@
 """The packed file that is written beside the segments: the bytes of one that is packed at the end, or none at all."""
 
+import errno
 from pathlib import Path
 
 import h5py
@@ -9,10 +10,12 @@ from test_output_frames import assert_same_frame, make_frame, make_row
 
 from mpmcli.errors import NoRoomError, RunError
 from mpmcli.output import SegmentStore, open_result
+from mpmcli.output import durable as durable_module
 from mpmcli.output import pack as pack_module
 from mpmcli.output import packed_beside as beside_module
 from mpmcli.output import segments as segments_module
 from mpmcli.output.segments import PACKED
+from mpmcli.output.vtkhdf import VtkhdfWriter
 
 HEADER = {"dimension": 3, "bodies": ["column"], "laws": ["fluid"], "precision": "f32", "scene": "title = 1\n"}
 TEMPORARY = f"{PACKED}.tmp"
@@ -73,6 +76,77 @@ def test_a_packed_file_that_cannot_be_written_is_given_up(tmp_path, monkeypatch)
         store.write(frame, make_row(frame.index, 3))
     assert not (tmp_path / "beside" / TEMPORARY).exists()
     assert store.finish().read_bytes() == expected
+
+
+@pytest.mark.parametrize("fails", [2, 4])
+def test_frames_that_could_not_be_sealed_are_not_packed(tmp_path, monkeypatch, fails):
+    expected = packed_at_the_end(tmp_path / "at_the_end", fails)
+    store, sync = begin(tmp_path / "beside", fails), durable_module.sync_file
+
+    def fail(path: Path, **options: bool) -> None:
+        if path.name == f"frame_{fails:06d}.vtkhdf.tmp":
+            raise OSError("the disk is gone")
+        sync(path, **options)
+
+    monkeypatch.setattr(durable_module, "sync_file", fail)
+    with pytest.raises(RunError, match=f"frame {fails} could not be written"):
+        store.write(FRAMES[fails], make_row(fails, 3))
+        store.seal()
+    assert store.finish().read_bytes() == expected
+
+
+@pytest.mark.parametrize("k", [1, 4])
+def test_an_interrupt_in_a_write_loses_no_frame(tmp_path, monkeypatch, k):
+    expected = packed_at_the_end(tmp_path / "at_the_end", 5)
+    store = begin(tmp_path / "beside", k)
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(VtkhdfWriter, "finish", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            store.write(FRAMES[k], make_row(k, 3))
+    store.seal()
+    for frame in FRAMES[k + 1 :]:
+        store.write(frame, make_row(frame.index, 3))
+    assert store.finish().read_bytes() == expected
+
+
+def test_a_segment_finds_the_room_that_the_packed_file_took(tmp_path, monkeypatch):
+    expected = packed_at_the_end(tmp_path / "at_the_end", 5)
+    store, ask = begin(tmp_path / "beside", 3), durable_module.ask_for
+
+    def full(path: Path, size: int) -> None:
+        if (tmp_path / "beside" / TEMPORARY).exists():
+            raise OSError(errno.EDQUOT, "quota exceeded")
+        ask(path, size)
+
+    monkeypatch.setattr(durable_module, "ask_for", full)
+    for frame in FRAMES[3:]:
+        store.write(frame, make_row(frame.index, 3))
+    assert store.finish().read_bytes() == expected
+
+
+@pytest.mark.parametrize("count", [200, 400])
+def test_another_number_of_particles_ends_it(tmp_path, count):
+    store = begin(tmp_path, 2)
+    for k in (2, 3, 4):
+        store.write(make_frame(k, count, 3), make_row(k, 3))
+    assert not (tmp_path / TEMPORARY).exists()
+    store.finish()
+    assert_same_frame(open_result(tmp_path).frame(4), make_frame(4, count, 3))
+
+
+def test_more_frames_than_expected_end_it(tmp_path):
+    store = begin(tmp_path, 5, expected=3)
+    store.finish()
+    assert open_result(tmp_path).frame_count == 5
+
+
+def test_nothing_of_it_stays_where_a_run_ends_otherwise(tmp_path):
+    begin(tmp_path, 3).give_up()
+    assert [path.name for path in tmp_path.iterdir()] == ["segments"]
 
 
 def test_without_room_for_both_it_is_not_begun(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from mpmcli.output.directory import TakenDirectory, has_frames
@@ -35,7 +36,8 @@ def close_abandoned(directory: Path, made: Sequence[Path], pid: int, signal: str
             taken.undo()
         elif ours:
             # The packed file that it wrote beside the segments.
-            temporary_of(directory / PACKED).unlink(missing_ok=True)
+            with suppress(OSError):
+                temporary_of(directory / PACKED).unlink(missing_ok=True)
             message = f"the run was interrupted ({signal}) and ended by force; its frames were left unpacked"
             failure = {"message": message, "signal": signal}
             closed = {**record, "status": "interrupted", "ended": time_now(), "failure": failure}

@@ -32,7 +32,8 @@ def sync_file(path: Path, *, cached: bool = True) -> None:
     try:
         os.fsync(descriptor)
         if not cached and hasattr(os, "posix_fadvise"):
-            os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+            with suppress(OSError):
+                os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
     finally:
         os.close(descriptor)
 
@@ -74,7 +75,7 @@ class Unsealed:
     """A file that is first written, and then put at its path in one durable step, by another thread maybe."""
 
     def __init__(self, path: Path) -> None:
-        self._path, self._temporary = path, temporary_of(path)
+        self.path, self._temporary = path, temporary_of(path)
 
     @contextmanager
     def written(self, size: int = 0) -> Iterator[Path]:
@@ -88,8 +89,8 @@ class Unsealed:
         """Put the file at its path; where that fails, the temporary one is removed; `cached` is as in `sync_file`."""
         with self._removed_on_error():
             sync_file(self._temporary, cached=cached)
-            os.replace(self._temporary, self._path)
-        sync_directory(self._path.parent)
+            os.replace(self._temporary, self.path)
+        sync_directory(self.path.parent)
 
     @contextmanager
     def _removed_on_error(self) -> Iterator[None]:

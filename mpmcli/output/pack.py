@@ -152,7 +152,7 @@ def find_difference(packed: Path, expected: FrameIndex, stop: Callable[[], bool]
     with closing(open_vtkhdf(packed, known=True)) as file:
         try:
             index = read_index(file)
-        except DamageError as error:
+        except (DamageError, ValueError) as error:
             return str(error).rstrip(".")
         for table in ("times", "frames", "steps", "offsets", "counts", "checksums"):
             if not _same(getattr(index, table), getattr(expected, table)):

@@ -1,5 +1,6 @@
 """The packed file of a run, written beside its segments while the run goes on, so that its end copies nothing."""
 
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,8 +16,8 @@ from mpmcli.output.vtkhdf_parts import file_size
 class PackedBeside:
     """The temporary file of a packed result, which gets the arrays of all frames of a run in order.
 
-    It is worth nothing until it is whole. Where it cannot be written, or frames are missing at the end, it is given up,
-    and the segments are packed.
+    It is worth nothing until it is whole. Where it cannot be written, or other frames come than those that are
+    expected, it is given up, and the segments are packed.
 
     Attributes:
         writer: of the file, None once it was given up.
@@ -24,7 +25,9 @@ class PackedBeside:
 
     def __init__(self, target: Path, layout: FrameLayout, frames: int, particles: int) -> None:
         """Begin the temporary file of `target`, if the disk has room for all frames twice."""
-        self._temporary, self._missing = temporary_of(target), frames
+        self._temporary, self._frames, self._particles = temporary_of(target), frames, particles
+        # Frames whose arrays it has, and those of them whose segments are sealed.
+        self._written = self._sealed = 0
         self.writer: VtkhdfWriter | None = None
         counts = [particles] * frames
         size = file_size(layout, counts)
@@ -36,23 +39,27 @@ class PackedBeside:
     @property
     def whole(self) -> bool:
         """Whether it has all frames."""
-        return self.writer is not None and self._missing == 0
+        return self.writer is not None and self._sealed == self._frames
+
+    def expect(self, first: int, counts: Sequence[int]) -> None:
+        """Give it up unless frames with so many particles, from number `first` on, are the next ones."""
+        fit = first == self._written and first + len(counts) <= self._frames
+        if not fit or any(count != self._particles for count in counts):
+            self.give_up()
+        self._written += len(counts)
 
     def append(self, name: str, stored: np.ndarray) -> None:
-        """Write the next rows of an array, as `VtkhdfWriter.append`."""
+        """Write the rows of an array of all frames that were expected last, as `VtkhdfWriter.append`."""
         try:
             if self.writer is not None:
                 self.writer.append(name, stored)
         except (OSError, RuntimeError, TypeError, ValueError):
             self.give_up()
 
-    def count(self, frames: int) -> None:
-        """Note that all arrays of so many more frames were written."""
-        self._missing -= frames
-
-    def sync(self) -> None:
-        """Force what was written to the disk, so that little is left for the end."""
-        if self.writer is not None:
+    def seal(self, frames: int, *, sync: bool) -> None:
+        """Note that so many more frames are sealed; `sync` what was written, so that little is left for the end."""
+        self._sealed += frames
+        if sync and self.writer is not None:
             with suppress(OSError):
                 sync_file(self._temporary)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from mpmcli.errors import InputError
 from mpmcli.output.collider_files import write_collider_files
-from mpmcli.output.durable import sync_directory, write_text
+from mpmcli.output.durable import sync_directory, temporary_of, write_text
 from mpmcli.output.header import RunHeader
 from mpmcli.output.lock import take_lock
 from mpmcli.output.pack import pack_segments
@@ -140,6 +140,8 @@ def _salvage(packed: Path, verdict: FileVerdict, done: Repair) -> None:
 def _replace(sources: Sequence[Path], frames: int, done: Repair, *, damaged: bool) -> None:
     """Pack frames, verify the new file, and only then give it its name."""
     packed, new = done.path / PACKED, done.path / REPAIRED
+    # Of a run that was killed.
+    temporary_of(packed).unlink(missing_ok=True)
     with closing(open_vtkhdf(sources[0])) as file:
         compress = _compresses(read_index(file).header)
     try:

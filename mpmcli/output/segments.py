@@ -84,9 +84,16 @@ class SegmentStore(Store):
                 self._beside.give_up()
             return self._pack(None if self._beside is None else self._beside.writer, stop)
         finally:
-            if self._beside is not None:
-                self._beside.give_up()
-                self._beside = None
+            self._end_beside()
+
+    def give_up(self) -> None:
+        super().give_up()
+        self._end_beside()
+
+    def _end_beside(self) -> None:
+        if self._beside is not None:
+            self._beside.give_up()
+            self._beside = None
 
     def _pack(self, begun: VtkhdfWriter | None, stop: Callable[[], bool]) -> Path | None:
         """Pack all segments; `begun` is as `pack_segments` has it."""
@@ -144,32 +151,50 @@ class SegmentStore(Store):
     def _write(
         self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int
     ) -> Callable[[], None]:
-        path, counts = self.place / segment_name(frames[0].index), [len(frame.position) for frame in frames]
+        counts = [len(frame.position) for frame in frames]
         whole = file_size(layout, [counts[0]] * self._expected) if self._expected > 1 else 0
-        if whole > MOST_WAITING and not (self._compress or self._sealed):
+        if whole > MOST_WAITING and not (self._compress or self._sealed or self._beside):
             self._beside = PackedBeside(self._directory / PACKED, layout, self._expected, counts[0])
-        file, beside = Unsealed(path), self._beside
+        beside = self._beside
+        if beside is not None:
+            beside.expect(frames[0].index, counts)
+        try:
+            file = self._write_segment(layout, frames, rows, size)
+        except BaseException as error:
+            if beside is None or beside.writer is None:
+                raise
+            beside.give_up()
+            if not isinstance(error, OSError | RuntimeError):
+                raise
+            # In the room that it took.
+            file = self._write_segment(layout, frames, rows, size)
+
+        def seal() -> None:
+            # New frames find memory at once where the system need not look for it.
+            file.seal(cached=beside is None or beside.writer is None)
+            if beside is not None:
+                beside.seal(len(frames), sync=size >= ASIDE)
+            self._sealed.add(file.path.name)
+            self._counts += counts
+
+        return seal
+
+    def _write_segment(
+        self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int
+    ) -> Unsealed:
+        """Write frames to a segment, and to the packed file where that is written beside it."""
+        counts = [len(frame.position) for frame in frames]
+        file = Unsealed(self.place / segment_name(frames[0].index))
         with file.written(size) as temporary, VtkhdfWriter(temporary, layout, counts) as writer:
             for name, arrays in layout.stored_together(frames):
                 writer.append(name, arrays)
-                if beside is not None:
-                    beside.append(name, arrays)
+                if self._beside is not None:
+                    self._beside.append(name, arrays)
                 # Before the next one is made.
                 del arrays
             tables = zip(*((frame.time, frame.index, frame.step) for frame in frames), strict=True)
             writer.finish(*tables, rows, self._header)
-        if beside is not None:
-            beside.count(len(frames))
-
-        def seal() -> None:
-            # New frames find memory at once where the system need not look for it.
-            file.seal(cached=beside is None)
-            if beside is not None and size >= ASIDE:
-                beside.sync()
-            self._sealed.add(path.name)
-            self._counts += counts
-
-        return seal
+        return file
 
 
 def remove_segments(directory: Path) -> None:

@@ -185,6 +185,10 @@ class Store(ABC):
             RunError: it could not be completed; what was written stays.
         """
 
+    def give_up(self) -> None:
+        """Forget waiting frames, and remove what is of no use without `finish`; sealed frames stay."""
+        self._waiting.clear()
+
     @abstractmethod
     def _holds_result(self) -> bool:
         """Return whether an earlier result lies in the directory."""

@@ -174,6 +174,7 @@ def _store_run(
     finally:
         if summary.status == "running":
             # A fault of mpmcli: the record must not state that the run is going on.
+            store.give_up()
             record.close("failed", "an internal error ended the run")
     summary.steps = solver.step_count
     clock.book(solver.first_step_seconds, "compile_s")
