@@ -293,6 +293,8 @@ def test_the_output_of_pytest_is_read(parts: Callable) -> None:
     assert "| quick | 1 passed, 1 failed, 1 skipped | 12, ended by time |" in text
     assert "* `FAILED tests/test_a.py::test_two[a b] - AssertionError: assert 1 == 2`" in text
     assert parts("tests").read_output("ERROR: no module\n")["said"] == ["ERROR: no module"]
+    begun = "==== test session starts ====\nplatform linux -- Python 3.11 -- /opt/python\nrootdir: /home/me\nno tests\n"
+    assert parts("tests").read_output(begun)["said"] == ["no tests"]
 
 
 def test_every_file_with_tests_of_a_gpu_is_found(parts: Callable) -> None:

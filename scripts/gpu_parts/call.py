@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None, output: IO[str]) -> int:
     report = (folder / NAME).read_text(encoding="utf-8")
     output.write(report)
     if options.write:
-        replace_section("gpu", report)
+        replace_section("gpu-cpu" if arch == "cpu" else "gpu", report)
     return 0 if all(record.state == DONE for record in records) else 1
 
 

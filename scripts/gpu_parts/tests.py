@@ -25,6 +25,9 @@ LINE = re.compile(
 )
 # Lines of its summary that say why: "FAILED tests/test_x.py::test_y - AssertionError: ...".
 REASON = re.compile(r"^(?:FAILED|ERROR|SKIPPED) .*$")
+HEADER = re.compile(
+    r"^(?:=+ test session|platform |hypothesis |cachedir: |rootdir: |configfile: |plugins: |created: ).*$"
+)
 MOST_REASONS, MOST_PROCESSES = 20, 8
 # Time that is kept for pytest's own end, s.
 MARGIN = 4.0
@@ -88,8 +91,9 @@ def read_output(output: str) -> dict:
         "failed": [test for test, word in outcomes.items() if word in ("FAILED", "ERROR")],
         "reasons": reasons[:MOST_REASONS],
     }
-    # Where nothing ran, the last lines say why.
-    return row if outcomes else row | {"said": output.strip().splitlines()[-8:]}
+    # Where nothing ran, the last lines say why; those with which pytest begins say where and with what.
+    lines = [line for line in output.strip().splitlines() if not HEADER.match(line)]
+    return row if outcomes else row | {"said": lines[-8:]}
 
 
 def section(rows: dict[str, dict]) -> str:
