@@ -169,11 +169,12 @@ class SegmentStore(Store):
             # In the room that it took.
             file = self._write_segment(layout, frames, rows, size)
 
+        # It keeps no frame: another one is built meanwhile.
         def seal() -> None:
             # New frames find memory at once where the system need not look for it.
             file.seal(cached=beside is None or beside.writer is None)
             if beside is not None:
-                beside.seal(len(frames), sync=size >= ASIDE)
+                beside.seal(len(counts), sync=size >= ASIDE)
             self._sealed.add(file.path.name)
             self._counts += counts
 
