@@ -41,8 +41,8 @@ def screen(header: RunHeader, entries: Sequence[KeptEntry]) -> Screened | None:
     """Look at all frames of a run; None where they are not alike, particles come and go, or a field is of CHECKED."""
     frames = [entry.frame for entry in entries]
     counts = {len(frame.position) for frame in frames}
-    inside = header.origin is not None and header.spacing is not None and not any(header.open_axes)
-    known = inside and not header.comes_and_goes and not header.drops
+    bounded = header.origin is not None and header.spacing is not None and not any(header.open_axes)
+    known = bounded and not header.comes_and_goes and not header.drops
     if not known or len(counts) != 1 or 0 in counts or not set(CHECKED).isdisjoint(frames[0].fields):
         return None
     d = header.dimension

@@ -52,8 +52,8 @@ def show_range(
 ):
     """Write what some particles show, as `FrameColumns` has it, each to the row of its number after `row`.
 
-    Rows are far from each other, as particles are sorted. So that sums need not look there, their energies are written
-    in the order of the particles, too.
+    Rows are far from each other, as particles are sorted. So that sums need not look there, the energies of the
+    particles are written in their order, too.
 
     Their state does not change: the next step applies the plastic flow that the frame shows.
 
@@ -204,10 +204,11 @@ def build_frame_reader(
 ) -> Callable[[float, int, int, FrameArrays], tuple[Sums, bool]]:
     """Return the reader of a range of particles: a function (dt, first, count, active, arrays).
 
-    It uses `scratch`, a number for each particle.
-
     Its `dt` is the last step, s. It fills the rows of those particles in `arrays`, which have one time, and returns the
     sums over those that take part, the first `active` ones, and whether each of these is sound.
+
+    Args:
+        scratch: (m) field, a number for each particle, overwritten.
     """
     d, serial = group.dimension, group.serial
     width = sum_entries(d)
