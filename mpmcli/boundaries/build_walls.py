@@ -21,6 +21,8 @@ def build_walls(
     friction: RoughFaces,
     moving: MovingFaces,
     runs: int = 1,
+    *,
+    on_cpu: bool,
 ) -> tuple[Walls | ZeroedWalls, MirrorImages | None]:
     """Return the boundary, and the images of nodes behind it, None where there are none.
 
@@ -34,8 +36,8 @@ def build_walls(
     mirroring = faces_on_grid(faces, settings)
     if settings.walls != "zeroed":
         walls = Walls(mirroring, first, cells, shape, runs, friction, moving)
-        return walls, MirrorImages(walls, on_node)
+        return walls, MirrorImages(walls, on_node, on_cpu=on_cpu)
     zeroed = ZeroedWalls(faces, first, cells, friction, moving)
     if not any(PERIODIC in pair for pair in faces):
         return zeroed, None
-    return zeroed, MirrorImages(Walls(mirroring, first, cells, shape, runs), on_node)
+    return zeroed, MirrorImages(Walls(mirroring, first, cells, shape, runs), on_node, on_cpu=on_cpu)

@@ -5,6 +5,9 @@ becomes velocity; afterwards the nodes beyond receive the mirrored velocity. The
 where setting node velocities to zero makes it first-order (docs/theory.md, 3.1).
 """
 
+from collections.abc import Sequence
+from copy import copy
+
 import taichi as ti
 
 from mpmcli.boundaries.walls import REACH, Walls
@@ -15,7 +18,7 @@ class MirrorImages:
     """The mirror images of nodes behind walls.
 
     A node has an image for every set of axes along which a wall acts on it and it lies inside that wall. Sets are bits:
-    bit a stands for a mirror across the wall of axis a; 0 is the node itself.
+    bit i stands for a mirror across the wall of the i-th of the axes of `walls`; 0 is the node itself.
 
     Attributes:
         walls: the mirrors.
@@ -25,23 +28,48 @@ class MirrorImages:
             the spline's weights at the wall, as a shear stress up to the wall is then in balance.
         planes: axes of the faces that either of them runs over.
         crossed: per axis, whether walls along other axes always act on its faces.
+        apart: whether nodes near walls of one axis alone are of kinds of their own.
     """
 
-    def __init__(self, walls: Walls, on_node: float) -> None:
+    def __init__(self, walls: Walls, on_node: float, *, on_cpu: bool) -> None:
         self.walls = walls
         self.dimension = walls.dimension
         self.needs_contact = len(walls.separating) > 0
         self.needs_friction = len(walls.rough) > 0
         self.shares = (on_node, 1 - on_node)
+        # In 2D nothing is gained, and software Vulkan compiles for 6 s longer.
+        self.apart = on_cpu and walls.dimension == 3
         self.planes = tuple(a for a, _ in walls.separating) + tuple(a for _, _, a, _ in walls.rough)
         self.crossed = tuple(
             any(word != "separate" for b in walls.lateral[a] for word in walls.faces[b]) for a in range(self.dimension)
         )
 
+    def along(self, axes: Sequence[int]) -> "MirrorImages":
+        """Return the same for nodes that are near no walls of other axes."""
+        images = copy(self)
+        images.walls = self.walls.along(axes)
+        return images
+
+    @property
+    def kinds(self) -> tuple["MirrorImages", ...]:
+        """For each kind of node the same for nodes of it, see `kind`: near walls of one axis alone, and all others.
+
+        Nearly all nodes near walls are near those of one axis: they have two images in place of eight, and need not
+        look for others.
+        """
+        return (*(self.along((a,)) for a in range(self.dimension) if self.apart), self)
+
     @ti.func
-    def near(self, node: ti.template()):
-        """Return whether the node may have images or be one."""
-        return self.walls.near(node)
+    def kind(self, node: ti.template()):
+        """Return the number of the kind of a node that may have images or be one; -1 of others."""
+        result = -1
+        if ti.static(self.apart):
+            for a in ti.static(range(self.dimension)):
+                if self.walls.distance_along(node, a) <= self.walls.reach:
+                    result = ti.static(a) if result < 0 else ti.static(self.dimension)
+        elif self.walls.near(node):
+            result = 0
+        return result
 
     @ti.func
     def fold(
@@ -67,7 +95,7 @@ class MirrorImages:
         """
         depth, mirror, upper, acts, holds = ti.static(place)
         owned = True
-        for a in ti.static(range(self.dimension)):
+        for a in ti.static(self.walls.axes):
             if acts[a] == 1 and depth[a] < 0:
                 owned = False
         total = ti.Vector.zero(float, grid.width)
@@ -75,12 +103,13 @@ class MirrorImages:
             total = self.image_sum(grid, field, node, mirror, acts, depth, holds, upper, gravity_step)
             if ti.static(rubbed):
                 for r, _number, axis, side in ti.static(self.walls.rough):
-                    if acts[axis] == 1 and depth[axis] <= 1 and upper[axis] == side:
-                        impulse = self.walls.impulse[self.walls.first_rough + r, self.walls.plane_index(node, axis)]
-                        share = self.shares[0] if depth[axis] == 0 else self.shares[1]
-                        for c in ti.static(self.walls.lateral[axis]):
-                            total[c] += share * impulse[c]
-            for a in ti.static(range(self.dimension)):
+                    if ti.static(axis in self.walls.axes):
+                        if acts[axis] == 1 and depth[axis] <= 1 and upper[axis] == side:
+                            impulse = self.walls.impulse[self.walls.first_rough + r, self.walls.plane_index(node, axis)]
+                            share = self.shares[0] if depth[axis] == 0 else self.shares[1]
+                            for c in ti.static(self.walls.lateral[axis]):
+                                total[c] += share * impulse[c]
+            for a in ti.static(self.walls.axes):
                 if acts[a] == 1 and depth[a] == 0:
                     total = self.walls.stopped(total, a, holds, upper, total[self.dimension])
             if ti.static(self.walls.moves):
@@ -98,8 +127,9 @@ class MirrorImages:
     ):
         """Write a velocity to a node near a wall, and mirrored to its images; `place` as of `fold`."""
         depth, mirror, upper, acts, holds = ti.static(place)
-        for images in range(ti.static(2**self.dimension)):
-            if self.has_image(images, acts, depth):
+        every = self.every_image(acts, depth)
+        for images in range(self.image_sets(every)):
+            if images & every == images:
                 mirrored = self.mirrored_value(value, images, holds, upper, 1.0)
                 field[self.image(grid, node, mirror, images)] = mirrored
 
@@ -122,26 +152,36 @@ class MirrorImages:
         floor would exceed what its stress balances.
         """
         total = ti.Vector.zero(float, grid.width)
-        for images in range(ti.static(2**self.dimension)):
-            if self.has_image(images, acts, depth):
+        every = self.every_image(acts, depth)
+        for images in range(self.image_sets(every)):
+            if images & every == images:
                 value = pulled(field[self.image(grid, node, mirror, images)], self.dimension, gravity_step)
                 total += self.mirrored_value(value, images, holds, upper, value[self.dimension])
         return total
 
     @ti.func
-    def has_image(self, images: int, acts: ti.template(), depth: ti.template()):
-        """Return whether the node has an image mirrored in exactly the axes of the bit set `images`."""
-        exists = True
-        for a in ti.static(range(self.dimension)):
-            exists = exists and (images >> a & 1 == 0 or (acts[a] == 1 and depth[a] >= 1))
-        return exists
+    def every_image(self, acts: ti.template(), depth: ti.template()):
+        """Return the set of all axes along which the node has an image: there is one for each of its subsets."""
+        every = 0
+        for i, a in ti.static(enumerate(self.walls.axes)):
+            if acts[a] == 1 and depth[a] >= 1:
+                every += ti.static(2**i)
+        return every
+
+    @ti.func
+    def image_sets(self, every: int):
+        """Return a number above that of any subset: one that is known for a single axis, where no loop is left."""
+        sets = every + 1
+        if ti.static(len(self.walls.axes) == 1):
+            sets = 2
+        return sets
 
     @ti.func
     def image(self, grid: ti.template(), node: ti.template(), mirror: ti.template(), images: int):
         """Return the linear index of that image."""
         place = node
-        for a in ti.static(range(self.dimension)):
-            if images >> a & 1 == 1:
+        for i, a in ti.static(enumerate(self.walls.axes)):
+            if images >> i & 1 == 1:
                 place[a] = mirror[a]
         return grid.linear_index(place)
 
@@ -158,10 +198,10 @@ class MirrorImages:
             mass: kg, of momentum; 1 of velocity.
         """
         result = value
-        for a in ti.static(range(self.dimension)):
+        for i, a in ti.static(enumerate(self.walls.axes)):
             # An image by translation has the same value.
             if ti.static(a not in self.walls.periodic):
-                if images >> a & 1 == 1:
+                if images >> i & 1 == 1:
                     for c in ti.static(range(self.dimension)):
                         if ti.static(c == a):
                             result[c] = -result[c]
@@ -178,9 +218,9 @@ class MirrorImages:
         """Return what the velocity of walls adds to a mirrored velocity: twice that of the last one that turned it."""
         result = ti.Vector.zero(float, self.dimension)
         turned = ti.Vector.zero(int, self.dimension)
-        for a in ti.static(range(self.dimension)):
+        for i, a in ti.static(enumerate(self.walls.axes)):
             if ti.static(a not in self.walls.periodic):
-                if images >> a & 1 == 1:
+                if images >> i & 1 == 1:
                     along = self.walls.velocity(a, upper[a])
                     for c in ti.static(range(self.dimension)):
                         # Through itself a wall does not move.
@@ -208,12 +248,17 @@ class MirrorImages:
         """Return the q-th node in use of the plane of a face, and whether there is one."""
         node = ti.Vector.zero(int, self.dimension)
         node[axis] = self.walls.last[axis] if ti.static(upper) else self.walls.first
-        rest = q
+        count = 1
         for b in ti.static(self.walls.lateral[axis]):
-            node[b] = grid.box[0, b] + rest % grid.box[1, b]
-            rest = rest // grid.box[1, b]
+            count *= grid.box[1, b]
         low = grid.box[0, axis]
-        inside = rest == 0 and node[axis] >= low and node[axis] < low + grid.box[1, axis]
+        inside = q < count and node[axis] >= low and node[axis] < low + grid.box[1, axis]
+        if inside:
+            rest = q
+            for b in ti.static(self.walls.lateral[axis]):
+                line = ti.raw_div(rest, grid.box[1, b])
+                node[b] = grid.box[0, b] + rest - line * grid.box[1, b]
+                rest = line
         return node, inside
 
     @ti.func

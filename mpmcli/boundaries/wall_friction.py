@@ -31,16 +31,20 @@ def find_friction(images: ti.template(), grid: ti.template(), q: int, gravity_st
                     for c in ti.static(range(d)):
                         along[c] = own[c]
         node, inside = ti.Vector.zero(int, d), True
-        rest, place = q, 0
+        rest, place, count = q, 0, 1
         for b in ti.static(range(d)):
             if b == axis:
                 node[b] = images.walls.last[b] if side == 1 else images.walls.first
                 inside = inside and node[b] >= grid.box[0, b] and node[b] < grid.box[0, b] + grid.box[1, b]
             else:
-                node[b] = grid.box[0, b] + rest % grid.box[1, b]
-                rest = rest // grid.box[1, b]
-                place = place * ti.static(images.walls.shape[b]) + node[b]
-        if inside and rest == 0:
+                count *= grid.box[1, b]
+        if inside and q < count:
+            for b in ti.static(range(d)):
+                if b != axis:
+                    line = ti.raw_div(rest, grid.box[1, b])
+                    node[b] = grid.box[0, b] + rest - line * grid.box[1, b]
+                    place = place * ti.static(images.walls.shape[b]) + node[b]
+                    rest = line
             impulse = ti.Vector.zero(float, d)
             # What an image has fills the node of a periodic face too.
             filled = grid.nodes[grid.linear_index(node)][d] > 0

@@ -6,6 +6,7 @@ velocity. What particles scatter beyond them is folded back by `mirror_images` (
 
 import math
 from collections.abc import Sequence
+from copy import copy
 
 import taichi as ti
 
@@ -45,6 +46,7 @@ class Walls:
         first: index of the wall's node plane at the lower faces; `last`, per axis, at the upper ones.
         separating: (axis, side) of every face whose word is "separate".
         lateral: per axis, the other axes.
+        axes: those whose faces are asked for: all, or fewer for nodes that are near no others, see `along`.
         contact: (planes, nodes) int, per separating face and node of its plane, whether the material presses on it.
         first_plane: row of `contact` of the first separating face.
         friction: the coefficients; rough: of every face that has one and is a wall here its place among these,
@@ -72,7 +74,7 @@ class Walls:
             shape: nodes of the grid per axis.
             runs: sets of planes in `contact`.
         """
-        self.dimension = len(faces)
+        self.dimension, self.axes = len(faces), tuple(range(len(faces)))
         self.faces = tuple(tuple(pair) for pair in faces)
         self.periodic = tuple(a for a, pair in enumerate(self.faces) if PERIODIC in pair)
         self.reach = PERIODIC_REACH if self.periodic else REACH
@@ -100,6 +102,12 @@ class Walls:
         """Return the nodes of a plane normal to `axis`."""
         return math.prod(self.shape[b] for b in self.lateral[axis])
 
+    def along(self, axes: Sequence[int]) -> "Walls":
+        """Return the same walls for nodes that are near none of other axes."""
+        walls = copy(self)
+        walls.axes = tuple(axes)
+        return walls
+
     @ti.func
     def constrain(self, node: ti.template(), velocity: ti.template()):
         """Return the velocity of a node after the walls.
@@ -126,7 +134,7 @@ class Walls:
     ):
         """Return what `constrain` does, of a node whose place, walls that act and that hold are known."""
         result = velocity
-        for a in ti.static(range(self.dimension)):
+        for a in ti.static(self.axes):
             if acts[a] == 1 and depth[a] == 0:
                 result = self.stopped(result, a, holds, upper, 1.0)
             elif depth[a] <= 0:
@@ -141,10 +149,15 @@ class Walls:
     def distance(self, node: ti.template()):
         """Return the nodes from the nearest wall inwards to the node, negative behind a wall."""
         # Minima and no `or`: branches at every node of the grid would cost more.
-        result = ti.min(node[0] - self.first, self.last[0] - node[0])
+        result = self.distance_along(node, 0)
         for a in ti.static(range(1, self.dimension)):
-            result = ti.min(result, ti.min(node[a] - self.first, self.last[a] - node[a]))
+            result = ti.min(result, self.distance_along(node, a))
         return result
+
+    @ti.func
+    def distance_along(self, node: ti.template(), axis: ti.template()):
+        """Return the nodes from the nearest wall of an axis inwards to the node, negative behind a wall."""
+        return ti.min(node[axis] - self.first, self.last[axis] - node[axis])
 
     @ti.func
     def near(self, node: ti.template()):
@@ -163,7 +176,9 @@ class Walls:
         upper = ti.Vector.zero(int, self.dimension)
         for a in ti.static(range(self.dimension)):
             depth[a] = REACH + 1
-            if ti.static(self.faces[a][0] == PERIODIC):
+            if ti.static(a not in self.axes):
+                pass
+            elif ti.static(self.faces[a][0] == PERIODIC):
                 period = self.last[a] - self.first
                 if node[a] <= self.first + PERIODIC_REACH:
                     mirror[a] = node[a] + period
@@ -187,15 +202,16 @@ class Walls:
         """Return, per axis, whether a wall acts on the node: it is within reach and, if separating, pressed."""
         acts = ti.Vector.zero(int, self.dimension)
         inner = node
-        for a in ti.static(range(self.dimension)):
+        for a in ti.static(self.axes):
             acts[a] = ti.cast(depth[a] <= REACH, int)
             if depth[a] < 0:
                 inner[a] = mirror[a]
         # Contact is looked up at the image inside the domain: a node and all its images agree.
         for f in ti.static(range(len(self.separating))):
             axis = ti.static(self.separating[f][0])
-            if depth[axis] <= REACH and upper[axis] == self.separating[f][1]:
-                acts[axis] = self.contact[self.first_plane + f, self.plane_index(inner, axis)]
+            if ti.static(axis in self.axes):
+                if depth[axis] <= REACH and upper[axis] == self.separating[f][1]:
+                    acts[axis] = self.contact[self.first_plane + f, self.plane_index(inner, axis)]
         return acts
 
     @ti.func
@@ -227,12 +243,14 @@ class Walls:
             rubbed: whether friction was found.
         """
         holds = ti.Vector.zero(int, self.dimension)
-        for a in ti.static(range(self.dimension)):
+        for a in ti.static(self.axes):
             holds[a] = ti.cast(self.face_is("stick", a, upper[a]), int)
         if ti.static(rubbed):
             for r, _number, axis, side in ti.static(self.rough):
-                if depth[axis] <= REACH and upper[axis] == side:
-                    holds[axis] = ti.cast(self.impulse[self.first_rough + r, self.plane_index(node, axis)][axis], int)
+                if ti.static(axis in self.axes):
+                    if depth[axis] <= REACH and upper[axis] == side:
+                        entry = self.impulse[self.first_rough + r, self.plane_index(node, axis)][axis]
+                        holds[axis] = ti.cast(entry, int)
         return holds
 
     @ti.func
@@ -259,7 +277,7 @@ class Walls:
     def closed(self, value: ti.template(), acts: ti.template(), depth: ti.template()):
         """Return it without what a moving wall drives through another one, which it meets in an edge."""
         result = value
-        for a in ti.static(range(self.dimension)):
+        for a in ti.static(self.axes):
             if acts[a] == 1 and depth[a] == 0:
                 result[a] = 0.0
         return result

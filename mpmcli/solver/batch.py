@@ -106,7 +106,16 @@ class Batch:
             group.repeat(period)
         friction, moving = RoughFaces(kind.rough, runs), MovingFaces(kind.moving, d, runs)
         walls, images = build_walls(
-            kind.faces, kind.settings, PAD, grid.cells, grid.shape, scheme.spline.on_node, friction, moving, runs
+            kind.faces,
+            kind.settings,
+            PAD,
+            grid.cells,
+            grid.shape,
+            scheme.spline.on_node,
+            friction,
+            moving,
+            runs,
+            on_cpu=on_cpu,
         )
         self._buffers = SortBuffers(groups, runs) if on_cpu else None
         orders = self._make_orders(groups, grid) if on_cpu else []

@@ -68,7 +68,10 @@ def update_blocks(grid: ti.template(), nodes: ti.template(), first: int, after: 
                 inside = inside and node[a] >= grid.box[0, a] and node[a] < grid.box[0, a] + grid.box[1, a]
             if inside:
                 index = b * ti.static(grid.block) + q
-                speed_squared = ti.max(speed_squared, nodes.update(node, index, gravity_step))
+                squared = nodes.update(node, index, gravity_step)
+                # As in `update_rows`.
+                if squared > speed_squared:
+                    speed_squared = squared
     return speed_squared
 
 

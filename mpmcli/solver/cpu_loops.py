@@ -59,6 +59,9 @@ def update_rows(grid: ti.template(), nodes: ti.template(), first: int, last: int
         node = grid.row_start(row)
         index = grid.linear_index(node)
         for k in range(grid.box[1, d - 1]):
-            speed_squared = ti.max(speed_squared, nodes.update(node, index + k, gravity_step))
+            squared = nodes.update(node, index + k, gravity_step)
+            # Not `ti.max`, which takes twice as long for its care of NaN, at every node without mass.
+            if squared > speed_squared:
+                speed_squared = squared
             node[d - 1] += 1
     return speed_squared

@@ -76,7 +76,15 @@ class Kernels:
         if self.grid.deterministic:
             self.grid.fixed = FixedPoint(self.grid, groups, backend.arch)
         walls, images = build_walls(
-            faces, scene.solver, PAD, self.grid.cells, self.grid.shape, scheme.spline.on_node, friction, moving
+            faces,
+            scene.solver,
+            PAD,
+            self.grid.cells,
+            self.grid.shape,
+            scheme.spline.on_node,
+            friction,
+            moving,
+            on_cpu=backend.on_cpu,
         )
         self.colliders = None
         if scene.colliders:

@@ -64,7 +64,7 @@ class NodeUpdate:
         massive = self.grid.nodes[index][ti.static(self.dimension)] > 0
         if ti.static(len(self.grid.period.axes) > 0):
             # Not so beyond a periodic face.
-            massive = massive or self.images.near(node)
+            massive = massive or self.images.walls.near(node)
         if massive:
             speed_squared = self.update_massive(node, index, gravity_step)
         return speed_squared
@@ -75,7 +75,7 @@ class NodeUpdate:
         d = ti.static(self.dimension)
         value = self.grid.nodes[index]
         pull = gravity_step
-        mirrored = False
+        kind = -1
         speed_squared = 0.0
         # Asked for once: what follows from them is most of the code of this loop.
         depth, mirror, upper = ti.Vector([REACH + 1] * d), node, ti.Vector.zero(int, d)
@@ -84,20 +84,21 @@ class NodeUpdate:
 
         # Fold.
         if ti.static(self.mirrors):
-            mirrored = self.images.near(node)
-            if mirrored:
-                found_depth, found_mirror, found_upper = self.images.walls.place(node)
-                found_acts = self.images.walls.acting(node, found_depth, found_mirror, found_upper)
-                found_holds = self.images.walls.holding(node, found_depth, found_upper, True)
-                for a in ti.static(range(d)):
-                    depth[a], mirror[a], upper[a] = found_depth[a], found_mirror[a], found_upper[a]
-                    acts[a], holds[a] = found_acts[a], found_holds[a]
-                total = self.images.fold(self.grid, self.grid.nodes, node, place, gravity_step, True)
-                # Entry by entry here and below: Taichi loses vectors that are assigned as a whole in static blocks.
-                for c in ti.static(range(self.grid.width)):
-                    value[c] = total[c]
-                for a in ti.static(range(d)):
-                    pull[a] = 0.0
+            kind = self.images.kind(node)
+            for k, images in ti.static(enumerate(self.images.kinds)):
+                if kind == k:
+                    found_depth, found_mirror, found_upper = images.walls.place(node)
+                    found_acts = images.walls.acting(node, found_depth, found_mirror, found_upper)
+                    found_holds = images.walls.holding(node, found_depth, found_upper, True)
+                    for a in ti.static(images.walls.axes):
+                        depth[a], mirror[a], upper[a] = found_depth[a], found_mirror[a], found_upper[a]
+                        acts[a], holds[a] = found_acts[a], found_holds[a]
+                    total = images.fold(self.grid, self.grid.nodes, node, place, gravity_step, True)
+                    # Entry by entry here and below: Taichi loses vectors that are assigned as a whole in static blocks.
+                    for c in ti.static(range(self.grid.width)):
+                        value[c] = total[c]
+                    for a in ti.static(range(d)):
+                        pull[a] = 0.0
 
         if value[d] > 0:
             # Velocity.
@@ -108,7 +109,7 @@ class NodeUpdate:
             # Constrain.
             for boundary in ti.static(self.boundaries):
                 if ti.static(self.is_mirror(boundary)):
-                    if mirrored:
+                    if kind >= 0:
                         constrained = boundary.constrained(velocity, depth, upper, acts, holds)
                         for c in ti.static(range(d)):
                             velocity[c] = constrained[c]
@@ -123,15 +124,15 @@ class NodeUpdate:
                     velocity[c] = met[c]
 
             # Unfold.
-            self.write(self.grid.nodes, node, index, mirrored, place, velocity)
+            self.write(self.grid.nodes, node, index, kind, place, velocity)
             if ti.static(self.grid.scheme.keeps_before):
-                self.update_before(node, index, mirrored, place, value[d])
+                self.update_before(node, index, kind, place, value[d])
             for a in ti.static(range(d)):
                 speed_squared += velocity[a] ** 2
         return speed_squared
 
     @ti.func
-    def update_before(self, node: ti.template(), index: int, mirrored: bool, place: ti.template(), mass: float):
+    def update_before(self, node: ti.template(), index: int, kind: int, place: ti.template(), mass: float):
         """Turn the momentum from before stress and forces into velocity: fold and unfold, without any boundary.
 
         Mirror images have it too, so that a wall that acts changes nothing but what stress does. Friction does not act
@@ -139,19 +140,25 @@ class NodeUpdate:
         """
         before = self.grid.before[index]
         if ti.static(self.mirrors):
-            if mirrored:
-                depth, _mirror, upper, _acts, holds = ti.static(place)
-                by_word = self.images.walls.holding(node, depth, upper, False)
-                for a in ti.static(range(self.dimension)):
-                    holds[a] = by_word[a]
-                total = self.images.fold(
-                    self.grid, self.grid.before, node, place, ti.Vector.zero(float, ti.static(self.dimension)), False
-                )
-                for c in ti.static(range(self.grid.width)):
-                    before[c] = total[c]
+            depth, _mirror, upper, _acts, holds = ti.static(place)
+            for k, images in ti.static(enumerate(self.images.kinds)):
+                if kind == k:
+                    by_word = images.walls.holding(node, depth, upper, False)
+                    for a in ti.static(images.walls.axes):
+                        holds[a] = by_word[a]
+                    total = images.fold(
+                        self.grid,
+                        self.grid.before,
+                        node,
+                        place,
+                        ti.Vector.zero(float, ti.static(self.dimension)),
+                        False,
+                    )
+                    for c in ti.static(range(self.grid.width)):
+                        before[c] = total[c]
         for a in ti.static(range(self.dimension)):
             before[a] /= mass
-        self.write(self.grid.before, node, index, mirrored, place, before)
+        self.write(self.grid.before, node, index, kind, place, before)
 
     @ti.func
     def write(
@@ -159,15 +166,16 @@ class NodeUpdate:
         field: ti.template(),
         node: ti.template(),
         index: int,
-        mirrored: bool,
+        kind: int,
         place: ti.template(),
         value: ti.template(),
     ):
         """Write the velocity of a node, and of its images."""
         if ti.static(self.mirrors):
-            if mirrored:
-                self.images.unfold(self.grid, field, node, place, value)
-            else:
+            if kind < 0:
                 field[index] = value
+            for k, images in ti.static(enumerate(self.images.kinds)):
+                if kind == k:
+                    images.unfold(self.grid, field, node, place, value)
         else:
             field[index] = value
