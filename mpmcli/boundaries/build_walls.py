@@ -32,6 +32,7 @@ def build_walls(
             axis.
         on_node: weight of a node for a point on it.
         friction, moving: coefficients and velocities of all runs.
+        on_cpu: whether nodes are updated on the CPU.
     """
     mirroring = faces_on_grid(faces, settings)
     if settings.walls != "zeroed":

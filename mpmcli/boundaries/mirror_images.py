@@ -45,7 +45,7 @@ class MirrorImages:
         )
 
     def along(self, axes: Sequence[int]) -> "MirrorImages":
-        """Return the same for nodes that are near no walls of other axes."""
+        """Return what folds and unfolds the same for nodes that are near no walls of other axes."""
         images = copy(self)
         images.walls = self.walls.along(axes)
         return images

@@ -103,7 +103,7 @@ class Walls:
         return math.prod(self.shape[b] for b in self.lateral[axis])
 
     def along(self, axes: Sequence[int]) -> "Walls":
-        """Return the same walls for nodes that are near none of other axes."""
+        """Return what acts the same on nodes that are near no walls of other axes; distances are those from all."""
         walls = copy(self)
         walls.axes = tuple(axes)
         return walls
