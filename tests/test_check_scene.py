@@ -7,12 +7,13 @@ from collections.abc import Callable
 import pytest
 from check_scenes import FLUID, SOLID, box, check, found, loaded
 from command import CONFIGS, run_here
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from mpmcli.check.facts import SceneFacts
-from mpmcli.check.scene_check import SceneCheck, check_scene
+from mpmcli.check.scene_check import MOST_STEPS, SceneCheck, check_scene
 from mpmcli.check.scene_limits import JET
+from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import load_scene, scene_bounds
 from mpmcli.scene.presets import PRESETS
@@ -248,10 +249,14 @@ def test_the_binding_step_is_the_smallest() -> None:
     step=st.one_of(st.just("auto"), st.floats(1e-9, 1.0)),
     count=st.sampled_from([1, 4, 25]),
 )
+@example(preset="clay", size=1e-4, speed=68583.0, gravity=0.0, end=912.0, step="auto", count=1)
 def test_any_scene_can_be_checked(
     preset: str, size: float, speed: float, gravity: float, end: float, step: float | str, count: int
 ) -> None:
-    """Whatever its numbers: a step that exists, steps within their range, sentences, and JSON."""
+    """Whatever its numbers: a step that exists, steps within their range, sentences, and JSON.
+
+    Or one sentence, where nobody could count the steps.
+    """
     scene = loaded(
         material={"preset": preset},
         shape=box([0.25 * size, 0.1 * size], [0.5 * size, 0.3 * size]),
@@ -260,6 +265,10 @@ def test_any_scene_can_be_checked(
         velocity=[speed, -speed],
         particles_per_cell=count,
     )
+    if end > MOST_STEPS * SceneFacts(scene.scene).step:
+        with pytest.raises(InputError, match=f"no run is possible: .* in a run of {end:.3g} s".replace("+", r"\+")):
+            check_scene(scene)
+        return
     checked = check_scene(scene)
     assert 0 < checked.step <= checked.step_at_start
     low, high = checked.forecast.steps_range

@@ -96,14 +96,16 @@ def check_scene(
         directory: where results would be written, for the free space of its disk.
 
     Raises:
-        InputError: no step is stable, for example because gravity is infinite at some time.
+        InputError: no step is stable, for example because gravity is infinite at some time, or more than MOST_STEPS are
+            needed.
     """
     scene = loaded.scene
     facts = SceneFacts(scene)
     if not scene.time.end <= MOST_STEPS * facts.taken(facts.step):
         raise InputError(
             f"{loaded.source}: no run is possible: with speeds up to {facts.bounds.speed:.3g} m/s and accelerations up "
-            f"to {facts.bounds.gravity:.3g} m/s^2 the largest stable step is {facts.step:.3g} s. {facts.binding.why}"
+            f"to {facts.bounds.gravity:.3g} m/s^2 the largest stable step is {facts.step:.3g} s, in a run of "
+            f"{scene.time.end:.3g} s. {facts.binding.why}"
         )
     if plan is None:
         plan = make_plan(scene, Backend("cpu", available_cores(), scene.solver.precision, compile_cache=True))
