@@ -52,10 +52,9 @@ class MirrorImages:
 
     @property
     def kinds(self) -> tuple["MirrorImages", ...]:
-        """For each kind of node the same for nodes of it, see `kind`: near walls of one axis alone, and all others.
+        """The kinds of nodes, see `kind`: for each axis nodes near its walls alone, and all others in one.
 
-        Nearly all nodes near walls are near those of one axis: they have two images in place of eight, and need not
-        look for others.
+        Most nodes near walls are near those of one axis, and have one image at most beside themselves.
         """
         return (*(self.along((a,)) for a in range(self.dimension) if self.apart), self)
 
