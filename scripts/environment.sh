@@ -79,8 +79,8 @@ prepare_environment() {
     .venv/bin/python -m pip --version >/dev/null 2>&1 || make_venv || return 1
     stamp=$(installation_stamp)
     [ "$(cat "$stamp_file" 2>/dev/null)" = "$stamp" ] && return 0
-    # With the test extra installed, the package itself is installed too.
-    [ -z "$extra" ] && [ "$(cat .venv/installed-test 2>/dev/null)" = "$stamp" ] && return 0
+    # The test extra has all that the others have.
+    [ "$extra" != test ] && [ "$(cat .venv/installed-test 2>/dev/null)" = "$stamp" ] && return 0
     echo "Installing mpmcli and its dependencies into .venv. The first time takes a minute or two." >&2
     if ! .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e "$target" >&2; then
         echo "Installing failed, see pip's message above; nothing outside .venv was changed." >&2

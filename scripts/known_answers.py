@@ -8,10 +8,10 @@ import math
 import numpy as np
 
 from mpmcli.output.result import Result
+from mpmcli.validation.cases.dam_break import N_SQUARED, mean_error, measured
+from mpmcli.validation.cases.dam_break_obstacle import FILM, IMPACT, impact, water_height
+from mpmcli.validation.cases.dam_break_obstacle import measured as gauges
 from mpmcli.validation.cases.elliptical_drop import half_axis
-from mpmcli.validation.kleefsman import FILM, IMPACT, impact, water_height
-from mpmcli.validation.kleefsman import measured as gauges
-from mpmcli.validation.martin_moyce import N_SQUARED, mean_error, measured
 
 # How much later than assumed the column may have been free to move, in T: the gate takes its time.
 GATE = 0.3
@@ -92,7 +92,7 @@ def block_slide_2d(result: Result) -> str:
 
 
 def couette_2d(result: Result) -> str:
-    """Compare the velocity with the series at four times: see `mpmcli.validation.cases.couette`."""
+    """Compare the velocity with the series at four times: see `mpmcli.validation.cases.channel`."""
     width, speed, viscosity, n = 0.1, 0.1, 0.01, np.arange(1, 100)
     errors = []
     for k in (5, 10, 25, 100):

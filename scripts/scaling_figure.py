@@ -1,7 +1,6 @@
 """The figure of `mpmcli bench --scaling`: time per particle and step against the number of particles."""
 
-from mpmcli.validation.figure_axes import logarithmic_x, logarithmic_y
-from mpmcli.validation.figures import drawing, saved
+from mpmcli.validation.figures import drawing, logarithmic_x, logarithmic_y, saved
 
 # Colour and marker of each contestant, of the colours of Okabe and Ito (2008), and their order in the legend.
 STYLES = {"mpmcli": ("#000000", "o"), "C": ("#0072b2", "s"), "mpm88": ("#d55e00", "^"), "mpm3d": ("#d55e00", "^")}
@@ -42,4 +41,4 @@ def draw_scaling(report: dict) -> bytes:
             axes.legend(loc="best", fontsize=8.5)
         logarithmic_y(panels[0], [row["ns_per_particle_step"] for row in found])
         panels[0].set_ylabel("ns per particle and step")
-        return saved(figure, "svg")
+        return saved(figure)

@@ -7,7 +7,7 @@ Stage k raises all values by k + 1. The kernel does all stages, adds a value to 
 
 import taichi as ti
 
-from mpmcli.solver.backend import start_backend
+from mpmcli.solver.machine.backend import start_backend
 
 STAGES, TIMES, COUNT = 5, 3, 4
 # Values are 15, 30 and 45 in turn.

@@ -8,9 +8,17 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from mpmcli.output.checksums import NAME, checksum, store_checksums
-from mpmcli.output.file_checksum import append_checksum, gaps_of
-from mpmcli.output.sums_file import SUMS, path_digest, read_sums, write_sums
+from mpmcli.output.checksums import (
+    NAME,
+    SUMS,
+    append_checksum,
+    checksum,
+    gaps_of,
+    path_digest,
+    read_sums,
+    store_checksums,
+    write_sums,
+)
 
 
 def accept_changes(directory: Path) -> None:

@@ -42,7 +42,7 @@ class Outcome:
 def run_here(*arguments: object) -> Outcome:
     """Run a command in this process; on a fresh backend, should it need one."""
     from mpmcli.cli import program
-    from mpmcli.solver.backend import stop_backend
+    from mpmcli.solver.machine.backend import stop_backend
 
     stop_backend()
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}

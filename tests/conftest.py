@@ -13,12 +13,14 @@ import pytest
 from hypothesis import settings
 
 if TYPE_CHECKING:
-    from mpmcli.solver.backend import Backend
+    from mpmcli.solver.machine.backend import Backend
 
 ROOT = Path(__file__).resolve().parent.parent
 
 # Kernels compile inside examples and machines are shared: time says nothing about correctness.
-settings.register_profile("mpmcli", deadline=None, max_examples=50, print_blob=True)
+# A run of the suite tries the same examples each time; `--hypothesis-profile random` tries others.
+settings.register_profile("random", deadline=None, max_examples=50, print_blob=True)
+settings.register_profile("mpmcli", settings.get_profile("random"), derandomize=True)
 settings.load_profile("mpmcli")
 
 # The backend of tests marked gpu; scripts/gpu sets it to that of the device.
@@ -117,6 +119,14 @@ def few_optimisations() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_kernel_store() -> Iterator[None]:
+    """Let no run take a stored kernel, or store one: tests change what kernels are made from. See test_kernel_store."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MPMCLI_KERNEL_STORE", "off")
+        yield
+
+
 @pytest.fixture
 def usual_optimisations(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a test compile with the optimisations that users have."""
@@ -134,13 +144,13 @@ def backend_of() -> "Iterator[Callable[..., Backend]]":
     """Return `start(precision, threads=2, arch="cpu", fully_optimised=False)`, which replaces the running backend.
 
     Taichi is global: whatever was built on the backend before dies with it, so a module starts one and
-    builds its solvers on it, or keeps no solver from one test to the next.
+    builds its runs on it, or keeps no run from one test to the next.
 
     It compiles with few of Taichi's optimisations, as all tests do; a `fully_optimised` one has all.
 
     Vulkan stands for the GPU of the tests, see GPU.
     """
-    from mpmcli.solver.backend import start_backend, stop_backend
+    from mpmcli.solver.machine.backend import start_backend, stop_backend
 
     def start(precision: str, threads: int = 2, arch: str = "cpu", *, fully_optimised: bool = False) -> "Backend":
         stop_backend()

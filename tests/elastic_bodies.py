@@ -6,7 +6,7 @@ import numpy as np
 from solver_state import scene_of
 
 from mpmcli.scene import Scene
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.run import Run
 
 H = 0.1
 E, NU, DENSITY = 1e5, 0.3, 1000.0
@@ -51,15 +51,14 @@ def body_scene(
     )
 
 
-def stirred(solver: Solver, dimension: int) -> None:
+def stirred(run: Run, dimension: int) -> None:
     """Give the particles velocities at random, and deformations of up to a fifth, where they are."""
-    group, rng = solver.groups[0], np.random.default_rng(0)
+    group, rng = run.groups[0], np.random.default_rng(0)
     n, d = group.count, dimension
-    group.set_motion(rng.uniform(-1, 1, (n, d)), rng.uniform(-3, 3, (n, d, d)))
-    group.set_deformation(np.eye(d) + rng.uniform(-0.2, 0.2, (n, d, d)))
-    x = group.x.to_numpy()
-    group.x.from_numpy((x + rng.uniform(-0.02, 0.02, x.shape)).astype(group.real))
-    solver.state_was_replaced()
+    v, C = rng.uniform(-1, 1, (n, d)), rng.uniform(-3, 3, (n, d, d))
+    deformation = np.eye(d) + rng.uniform(-0.2, 0.2, (n, d, d))
+    group.replace(x=group.read()["x"] + rng.uniform(-0.02, 0.02, (n, d)), v=v, C=C, deformation=deformation)
+    run.state_was_replaced()
 
 
 def bars(n: int, shift: float, *, precision: str = "f64", solids: str = "total", frames: int = 400) -> Scene:

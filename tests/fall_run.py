@@ -12,9 +12,9 @@ from solver_state import scene_of
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
-from mpmcli.solver.backend import Backend, start_backend
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import Backend, start_backend
 
 GRAVITY, SECONDS, H = 9.81, 0.5, 0.05
 
@@ -36,29 +36,29 @@ def soft_block() -> Scene:
 
 def fall(backend: Backend) -> dict:
     """Return the fall, the speed and the largest Courant number of the block."""
-    solver = Solver(soft_block(), backend)
-    (first, _), (last, row) = solver.frames()
+    run = build_run(soft_block(), backend)
+    (first, _), (last, row) = run.frames()
     return {
         "fallen": float((first.position - last.position)[:, 1].mean()),
         "speeds": [float(v) for v in (last.velocity[:, 1].min(), last.velocity[:, 1].max())],
         "courant": float(row.courant_max),
         "step_max": float(row.step_max),
-        "last": solver.last_step,
+        "last": run.last_step,
     }
 
 
 def lose(backend: Backend) -> dict:
     """Return how a run ends whose particle 10 loses its state after 20 steps."""
-    solver = Solver(soft_block(), backend)
+    run = build_run(soft_block(), backend)
     for _ in range(20):
-        solver.step(1e-4)
-    group = solver.groups[0]
-    deformation = group.deformation_to_numpy()
-    deformation[np.flatnonzero(group.id.to_numpy() == 10)] = np.nan
-    group.set_deformation(deformation)
+        run.step(1e-4)
+    group = run.groups[0]
+    deformation = group.read()["deformation"]
+    deformation[np.flatnonzero(group.read()["id"] == 10)] = np.nan
+    group.replace(deformation=deformation)
     try:
         for _ in range(40):
-            solver.step(1e-4)
+            run.step(1e-4)
     except UnstableRunError as error:
         return {"particle": error.diagnosis.particle, "step": error.diagnosis.step, "sentence": str(error)}
     return {}

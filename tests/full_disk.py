@@ -27,7 +27,7 @@ from mpmcli.scene import LoadedScene, parse_scene
 from mpmcli.simulation import stored_run
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.simulate import simulate
-from mpmcli.solver import launch_budget
+from mpmcli.solver.engine import exchange
 
 Kind = Literal["disk", "limit"]
 # What the run knows of the room: less the usual margin, all of it, or nothing, as where there is a quota.
@@ -206,7 +206,7 @@ def _simulate(
         The exit status of `mpmcli simulate`.
     """
     stored_run.HOLD = 0.0
-    launch_budget.FIRST, launch_budget.LAUNCH = STEPS * 2500, 0.02
+    exchange.FIRST, exchange.LAUNCH = STEPS * 2500, 0.02
     # Before the limit, as this file is no part of the run.
     with open(told, "w+", encoding="utf-8") as tale:
         reported, status, sentence = 0, 1, ""

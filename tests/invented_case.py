@@ -3,10 +3,8 @@
 from collections.abc import Callable
 from typing import Any
 
-from mpmcli.validation.case import Case, Measure
-from mpmcli.validation.matrix import Run, runs_of
-from mpmcli.validation.run_result import RunResult, failure
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.case import Case, Measure, Setting
+from mpmcli.validation.runs import Run, RunResult, failure, runs_of
 
 
 class Invented(Case):
@@ -16,8 +14,8 @@ class Invented(Case):
     source, resolution, note = "nobody | nowhere", "cells", "A note."
     levels = {"coarse": (8, 16), "default": (8, 16, 32), "fine": (8, 16, 32, 64)}  # noqa: RUF012
     measures = (
-        Measure("error", "", "What is wrong.", bound=lambda n: 0.6 * (8 / n) ** 2, order=1.9, expected=2.0),
-        Measure("drift", "m", "How far it went astray."),
+        Measure("error: What is wrong.", lambda n: 0.6 * (8 / n) ** 2, order=1.9, expected=2.0),
+        Measure("drift (m): How far it went astray."),
     )
 
     def tables(self, n: int) -> dict[str, Any]:

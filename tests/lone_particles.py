@@ -9,11 +9,11 @@ from solver_state import scene_of
 from mpmcli.check.facts import SceneFacts
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.batch import Batch
-from mpmcli.solver.batch_kind import Kind
-from mpmcli.solver.batch_run import BatchRun
-from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.engine.batch import Batch
+from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import Backend
 
 H, FRAMES = 0.1, 20
 
@@ -48,8 +48,8 @@ def let_go(
 ) -> list[Outcome]:
     """Run `starts` starts of `count` particles for about `steps` default steps, moving by up to three cells."""
     asked = [_asked(material, *start_of(count, k, sizes), steps) for k in range(starts)]
-    batch = Batch(Kind.of(*asked[0]), backend, starts)
-    streams = {k: BatchRun(batch, k, scene, particles).events() for k, (scene, particles) in enumerate(asked)}
+    batch = Batch(CompiledKind.of(*asked[0]), backend, starts)
+    streams = {k: Run(batch, k, scene, particles).events() for k, (scene, particles) in enumerate(asked)}
     rows: list[list[LedgerRow]] = [[] for _ in asked]
     stopped = [""] * starts
     while streams:

@@ -11,16 +11,14 @@ import pytest
 from good_sweep import BASE, SWEEP, sweep_of
 from made_dataset import made_trajectory
 
-from mpmcli.dataset import sweep_folder, sweep_run
+from mpmcli.dataset import sweep_run
 from mpmcli.dataset.compute import Task
 from mpmcli.dataset.draw import draw
-from mpmcli.dataset.manifest import Row
-from mpmcli.dataset.paths import PENDING, QUARANTINE, file_name
-from mpmcli.dataset.shard import checksum, group_name, write_trajectory
+from mpmcli.dataset.folder import Row
+from mpmcli.dataset.shard import PENDING, QUARANTINE, checksum, file_name, group_name, write_trajectory
 from mpmcli.dataset.sweep import Sweep
-from mpmcli.dataset.sweep_run import run_sweep
-from mpmcli.dataset.sweep_state import SweepSettings
-from mpmcli.output.file_checksum import append_checksum
+from mpmcli.dataset.sweep_run import SweepSettings, run_sweep
+from mpmcli.output.checksums import append_checksum
 
 COUNT, PER_SHARD = 12, 3
 # Of the numbers that are not stable.
@@ -85,7 +83,7 @@ def made_workers(tmp_path, monkeypatch) -> None:
     """Let sweeps of this test be computed by nobody, in shards of a few trajectories, in an empty directory."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sweep_run, "local_workers", lambda count: nullcontext(MadeWorkers()))
-    monkeypatch.setattr(sweep_folder, "_per_shard", lambda size: PER_SHARD)
+    monkeypatch.setattr(sweep_run, "_per_shard", lambda size: PER_SHARD)
 
 
 def make_dataset(name: str, part: tuple[int, int] = (1, 1), *, count: int = COUNT, broken_after: int = 0) -> Path:

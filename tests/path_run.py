@@ -13,9 +13,10 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import BodyParticles, Scene, parse_scene, sample_bodies
-from mpmcli.solver.backend import Backend, start_backend
-from mpmcli.solver.snapshot import read_group
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import read_group
+from mpmcli.solver.machine.backend import Backend, start_backend
 
 NO_DEVICE = 77
 STEP = 0.006
@@ -96,19 +97,19 @@ def stirred(scene: Scene) -> list[BodyParticles]:
     ]
 
 
-def deform(solver: Solver) -> None:
+def deform(run: Run) -> None:
     """Give every particle a random deformation, the same for every backend."""
     random = np.random.default_rng(11)
-    for group in solver.groups:
-        rest = group.deformation_to_numpy()
+    for group in run.groups:
+        rest = group.read()["deformation"]
         spread = 0.03 * random.standard_normal(rest.shape)
-        group.set_deformation(rest + spread)
+        group.replace(deformation=rest + spread)
 
 
-def state(solver: Solver) -> dict[str, np.ndarray]:
+def state(run: Run) -> dict[str, np.ndarray]:
     """Return x, v, C and deformation of each group, by id, as <law>_<name>."""
     found = {}
-    for law, group in zip(solver.laws, solver.groups, strict=True):
+    for law, group in zip(run.laws, run.groups, strict=True):
         snapshot = read_group(group)
         order = np.argsort(snapshot.id)
         for name in ("x", "v", "C", "deformation"):
@@ -116,18 +117,18 @@ def state(solver: Solver) -> dict[str, np.ndarray]:
     return found
 
 
-def nodes_of(solver: Solver) -> np.ndarray:
+def nodes_of(run: Run) -> np.ndarray:
     """Return the nodes, (..., d + 1): velocity, or momentum after P2G, and mass; any padding is left out."""
-    nodes = solver.grid.nodes.to_numpy()[:, : solver.grid.dimension + 1]
-    return nodes.reshape(*solver.grid.shape, -1)
+    nodes = run.grid.nodes.to_numpy()[:, : run.grid.dimension + 1]
+    return nodes.reshape(*run.grid.shape, -1)
 
 
-def prepare(backend: Backend, dimension: int) -> Solver:
-    """Return a solver of the scene with its random state."""
+def prepare(backend: Backend, dimension: int) -> Run:
+    """Return a run of the scene with its random state."""
     scene = scene_of(dimension, backend.precision)
-    solver = Solver(scene, backend, stirred(scene))
-    deform(solver)
-    return solver
+    run = build_run(scene, backend, stirred(scene))
+    deform(run)
+    return run
 
 
 def record(backend: Backend, dimension: int) -> dict[str, np.ndarray]:
@@ -135,34 +136,34 @@ def record(backend: Backend, dimension: int) -> dict[str, np.ndarray]:
     return record_steps(prepare(backend, dimension))
 
 
-def record_steps(solver: Solver) -> dict[str, np.ndarray]:
-    """Take the first steps of a solver; see `record`."""
-    arrays = {f"0_{name}": value for name, value in state(solver).items()}
+def record_steps(run: Run) -> dict[str, np.ndarray]:
+    """Take the first steps of a run; see `record`."""
+    arrays = {f"0_{name}": value for name, value in state(run).items()}
     for k in range(RECORDED):
-        solver.step(STEP)
-        arrays[f"{k}_nodes"] = nodes_of(solver)
-        arrays |= {f"{k + 1}_{name}": value for name, value in state(solver).items()}
+        run.step(STEP)
+        arrays[f"{k}_nodes"] = nodes_of(run)
+        arrays |= {f"{k + 1}_{name}": value for name, value in state(run).items()}
     return arrays
 
 
-def order_of(solver: Solver) -> bytes:
+def order_of(run: Run) -> bytes:
     """Return the order of the particles in memory: it changes when a sort moves one."""
-    return b"".join(group.id.to_numpy().tobytes() for group in solver.groups)
+    return b"".join(group.read()["id"].tobytes() for group in run.groups)
 
 
 def run(backend: Backend, dimension: int) -> dict[str, np.ndarray]:
     """Run the scene on a backend and return every array that it left."""
-    solver = prepare(backend, dimension)
-    arrays = record_steps(solver)
-    sorts, order = 0, order_of(solver)
+    run = prepare(backend, dimension)
+    arrays = record_steps(run)
+    sorts, order = 0, order_of(run)
     for k in range(RECORDED, LONG):
-        solver.step(STEP)
-        sorts, order = sorts + (order_of(solver) != order), order_of(solver)
+        run.step(STEP)
+        sorts, order = sorts + (order_of(run) != order), order_of(run)
         if k + 1 == WATCHED:
-            arrays |= {f"watched_{name}": value for name, value in state(solver).items()}
-    arrays |= {f"long_{name}": value for name, value in state(solver).items()}
+            arrays |= {f"watched_{name}": value for name, value in state(run).items()}
+    arrays |= {f"long_{name}": value for name, value in state(run).items()}
     arrays["sorts"] = np.array(sorts)
-    for frame, row in solver.frames():
+    for frame, row in run.frames():
         arrays |= {"frame_position": frame.position, "frame_velocity": frame.velocity, **frame.fields}
         arrays["ledger"] = np.array([row.steps, row.step_min, row.step_max, row.speed_max, row.kinetic])
     return arrays

@@ -7,10 +7,8 @@ import numpy as np
 from solver_state import scene_of
 
 from mpmcli.scene import BodyParticles, Scene
-from mpmcli.solver.frame_arrays import FrameArrays, RunConstants
-from mpmcli.solver.solver import Solver
-from mpmcli.solver.sums import ledger_sums
-from mpmcli.solver.volume_error import FilledCells
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.builder import FilledCells
 
 GRAVITY = 9.81
 
@@ -64,42 +62,21 @@ def stresses(fields: dict[str, np.ndarray]) -> np.ndarray:
     return fields["stress"].reshape(-1, 3, 3)
 
 
-def restart(solver: Solver, samples: Sequence[BodyParticles], end: float) -> None:
+def restart(run: Run, samples: Sequence[BodyParticles], end: float) -> None:
     """Begin a run of a scene with one body of each law again, with other particles, as many: kernels stay compiled."""
-    for group in solver.groups:
+    for group in run.groups:
         (body,) = group.bodies
-        sample, d = samples[body], group.dimension
-        group.x.from_numpy((sample.position - solver.scene.domain.origin).astype(group.real))
-        group.set_motion(sample.velocity, sample.affine)
-        group.set_deformation(
-            np.ones(group.count) if group.law.deformation == "J" else np.tile(np.eye(d), (group.count, 1, 1))
+        sample, n = samples[body], group.count
+        group.replace(
+            x=sample.position - run.scene.domain.origin,
+            v=sample.velocity,
+            C=sample.affine,
+            deformation=np.ones(n) if group.law.deformation == "J" else np.tile(np.eye(group.dimension), (n, 1, 1)),
+            internal=np.tile([variable.at_rest for variable in group.law.internal], (n, 1)),
+            id=np.arange(n) + sum(s.count for s in samples[:body]),
         )
-        for variable, values in zip(group.law.internal, group.internal, strict=True):
-            values.fill(variable.at_rest)
-        group.id.from_numpy(np.arange(group.count, dtype=np.int32) + sum(s.count for s in samples[:body]))
-    solver.scene = solver.scene.model_copy(update={"time": solver.scene.time.model_copy(update={"end": end})})
-    solver.restart()
-
-
-def sums(solver: Solver) -> dict:
-    """Return what the ledger sums at this moment, in float64."""
-    columns = solver._builder.columns
-    arrays = FrameArrays(columns, np.empty((1, solver.particle_count, columns.count), solver.groups[0].real))
-    # As on a GPU: in numpy.
-    found = solver._observe(arrays)
-    everything = slice(0, solver.particle_count)
-    constants = RunConstants(solver.groups, [len(b.position) for b in solver._particles]).of_rows(everything)
-    gravity, dt = np.array([solver.scene.domain.gravity]), np.array([solver.last_step])
-    ratios = constants.volume_ratios(arrays)
-    result = ledger_sums(found, gravity, solver.spacing, dt)
-    result |= {"volume_ratio_min": ratios.min(axis=1), "volume_ratio_max": ratios.max(axis=1)}
-    return {name: values[0] for name, values in result.items()}
-
-
-def total_energy(solver: Solver) -> float:
-    """Return the total energy as the ledger gives it, J."""
-    found = sums(solver)
-    return found["kinetic"] + found["elastic"] + found["potential"]
+    run.scene = run.scene.model_copy(update={"time": run.scene.time.model_copy(update={"end": end})})
+    run.restart()
 
 
 def volume_errors(

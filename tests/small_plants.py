@@ -33,44 +33,54 @@ def _of(file: str, *changes: tuple) -> tuple[SmallPlant, ...]:
 
 TRANSFERS = (
     *_of(
-        "solver/transfer.py",
+        "solver/transfer/particle_update.py",
         ("stress_scale = kick * volume", "stress_scale = 1.05 * kick * volume", "bar_fixed_fixed"),
         ("(mass * grid.spacing) * C[c, a] - stress", "(0.95 * mass * grid.spacing) * C[c, a] - stress", "taylor_green"),
         ("(distance[a] - 1.0)) * grid", "(distance[a] - 1.0)) * 1.05 * grid", "bar_fixed_fixed"),
         ("middle[d] = mass", "middle[d] = 1.05 * mass", "bar_fixed_fixed"),
     ),
     *_of(
-        "solver/splines.py",
+        "solver/transfer/splines.py",
         ("0.75 - (distance", "0.7875 - (distance", "bar_fixed_fixed"),
         ("0.5 * (1.5 - distance) ** 2", "0.525 * (1.5 - distance) ** 2", "bar_fixed_fixed"),
     ),
-    *_of("solver/volume_average.py", ("exp(missing * ti", "exp(0.95 * missing * ti", "cook")),
+    *_of("solver/transfer/volume_average.py", ("exp(missing * ti", "exp(0.95 * missing * ti", "cook")),
     *_of("stability/transfer_factors.py", ('"quadratic": 4', '"quadratic": 4.2', "bar_fixed_fixed")),
-    *_of("solver/nodes.py", ("value[a] / value[d] + pull[a]", "value[a] / value[d] + 1.05 * pull[a]", "take_off")),
     *_of(
-        "solver/particle_update.py",
+        "solver/transfer/node_update.py",
+        ("value[a] / value[d] + pull[a]", "value[a] / value[d] + 1.05 * pull[a]", "take_off"),
+    ),
+    *_of(
+        "solver/transfer/particle_update.py",
         ("rate = dt * C[i, k]", "rate = 1.05 * dt * C[i, k]", "bar_fixed_fixed"),
         ("new[i, j] += rate * H[k, j]", "new[i, j] += 0.95 * rate * H[k, j]", "sand_blocks"),
         ("way = dt * v[c] + remainder[c]", "way = 1.05 * dt * v[c] + remainder[c]", "take_off"),
     ),
     *_of(
-        "materials/volume_relaxation.py",
-        ("(growth + growth * J_minus_1)", "(growth + 0.95 * growth * J_minus_1)", "fluid_blocks"),
+        "materials/fluid.py",
+        (
+            "opened = J_minus_1 + (growth + growth * J_minus_1)",
+            "opened = J_minus_1 + (growth + 0.95 * growth * J_minus_1)",
+            "fluid_blocks",
+        ),
     ),
     *_of(
-        "solver/state_bounds.py",
+        "solver/particles/state_bounds.py",
         ("dt * (C.trace() +", "dt * (1.05 * C.trace() +", "hydrostatic_drop"),
         ("dt * second_invariant(C))", "dt * 0.95 * second_invariant(C))", "elliptical_drop"),
     ),
 )
 DRIVES = (
     *_of(
-        "solver/forces.py",
-        ("kick * self.constant[a]", "1.05 * kick * self.constant[a]", "take_off"),
-        ("result[a] = kick * node", "result[a] = 1.05 * kick * node", "column_static"),
+        "solver/engine/cpu_phases.py",
+        ("self.values[w, KICK] * pull", "1.05 * self.values[w, KICK] * pull", "take_off"),
     ),
     *_of(
-        "solver/scatter_range.py",
+        "solver/drive/forces.py",
+        ("result[a] = kick * self.values", "result[a] = 1.05 * kick * self.values", "column_static"),
+    ),
+    *_of(
+        "solver/transfer/cpu_transfers.py",
         ("own += kick * vector_of(pushes", "own += 1.05 * kick * vector_of(pushes", "mms_1d"),
         (
             "C[c, a] += kick *",
@@ -80,23 +90,23 @@ DRIVES = (
         ),
     ),
     *_of(
-        "solver/solver.py",
-        ("0.5 * (state.last_step + dt)", "0.525 * (state.last_step + dt)", "take_off"),
-        ("state.time + dt if", "state.time + 1.05 * dt if", "bar_fixed_fixed"),
+        "solver/engine/step_size.py",
+        ("0.5 * (numbers[w, self.real.last_step] + dt)", "0.525 * (numbers[w, self.real.last_step] + dt)", "take_off"),
+        ("numbers[w, self.real.time] + dt\n", "numbers[w, self.real.time] + 1.05 * dt\n", "bar_fixed_fixed"),
     ),
     *_of(
         "scene/sampling.py",
-        ("mass=body.material.density * volume", "mass=1.05 * body.material.density * volume", "bar_fixed_fixed"),
+        ("volume, body.material.density * volume", "volume, 1.05 * body.material.density * volume", "bar_fixed_fixed"),
         ("volume = form.volume / len(position)", "volume = 1.05 * form.volume / len(position)", "conservation"),
     ),
     *_of(
-        "scene/initial.py",
+        "scene/sampling.py",
         ("body.material.density * (position", "1.05 * body.material.density * (position", "hydrostatic"),
         ("_offset(body, position) @ affine.T", "1.05 * _offset(body, position) @ affine.T", "metal_blocks"),
     ),
 )
 WALLS = (
-    *_of("boundaries/wall_friction.py", ("bound = coefficient * (", "bound = 1.05 * coefficient * (", "sliding_block")),
+    *_of("boundaries/mirror_images.py", ("bound = coefficient * (", "bound = 1.05 * coefficient * (", "sliding_block")),
     SmallPlant(
         "boundaries/mirror_images.py",
         "result[c] = -result[c]",
@@ -120,7 +130,7 @@ ELASTIC = (
     *_of(
         "materials/elasticity.py",
         ("youngs_modulus / (2 *", "youngs_modulus / (2.1 *", "bar_fixed_fixed"),
-        ("(1 - 2 * poissons_ratio))", "(1 - 2.1 * poissons_ratio))", "mms_2d_neo_hookean homogeneous"),
+        ("(1 - 2 * nu))", "(1 - 2.1 * nu))", "mms_2d_neo_hookean homogeneous"),
     ),
     *_of(
         "materials/neo_hookean.py",
@@ -138,7 +148,7 @@ ELASTIC = (
         ),
         ("constants[LAMBDA] * (J - 1.0) * J", "constants[LAMBDA] * (J - 1.0)", "mms_2d_corotated homogeneous"),
     ),
-    *_of("materials/hencky.py", ("strains[i] = log(", "strains[i] = 1.05 * log(", "column_hencky")),
+    *_of("materials/elasticity.py", ("strains[i] = log(", "strains[i] = 1.05 * log(", "column_hencky")),
 )
 FLUIDS = (
     *_of(
@@ -163,7 +173,7 @@ FLUIDS = (
         ("identity(float, F.n) + constants[SHEAR", "identity(float, F.n) + 1.05 * constants[SHEAR", "paste_blocks"),
         ("= constants[BULK_MODULUS] * (J - 1.0)", "= 1.05 * constants[BULK_MODULUS] * (J - 1.0)", "paste_blocks"),
     ),
-    *_of("solver/frame_arrays.py", ("(-3 * ratios)", "(-3.15 * ratios)", "hydrostatic")),
+    *_of("solver/frames/columns.py", ("(-3 * ratios)", "(-3.15 * ratios)", "hydrostatic")),
 )
 PLASTIC = (
     *_of(

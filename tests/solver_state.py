@@ -1,4 +1,4 @@
-"""What tests read from a solver: the state of each body in the particles' own order, and its momenta."""
+"""What tests read from a run: the state of each body in the particles' own order, and its momenta."""
 
 from dataclasses import dataclass
 
@@ -8,8 +8,8 @@ from pydantic import TypeAdapter
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene
 from mpmcli.scene.colliders import Collider
-from mpmcli.solver.snapshot import read_group
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import Snapshot, read_group
 
 
 @dataclass(frozen=True)
@@ -53,15 +53,21 @@ def with_colliders(scene: Scene, colliders: list[dict]) -> Scene:
     return scene.model_copy(update={"colliders": made})
 
 
-def bodies_of(solver: Solver) -> dict[str, BodyState]:
+def masses_of(snapshot: Snapshot) -> np.ndarray:
+    """Return the mass of each particle of a group, (n,) float64, kg."""
+    masses = snapshot.group.rows[:, 0].astype(np.float64)
+    return masses[np.searchsorted(snapshot.group.bodies, snapshot.body)]
+
+
+def bodies_of(run: Run) -> dict[str, BodyState]:
     """Return the state of every body by name, in float64, particles in the order of their ids."""
     found = {}
-    for group in solver.groups:
+    for group in run.groups:
         snapshot = read_group(group)
-        mass = snapshot.per_body(0)
+        mass = masses_of(snapshot)
         for body in group.bodies:
             rows = np.flatnonzero(snapshot.body == body)
             rows = rows[np.argsort(snapshot.id[rows])]
             arrays = (snapshot.x, snapshot.v, snapshot.C, snapshot.deformation, mass)
-            found[solver.scene.bodies[body].name] = BodyState(*(a[rows].astype(np.float64) for a in arrays))
+            found[run.scene.bodies[body].name] = BodyState(*(a[rows].astype(np.float64) for a in arrays))
     return found

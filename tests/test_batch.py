@@ -1,4 +1,4 @@
-"""Runs of a batch have the bytes that they have alone in a `Solver`: for any law and wall, on any number of threads."""
+"""Runs of a batch have the bytes that they have alone, in a batch of one: any law and wall, any number of threads."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -12,12 +12,12 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene, sample_bodies
-from mpmcli.solver import launch_budget
-from mpmcli.solver.batch import Batch
-from mpmcli.solver.batch_kind import Kind
-from mpmcli.solver.batch_run import BatchRun
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine import exchange
+from mpmcli.solver.engine.batch import Batch
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
 
 # By name: materials, dimension, and further tables of the scene.
 DRIVEN = ("gravity of time", "a force of the place", "forces on one body of two")
@@ -86,7 +86,7 @@ def colliders(dimension: int, k: int) -> list[dict]:
     return [{"name": f"collider {n}", **table} for n, table in enumerate(found[: 5 - (k == 2)])]
 
 
-# In the default suite, with the runs that a solver repeats: the second is smaller than what the batch has room for.
+# In the default suite, with the runs that are repeated alone: the second is smaller than what the batch has room for.
 # All others, and the first runs of these, carry the marker slow. Colliders are rough, as is the wall that moves.
 USUAL = {
     "colliders": (1,),
@@ -140,7 +140,7 @@ def scene_named(name: str, other: bool = False) -> Scene:
 
 def batch_of(scenes: Sequence[Scene], backend: object) -> Batch:
     """Return a batch with room for one run of each scene."""
-    kinds = [Kind.of(scene, sample_bodies(scene)) for scene in scenes]
+    kinds = [CompiledKind.of(scene, sample_bodies(scene)) for scene in scenes]
     kind = kinds[0]
     for more in kinds[1:]:
         kind = kind.joined(more)
@@ -149,7 +149,7 @@ def batch_of(scenes: Sequence[Scene], backend: object) -> Batch:
 
 def outputs_of(batch: Batch, scenes: Sequence[Scene]) -> list[Output | MpmcliError]:
     """Run a scene in each place of a batch, all at once; a run that stops gives its error."""
-    streams = [BatchRun(batch, slot, scene).events() for slot, scene in enumerate(scenes)]
+    streams = [Run(batch, slot, scene).events() for slot, scene in enumerate(scenes)]
     found: list = [[] for _ in scenes]
     open_streams = dict(enumerate(streams))
     while open_streams:
@@ -189,13 +189,13 @@ def same(found: Output, expected: Output) -> Iterator[str]:
     ],
     ids=lambda value: value if isinstance(value, str) else " and ".join(["first", "second"][k] for k in value),
 )
-def test_runs_of_a_batch_have_the_bytes_of_a_solver(backend_of: Callable, name: str, compared: tuple[int, ...]) -> None:
+def test_runs_have_the_bytes_that_they_have_alone(backend_of: Callable, name: str, compared: tuple[int, ...]) -> None:
     """Two runs in which all numbers differ."""
     scenes = [scene_named(name), scene_named(name, other=True)]
     backend = backend_of(scenes[0].solver.precision, 1)
     found = outputs_of(batch_of(scenes, backend), scenes)
     for k in compared:
-        expected = list(Solver(scenes[k], backend).frames())
+        expected = list(build_run(scenes[k], backend).frames())
         assert expected[-1][1].steps >= 5
         assert list(same(found[k], expected)) == []
 
@@ -239,12 +239,12 @@ def test_a_place_is_used_again(backend_of: Callable) -> None:
 
 
 def test_an_unstable_run_stops_alone(backend_of: Callable) -> None:
-    """It says what a solver says, and the others and the next in its place go on."""
+    """It says what it says alone, and the others and the next in its place go on."""
     sound = scene_named("neo_hookean")
     time = sound.time.model_copy(update={"step": 0.004, "end": 0.4})
     wild = sound.model_copy(update={"time": time})
     batch = batch_of([sound, wild], backend_of("f32", 1))
-    runs = [BatchRun(batch, 0, sound), BatchRun(batch, 1, wild, force=True)]
+    runs = [Run(batch, 0, sound), Run(batch, 1, wild, force=True)]
     streams, found, errors = [run.events() for run in runs], [[], []], [None, None]
     for _ in range(1000):
         for slot, stream in enumerate(streams):
@@ -257,21 +257,21 @@ def test_an_unstable_run_stops_alone(backend_of: Callable) -> None:
     again = outputs_of(batch, [wild.model_copy(update={"time": sound.time}), sound])
     assert list(same(again[1], found[0])) == []
     # A fresh backend numbers its fields from 0, and finds the kernels that it has compiled before.
-    solver = Solver(wild, backend_of("f32", 1), force=True)
+    alone = build_run(wild, backend_of("f32", 1), force=True)
     expected = []
     with pytest.raises(UnstableRunError) as caught:
-        expected.extend(solver.frames())
+        expected.extend(alone.frames())
     assert errors[0] is None
     assert str(errors[1]) == str(caught.value)
-    assert list(same(found[0], list(Solver(sound, backend_of("f32", 1)).frames()))) == []
+    assert list(same(found[0], list(build_run(sound, backend_of("f32", 1)).frames()))) == []
 
 
 def test_what_is_compiled_decides_on_the_kind() -> None:
-    def kind_of(name: str, **changes: object) -> Kind:
+    def kind_of(name: str, **changes: object) -> CompiledKind:
         scene = scene_named(name).model_copy(update=changes)
-        return Kind.of(scene, sample_bodies(scene))
+        return CompiledKind.of(scene, sample_bodies(scene))
 
-    wide = kind_of("sand").joined(Kind.of(other := scene_named("sand", other=True), sample_bodies(other)))
+    wide = kind_of("sand").joined(CompiledKind.of(other := scene_named("sand", other=True), sample_bodies(other)))
     assert wide.cells == (20, 20)
     assert wide.particles == kind_of("sand").particles
     assert kind_of("sand").joined(kind_of("fluid")) is None
@@ -285,20 +285,20 @@ def test_kinds_are_equal_where_flags_are() -> None:
     thin = fluid.bodies[0].material.model_copy(update={"viscosity": 0.1})
     dry = fluid.bodies[0].material.model_copy(update={"viscosity": 0.0})
 
-    def kind_with(material: object) -> Kind:
+    def kind_with(material: object) -> CompiledKind:
         scene = fluid.model_copy(update={"bodies": (fluid.bodies[0].model_copy(update={"material": material}),)})
-        return Kind.of(scene, sample_bodies(scene))
+        return CompiledKind.of(scene, sample_bodies(scene))
 
-    assert kind_with(thin).joined(Kind.of(fluid, sample_bodies(fluid))) is not None
-    assert kind_with(dry).joined(Kind.of(fluid, sample_bodies(fluid))) is None
+    assert kind_with(thin).joined(CompiledKind.of(fluid, sample_bodies(fluid))) is not None
+    assert kind_with(dry).joined(CompiledKind.of(fluid, sample_bodies(fluid))) is None
 
 
 def test_frames_stop_on_request(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between two launches, after the frames that were recorded until then."""
-    monkeypatch.setattr(launch_budget, "FIRST", 1)
-    monkeypatch.setattr(launch_budget, "LAUNCH", 0.0)
+    monkeypatch.setattr(exchange, "FIRST", 1)
+    monkeypatch.setattr(exchange, "LAUNCH", 0.0)
     scene = scene_named("sand")
-    run = BatchRun(batch_of([scene, scene_named("sand", other=True)], backend_of("f32", 1)), 0, scene)
+    run = Run(batch_of([scene, scene_named("sand", other=True)], backend_of("f32", 1)), 0, scene)
     frames = run.frames(stop=lambda: run.step_count > 0)
     next(frames)
     with pytest.raises(KeyboardInterrupt):
@@ -310,12 +310,8 @@ def test_no_frame_shows_a_particle_without_volume(backend_of: Callable) -> None:
     """The step that crushed it cannot tell, and the next one comes after the frame."""
     scene = scene_named("sand")
     backend = backend_of("f32", 1)
-    run = BatchRun(batch_of([scene], backend), 0, scene)
-    run.begin()
+    run = build_run(scene, backend)
     assert run.frame()[1].volume_ratio_min > 0.9
     run.groups[0].arrays.displacement_gradient[5][0, 0] = -1.0
-    solver = Solver(scene, backend)
-    solver.groups[0].displacement_gradient[5][0, 0] = -1.0
-    for crushed in (run, solver):
-        with pytest.raises(UnstableRunError, match="inside out"):
-            crushed.frame()
+    with pytest.raises(UnstableRunError, match="inside out"):
+        run.frame()

@@ -9,9 +9,9 @@ from test_batch import batch_of, outputs_of, scene_named
 from tiny_sweep import tiny_sweep
 
 from mpmcli.dataset.compute import Task, compute
-from mpmcli.solver.batch_run import BatchRun
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
 
 pytestmark = pytest.mark.gpu
 
@@ -41,7 +41,7 @@ def test_runs_follow_those_on_the_cpu(backend_of: Callable, name: str) -> None:
     found = outputs_of(batch_of(scenes, backend), scenes)
     cpu = backend_of("f32", 1)
     for outcome, scene in zip(found, scenes, strict=True):
-        expected = list(Solver(scene, cpu).frames())
+        expected = list(build_run(scene, cpu).frames())
         assert [row.steps for _, row in outcome] == [row.steps for _, row in expected]
         steps = expected[-1][0].step
         assert steps > 15
@@ -60,7 +60,7 @@ def test_an_unstable_run_stops_alone(backend_of: Callable) -> None:
     time = sound.time.model_copy(update={"step": 0.004, "end": 0.4})
     wild = sound.model_copy(update={"time": time})
     batch = batch_of([sound, wild], backend_of("f32", 1, "vulkan"))
-    streams, frames = [BatchRun(batch, 0, sound).events(), BatchRun(batch, 1, wild, force=True).events()], []
+    streams, frames = [Run(batch, 0, sound).events(), Run(batch, 1, wild, force=True).events()], []
     with pytest.raises(UnstableRunError, match="the run became unstable at step"):
         for _ in range(200):
             list(iter(lambda: next(streams[1]), None))

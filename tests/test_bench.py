@@ -1,18 +1,18 @@
 """The benchmark: peers are the package's own examples, and both sides run in turn. No clock decides here."""
 
-import io
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fake_contestant import FakeWorker, figures_of
 
 from mpmcli.bench import contestant, ours, peers
 from mpmcli.bench.cases import CASES, DENSITY, EDGE, GRAVITY, SPEED, BenchCase
-from mpmcli.bench.compare import Setting, Side, run_bench, start_worker
-from mpmcli.bench.report import BenchReport, CaseResult, ContestantResult
+from mpmcli.bench.compare import bench_record, bench_table, run_bench
+from mpmcli.bench.report import describe_machine
+from mpmcli.bench.side import BenchOptions, Setting, Side, start_worker
 from mpmcli.errors import RunError
 
 SMALL_2D = BenchCase(dimension=2, cells=32, particles=200, step=5e-4)
@@ -105,8 +105,8 @@ side = {name}({case!r}, threads=2, precision="f64", arch="cpu")
 if "{module}" == "ours":
     # Few particles: one thread.
     assert side.threads == 1
-    side.engine.begin()
-    side.engine.state.last_step = {case.step}
+    side.run.begin()
+    side.run.state.last_step = {case.step}
 assert side.advance({steps}) == {steps}
 side.sync()
 assert side.particles == {case.particles}
@@ -180,10 +180,15 @@ class TestWorker:
         assert 1.0 <= seconds <= 1.02
 
     def test_commands_are_answered_line_by_line(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        clock, answers = Clock(), io.StringIO()
+        clock, answers = Clock(), []
         monkeypatch.setattr(contestant.time, "perf_counter", lambda: clock.now)
-        assert contestant.serve(lambda: clock, ["first\n", "run 0.1\n", "finish\n"], answers) == 0
-        ready, first, block, end = map(json.loads, answers.getvalue().splitlines())
+        assert (
+            contestant.serve(
+                lambda: clock, ["first\n", "run 0.1\n", "finish\n"], lambda **values: answers.append(values)
+            )
+            == 0
+        )
+        ready, first, block, end = answers
         assert ready == {"particles": 7, "bytes_per_particle": 64, "threads": 2}
         assert first == {"seconds": pytest.approx(0.01)}
         assert block["steps"] in (10, 11)
@@ -195,9 +200,9 @@ class TestWorker:
         def fail() -> Clock:
             raise RunError("There is no such example.")
 
-        answers = io.StringIO()
-        assert contestant.serve(fail, [], answers) == 1
-        assert json.loads(answers.getvalue()) == {"error": "There is no such example."}
+        answers = []
+        assert contestant.serve(fail, [], lambda **values: answers.append(values)) == 1
+        assert answers == [{"error": "There is no such example."}]
 
     def test_a_peer_runs_in_its_own_process(self) -> None:
         with start_worker("peer", SMALL_2D, Setting(threads=1)) as process:
@@ -211,72 +216,45 @@ class TestWorker:
             start_worker("peer", SMALL_2D, Setting(threads=1, arch="no_such_arch"))
 
 
-class FakeWorker:
-    """Answers like a contestant that takes `step_seconds` per step, and notes what it was asked."""
-
-    start_seconds = 0.5
-
-    def __init__(self, who: str, step_seconds: float, particles: int, log: list, threads: int) -> None:
-        self.who, self.step_seconds, self.log = who, step_seconds, log
-        self.ready = {"particles": particles, "bytes_per_particle": None, "threads": 1}
-        self.closed = False
-        self.shared = threads > 1
-
-    def ask(self, command: str) -> dict:
-        self.log.append((self.who, command))
-        match command.split():
-            case ["first"]:
-                return {"seconds": 2.0 + self.step_seconds}
-            case ["run", _]:
-                # Of other processes there are as many again.
-                busy = 100 * self.step_seconds
-                return {"steps": 100, "seconds": (2 - self.shared) * busy, "processor_seconds": busy}
-        return {"sound": True, "smallest_step": SMALL_2D.step, "peak_memory": 10**8}
-
-    def __enter__(self) -> "FakeWorker":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.closed = True
-
-
 # Of a step on one thread.
-SECONDS = {"ours": 0.002, "peer": 0.008, "yardstick": 0.001, "mpm99": 0.01, "mpm128": 0.016}
+SECONDS = {"ours": 0.002, "peer": 0.008, "yardstick": 0.001, "mpm99": 0.01, "mpm128": 0.0152}
 
 
 class TestComparison:
     def run(
         self,
         particles: int = 200,
-        threads: int | tuple[int, ...] = 2,
+        threads: tuple[int, ...] = (2,),
         cases: tuple[BenchCase, ...] = (SMALL_2D,),
         **options,
-    ) -> tuple[BenchReport, list[tuple[str, str]], list[FakeWorker]]:
+    ) -> tuple[dict, list[tuple[str, str]], list[FakeWorker]]:
         log, started = [], []
 
         def start(who: str, case: BenchCase, setting: Setting) -> FakeWorker:
-            started.append(FakeWorker(who, SECONDS[who] / setting.threads, particles, log, setting.threads))
+            # On one thread there are as many other processes again.
+            each, wall = SECONDS[who] / setting.threads, 2 - (setting.threads > 1)
+            started.append(FakeWorker(who, each, particles, SMALL_2D.step, log=log, wall=wall))
             return started[-1]
 
         try:
-            report = run_bench(cases, threads=threads, seconds=1.5, start=start, blocks=3, **options)
+            record = run_bench(cases, BenchOptions(threads, 1.5, blocks=3, start=start, **options))
         finally:
             assert all(fake.closed for fake in started)
-        return report, log, started
+        return record, log, started
 
     def test_blocks_alternate(self) -> None:
         _, log, _ = self.run()
         assert [who for who, command in log if command == "run 1.5"] == ["ours", "peer"] * 3
 
     def test_medians_and_ratio(self) -> None:
-        report, _, _ = self.run()
-        (result,) = report.results
-        assert result.ours.rates == pytest.approx([200 / 0.001] * 3)
-        assert result.ratio == pytest.approx(4)
-        assert result.ours.compile_seconds == pytest.approx(2.0)
+        record, _, _ = self.run()
+        (case,) = record["cases"]
+        assert case["ours"]["particle_steps_per_s_blocks"] == pytest.approx([200 / 0.001] * 3)
+        assert case["ratio"] == pytest.approx(4)
+        assert case["ours"]["compile_s"] == pytest.approx(2.0)
 
     def test_the_yardstick_and_other_examples_take_their_turns(self) -> None:
-        report, log, _ = self.run(yardstick=True, peers=True)
+        record, log, _ = self.run(yardstick=True, peers=True)
         assert [who for who, command in log if command == "run 1.5"] == [
             "ours",
             "peer",
@@ -284,12 +262,10 @@ class TestComparison:
             "mpm99",
             "mpm128",
         ] * 3
-        (result,) = report.results
-        assert result.times_slower == pytest.approx(2)
-        found = json.loads(json.dumps(report.as_dict()))["cases"][0]
+        found = json.loads(json.dumps(record))["cases"][0]
         assert found["times_slower_than_yardstick"] == pytest.approx(2)
-        assert found["others"]["mpm128"]["particle_steps_per_s"] == pytest.approx(200 / 0.008)
-        row = report.table().splitlines()[4].split()
+        assert found["others"]["mpm128"]["particle_steps_per_s"] == pytest.approx(200 / 0.0076)
+        row = bench_table(record).splitlines()[4].split()
         assert row[10:12] == ["0.40", "2.00"]
         assert row[-2:] == ["0.04", "0.03"]
 
@@ -304,27 +280,27 @@ class TestComparison:
         usual = Side.begin
         monkeypatch.setattr(Side, "begin", begin)
         lines = []
-        report, _, _ = self.run(yardstick=True, progress=lines.append, cases=(SMALL_2D, SMALL_3D))
-        assert [bool(result.yardstick) for result in report.results] == [False, True]
+        record, _, _ = self.run(yardstick=True, progress=lines.append, cases=(SMALL_2D, SMALL_3D))
+        assert [bool(case["yardstick"]) for case in record["cases"]] == [False, True]
         assert "2d-32, 2 threads: yardstick is left out. gcc fell over." in lines
-        assert report.as_dict()["cases"][0]["yardstick"] is None
-        rows = [line.split() for line in report.table().splitlines()[4:6]]
+        assert record["cases"][0]["yardstick"] is None
+        rows = [line.split() for line in bench_table(record).splitlines()[4:6]]
         assert len(rows[1]) == len(rows[0]) + 2
 
     def test_numbers_of_threads_in_turn(self) -> None:
         """Twice as fast on 2 threads, and on 3 a half faster than that: all efficiencies are 1."""
-        report, _, started = self.run(threads=(1, 2, 3))
+        record, _, started = self.run(threads=(1, 2, 3))
         assert len(started) == 6
-        assert [report.speed_up(result) for result in report.results] == pytest.approx([1, 2, 3])
-        assert [report.efficiency(result) for result in report.results] == pytest.approx([1, 1, 1])
-        assert report.as_dict()["threads"] == [1, 2, 3]
-        assert "cpu, 1, 2 and 3 threads, f32" in report.table()
-        assert report.table().splitlines()[-7].split()[-2:] == ["3.00", "100%"]
+        assert [case["speed_up"] for case in record["cases"]] == pytest.approx([1, 2, 3])
+        assert [case["efficiency"] for case in record["cases"]] == pytest.approx([1, 1, 1])
+        assert record["threads"] == [1, 2, 3]
+        assert "cpu, 1, 2 and 3 threads, f32" in bench_table(record)
+        assert bench_table(record).split("\n\n")[1].splitlines()[-1].split()[-2:] == ["3.00", "100%"]
 
     def test_one_number_of_threads_has_no_speed_up(self) -> None:
-        report, _, _ = self.run()
-        assert report.as_dict()["cases"][0]["speed_up"] is None
-        assert "speed-up" not in report.table()
+        record, _, _ = self.run()
+        assert record["cases"][0]["speed_up"] is None
+        assert "speed-up" not in bench_table(record)
 
     def test_progress_is_told(self) -> None:
         lines = []
@@ -338,24 +314,34 @@ class TestComparison:
 
 
 class TestReport:
-    side = ContestantResult(
-        rates=(2e6, 4e6, 3e6),
-        start_seconds=0.51,
-        compile_seconds=1.24,
-        peak_memory=150_000_000,
-        bytes_per_particle=96,
-        threads=1,
-        smallest_step=8e-5,
-        sound=True,
+    ours = figures_of(
+        "ours",
+        CASES[-1],
+        (1 / 2e6, 1 / 4e6, 1 / 3e6),
+        2,
+        start_s=0.51,
+        compile_s=1.24,
+        peak_memory_bytes=150_000_000,
+        device_bytes_per_particle=96,
     )
-    peer = replace(side, rates=(1e6, 1e6, 2e6), bytes_per_particle=None, threads=2)
+    peer = figures_of(
+        "peer",
+        CASES[-1],
+        (1e-6, 1e-6, 1 / 2e6),
+        2,
+        start_s=0.51,
+        compile_s=1.24,
+        peak_memory_bytes=150_000_000,
+        device_bytes_per_particle=None,
+        threads_used=2,
+    )
 
-    def report(self, peer: ContestantResult = peer) -> BenchReport:
-        result = CaseResult(CASES[-1], 2, ours=self.side, peer=peer)
-        return BenchReport((result,), (2,), "f32", "cpu", 1.0, {"processor": "A processor", "taichi": "1.7.4"})
+    def record(self, ours: dict = ours, peer: dict = peer) -> dict:
+        machine = {"processor": "A processor", "taichi": "1.7.4"}
+        return bench_record([{"ours": ours, "peer": peer}], BenchOptions((2,))) | {"machine": machine}
 
     def test_table(self) -> None:
-        lines = self.report().table().splitlines()
+        lines = bench_table(self.record()).splitlines()
         assert lines[0] == "A processor, cpu, 2 threads, f32, taichi 1.7.4"
         row = next(line for line in lines if line.startswith("3d-128"))
         found = " ".join(row.split())
@@ -363,29 +349,29 @@ class TestReport:
         assert lines[-1] == "Device memory at 3d-128: 96 bytes per particle."
 
     def test_table_warns_of_a_run_that_broke_down(self) -> None:
-        assert "Beware" not in self.report().table()
-        assert "Beware: mpm3d broke down at 3d-128" in self.report(replace(self.peer, sound=False)).table()
+        assert "Beware" not in bench_table(self.record())
+        broken = self.record(peer=self.peer | {"sound": False})
+        assert "Beware: mpm3d broke down at 3d-128" in bench_table(broken)
 
     def test_table_warns_of_smaller_steps(self) -> None:
-        def report_of(step: float) -> str:
-            result = CaseResult(CASES[-1], 2, ours=replace(self.side, smallest_step=step), peer=self.peer)
-            return replace(self.report(), results=(result,)).table()
+        def table_of(step: float) -> str:
+            return bench_table(self.record(self.ours | {"smallest_step_s": step}))
 
-        assert "Beware" not in report_of((1 - 1e-9) * 8e-5)
-        assert "Beware: at 3d-128 mpmcli's own limits asked for steps down to 4e-05 s" in report_of(4e-5)
+        assert "Beware" not in table_of((1 - 1e-9) * 8e-5)
+        assert "Beware: at 3d-128 mpmcli's own limits asked for steps down to 4e-05 s" in table_of(4e-5)
 
-    def test_dictionary_is_json_with_every_block(self) -> None:
-        found = json.loads(json.dumps(self.report().as_dict()))
+    def test_record_is_json_with_every_block(self) -> None:
+        found = json.loads(json.dumps(self.record()))
         (case,) = found["cases"]
         assert found["threads"] == [2]
         assert case["threads"] == 2
-        assert case["ours"]["particle_steps_per_s_blocks"] == [2e6, 4e6, 3e6]
+        assert case["ours"]["particle_steps_per_s_blocks"] == pytest.approx([2e6, 4e6, 3e6], rel=1e-12)
         assert (case["ours"]["threads"], case["peer"]["threads"]) == (1, 2)
-        assert case["ratio"] == 3
-        assert (case["ratio_min"], case["ratio_max"]) == (1.5, 4)
+        assert case["ratio"] == pytest.approx(3, rel=1e-12)
+        assert (case["ratio_min"], case["ratio_max"]) == pytest.approx((1.5, 4), rel=1e-12)
         assert case["ours"]["device_bytes_per_particle"] == 96
 
     def test_machine_is_described(self) -> None:
-        found = BenchReport((), (1,), "f32", "cpu", 1.0).machine
+        found = describe_machine()
         assert found["processor"]
         assert found["taichi"].startswith("1.7")

@@ -2,19 +2,22 @@
 
 import importlib.util
 import json
+from collections.abc import Callable
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 from command import run_here
+from fake_contestant import figures_of
 
 from mpmcli.bench.cases import BenchCase
-from mpmcli.bench.device import DeviceReport
-from mpmcli.bench.profile import ProfileReport, ProfileResult
-from mpmcli.bench.report import BenchReport, ContestantResult
-from mpmcli.bench.scaling import COUNTS
-from mpmcli.bench.scaling_report import ScalingReport, ScalingResult
+from mpmcli.bench.compare import COUNTS, bench_record, scaling_record
+from mpmcli.bench.device import device_record, device_table
+from mpmcli.bench.features import feature_record
+from mpmcli.bench.materials import cost_record
+from mpmcli.bench.profile import profile_record
+from mpmcli.bench.side import BenchOptions
 
 SCRIPTS = Path(__file__).parent.parent / "scripts"
 MACHINE = {"processor": "A processor", "taichi": "1.7.4"}
@@ -30,6 +33,9 @@ DEVICE = {
     "launch_and_wait_us": 10.0,
     "tables": {"large": TABLE, "small": TABLE},
 }
+
+
+ASKED = ("threads", "seconds", "blocks", "arch", "yardstick", "peers")
 
 
 @pytest.mark.parametrize(
@@ -63,68 +69,78 @@ def test_what_a_table_does_not_have_is_refused(arguments: list[str], sentence: s
 
 
 class TestChoices:
-    def test_comparison(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        asked = []
+    @pytest.fixture
+    def asked(self, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, dict], list]:
+        """Return `replaced(name, record)`: the first arguments, options and others of each call of a benchmark."""
 
-        def run_bench(cases: list, threads: tuple, seconds: float, progress: object, **options: object) -> BenchReport:
-            asked.append(([case.name for case in cases], threads, seconds, options))
-            return BenchReport((), threads, "f32", "cpu", seconds, MACHINE)
+        def replaced(name: str, record: dict) -> list[tuple[object, dict, dict]]:
+            calls = []
 
-        monkeypatch.setattr("mpmcli.bench.compare.run_bench", run_bench)
-        monkeypatch.setattr("mpmcli.bench.yardstick.is_here", lambda: False)
+            def run(first: object, options: BenchOptions, **others: object) -> dict:
+                calls.append((first, {key: getattr(options, key) for key in ASKED}, others))
+                return record
+
+            monkeypatch.setattr(f"mpmcli.bench.{name}", run)
+            return calls
+
+        return replaced
+
+    def test_comparison(self, asked: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+        calls = asked("compare.run_bench", bench_record([], BenchOptions((1, 2))))
+        monkeypatch.setattr("mpmcli.bench.peers.is_here", lambda: False)
         outcome = run_here("bench", "--case", "3d-32", "--threads", "1, 2", "--seconds", "0.5", "--peers", "--json")
-        options = {"blocks": 5, "arch": "cpu", "yardstick": False, "peers": True}
-        assert asked == [(["3d-32"], (1, 2), 0.5, options)]
+        usual = {"threads": (1, 2), "seconds": 0.5, "blocks": 5, "arch": "cpu", "yardstick": False, "peers": True}
+        assert [([case.name for case in cases], *others) for cases, *others in calls] == [(["3d-32"], usual, {})]
         assert json.loads(outcome.stdout)["threads"] == [1, 2]
         assert outcome.stderr == "note: gcc is not here: the table has no column of the yardstick in C.\n"
         assert run_here("bench", "--arch", "vulkan", "--quick").stderr == ""
-        assert asked[1][3] == {"blocks": 5, "arch": "vulkan", "yardstick": False, "peers": False}
+        assert (calls[1][1]["arch"], calls[1][1]["yardstick"], calls[1][1]["peers"]) == ("vulkan", False, False)
 
-    def test_scaling(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        asked = []
-
-        def run_scaling(*arguments: object, **options: object) -> ScalingReport:
-            asked.append((arguments[:3], options))
-            return ScalingReport((), (), 1.0, MACHINE)
-
-        monkeypatch.setattr("mpmcli.bench.scaling.run_scaling", run_scaling)
-        monkeypatch.setattr("mpmcli.bench.yardstick.is_here", lambda: True)
+    def test_scaling(self, asked: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+        calls = asked("compare.run_scaling", scaling_record([], [], BenchOptions()))
+        monkeypatch.setattr("mpmcli.bench.peers.is_here", lambda: True)
         run_here("bench", "--scaling")
         run_here(
             "bench", "--scaling", "--case", "3d", "--largest", "1e5", "--budget", "5m", "--threads", "4", "--peers"
         )
-        usual = {"budget": 1200.0, "counts": list(COUNTS), "blocks": 3, "yardstick": True, "peer": False}
-        assert asked[0] == (((2, 3), (1, 2), 2.0), usual)
+        usual = {"threads": (1, 2), "seconds": 2.0, "blocks": 3, "arch": "cpu", "yardstick": True, "peers": False}
+        assert calls[0] == ((2, 3), usual, {"budget": 1200.0, "counts": list(COUNTS)})
         counts = [10_000, 30_000, 100_000]
-        assert asked[1] == (((3,), (4,), 2.0), usual | {"budget": 300.0, "counts": counts, "peer": True})
+        assert calls[1] == ((3,), usual | {"threads": (4,), "peers": True}, {"budget": 300.0, "counts": counts})
 
-    def test_profile(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        asked = []
-
-        def run_profile(
-            cases: list, threads: int, seconds: float, progress: object, **options: object
-        ) -> ProfileReport:
-            asked.append(([case.name for case in cases], threads, seconds, options))
-            return ProfileReport((), (), threads, seconds, MACHINE)
-
-        monkeypatch.setattr("mpmcli.bench.profile.run_profile", run_profile)
-        monkeypatch.setattr("mpmcli.bench.yardstick.is_here", lambda: True)
+    def test_profile(self, asked: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+        calls = asked("profile.run_profile", profile_record([], [], BenchOptions()))
+        monkeypatch.setattr("mpmcli.bench.peers.is_here", lambda: True)
         run_here("bench", "--profile", "--case", "3d-64", "--blocks", "2")
-        assert asked == [(["3d-64"], 1, 2.0, {"blocks": 2, "yardstick": True})]
+        ((cases, options, _),) = calls
+        assert [case.name for case in cases] == ["3d-64"]
+        assert [options[key] for key in ("threads", "seconds", "blocks", "yardstick")] == [(1,), 2.0, 2, True]
+
+    @pytest.mark.parametrize(
+        ("table", "run", "record", "usual"),
+        [
+            ("materials", "materials.run_costs", cost_record, (["2d-128", "3d-64"], (1,), 2.0, 5)),
+            ("features", "features.run_features", feature_record, (["2d-128", "3d-32"], (1, 2), 0.5, 15)),
+        ],
+    )
+    def test_costs(self, asked: Callable, table: str, run: str, record: Callable, usual: tuple) -> None:
+        calls = asked(run, record([], [], BenchOptions()))
+        first = run_here("bench", f"--{table}", "--json")
+        run_here("bench", f"--{table}", "--case", usual[0][1], "--threads", "2", "--blocks", "3")
+        keys = ("threads", "seconds", "blocks")
+        found = [([case.name for case in cases], *(options[key] for key in keys)) for cases, options, _ in calls]
+        assert found == [usual, (usual[0][1:], (2,), usual[2], 3)]
+        assert json.loads(first.stdout)[{"materials": "results"}.get(table, table)] == []
 
 
-def side(nanoseconds: float) -> ContestantResult:
-    return ContestantResult((1e9 / nanoseconds,), 0.5, 1.0, 10**8, 100, 1, 1e-3, True)
-
-
-def scaling_report() -> ScalingReport:
+def scaling() -> dict:
     results = [
-        ScalingResult(who, BenchCase(dimension, 16, particles, 1e-3), 1, side(each))
+        figures_of(who, BenchCase(dimension, 16, particles, 1e-3), (1e-9 * each,))
         for dimension in (2, 3)
         for particles in (10_000, 100_000)
         for who, each in (("ours", 40.0), ("yardstick", 20.0), ("peer", 200.0))
     ]
-    return ScalingReport(tuple(results), ("3d: left out.",), 1.0, MACHINE)
+    return scaling_record(results, ["3d: left out."], BenchOptions()) | {"machine": MACHINE}
 
 
 class TestDocuments:
@@ -138,7 +154,7 @@ class TestDocuments:
         return module
 
     def test_scaling(self, script: ModuleType) -> None:
-        lines = script.scaling_tables(scaling_report().as_dict()).splitlines()
+        lines = script.scaling_tables(scaling()).splitlines()
         assert "| particles, 3D, 1 thread | mpmcli | C | mpm3d | times slower than C |" in lines
         assert "| 100,000 | 40.0 | 20.0 | 200.0 | 2.0 |" in lines
         assert "| exponent | 1.00 | 1.00 | 1.00 |  |" in lines
@@ -147,19 +163,20 @@ class TestDocuments:
     def test_figure_is_the_same_every_time_and_names_every_line(self, script: ModuleType) -> None:
         from scaling_figure import draw_scaling
 
-        report = scaling_report().as_dict()
+        report = scaling()
         figure = draw_scaling(report)
         assert figure == draw_scaling(json.loads(json.dumps(report)))
         for text in (b"mpmcli, 1 thread", b"C, 1 thread", b"mpm88, 1 thread", b"2D fluid", b"3D fluid"):
             assert text in figure
 
     def test_profile(self, script: ModuleType) -> None:
-        case = BenchCase(3, 64, 1, 1e-3)
+        case = BenchCase(3, 64, 100, 1e-3)
         results = [
-            ProfileResult(case, "fluid", 100, {"p2g": (10.0,), "volumes": (1.0,)}, (15.0,)),
-            ProfileResult(case, "fluid in C", 100, {"p2g": (5.0,)}, (6.0,)),
+            figures_of("profile:fluid", case, (15e-9,), phases={"p2g": [10.0], "volumes": [1.0]}),
+            figures_of("yardstick", case, (6e-9,), phases={"p2g": [5.0]}),
         ]
-        lines = script.profile_table(ProfileReport(tuple(results), (), 1, 1.0, MACHINE).as_dict()).splitlines()
+        record = profile_record(results, [], BenchOptions()) | {"machine": MACHINE}
+        lines = script.profile_table(record).splitlines()
         assert lines[2] == "| case | law | p2g | volumes | rest | total |"
         assert lines[4:] == [
             "| 3d-64 | fluid | 10.0 | 1.0 | 4.0 | 15.0 |",
@@ -167,12 +184,12 @@ class TestDocuments:
         ]
 
     def test_device(self, script: ModuleType) -> None:
-        report = DeviceReport(DEVICE, MACHINE)
-        lines = script.device_table(report.as_dict()).splitlines()
+        record = device_record(DEVICE) | {"machine": MACHINE}
+        lines = script.device_table(record).splitlines()
         assert lines[0] == "A processor, cuda, 1 thread, Taichi 1.7.4."
         assert "| atomic add, random | 0.125 | 0.125 | 1e9/s |" in lines
         assert "| launch, 4 loops | 12.0 |  | us |" in lines
-        rows = [" ".join(line.split()) for line in report.table().splitlines()]
+        rows = [" ".join(line.split()) for line in device_table(record).splitlines()]
         assert "copy 12.5 12.5 GB/s" in rows
         loops = "1 loop 3.0, 2 loops 6.0, 3 loops 9.0, 4 loops 12.0"
         assert f"Launch of a kernel, us: {loops}; with a number from the host 4.0; and" in rows

@@ -6,10 +6,15 @@ import pytest
 from command import run_here
 
 from mpmcli.bench.cases import CASES, BenchCase
-from mpmcli.bench.compare import Setting
-from mpmcli.bench.sand_block import FRAMES, sand_sweep
-from mpmcli.bench.throughput import run_throughput
-from mpmcli.bench.throughput_report import GENERATOR_PEER_RATE, ThroughputReport, ThroughputResult
+from mpmcli.bench.side import BenchOptions, Setting
+from mpmcli.bench.throughput import (
+    FRAMES,
+    GENERATOR_PEER_RATE,
+    run_throughput,
+    sand_sweep,
+    throughput_record,
+    throughput_table,
+)
 from mpmcli.check.scene_check import check_scene
 from mpmcli.dataset.draw import draw
 from mpmcli.materials.registry import parameter_models
@@ -35,12 +40,21 @@ class FakePeer:
         self.asked.append("end")
 
 
-def report_of(*results: ThroughputResult, rate: float = GENERATOR_PEER_RATE) -> ThroughputReport:
-    return ThroughputReport(results, (rate, 2 * rate, rate), 1444, FRAMES, 20.0, MACHINE)
+def record_of(*results: dict, rate: float = GENERATOR_PEER_RATE) -> dict:
+    return throughput_record(results, (rate, 2 * rate, rate), 1444, FRAMES, 20.0) | {"machine": MACHINE}
 
 
-ONE = ThroughputResult(1, (3000.0, 4000.0), (20.0, 19.0), 40, 40, 3500.0)
-TWO = ThroughputResult(2, (6000.0, 8000.0), (21.0, 22.0), 80, 79, 3500.0)
+ONE = {
+    "workers": 1,
+    "trajectories_per_hour": 3500.0,
+    "trajectories_per_hour_blocks": [3000.0, 4000.0],
+    "blocks_s": [20.0, 19.0],
+    "trajectories": 40,
+    "accepted": 40,
+    "steps": 3500.0,
+}
+TWO = ONE | {"workers": 2, "trajectories_per_hour": 7000.0, "trajectories_per_hour_blocks": [6000.0, 8000.0]}
+TWO |= {"trajectories": 80, "accepted": 79}
 
 
 def test_the_scene_is_that_of_the_generator(tmp_path) -> None:
@@ -65,35 +79,36 @@ def test_every_block_is_a_sweep_that_is_stored() -> None:
         return FakePeer(asked)
 
     lines: list[str] = []
-    report = run_throughput(1, progress=lines.append, rounds=2, trajectories=2, frames=3, start=start)
+    options = BenchOptions((1,), blocks=2, progress=lines.append, start=start)
+    record = run_throughput(options, trajectories=2, frames=3)
     assert asked == ["first", "run 0.3", "run 2.0", "run 2.0", "end"]
     assert len(lines) == 3
-    (result,) = report.results
-    assert (result.workers, result.trajectories, result.accepted) == (1, 4, 4)
-    assert (report.particles, report.frames) == (1444, 3)
-    assert result.steps == pytest.approx(30, abs=3)
-    for rate, seconds in zip(result.per_hour, result.seconds, strict=True):
+    (result,) = record["results"]
+    assert (result["workers"], result["trajectories"], result["accepted"]) == (1, 4, 4)
+    assert (record["particles"], record["frames"]) == (1444, 3)
+    assert result["steps"] == pytest.approx(30, abs=3)
+    for rate, seconds in zip(result["trajectories_per_hour_blocks"], result["blocks_s"], strict=True):
         # The first of the two starts the worker.
         assert rate > 2 * 3600 / seconds
-    assert report.peer_rate == pytest.approx(CASES[0].particles * 1000)
+    assert record["peer_particle_steps_per_s"] == pytest.approx(CASES[0].particles * 1000)
 
 
 def test_the_ratio_is_to_a_generator_on_each_core() -> None:
     """8.4 s where mpm88 makes 6.5 million particle-steps/s, and half of that where it makes twice as many."""
-    report = report_of(ONE, TWO)
-    assert report.generator_seconds == pytest.approx(8.4)
-    assert report.ratio(ONE) == pytest.approx(3500 * 8.4 / 3600)
-    assert report.ratio(TWO) == pytest.approx(7000 * 8.4 / 3600 / 2)
-    fast = report_of(ONE, rate=2 * GENERATOR_PEER_RATE)
-    assert fast.ratio(ONE) == pytest.approx(report.ratio(ONE) / 2)
-    one, two = json.loads(json.dumps(report.as_dict()))["results"]
+    record = record_of(ONE, TWO)
+    assert record["generator_s"] == pytest.approx(8.4)
+    one, two = json.loads(json.dumps(record))["results"]
+    assert one["ratio"] == pytest.approx(3500 * 8.4 / 3600)
+    assert two["ratio"] == pytest.approx(7000 * 8.4 / 3600 / 2)
+    fast = record_of(ONE, rate=2 * GENERATOR_PEER_RATE)["results"][0]
+    assert fast["ratio"] == pytest.approx(one["ratio"] / 2)
     assert one["trajectories_per_hour"] == 3500
     assert one["trajectories_per_hour_blocks"] == [3000, 4000]
     assert (two["ratio_min"], two["ratio_max"]) == pytest.approx((3000 * 8.4 / 3600, 4000 * 8.4 / 3600))
 
 
 def test_the_table_tells_what_was_refused() -> None:
-    lines = report_of(ONE, TWO).table().splitlines()
+    lines = throughput_table(record_of(ONE, TWO)).splitlines()
     assert lines[1] == "A block of sand: 1,444 particles, 64 x 64 cells, 350 frames."
     assert " ".join(lines[5].split()) == "1 40 3,500 3,500 3,000-4,000 1.03 8.2 7.0-9.3"
     assert lines[-1] == "Beware: with 2 workers 1 of 80 trajectories were not accepted."

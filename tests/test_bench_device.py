@@ -35,7 +35,7 @@ class TestBestSeconds:
 
 class TestKernels:
     def test_places(self, backend_of) -> None:
-        from mpmcli.solver.device_speed import EQUAL, RANDOM, SHARED, SORTED, build_device_kernels
+        from mpmcli.solver.machine.device_speed import EQUAL, RANDOM, SHARED, SORTED, build_device_kernels
 
         backend_of("f32")
         kernels = build_device_kernels(PLACES, on_cpu=True)
@@ -56,7 +56,7 @@ def test_every_figure_is_there_as_json(arch: str, run_python) -> None:
     done = run_python(f"""
 import json
 from mpmcli.bench.device import measure_device
-from mpmcli.solver.backend import start_backend
+from mpmcli.solver.machine.backend import start_backend
 print(json.dumps(measure_device(start_backend("{arch}"), 0.0, large=4096, small=1024)))
 """)
     found = json.loads(done.stdout)

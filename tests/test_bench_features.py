@@ -1,25 +1,23 @@
 """The table of what features cost: scenes with and without one, measured in turn. No clock decides here."""
 
 import importlib.util
-import json
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import run_here
+from fake_contestant import FakeWorker
 
 from mpmcli.bench import features
 from mpmcli.bench.cases import BenchCase
-from mpmcli.bench.compare import Setting, start_worker
-from mpmcli.bench.feature_costs import run_features
-from mpmcli.bench.feature_report import FeatureReport
-from mpmcli.bench.features import FEATURE_CASES, FEATURES, Feature
+from mpmcli.bench.features import FEATURE_CASES, FEATURES, Feature, feature_table, run_features
+from mpmcli.bench.side import BenchOptions, Setting, start_worker
 from mpmcli.errors import RunError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene, sample_bodies
-from mpmcli.scene.mesh_file import read_mesh
-from mpmcli.scene.triangles import Surface
+from mpmcli.scene.mesh import read_mesh
+from mpmcli.scene.triangles import ClosedSurface
 
 SCRIPTS = Path(__file__).resolve().parent.parent / "scripts"
 SMALL = BenchCase(dimension=2, cells=16, particles=576, step=1e-3)
@@ -64,7 +62,7 @@ class TestScenes:
 
     def test_the_octahedron_is_closed_and_faces_outward(self, tmp_path: Path) -> None:
         (tmp_path / "mesh.obj").write_text(features.octahedron(0.25), encoding="utf-8")
-        surface = Surface(*read_mesh(tmp_path / "mesh.obj"))
+        surface = ClosedSurface(*read_mesh(tmp_path / "mesh.obj"))
         assert surface.volume == pytest.approx(4 / 3 * 0.25**3)
         assert np.ptp(np.linalg.norm(read_mesh(tmp_path / "mesh.obj")[0], axis=1)) < 1e-6
 
@@ -74,50 +72,27 @@ COSTS = {"plain": 40.0, "plain again": 40.2, "moving ball": 44.8, "friction of t
 SOME = FEATURES[:4]
 
 
-class FakeWorker:
-    """Answers like a scene whose cost is known, and notes what it was asked."""
-
-    def __init__(self, who: str, threads: int, log: list[tuple[str, int, str]]) -> None:
-        self.ready = {"particles": SMALL.particles}
-        self.who, self.threads, self.log = who, threads, log
-
-    def ask(self, command: str) -> dict:
-        self.log.append((self.who, self.threads, command))
-        if command == "finish":
-            return {"sound": True, "smallest_step": SMALL.step}
-        if command == "first":
-            return {"seconds": 1.0}
-        steps = int(command.split()[1])
-        busy = 1e-9 * steps * SMALL.particles * COSTS[self.who]
-        return {"steps": steps, "seconds": 2 * busy, "processor_seconds": busy}
-
-    def __enter__(self) -> "FakeWorker":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-
 class TestRun:
-    def run(self, fails: str = "", wanted: tuple[Feature, ...] = SOME) -> tuple[FeatureReport, list]:
+    def run(self, fails: str = "", wanted: tuple[Feature, ...] = SOME) -> tuple[dict, list]:
         log = []
 
         def start(who: str, case: BenchCase, setting: Setting) -> FakeWorker:
             if who == fails:
                 raise RunError("It has no ball.")
-            return FakeWorker(who, setting.threads, log)
+            each = 1e-9 * SMALL.particles * COSTS[who]
+            return FakeWorker((who, setting.threads), each, SMALL.particles, SMALL.step, log=log, wall=2)
 
-        return run_features([SMALL], (1, 2), 0.001, features=wanted, rounds=2, start=start), log
+        return run_features([SMALL], BenchOptions((1, 2), 0.001, blocks=2, start=start), features=wanted), log
 
     def test_blocks_are_in_turn_and_take_as_many_steps(self) -> None:
         """A block of the first takes 1 ms of wall time, of which a step takes 2 x 40 ns x 576: 22 steps."""
         _, log = self.run()
-        measured = [(who, command) for who, threads, command in log if threads == 1 and "repeat" in command]
+        measured = [(who, command) for (who, threads), command in log if threads == 1 and "repeat" in command]
         assert measured == [(name, "repeat 100 0") for name in COSTS] + [(name, "repeat 22 0") for name in COSTS] * 2
 
     def test_ratios_and_bounds(self) -> None:
-        report, _ = self.run()
-        found = report.as_dict()["features"]
+        record, _ = self.run()
+        found = record["features"]
         assert [row["threads"] for row in found] == [1] * 4 + [2] * 4
         assert [row["ns_per_particle_step"] for row in found] == pytest.approx(
             [scale * cost for scale in (1, 2) for cost in COSTS.values()]
@@ -129,14 +104,14 @@ class TestRun:
             pytest.approx(45.0 / 44.8),
         ]
         assert [row["met"] for row in found[:4]] == [None, True, False, True]
-        lines = [" ".join(line.split()) for line in report.table().splitlines()]
+        lines = [" ".join(line.split()) for line in feature_table(record).splitlines()]
         assert "2d-16 1 moving ball plain 44.8 1.120 1.120-1.120 1.120 1.10 MISSED" in lines
 
     def test_a_scene_that_cannot_run_is_left_out_with_a_reason(self) -> None:
-        report, _ = self.run(fails="plain")
-        assert [report.ratio(result) is None for result in report.results[:3]] == [True, True, False]
-        assert report.flaws[0] == '"plain" at 2d-16 could not be measured. It has no ball.'
-        assert "Beware" in report.table()
+        record, _ = self.run(fails="plain")
+        assert [row["ratio"] is None for row in record["features"][:3]] == [True, True, False]
+        assert record["flaws"][0] == '"plain" at 2d-16 could not be measured. It has no ball.'
+        assert "Beware" in feature_table(record)
 
     def test_a_scene_runs_in_its_own_process(self) -> None:
         """One block is as many steps on, from the time that the last one ended at."""
@@ -153,8 +128,8 @@ class TestRun:
         script = importlib.util.module_from_spec(importlib.util.spec_from_loader("bench_table", loader))
         monkeypatch.setattr("sys.dont_write_bytecode", True)
         loader.exec_module(script)
-        report, _ = self.run()
-        lines = script.features_table(report.as_dict()).splitlines()
+        record, _ = self.run()
+        lines = script.features_table(record).splitlines()
         cell = "**1.120** (1.120 to 1.120), 1.120"
         assert f"| moving ball | plain | 1.10 | 44.8 | {cell} | 89.6 | {cell} |" in lines
         assert lines[-1].startswith("* Missed, 2d-16, 2 threads: moving ball, 1.120")
@@ -173,16 +148,3 @@ class TestCommand:
         outcome = run_here("bench", "--features", *arguments)
         assert outcome.status == 2
         assert outcome.stderr.startswith(sentence)
-
-    def test_one_thread_and_two_unless_told_otherwise(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        asked = []
-
-        def measured(cases, threads, seconds, progress, *, rounds) -> FeatureReport:
-            asked.append(([case.name for case in cases], threads, seconds, rounds))
-            return FeatureReport((), (), "f32", seconds)
-
-        monkeypatch.setattr("mpmcli.bench.feature_costs.run_features", measured)
-        first = run_here("bench", "--features", "--json")
-        run_here("bench", "--features", "--case", "3d-32", "--threads", "2", "--blocks", "3")
-        assert asked == [(["2d-128", "3d-32"], (1, 2), 0.5, 15), (["3d-32"], (2,), 0.5, 3)]
-        assert json.loads(first.stdout)["features"] == []

@@ -1,29 +1,26 @@
 """The cost table: every law on the same column, measured in turn, and held to its targets. No clock decides here."""
 
 import importlib.util
-import io
 import json
-from dataclasses import replace
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
 from command import run_here
+from fake_contestant import FakeWorker, figures_of
 from pydantic import Field
 
 from mpmcli.bench import contestant, materials
 from mpmcli.bench.cases import BenchCase
-from mpmcli.bench.compare import Setting, start_worker
-from mpmcli.bench.cost_report import CostReport, CostResult
-from mpmcli.bench.costs import run_costs
+from mpmcli.bench.materials import cost_record, cost_table, parts_of, run_costs
+from mpmcli.bench.side import BenchOptions, Setting, start_worker
 from mpmcli.errors import RunError
 from mpmcli.materials.law import StateBound
 from mpmcli.materials.registry import laws, parameter_models
 from mpmcli.scene import Scene, estimate_particles, parse_scene
 from mpmcli.scene.bounds import scene_bounds
-from mpmcli.scene.knobs import Knob
-from mpmcli.scene.material import MaterialParameters
+from mpmcli.scene.material import Knob, MaterialParameters
 from mpmcli.scene.quantity import Positive
 from mpmcli.stability.limits import mode_limit
 
@@ -137,12 +134,12 @@ class Spring:
 class TestWorker:
     def test_the_same_steps_are_taken_again_and_rewinding_is_free(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Steps 4, 5 and 6 take 0.15 s, so that a block of 0.4 s has three times these."""
-        spring, answers = Spring(), io.StringIO()
+        spring, answers = Spring(), []
         for clock in ("perf_counter", "process_time"):
             monkeypatch.setattr(contestant.time, clock, lambda: spring.now)
         commands = ["first\n", "keep 2\n", "repeat 3 0.4\n", "repeat 3 0\n", "flowing\n", "finish\n"]
-        assert contestant.serve(lambda: spring, commands, answers) == 0
-        _, _, kept, *blocks, flowing, _ = map(json.loads, answers.getvalue().splitlines())
+        assert contestant.serve(lambda: spring, commands, lambda **values: answers.append(values)) == 0
+        _, _, kept, *blocks, flowing, _ = answers
         assert kept == {}
         for block, times in zip(blocks, (3, 1), strict=True):
             assert block["steps"] == 3 * times
@@ -173,55 +170,27 @@ class TestWorker:
 COSTS = {"fluid": 40.0, "neo_hookean": 60.0, "sand": 180.0, "fluid,": 42.0, ",sand": 188.0, "fluid,sand": 126.5}
 
 
-class FakeWorker:
-    """Answers like a column whose costs are known, and notes what it was asked."""
-
-    start_seconds = 0.5
-
-    def __init__(self, who: str, log: list[tuple[str, str]], particles: int = SMALL.particles) -> None:
-        self.who, self.log = who, log
-        if "" in who.split(","):
-            particles //= 2
-        self.step_seconds = 1e-9 * COSTS[who] * particles
-        self.ready = {"particles": particles, "bytes_per_particle": 100}
-        self.closed = False
-
-    def ask(self, command: str) -> dict:
-        self.log.append((self.who, command))
-        match command.split():
-            case ["first"]:
-                return {"seconds": 2.0 + self.step_seconds}
-            case ["repeat", stretch, _]:
-                steps = int(stretch)
-                busy = steps * self.step_seconds
-                return {"steps": steps, "seconds": 2 * busy, "processor_seconds": busy, "watch_seconds": 0.02 * busy}
-            case ["flowing"]:
-                return {"share": 0.25}
-            case ["finish"]:
-                return {"sound": True, "smallest_step": SMALL.step, "peak_memory": 10**8}
-        return {}
-
-    def __enter__(self) -> "FakeWorker":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.closed = True
+def started(who: str, log: list[tuple[str, str]], particles: int = SMALL.particles) -> FakeWorker:
+    if "" in who.split(","):
+        particles //= 2
+    return FakeWorker(who, 1e-9 * COSTS[who] * particles, particles, SMALL.step, log=log, wall=2)
 
 
 class TestRun:
-    def run(self, threads: int = 1, fails: str = "", **options) -> tuple[CostReport, list[tuple[str, str]]]:
-        log, started = [], []
+    def run(self, threads: int = 1, fails: str = "", **options) -> tuple[dict, list[tuple[str, str]]]:
+        log, workers = [], []
 
         def start(who: str, case: BenchCase, setting: Setting) -> FakeWorker:
             if who == fails:
                 raise RunError("It has no stiffness.")
-            started.append(FakeWorker(who, log))
-            return started[-1]
+            workers.append(started(who, log))
+            return workers[-1]
 
         names, mixes = ["fluid", "neo_hookean", "sand"], [("fluid", "sand")]
-        report = run_costs([SMALL], threads, 0.5, names=names, mixes=mixes, blocks=2, start=start, **options)
-        assert all(fake.closed for fake in started)
-        return report, log
+        chosen = BenchOptions((threads,), 0.5, blocks=2, start=start, **options)
+        record = run_costs([SMALL], chosen, names=names, mixes=mixes)
+        assert all(fake.closed for fake in workers)
+        return record, log
 
     def test_blocks_are_in_turn(self) -> None:
         _, log = self.run()
@@ -232,19 +201,19 @@ class TestRun:
         }
 
     def test_costs_and_ratios(self) -> None:
-        report, _ = self.run()
-        assert [result.nanoseconds for result in report.results] == pytest.approx([*COSTS.values()])
-        assert report.results[0].compile_seconds == pytest.approx(2.0)
-        assert report.results[0].watch_share == pytest.approx(0.01)
-        _, _, sand, _, _, mix = report.results
-        assert report.of(sand, ("fluid",)).value == pytest.approx(4.5)
-        assert mix.parts == (("fluid", ""), ("", "sand"))
-        assert report.of(mix, *mix.parts).value == pytest.approx(1.1)
+        record, _ = self.run()
+        assert [row["ns_per_particle_step"] for row in record["results"]] == pytest.approx([*COSTS.values()])
+        assert record["results"][0]["compile_s"] == pytest.approx(2.0)
+        assert record["results"][0]["watch_share"] == pytest.approx(0.01)
+        _, _, sand, _, _, mix = record["results"]
+        assert sand["over_fluid"] == pytest.approx(4.5)
+        assert parts_of("fluid,sand") == ["fluid,", ",sand"]
+        assert mix["over_sum_of_parts"] == pytest.approx(1.1)
 
     def test_several_threads_are_timed_by_the_wall(self) -> None:
-        report, _ = self.run(threads=2)
-        assert report.results[0].nanoseconds == pytest.approx(80)
-        assert report.clock == "wall time"
+        record, _ = self.run(threads=2)
+        assert record["results"][0]["ns_per_particle_step"] == pytest.approx(80)
+        assert record["clock"] == "wall time"
 
     def test_progress_is_told(self) -> None:
         lines = []
@@ -256,18 +225,18 @@ class TestRun:
         )
 
     def test_a_law_that_cannot_run_is_left_out_with_a_reason(self) -> None:
-        report, _ = self.run(fails=",sand")
-        assert [result.name for result in report.results][3:] == ["half of fluid", "fluid + sand"]
-        mix = report.results[-1]
-        assert report.of(mix, *mix.parts) is None
-        assert report.flaws == ("half of sand at 2d-16 could not be measured. It has no stiffness.",)
-        assert "Beware: half of sand at 2d-16 could not be measured." in report.table()
+        record, _ = self.run(fails=",sand")
+        assert [(row["laws"], row["share_of_column"]) for row in record["results"]][3:] == [
+            (["fluid"], 0.5),
+            (["fluid", "sand"], 1.0),
+        ]
+        assert record["results"][-1]["over_sum_of_parts"] is None
+        assert record["flaws"] == ["half of sand at 2d-16 could not be measured. It has no stiffness."]
+        assert "Beware: half of sand at 2d-16 could not be measured." in cost_table(record)
 
     def test_another_number_of_particles_is_refused(self) -> None:
-        report = run_costs(
-            [SMALL], names=["fluid"], mixes=[], start=lambda who, case, setting: FakeWorker(who, [], particles=575)
-        )
-        assert "575 particles instead of 576" in report.flaws[0]
+        options = BenchOptions(start=lambda who, case, setting: started(who, [], particles=575))
+        assert "575 particles instead of 576" in run_costs([SMALL], options, names=["fluid"], mixes=[])["flaws"][0]
 
 
 class TestCommand:
@@ -283,74 +252,55 @@ class TestCommand:
         assert outcome.status == 2
         assert outcome.stderr.startswith(sentence)
 
-    def test_one_thread_unless_told_otherwise(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        asked = []
 
-        def measured(cases, threads, seconds, progress, *, blocks) -> CostReport:
-            asked.append(([case.name for case in cases], threads, blocks))
-            return CostReport((), (), threads, "f32", seconds)
-
-        monkeypatch.setattr("mpmcli.bench.costs.run_costs", measured)
-        first = run_here("bench", "--materials", "--json")
-        run_here("bench", "--materials", "--case", "3d-64", "--threads", "2", "--blocks", "3")
-        assert asked == [(["2d-128", "3d-64"], 1, 5), (["3d-64"], 2, 3)]
-        assert json.loads(first.stdout)["results"] == []
+FACTS = {"compile_s": 1.94, "device_bytes_per_particle": 104, "flowing": 0.66, "watch_share": 0.012}
+HALF = FACTS | {"particles": CASES[0].particles // 2}
 
 
 class TestReport:
-    fluid = CostResult(
-        CASES[0],
-        ("fluid",),
-        costs=(20e-9, 22e-9, 30e-9),
-        compile_seconds=1.94,
-        bytes_per_particle=104,
-        flowing=0.66,
-        watch_share=0.012,
-        smallest_step=CASES[0].step,
-        sound=True,
-    )
-    neo_hookean = replace(fluid, names=("neo_hookean",), costs=(30e-9, 33e-9, 40e-9))
-    corotated = replace(fluid, names=("fixed_corotated",), costs=(60e-9, 72.6e-9, 80e-9))
-    left = replace(fluid, names=("fluid", ""), costs=(21e-9, 23e-9, 24e-9))
-    right = replace(fluid, names=("", "neo_hookean"), costs=(30e-9, 32e-9, 34e-9))
-    mix = replace(fluid, names=("fluid", "neo_hookean"), costs=(25e-9, 27.5e-9, 34e-9))
+    fluid = figures_of("fluid", CASES[0], (20e-9, 22e-9, 30e-9), **FACTS)
+    neo_hookean = figures_of("neo_hookean", CASES[0], (30e-9, 33e-9, 40e-9), **FACTS)
+    corotated = figures_of("fixed_corotated", CASES[0], (60e-9, 72.6e-9, 80e-9), **FACTS)
+    left = figures_of("fluid,", CASES[0], (21e-9, 23e-9, 24e-9), **HALF)
+    right = figures_of(",neo_hookean", CASES[0], (30e-9, 32e-9, 34e-9), **HALF)
+    mix = figures_of("fluid,neo_hookean", CASES[0], (25e-9, 27.5e-9, 34e-9), **FACTS)
 
-    def report(self, *results: CostResult) -> CostReport:
+    def record(self, *results: dict) -> dict:
         results = results or (self.fluid, self.neo_hookean, self.corotated, self.left, self.right, self.mix)
-        return CostReport(results, (), 1, "f32", 1.0, {"processor": "A processor", "taichi": "1.7.4"})
+        return cost_record(results, [], BenchOptions()) | {"machine": {"processor": "A processor", "taichi": "1.7.4"}}
 
     def test_table(self) -> None:
-        lines = [" ".join(line.split()) for line in self.report().table().splitlines()]
+        lines = [" ".join(line.split()) for line in cost_table(self.record()).splitlines()]
         assert lines[0] == "A processor, cpu, 1 thread, f32, taichi 1.7.4"
         assert "2d-128 neo_hookean 33.0 30.0-40.0 1.50 1.00 104 1.9 66 % 1.2 %" in lines
         assert "2d-128 fluid + neo_hookean 27.5 25.0-34.0 1.00 1.9" in lines
-        assert "Beware" not in self.report().table()
+        assert "Beware" not in cost_table(self.record())
 
     def test_targets(self) -> None:
-        found = {target.text: (target.ratio.value, target.met) for target in self.report().targets}
+        found = {target["target"]: (target["ratio"], target["met"]) for target in self.record()["targets"]}
         assert found == {
             "fluid over the next cheapest, neo_hookean": (pytest.approx(2 / 3), True),
             "fixed_corotated over neo_hookean": (pytest.approx(2.2), False),
             "fluid + neo_hookean over the sum of its parts": (pytest.approx(1.0), True),
         }
-        said = self.report().table()
+        said = cost_table(self.record())
         assert "2d-128: fixed_corotated over neo_hookean: 2.200, should be at most 2, MISSED." in said
 
     def test_ratios_are_of_one_case(self) -> None:
-        other = replace(self.neo_hookean, case=CASES[1])
-        assert self.report(self.fluid, other).of(other, ("fluid",)) is None
+        other = self.neo_hookean | {"case": CASES[1].name}
+        assert self.record(self.fluid, other)["results"][1]["over_fluid"] is None
 
     def test_range_of_a_ratio_is_that_of_the_rounds(self) -> None:
-        ratio = self.report().of(self.neo_hookean, ("fluid",))
-        assert (ratio.low, ratio.high) == pytest.approx((4 / 3, 1.5))
+        (target,) = self.record(self.fluid, self.neo_hookean)["targets"]
+        assert (target["ratio_min"], target["ratio_max"]) == pytest.approx((2 / 3, 0.75))
 
     def test_table_warns_of_smaller_steps_and_of_a_run_that_broke_down(self) -> None:
-        said = self.report(replace(self.fluid, smallest_step=1e-5, sound=False)).table()
+        said = cost_table(self.record(self.fluid | {"smallest_step_s": 1e-5, "sound": False}))
         assert "Beware: the limits of fluid at 2d-128 asked for steps down to 1e-05 s, below the 4e-05 s" in said
         assert "Beware: fluid at 2d-128 broke down" in said
 
     def test_dictionary_is_json(self) -> None:
-        found = json.loads(json.dumps(self.report().as_dict()))
+        found = json.loads(json.dumps(self.record()))
         _, _, corotated, left, _, mix = found["results"]
         assert (left["laws"], left["share_of_column"], left["particles"]) == (["fluid"], 0.5, CASES[0].particles // 2)
         assert corotated["laws"] == ["fixed_corotated"]
@@ -367,7 +317,7 @@ class TestReport:
         script = importlib.util.module_from_spec(importlib.util.spec_from_loader("materials_table", loader))
         monkeypatch.setattr("sys.dont_write_bytecode", True)
         loader.exec_module(script)
-        lines = script.tables(self.report().as_dict()).splitlines()
+        lines = script.tables(self.record()).splitlines()
         assert lines[0].startswith("A processor, cpu, 1 thread, f32, Taichi 1.7.4; 36,864 particles in 2D.")
         assert "| `fixed_corotated` | 72.6 | 3.30 | 2.20 | 104 | 1.9 | 1.2 |" in lines
         assert "| `fluid` + `neo_hookean` | 27.5 | 1.00 |" in lines

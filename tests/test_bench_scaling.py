@@ -3,11 +3,19 @@
 import json
 
 import pytest
+from fake_contestant import FakeWorker
 
 from mpmcli.bench.cases import EDGE, BenchCase
-from mpmcli.bench.compare import Setting
-from mpmcli.bench.scaling import COUNTS, PER_CELL, case_of, peer_case_of, run_scaling
-from mpmcli.bench.scaling_report import ScalingReport, fitted_exponent
+from mpmcli.bench.compare import (
+    COUNTS,
+    PER_CELL,
+    case_of,
+    fitted_exponent,
+    peer_case_of,
+    run_scaling,
+    scaling_table,
+)
+from mpmcli.bench.side import BenchOptions, Setting
 from mpmcli.errors import RunError
 
 # Time of a step per particle on one thread, s, and bytes of a process of each particle.
@@ -15,34 +23,16 @@ EACH = {"ours": 4e-8, "yardstick": 2e-8, "peer": 16e-8}
 BYTES = 1000
 
 
-class FakeWorker:
-    """Answers like a contestant whose steps take a time proportional to the number of particles."""
-
-    start_seconds = 0.1
-
-    def __init__(self, who: str, case: BenchCase, setting: Setting) -> None:
-        self.case, self.step = case, EACH[who] * case.particles / setting.threads
-        self.ready = {"particles": case.particles, "bytes_per_particle": None, "threads": setting.threads}
-
-    def ask(self, command: str) -> dict:
-        match command.split():
-            case ["first"]:
-                return {"seconds": 1.0}
-            case ["run", _]:
-                return {"steps": 10, "seconds": 10 * self.step, "processor_seconds": 10 * self.step}
-        memory = 200_000_000 + BYTES * self.case.particles
-        return {"sound": True, "smallest_step": self.case.step, "peak_memory": memory}
-
-    def __enter__(self) -> "FakeWorker":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
+def started(who: str, case: BenchCase, setting: Setting) -> FakeWorker:
+    """Start a contestant whose steps take a time proportional to the number of particles."""
+    memory = 200_000_000 + BYTES * case.particles
+    each = EACH[who] * case.particles / setting.threads
+    return FakeWorker(who, each, case.particles, case.step, peak_memory=memory)
 
 
-def measured(**options) -> ScalingReport:
-    options = {"threads": (1,), "yardstick": True, "start": FakeWorker} | options
-    return run_scaling((3,), seconds=0.5, blocks=2, **options)
+def measured(threads: tuple[int, ...] = (1,), start=started, peers: bool = True, **others) -> dict:
+    options = BenchOptions(threads, 0.5, blocks=2, yardstick=True, peers=peers, start=start)
+    return run_scaling((3,), options, **others)
 
 
 class TestSizes:
@@ -66,9 +56,9 @@ class TestSizes:
 
 class TestRun:
     def test_exponents_and_ratios(self) -> None:
-        report = measured(counts=(10_000, 100_000), threads=(1, 2))
-        assert not report.flaws
-        found = json.loads(json.dumps(report.as_dict()))
+        record = measured(counts=(10_000, 100_000), threads=(1, 2))
+        found = json.loads(json.dumps(record))
+        assert not found["flaws"]
         assert [entry["exponent"] for entry in found["exponents"]] == pytest.approx([1.0] * 6)
         assert {(row["label"], row["threads"]): row["ns_per_particle_step"] for row in found["scaling"]} == {
             ("mpmcli", 1): pytest.approx(40),
@@ -78,7 +68,7 @@ class TestRun:
             ("C", 2): pytest.approx(10),
             ("mpm3d", 2): pytest.approx(80),
         }
-        rows = [" ".join(line.split()) for line in report.table().splitlines()]
+        rows = [" ".join(line.split()) for line in scaling_table(record).splitlines()]
         assert "3D, threads: 1" in rows
         assert "10,000 34 40.0 20.0 2.00" in rows
         assert "exponent 1.000 1.000 1.000" in rows
@@ -89,31 +79,31 @@ class TestRun:
 
         def start(*arguments) -> FakeWorker:
             now[0] += 5.0
-            return FakeWorker(*arguments)
+            return started(*arguments)
 
-        report = measured(counts=COUNTS[:4], budget=26.0, clock=lambda: now[0], start=start, peer=False)
-        assert sorted({result.case.particles for result in report.results}) == [10_000, 30_000]
-        assert report.flaws == (
+        record = measured(counts=COUNTS[:4], budget=26.0, clock=lambda: now[0], start=start, peers=False)
+        assert sorted({row["particles"] for row in record["scaling"]}) == [10_000, 30_000]
+        assert record["flaws"] == [
             "3d, 100,000 particles, 1 thread: left out, since the time would not suffice.",
             "3d, 300,000 particles, 1 thread: left out, since the time would not suffice.",
-        )
+        ]
 
     def test_sizes_beyond_the_memory_are_left_out(self) -> None:
         """Two contestants hold 1,000 bytes of each particle: 1e6 particles take 2e9 bytes, of 2e9 free ones."""
-        report = measured(counts=(100_000, 300_000, 1_000_000), free_memory=lambda: 2_000_000_000, peer=False)
-        assert sorted({result.case.particles for result in report.results}) == [100_000, 300_000]
-        assert report.flaws == ("3d, 1,000,000 particles, 1 thread: left out, since the memory would not suffice.",)
+        record = measured(counts=(100_000, 300_000, 1_000_000), free_memory=lambda: 2_000_000_000, peers=False)
+        assert sorted({row["particles"] for row in record["scaling"]}) == [100_000, 300_000]
+        assert record["flaws"] == ["3d, 1,000,000 particles, 1 thread: left out, since the memory would not suffice."]
 
     def test_one_that_fails_is_left_out_with_the_reason(self) -> None:
         def start(who: str, case: BenchCase, setting: Setting) -> FakeWorker:
             if who == "yardstick":
                 raise RunError("gcc fell over.")
-            return FakeWorker(who, case, setting)
+            return started(who, case, setting)
 
-        report = measured(counts=(10_000,), start=start)
-        assert [result.who for result in report.results] == ["ours", "peer"]
-        assert report.flaws == ("yardstick, 3d, 10,000 particles: gcc fell over.",)
-        assert report.exponents() == []
+        record = measured(counts=(10_000,), start=start)
+        assert [row["who"] for row in record["scaling"]] == ["ours", "peer"]
+        assert record["flaws"] == ["yardstick, 3d, 10,000 particles: gcc fell over."]
+        assert record["exponents"] == []
 
 
 def test_exponent_of_a_known_law() -> None:

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mpmcli.bench import yardstick
+from mpmcli.bench import peers
 from mpmcli.bench.cases import DENSITY, EDGE, BenchCase
 from mpmcli.errors import RunError
 
-needs_gcc = pytest.mark.skipif(not yardstick.is_here(), reason="gcc, which compiles the yardstick, is not here")
+needs_gcc = pytest.mark.skipif(not peers.is_here(), reason="gcc, which compiles the yardstick, is not here")
 # Cells enough that there are tiles of every colour, and steps enough that particles are sorted again.
 CASES = (
     BenchCase(dimension=2, cells=32, particles=1_500, step=8e-4),
@@ -52,7 +52,7 @@ def in_c(states: Callable, case: BenchCase) -> tuple[np.ndarray, np.ndarray]:
     return states(
         case,
         f"""
-from mpmcli.bench.yardstick import Yardstick
+from mpmcli.bench.peers import Yardstick
 found = []
 for threads in (3, 1):
     side = Yardstick(case, threads=threads, position=x, velocity=v, tension=True)
@@ -86,12 +86,12 @@ data["domain"]["walls"] = "slip"
 data["solver"]["walls"] = "zeroed"
 data["bodies"][0]["material"]["tension_cutoff"] = False
 particles = [replace(particles_of(case), velocity=v)]
-side = Ours(data, case.step, particles, threads=1, precision="f64", arch="cpu", batched=True, force=True)
+side = Ours(data, case.step, particles, threads=1, precision="f64", arch="cpu", force=True)
 # The yardstick's first step begins with a whole step of gravity, leapfrog with half a step.
-side.engine.begin()
-side.engine.state.last_step = case.step
+side.run.begin()
+side.run.state.last_step = case.step
 assert side.advance({STEPS}) == {STEPS}
-frame = side.engine.frame()[0]
+frame = side.run.frame()[0]
 np.savez("found.npz", x=frame.position, v=frame.velocity)
 """,
     )
@@ -108,36 +108,36 @@ np.savez("found.npz", x=frame.position, v=frame.velocity)
 
 @needs_gcc
 def test_source_compiles_without_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(yardstick, "FLAGS", (*yardstick.FLAGS, "-Wall", "-Wextra", "-Werror"))
+    monkeypatch.setattr(peers, "FLAGS", (*peers.FLAGS, "-Wall", "-Wextra", "-Werror"))
     for dimension in (2, 3):
-        yardstick.load_yardstick(dimension)
+        peers.load_yardstick(dimension)
 
 
 class TestWhereItCannotBe:
     def test_no_gcc_is_a_sentence(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("PATH", "/nowhere")
-        assert not yardstick.is_here()
+        assert not peers.is_here()
         with pytest.raises(RunError, match="needs gcc, which cannot be run"):
-            yardstick.load_yardstick(2)
+            peers.load_yardstick(2)
 
     @needs_gcc
     def test_what_gcc_says_is_in_the_sentence(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         broken = tmp_path / "broken.c"
         broken.write_text("#error that is no yardstick\n", encoding="utf-8")
-        monkeypatch.setattr(yardstick, "SOURCE", broken)
+        monkeypatch.setattr(peers, "YARDSTICK", broken)
         with pytest.raises(RunError, match="cannot compile the yardstick in C"):
-            yardstick.load_yardstick(2)
+            peers.load_yardstick(2)
 
     @pytest.mark.parametrize(("precision", "arch"), [("f64", "cpu"), ("f32", "cuda")])
     def test_other_precisions_and_devices_are_refused(self, precision: str, arch: str) -> None:
         with pytest.raises(RunError, match=f"not in {precision} on {arch}"):
-            yardstick.falling_block(CASES[0], threads=1, precision=precision, arch=arch)
+            peers.block_in_c(CASES[0], threads=1, precision=precision, arch=arch)
 
 
 @needs_gcc
 def test_denormal_numbers_stay() -> None:
     """A library linked with -ffast-math would flush them to zero in all of the process, as Taichi does in its own."""
     tell = "import numpy as np; print(np.array([5e-324])[0] * 1.0)"
-    program = f"from mpmcli.bench.yardstick import load_yardstick; load_yardstick(2); {tell}"
+    program = f"from mpmcli.bench.peers import load_yardstick; load_yardstick(2); {tell}"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "5e-324"

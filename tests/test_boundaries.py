@@ -7,10 +7,9 @@ import pytest
 import taichi as ti
 from solver_state import scene_of
 
-from mpmcli.solver import kernels
-from mpmcli.solver.nodes import NodeUpdate
-from mpmcli.solver.solver import Solver
-from mpmcli.solver.splines import PAD
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.transfer.node_update import NodeUpdate
+from mpmcli.solver.transfer.splines import PAD
 
 CELLS, FROM = 16, 8
 
@@ -29,10 +28,22 @@ class Plate:
         return result
 
 
+class WithPlate(NodeUpdate):
+    """A node update with the plate beside its own boundaries, in the view of each run, too."""
+
+    @property
+    def boundaries(self) -> tuple[object, ...]:
+        """All boundaries."""
+        return (*self._given, Plate())
+
+    @boundaries.setter
+    def boundaries(self, given: tuple[object, ...]) -> None:
+        self._given = given
+
+
 def test_a_boundary_acts_on_nodes_and_on_their_images(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     """Water slides along the floor into a plate: nodes and ghost nodes beyond it rest, and the others move."""
-    update = lambda grid, images, boundaries, *more: NodeUpdate(grid, images, [*boundaries, Plate()], *more)  # noqa: E731
-    monkeypatch.setattr(kernels, "NodeUpdate", update)
+    monkeypatch.setattr("mpmcli.solver.engine.batch.NodeUpdate", WithPlate)
     water = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}
     box = {"min": [0.2, 0.0], "max": [0.8, 0.3]}
     scene = scene_of(
@@ -40,9 +51,9 @@ def test_a_boundary_acts_on_nodes_and_on_their_images(backend_of: Callable, monk
         time={"end": 1.0, "frames": 1},
         bodies=[{"name": "water", "material": water, "shape": {"box": box}, "velocity": [1.0, 0.0]}],
     )
-    solver = Solver(scene, backend_of("f32"))
-    solver.step(1e-3)
-    nodes = solver.grid.nodes.to_numpy().reshape(*solver.grid.shape, -1)
+    run = build_run(scene, backend_of("f32"))
+    run.step(1e-3)
+    nodes = run.grid.nodes.to_numpy().reshape(*run.grid.shape, -1)
     speed = np.linalg.norm(nodes[..., :2], axis=-1)
     # The nodes within the block, the ghost nodes behind the floor, and those on and above it.
     for rows in (slice(PAD - 2, PAD), slice(PAD, PAD + 4)):

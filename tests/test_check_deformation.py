@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scenes import block, scene
 
-from mpmcli.check.deformation import deformation_rate
-from mpmcli.check.scene_limits import scene_limits
+from mpmcli.check.scene_limits import deformation_rate, scene_limits
 from mpmcli.scene import scene_bounds
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 MATERIALS = {
     "fluid": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},
@@ -27,7 +26,7 @@ def test_check_and_solver_count_deformation_alike(backend_of: Callable, dimensio
         asked = scene([8] * dimension, 0.1, [body], end=1.0, precision="f64")
         told, taken = (
             next(limit for limit in limits if limit.name == "deformation")
-            for limits in (scene_limits(asked, scene_bounds(asked)), Solver(asked, backend).limits())
+            for limits in (scene_limits(asked, scene_bounds(asked)), build_run(asked, backend).limits())
         )
         assert told.state == "rest" and told.value == pytest.approx(taken.value, rel=1e-12)
 

@@ -17,11 +17,11 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.output import SegmentStore, VtkSeriesStore
 from mpmcli.output.layout import FrameLayout
 from mpmcli.scene import scene_to_toml
-from mpmcli.solver.batch_run import BatchRun
-from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError
-from mpmcli.solver.ordering import entry_count
-from mpmcli.solver.plan import make_plan
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import Diagnosis, UnstableRunError
+from mpmcli.solver.machine.plan import make_plan
+from mpmcli.solver.particles.sort import entry_count
 
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e7, "friction_angle": 30.0}
 WALLS = {"walls": "separate"}
@@ -81,8 +81,8 @@ def test_a_run_takes_what_was_forecast(backend_of: Callable, tmp_path: Path, cas
     checked = check_scene(scene, plan=make_plan(scene.scene, backend))
     forecast = checked.forecast
     before = fields()
-    solver = Solver(scene.scene, backend)
-    frames = solver.frames()
+    run = build_run(scene.scene, backend)
+    frames = run.frames()
     first = next(frames)
     known = {id(field) for field in before}
     taken = sum(bytes_of(field) for field in fields() if id(field) not in known and field.snode.ptr is not None)
@@ -97,9 +97,9 @@ def test_a_run_takes_what_was_forecast(backend_of: Callable, tmp_path: Path, cas
             store.write(frame, row)
     assert layout_of(scene.scene) == FrameLayout.of(written[0][0])
     assert forecast.frames == len(written)
-    assert forecast.steps == pytest.approx(solver.step_count, abs=2)
+    assert forecast.steps == pytest.approx(run.step_count, abs=2)
     low, high = forecast.steps_range
-    assert low <= solver.step_count <= high
+    assert low <= run.step_count <= high
     assert forecast.file_bytes == pytest.approx(stores[0].finish().stat().st_size, rel=0.05)
     series = sum(path.stat().st_size for path in (tmp_path / "series").glob("*.vtu"))
     assert forecast.vtk_bytes == pytest.approx(series, rel=0.05)
@@ -112,7 +112,7 @@ def test_the_layout_is_that_of_a_frame(backend_of: Callable) -> None:
         for corner in body["shape"]["box"].values():
             corner[0] += 1e5
     scene = loaded(bodies, domain={"origin": [1e5, 0.0]}, output={"fields": EVERYTHING}).scene
-    frame, _ = Solver(scene, backend_of("f32")).frame()
+    frame, _ = build_run(scene, backend_of("f32")).frame()
     assert layout_of(scene) == FrameLayout.of(frame)
     assert layout_of(scene).arrays["Points"].dtype == "float64"
 
@@ -173,10 +173,10 @@ def test_the_command_probes_and_writes_nothing(tmp_path: Path, monkeypatch: pyte
     assert forecast["seconds"] > forecast["steps"] * forecast["step_seconds"] + forecast["compile_seconds"] > 0
     assert list(tmp_path.iterdir()) == [path]
 
-    def broken(self: BatchRun, count: int) -> tuple[int, float]:
+    def broken(self: Run, count: int) -> tuple[int, float]:
         raise UnstableRunError(Diagnosis(1, 0.1, 7, "drop", (0.5, 0.5), "went to pieces", "wave", 0.1, "look at it"))
 
-    monkeypatch.setattr(BatchRun, "advance", broken)
+    monkeypatch.setattr(Run, "advance", broken)
     outcome = run_here("check", path, "--threads", "2")
     assert outcome.status == 1
     assert "error: The run became unstable within 0 steps of the probe: the run became unstable" in outcome.stdout

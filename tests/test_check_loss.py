@@ -12,16 +12,16 @@ from solver_state import scene_of
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import expected_steps
-from mpmcli.check.loss_rules import NOTED_SHARE, chord, flow_width
 from mpmcli.check.scene_check import check_scene
+from mpmcli.check.step_rules import NOTED_SHARE, chord, flow_width
 from mpmcli.scene import LoadedScene, Scene
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.scene.shapes import Ball, Box, Polygon
-from mpmcli.solver.engine import build_engine
+from mpmcli.solver.engine.build import build_run
 from mpmcli.stability.transfer_factors import impact_loss
 from mpmcli.validation.carry_out import scene_of as scene_of_case
+from mpmcli.validation.case import Setting
 from mpmcli.validation.cases.two_disks import CASES as TWO_DISKS
-from mpmcli.validation.setting import Setting
 
 DENSITY, SOUND, NU = 1000.0, 20.0, 0.1
 
@@ -87,7 +87,7 @@ def test_a_viscous_flow_is_as_slow_as_foretold(backend_of: Callable, cells: int,
     k = math.pi
     assert finding.value == pytest.approx(0.024 * (k / cells) ** 4 / (step * k**2) / NU)
     assert finding.severity == "note"
-    *_, (frame, _) = build_engine(scene, backend_of("f64", 1), batched=True).frames(lambda: False)
+    *_, (frame, _) = build_run(scene, backend_of("f64", 1)).frames()
     middle = np.abs(frame.position[:, 0] - np.median(frame.position[:, 0])) < 0.5
     expected = driven(frame.position[middle, 1], scene.time.end)
     slow = 1 - frame.velocity[middle, 0].mean() / expected.mean()
@@ -136,7 +136,7 @@ def test_an_impact_loses_what_was_foretold(backend_of: Callable, cells: int, saf
     finding, other = told(scene, "impact-loss")
     assert (finding.body, other.body, finding.severity) == ("left", "right", "note")
     assert finding.value == pytest.approx(other.value)
-    rows = [row for _, row in build_engine(scene, backend_of("f64", 1), batched=True).frames(lambda: False)]
+    rows = [row for _, row in build_run(scene, backend_of("f64", 1)).frames()]
     lost = 1 - rows[-1].energy / rows[0].energy
     assert lost / 1.5 < finding.value < 1.5 * lost
 
@@ -146,7 +146,7 @@ def test_disks_that_collide_lose_what_was_foretold(backend_of: Callable) -> None
     case = TWO_DISKS[0]
     scene = scene_of_case(case, 20, Setting())
     finding, _ = told(scene, "impact-loss")
-    frames = list(build_engine(scene, backend_of("f64", 1), batched=True).frames(lambda: False))
+    frames = list(build_run(scene, backend_of("f64", 1)).frames())
     lost = case.measure(20, scene, iter(frames))["energy loss"]
     assert lost / 2 < finding.value < 2 * lost
 

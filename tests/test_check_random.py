@@ -7,10 +7,10 @@ from random_drives import LAWS, random_scene
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.batch import Batch
-from mpmcli.solver.batch_kind import Kind
-from mpmcli.solver.batch_run import BatchRun
-from mpmcli.solver.engine import build_engine
+from mpmcli.solver.engine.batch import Batch
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.run import Run
 
 # The predicted step may be this much larger than the smallest one taken.
 OPTIMISTIC = 1.1
@@ -22,12 +22,12 @@ def test_safe_throughout_is_not_optimistic(backend_of: Callable) -> None:
     scenes = [scene for scene in scenes if scene.bodies[0].deformation is not None]
     # Walls of one kind, so that one kernel does.
     scenes = [scene for scene in scenes if scene.domain.walls == scenes[0].domain.walls][:5]
-    kinds = [Kind.of(scene, sample_bodies(scene)) for scene in scenes]
+    kinds = [CompiledKind.of(scene, sample_bodies(scene)) for scene in scenes]
     kind = kinds[0]
     for more in kinds[1:]:
         kind = kind.joined(more)
     batch = Batch(kind, backend_of("f32", 1), len(scenes))
-    streams = {k: BatchRun(batch, k, scene).events() for k, scene in enumerate(scenes)}
+    streams = {k: Run(batch, k, scene).events() for k, scene in enumerate(scenes)}
     smallest = {}
     while streams:
         for k, stream in list(streams.items()):
@@ -51,8 +51,8 @@ def test_200_random_scenes_are_forecast(backend_of: Callable, record_property: C
             # What was built on the one before is freed.
             backend = backend_of("f32", 1)
         scene = random_scene(seed)
-        engine = build_engine(scene, backend, batched=True)
-        rows = [row for _, row in engine.frames(lambda: False)]
+        run = build_run(scene, backend)
+        rows = [row for _, row in run.frames()]
         ratio = SceneFacts(scene).step / rows[-1].step_min
         if ratio > OPTIMISTIC:
             above.append((seed, ratio))

@@ -10,7 +10,7 @@ from check_scenes import FLUID, SOLID, box, check, found, loaded
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import SEVERITIES
-from mpmcli.check.rounding_rules import HALF_ULP, LOST_MOTION, STRESS_NOISE
+from mpmcli.check.step_rules import HALF_ULP, LOST_MOTION, STRESS_NOISE
 from mpmcli.materials.registry import laws
 
 H = 1 / 64
@@ -54,12 +54,12 @@ def test_a_step_that_only_rest_allows() -> None:
     """Between what is safe at the start and what is safe throughout, the run will take smaller ones."""
     material = FLUID | {"tension_cutoff": False}
     checked = check(material=material)
-    assert checked.step < checked.step_at_start
+    assert checked.facts.step < checked.facts.step_at_start
     (finding,) = found(
-        "step-above-safety", material=material, time={"step": 0.5 * (checked.step + checked.step_at_start)}
+        "step-above-safety", material=material, time={"step": 0.5 * (checked.facts.step + checked.facts.step_at_start)}
     )
     assert "J = " in finding.what
-    assert found("step-above-safety", material=material, time={"step": 0.999 * checked.step}) == []
+    assert found("step-above-safety", material=material, time={"step": 0.999 * checked.facts.step}) == []
 
 
 @pytest.mark.parametrize(("cells", "fires"), [(0.9, True), (2.9, True), (3.0, False)])
@@ -263,5 +263,5 @@ def test_findings_are_sentences_and_sorted() -> None:
 def test_a_law_declares_the_parameters_that_set_its_stiffness(monkeypatch: pytest.MonkeyPatch) -> None:
     """The fix of the wave limit names the first of `Law.stiffness_parameters`, with its value."""
     monkeypatch.setattr(laws()["fluid"], "stiffness_parameters", ("unknown", "density"))
-    (limit,) = (one for one in check().limits if (one.name, one.state) == ("wave", "rest"))
+    (limit,) = (one for one in check().facts.limits if (one.name, one.state) == ("wave", "rest"))
     assert limit.fix.startswith("A quarter of density = 1000 or ")

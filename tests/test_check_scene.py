@@ -17,8 +17,8 @@ from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import load_scene, scene_bounds
 from mpmcli.scene.presets import PRESETS
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.stability.limits import COURANT, DEFORMATION
 
 H = 1 / 64
@@ -28,7 +28,7 @@ LIGHT = {"law": "neo_hookean", "density": 2.0, "youngs_modulus": 100.0, "poisson
 
 def limit(checked: SceneCheck, name: str, state: str, body: str = "block") -> float:
     """Return the value of one limit."""
-    (value,) = [one.value for one in checked.limits if (one.name, one.state, one.body) == (name, state, body)]
+    (value,) = [one.value for one in checked.facts.limits if (one.name, one.state, one.body) == (name, state, body)]
     return value
 
 
@@ -37,11 +37,11 @@ def test_a_fluid_is_bounded_by_its_sound() -> None:
     checked = check()
     c = math.sqrt(FLUID["bulk_modulus"] / FLUID["density"])
     assert limit(checked, "wave", "rest") == pytest.approx(H / (c * math.sqrt(2)))
-    (stiffest,) = [one for one in checked.limits if (one.name, one.state) == ("wave", "stiffest")]
+    (stiffest,) = [one for one in checked.facts.limits if (one.name, one.state) == ("wave", "stiffest")]
     v = math.sqrt(2 * 10 * 0.25)
     assert stiffest.bound.volume_ratio_min == pytest.approx(1 / (1 + v / c + 10 * 0.25 / c**2))
-    assert checked.binding.state == checked.binding_at_start.state == "rest"
-    assert checked.step == checked.step_at_start == pytest.approx(0.8 * H / (c * math.sqrt(2)))
+    assert checked.facts.binding.state == checked.facts.binding_at_start.state == "rest"
+    assert checked.facts.step == checked.facts.step_at_start == pytest.approx(0.8 * H / (c * math.sqrt(2)))
 
 
 def test_a_fluid_with_tension_opens_and_becomes_stiffer() -> None:
@@ -50,7 +50,7 @@ def test_a_fluid_with_tension_opens_and_becomes_stiffer() -> None:
     c = math.sqrt(FLUID["bulk_modulus"] / FLUID["density"])
     J = 1 + math.sqrt(2 * 10 * 0.25) / c + 10 * 0.25 / c**2
     assert limit(checked, "wave", "stiffest") == pytest.approx(H / (c * math.sqrt(2 * J)))
-    assert checked.binding.state == "stiffest"
+    assert checked.facts.binding.state == "stiffest"
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -70,8 +70,8 @@ def test_viscosity_and_waves_share_the_step() -> None:
     checked = check(material=FLUID | {"viscosity": 1e4})
     nu = 10.0
     assert limit(checked, "viscosity", "rest") == pytest.approx(H**2 / (4 * nu))
-    assert checked.binding_at_start.name == "viscosity"
-    assert "viscosity" in checked.binding_at_start.fix
+    assert checked.facts.binding_at_start.name == "viscosity"
+    assert "viscosity" in checked.facts.binding_at_start.fix
 
 
 def test_the_speed_is_that_of_the_fall_and_its_jets() -> None:
@@ -88,10 +88,10 @@ def test_a_bound_says_what_binds_and_in_which_state() -> None:
     """Snow that is thrown hardens, and the limit names what it becomes, with numbers of this scene."""
     snow = {"law": "snow", "density": 400.0, "hardening_limit": 10.0}
     checked = check(material=snow, shape=box([0.25, 0.25], [0.5, 0.5]), velocity=[5.0, 0.0])
-    binding = checked.binding
+    binding = checked.facts.binding
     assert (binding.name, binding.body, binding.state) == ("wave", "block", "stiffest")
     # Packed to its limit it is ten times as stiff; its elastic part gives a little more.
-    assert 9.0 <= (checked.step_at_start / checked.step) ** 2 <= 12.0
+    assert 9.0 <= (checked.facts.step_at_start / checked.facts.step) ** 2 <= 12.0
     assert binding.bound.internal["plastic_volume_ratio"][0] == pytest.approx(1 - math.log(10) / 10, rel=1e-3)
     assert "plastic_volume_ratio" in binding.meaning
     assert "youngs_modulus" in binding.fix
@@ -120,11 +120,11 @@ def test_a_dense_body_packs_snow_harder() -> None:
 def test_the_first_step_is_the_solvers(backend_of: Callable, material: dict, velocity: float) -> None:
     """The solver measures its state and comes to the same step, where waves bind and where the speed does."""
     scene = loaded(material=material, velocity=[velocity, 0.0], solver={"precision": "f64"})
-    step, binding = Solver(scene.scene, backend_of("f64", 1)).stable_step()
+    step, binding = build_run(scene.scene, backend_of("f64", 1)).stable_step()
     checked = check_scene(scene)
-    assert checked.step_at_start == pytest.approx(step, rel=1e-9)
-    assert checked.binding_at_start.name == binding.name
-    assert checked.step <= checked.step_at_start
+    assert checked.facts.step_at_start == pytest.approx(step, rel=1e-9)
+    assert checked.facts.binding_at_start.name == binding.name
+    assert checked.facts.step <= checked.facts.step_at_start
 
 
 MPM88 = """\
@@ -161,7 +161,7 @@ def test_mpm88_is_called_right(backend_of: Callable, tmp_path, cells: int, stabl
         assert f"{courant:.3f}" in errors[0].what and "0.707" in errors[0].what
     outcome = run_here("check", path, "--no-probe", "--json")
     assert (outcome.status, json.loads(outcome.stdout)["ok"]) == (0 if stable else 1, stable)
-    solver = Solver(scene.scene, backend_of("f32"), force=True)
+    solver = build_run(scene.scene, backend_of("f32"), force=True)
     start = solver.frame()[1].energy
 
     def run() -> None:
@@ -183,7 +183,7 @@ def test_every_config_passes(path) -> None:
     checked = check_scene(scene)
     assert [finding.line for finding in checked.findings if finding.severity != "note"] == []
     assert checked.passes(strict=True)
-    assert 0 < checked.step <= checked.step_at_start
+    assert 0 < checked.facts.step <= checked.facts.step_at_start
     low, high = checked.forecast.steps_range
     assert low <= checked.forecast.steps <= high
 
@@ -235,7 +235,7 @@ def test_the_binding_step_is_the_smallest() -> None:
     """safety times the smallest bound, whatever the scene."""
     for keywords in ({}, {"material": SOLID}, {"velocity": [30.0, 0.0]}):
         checked = check(**keywords)
-        assert checked.step == 0.8 * min(one.value for one in checked.limits)
+        assert checked.facts.step == 0.8 * min(one.value for one in checked.facts.limits)
         assert scene_bounds(loaded(**keywords).scene).speed > 0
     assert found("step-above-limit") == []
 
@@ -270,10 +270,10 @@ def test_any_scene_can_be_checked(
             check_scene(scene)
         return
     checked = check_scene(scene)
-    assert 0 < checked.step <= checked.step_at_start
+    assert 0 < checked.facts.step <= checked.facts.step_at_start
     low, high = checked.forecast.steps_range
     assert low <= checked.forecast.steps <= high
     assert json.loads(json.dumps(checked.as_dict()))["ok"] == checked.passes()
     for finding in checked.findings:
         assert finding.what.endswith(".") and finding.fix.endswith(".") and "nan" not in finding.line
-    assert checked.title in checked.text()
+    assert checked.loaded.scene.title in checked.text()

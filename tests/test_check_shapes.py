@@ -9,9 +9,8 @@ from check_scenes import FLUID, box, loaded
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mpmcli.check.distance import close_pairs, distance_between
-from mpmcli.check.extent import RESOLUTION, thickness
-from mpmcli.check.flight import arrivals
+from mpmcli.check.facts import arrivals
+from mpmcli.check.geometry import RESOLUTION, close_pairs, distance_between, thickness
 from mpmcli.scene.shapes import Ball, Box, Capsule, Cylinder, Form, Polygon
 
 H = 1 / 64

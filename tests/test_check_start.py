@@ -7,8 +7,8 @@ import pytest
 from check_scenes import FLUID, SOLID, box, check, loaded
 
 from mpmcli.check.facts import SceneFacts
-from mpmcli.check.start import starts_of
-from mpmcli.solver.solver import Solver
+from mpmcli.check.scene_limits import Start, starts_of
+from mpmcli.solver.engine.build import build_run
 
 FREE = {"domain": {"gravity": [0.0, 0.0]}, "shape": box([0.3, 0.3], [0.5, 0.5])}
 SUCKING = FLUID | {"tension_cutoff": False}
@@ -27,9 +27,9 @@ def test_the_first_step_is_the_run_s(name: str, backend_of: Callable) -> None:
     asked = FREE | CASES[name]
     checked = check(**asked)
     backend = backend_of("f64")
-    solver = Solver(loaded(**asked, solver={"precision": "f64"}).scene, backend)
-    assert checked.step_at_start == pytest.approx(solver.stable_step()[0], rel=1e-9)
-    assert checked.step <= checked.step_at_start
+    run = build_run(loaded(**asked, solver={"precision": "f64"}).scene, backend)
+    assert checked.facts.step_at_start == pytest.approx(run.stable_step()[0], rel=1e-9)
+    assert checked.facts.step <= checked.facts.step_at_start
     assert "at-rest" not in [finding.rule for finding in checked.findings]
 
 
@@ -38,7 +38,7 @@ def test_deformation_is_found_where_particles_are() -> None:
     start = starts_of(loaded(**FREE, material=SUCKING, deformation="3 if abs(X - 0.30390625) < 1e-4 else 1").scene)[0]
     assert (start.bound.volume_ratio_min, start.bound.volume_ratio_max) == (1.0, 3.0)
     nowhere = starts_of(loaded(**FREE, material=SUCKING, deformation="3 if abs(X - 0.3) < 1e-4 else 1").scene)[0]
-    assert not nowhere.deformed
+    assert nowhere == Start()
 
 
 def test_stored_energy_becomes_speed() -> None:

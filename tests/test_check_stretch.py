@@ -11,13 +11,13 @@ from solver_state import scene_of
 
 from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_check import ResultCheck, check_kept
-from mpmcli.check.result_stretch import StretchCheck
+from mpmcli.check.result_state import StretchCheck
 from mpmcli.check.scene_check import check_scene
 from mpmcli.frames.frame import Frame
 from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import LoadedScene, Scene, sample_bodies, scene_to_toml
-from mpmcli.solver.engine import build_engine
+from mpmcli.solver.engine.build import build_run
 
 H, LENGTH = 0.1, 0.8
 SOUND = math.sqrt(SOLID["youngs_modulus"] / SOLID["density"])
@@ -51,7 +51,7 @@ def header_of(scene: Scene, law: str = "neo_hookean") -> RunHeader:
 
 def pulled(scene: Scene, backend_of: Callable) -> tuple[ResultCheck, list[Frame]]:
     """Return the check of a run, and its frames."""
-    run = list(build_engine(scene, backend_of("f64", 1), batched=True).frames(lambda: False))
+    run = list(build_run(scene, backend_of("f64", 1)).frames())
     frames = [frame for frame, _ in run]
     return check_kept(header_of(scene), frames, [row for _, row in run]), frames
 

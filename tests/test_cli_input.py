@@ -112,7 +112,7 @@ def test_a_bad_option_is_refused_with_one_sentence(refused, fault):
 
 
 def test_a_backend_that_is_not_there_is_refused(refused, monkeypatch):
-    monkeypatch.setattr("mpmcli.solver.backend._has", lambda arch: arch == "cpu")
+    monkeypatch.setattr("mpmcli.solver.machine.backend.backend_is_here", lambda arch: arch == "cpu")
     said = refused("simulate", "scene.toml", "--arch", "cuda")
     assert said == "--arch cuda needs a device that this machine does not have; use --arch cpu."
 
@@ -123,7 +123,7 @@ def test_a_backend_that_is_not_there_is_refused(refused, monkeypatch):
         (["simulat"], 'there is no command "simulat"; did you mean "simulate"? See mpmcli --help.'),
         (
             ["paint"],
-            'there is no command "paint"; the commands are simulate, check, sweep, dataset, info, ',
+            'there is no command "paint"; the commands are simulate, check, warm, sweep, dataset, ',
         ),
         (["--verbose"], "no such option '--verbose'"),
         (["simulate"], "missing argument 'SCENE'. See mpmcli simulate --help."),
@@ -155,9 +155,9 @@ def test_too_many_particles_are_refused_before_any_is_made(refused, monkeypatch)
     def unreachable(*_: object) -> None:
         raise AssertionError("particles were made")
 
-    monkeypatch.setattr("mpmcli.simulation.simulate.build_engine", unreachable)
+    monkeypatch.setattr("mpmcli.simulation.simulate.build_run", unreachable)
     said = refused("simulate", "scene.toml", scene=HUGE)
-    assert said.startswith("scene.toml: The scene needs 1e+12 particles and 1e+12 grid nodes, 17")
+    assert said.startswith("scene.toml: The scene needs 1e+12 particles and 1.03e+12 grid nodes, 17")
     assert " TB of memory, and " in said and said.endswith("fewer particles_per_cell needs less.")
 
 

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from mpmcli.cli.progress_bar import ProgressBar
+from mpmcli.cli.progress import ProgressBar
 
 
 class ClosedPipe(io.StringIO):

@@ -15,7 +15,7 @@ from PIL import Image
 
 from mpmcli.output import Result, VtkSeriesStore, open_result
 from mpmcli.output.segments import SEGMENTS
-from mpmcli.render.files.picture_file import settings_digest, write_picture
+from mpmcli.render.picture_file import settings_digest, write_picture
 from mpmcli.render.request import Request, plan_render
 
 pytestmark = pytest.mark.usefixtures("drawing")

@@ -10,7 +10,7 @@ from drawn_results import WATER, frame, header, row
 
 from mpmcli.output import SegmentStore, VtkSeriesStore, open_result, prepare_directory
 from mpmcli.output.collider_files import MOVING, RESTING, RESTING_PIECE, SERIES
-from mpmcli.scene import form_surface
+from mpmcli.scene import surface as scene_surface
 from mpmcli.scene.colliders import Collider
 
 BALL = {"name": "ball", "shape": {"ball": {"center": [0.3, 0.5, 0.5], "radius": 0.1}}, "velocity": [2.0, 0.0, 0.0]}
@@ -104,7 +104,7 @@ def test_what_was_read_from_a_file_is_drawn_without_it(tmp_path: Path, monkeypat
     import pyvista as pv
 
     # Half as many cells along the shell take an eighth of the time.
-    monkeypatch.setattr(form_surface, "level_surface", partial(form_surface.level_surface, cells=48))
+    monkeypatch.setattr(scene_surface, "level_surface", partial(scene_surface.level_surface, cells=48))
     pv.Sphere(radius=0.1, center=(0.3, 0.5, 0.5), theta_resolution=60, phi_resolution=60).save(tmp_path / "ball.stl")
     ring = {"mesh": {"file": "ball.stl"}, "subtract": [{"ball": {"center": [0.3, 0.5, 0.5], "radius": 0.06}}]}
     tables = [GROUND, {**BALL, "shape": {"mesh": {"file": "ball.stl"}}}, {**GROUND, "name": "shell", "shape": ring}]

@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from mpmcli.scene.collider_surface import collider_surface
 from mpmcli.scene.colliders import Collider
-from mpmcli.scene.form_surface import form_surface, level_surface
-from mpmcli.scene.surface import Surface
-from mpmcli.scene.surface_points import surface_points
+from mpmcli.scene.surface import Surface, collider_surface, form_surface, level_surface, surface_points
 
 LOWER, UPPER = np.zeros(3), np.ones(3)
 

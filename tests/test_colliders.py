@@ -8,13 +8,11 @@ import pytest
 import taichi as ti
 from solver_state import scene_of, with_colliders
 
-from mpmcli.boundaries.collider_kind import ColliderKind
-from mpmcli.boundaries.colliders import Colliders
+from mpmcli.boundaries.colliders import ColliderKind, Colliders
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene
-from mpmcli.solver.engine import build_engine
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 G = 10.0
 JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e6, "poissons_ratio": 0.3}
@@ -37,7 +35,7 @@ SHAPES_3D = [
 
 def run(scene: Scene, backend: object) -> list[tuple[Frame, LedgerRow]]:
     """Return the frames of a scene, run as `mpmcli simulate` does on the CPU."""
-    return list(build_engine(scene, backend, batched=True).frames(lambda: False))
+    return list(build_run(scene, backend).frames())
 
 
 @ti.kernel
@@ -326,7 +324,7 @@ def test_a_collider_at_speed_limits_the_step(backend_of: Callable) -> None:
         bodies=[{"name": "b", "material": JELLY, "shape": {"box": {"min": [0.1, 0.1], "max": [0.2, 0.2]}}}],
         colliders=[blade],
     )
-    solver = Solver(scene, backend_of("f64", 1))
+    solver = build_run(scene, backend_of("f64", 1))
     limit = {one.name: one for one in solver.limits()}["collider"]
     assert limit.value == pytest.approx(0.5 * 0.05 / (500 * math.hypot(0.4, 0.05)))
     assert run(scene, solver.backend)[-1][1].limit == "collider"

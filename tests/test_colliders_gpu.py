@@ -1,4 +1,4 @@
-"""A solver on a GPU meets colliders as one on the CPU does."""
+"""A run on a GPU meets colliders as one on the CPU does."""
 
 from collections.abc import Callable
 
@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from test_batch import scene_named
 
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 pytestmark = pytest.mark.gpu
 
 
-def test_a_solver_on_a_gpu_follows_the_cpu(backend_of: Callable) -> None:
+def test_a_run_on_a_gpu_follows_the_cpu(backend_of: Callable) -> None:
     """A hundred equal steps between colliders at rest and moving: positions to round-off, forces to 1e-3."""
     scene = scene_named("colliders")
     found = []
     for arch in ("vulkan", "cpu"):
-        solver = Solver(scene, backend_of("f32", 1, arch))
+        run = build_run(scene, backend_of("f32", 1, arch))
         for _ in range(100):
-            solver.step(2e-4)
-        frame, row = solver.frame()
+            run.step(2e-4)
+        frame, row = run.frame()
         found.append((frame.position, np.array(row.collider_force), np.array(row.collider_torque)))
     (position, force, torque), (expected, expected_force, expected_torque) = found
     assert np.abs(position - expected).max() < 100 * np.finfo(np.float32).eps

@@ -12,16 +12,13 @@ import pyvista as pv
 from changed_result import changed
 from fuzzing.seeds import datasets, results
 
-from mpmcli.dataset.manifest import Manifest
+from mpmcli.dataset.folder import Manifest
 from mpmcli.errors import InputError
 from mpmcli.output import open_result, read_record
-from mpmcli.output.guarded_read import read_rows, read_whole
-from mpmcli.output.hdf5_heaps import require_sound_heaps
-from mpmcli.output.hdf5_items import DamageError
+from mpmcli.output.guarded_read import DamageError, read_rows, read_whole, require_sound_heaps
 from mpmcli.plain_text import escaped
 from mpmcli.scene.geometry_file import GeometryFileError, read_geometry
-from mpmcli.scene.overrides import apply_overrides
-from mpmcli.scene.tables import copied, too_deep
+from mpmcli.scene.toml_file import apply_overrides, copied, too_deep
 
 
 def placed(directory: Path, files: dict[str, bytes]) -> Path:

@@ -13,7 +13,7 @@ from PIL import Image
 import mpmcli.dataset
 from mpmcli.dataset.montage import TrajectoryCells, plan_montage, write_montage
 from mpmcli.errors import InputError
-from mpmcli.render.painter import set_up
+from mpmcli.render.pictures import set_up
 from mpmcli.render.render_scene import render_scene_of
 from mpmcli.render.request import Request
 from mpmcli.render.settings import Settings

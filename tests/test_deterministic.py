@@ -9,20 +9,16 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import taichi as ti
-from solver_state import scene_of
-from test_batch import same, scene_named
+from solver_state import masses_of, scene_of
+from test_batch import batch_of, outputs_of, same, scene_named
 
-from mpmcli.errors import InputError
-from mpmcli.scene import BodyParticles, Scene
-from mpmcli.simulation.runner import _keeps
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.batch import Batch
-from mpmcli.solver.batch_kind import Kind
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.fixed_point import DENSEST
-from mpmcli.solver.fixed_sums import FixedSums
-from mpmcli.solver.plan import make_plan
-from mpmcli.solver.solver import Solver
+from mpmcli.scene import BodyParticles, Scene, sample_bodies
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import UnstableRunError, read_group
+from mpmcli.solver.grid.fixed_point import DENSEST, FixedSums
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.machine.plan import make_plan
 
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5}
 JELLY = {"law": "neo_hookean", "density": 900.0, "youngs_modulus": 5e4, "poissons_ratio": 0.47}
@@ -71,11 +67,11 @@ def mixed(
 
 def twice(scene: Scene, backend: Backend) -> tuple[list, list]:
     """Return the frames and ledger rows of two runs, with kernels compiled once."""
-    solver = Solver(scene, backend)
-    begin = solver.state.save()
-    first = list(solver.frames())
-    solver.state.load(begin)
-    return first, list(solver.frames())
+    run = build_run(scene, backend)
+    begin = run.save().copied()
+    first = list(run.frames())
+    run.load(begin)
+    return first, list(run.frames())
 
 
 @pytest.mark.gpu
@@ -92,7 +88,7 @@ def test_two_runs_on_vulkan_have_the_same_bytes(
     first, second = twice(scene, backend_of("f32", 1, "vulkan"))
     assert list(same(first, second)) == []
     assert first[-1][0].step > 20
-    expected = list(Solver(scene, backend_of("f32", 1)).frames())
+    expected = list(build_run(scene, backend_of("f32", 1)).frames())
     assert np.abs(first[-1][0].position - expected[-1][0].position).max() < 1e-5
 
 
@@ -102,7 +98,7 @@ def test_two_runs_on_threads_have_the_same_bytes(backend_of: Callable, precision
     scene = mixed(2, precision=precision, transfer="aflip")
     first, second = twice(scene, on_gpu_path(backend_of(precision, 3)))
     assert list(same(first, second)) == []
-    expected = list(Solver(scene, backend_of(precision, 1)).frames())
+    expected = list(build_run(scene, backend_of(precision, 1)).frames())
     error = np.abs(first[-1][0].position - expected[-1][0].position).max()
     assert error < {"f32": 1e-5, "f64": 1e-12}[precision]
 
@@ -116,7 +112,7 @@ def test_every_sum_has_the_same_bytes(backend_of: Callable, name: str) -> None:
     scene = scene.model_copy(update={"solver": scene.solver.model_copy(update={"deterministic": True})})
     first, second = twice(scene, backend_of("f32", 1, "vulkan"))
     assert list(same(first, second)) == []
-    expected = list(Solver(scene, backend_of("f32", 1)).frames())
+    expected = list(build_run(scene, backend_of("f32", 1)).frames())
     for (frame, row), (other, other_row) in zip(first, expected, strict=True):
         assert np.abs(frame.position - other.position).max() < 60 * np.finfo(np.float32).eps
         assert np.allclose(row.collider_force, other_row.collider_force, rtol=1e-3, atol=1e-3)
@@ -173,27 +169,27 @@ def test_momentum_is_kept_to_the_rounding_of_the_sums(backend_of: Callable) -> N
     domain = scene.domain.model_copy(update={"gravity": (0.0, 0.0)})
     lifted = [
         BodyParticles(b.name, 0.6 * b.position + 0.2, b.velocity, b.affine, 0.36 * b.volume, 0.36 * b.mass)
-        for b in Solver(scene, on_gpu_path(backend_of("f64", 3)))._particles
+        for b in sample_bodies(scene)
     ]
     still = scene.model_copy(update={"domain": domain})
-    solver = Solver(still, on_gpu_path(backend_of("f64", 3)), lifted)
-    before = momentum_of(solver)
+    run = build_run(still, on_gpu_path(backend_of("f64", 3)), lifted)
+    before = momentum_of(run)
     for _ in range(20):
-        solver.step(1e-3)
-    solver.measure_state(1e-3)
-    unit = solver.grid.fixed.pace[None][1]
-    change = np.abs(momentum_of(solver) - before)
+        run.step(1e-3)
+    run.measure()
+    unit = run.grid.fixed.pace[0][1]
+    change = np.abs(momentum_of(run) - before)
     scale = sum(float((body.mass * np.linalg.norm(body.velocity, axis=1)).sum()) for body in lifted)
     # Besides, round-off of G2P: a few units in the last place of the momentum of each particle.
-    assert (change <= 20 * (9 * solver.particle_count * unit / 2 + 8 * np.finfo(float).eps * scale)).all()
+    assert (change <= 20 * (9 * run.particle_count * unit / 2 + 8 * np.finfo(float).eps * scale)).all()
     assert scale > 50
 
 
-def momentum_of(solver: Solver) -> np.ndarray:
-    found = np.zeros(solver.scene.dimension)
-    for group in solver.groups:
-        mass = group.rows[:, 0][group.body.to_numpy() if group.several else np.zeros(group.count, int)]
-        found += mass @ group.motion_to_numpy()[0]
+def momentum_of(run: Run) -> np.ndarray:
+    found = np.zeros(run.scene.dimension)
+    for group in run.groups:
+        snapshot = read_group(group)
+        found += masses_of(snapshot) @ snapshot.v
     return found
 
 
@@ -213,23 +209,21 @@ def test_what_the_sums_have_no_room_for_stops_the_run(backend_of: Callable) -> N
     Sums have room for DENSEST to twice as many times the mass of a full cell.
     """
     assert 2 * DENSEST < 0.75**2 * 256
-    solver = Solver(lone_pool(), on_gpu_path(backend_of("f32", 2)))
-    (group,), begin = solver.groups, solver.state.save()
-    solver.step(1e-3)
-    velocity, C = group.motion_to_numpy()
-    velocity[group.id.to_numpy() == 7] = 1e6
-    group.set_motion(velocity, C)
-    solver.step(1e-3)
+    run = build_run(lone_pool(), on_gpu_path(backend_of("f32", 2)))
+    (group,), begin = run.groups, run.save().copied()
+    run.step(1e-3)
+    state = group.read()
+    state["v"][state["id"] == 7] = 1e6
+    group.replace(v=state["v"])
     with pytest.raises(UnstableRunError, match=r"particle 7 of .* got more momentum in a step than the sums of"):
-        solver.measure_state(1e-3)
-    solver.state.load(begin)
-    solver.step(1e-4)
-    solver.measure_state(1e-4)
-    group.x.fill(0.5)
-    solver.state_was_replaced()
-    solver.step(1e-4)
+        run.step(1e-3)
+    run.load(begin)
+    run.step(1e-4)
+    run.measure()
+    group.replace(x=np.full((group.count, 2), 0.5))
+    run.state_was_replaced()
     with pytest.raises(UnstableRunError, match=r"at \(0\.5, 0\.5\) m lies where more mass meets than the sums"):
-        solver.measure_state(1e-4)
+        run.step(1e-4)
 
 
 def test_on_the_cpu_nothing_changes(backend_of: Callable) -> None:
@@ -237,28 +231,31 @@ def test_on_the_cpu_nothing_changes(backend_of: Callable) -> None:
     backend = backend_of("f32", 2)
     with_it, without = (mixed(2, (WATER,), deterministic=asked) for asked in (True, False))
     assert make_plan(with_it, backend) == make_plan(without, backend)
-    solver = Solver(with_it, backend)
-    assert solver.grid.fixed is None and not solver.grid.deterministic
-    assert list(same(list(solver.frames()), list(Solver(without, backend).frames()))) == []
+    run = build_run(with_it, backend)
+    assert run.grid.fixed is None and not run.grid.deterministic
+    assert list(same(list(run.frames()), list(build_run(without, backend).frames()))) == []
 
 
 def test_a_gpu_without_it_has_nothing_of_it(backend_of: Callable) -> None:
     """And with it a node needs 8 bytes a number more, in place of the means of volume."""
     backend = on_gpu_path(backend_of("f32", 2))
     plain, asked = (mixed(2, (JELLY,), deterministic=asked) for asked in (False, True))
-    assert Solver(plain, backend).grid.fixed is None
-    grid = Solver(asked, backend).grid
+    assert build_run(plain, backend).grid.fixed is None
+    grid = build_run(asked, backend).grid
     bytes_of = 8 * sum(sums.width for sums in grid.fixed.kept) - 4 * 2
     assert make_plan(asked, backend).bytes_per_node - make_plan(plain, backend).bytes_per_node == bytes_of
     passes = make_plan(asked, backend).passes
     assert [name for name in passes if name not in make_plan(plain, backend).passes] == ["read sums in fixed point"]
 
 
-def test_deterministic_runs_share_no_batch_on_a_gpu(backend_of: Callable) -> None:
-    scene, backend = lone_pool(), Backend("vulkan", 1, "f32", True)
-    (particles,) = Solver(scene, backend_of("f32", 1))._particles
-    assert not _keeps(scene, [particles], backend)
-    plain = scene.model_copy(update={"solver": scene.solver.model_copy(update={"deterministic": False})})
-    assert _keeps(plain, [particles], backend)
-    with pytest.raises(InputError, match="run deterministic scenes one by one"):
-        Batch(Kind.of(scene, [particles]), backend)
+def test_deterministic_runs_of_a_batch_have_the_bytes_that_they_have_alone(backend_of: Callable) -> None:
+    """Two runs on the path of a GPU, in which all numbers differ: each has scales of its own."""
+    scenes = [scene_named("sand"), scene_named("sand", other=True)]
+    scenes = [
+        scene.model_copy(update={"solver": scene.solver.model_copy(update={"deterministic": True})}) for scene in scenes
+    ]
+    backend = on_gpu_path(backend_of("f32", 2))
+    found = outputs_of(batch_of(scenes, backend), scenes)
+    for output, scene in zip(found, scenes, strict=True):
+        assert list(same(output, list(build_run(scene, backend).frames()))) == []
+        assert output[-1][0].step > 15

@@ -18,7 +18,7 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.output.ledger_table import COLUMNS
 from mpmcli.scene import parse_scene, scene_to_toml
-from mpmcli.scene.functions import FUNCTIONS
+from mpmcli.scene.expression import FUNCTIONS
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 # The README's commands come first: the others read the result that it makes.

@@ -16,9 +16,8 @@ from made_dataset import made_dataset
 from made_sweep import made_workers, make_dataset  # noqa: F401
 
 import mpmcli.dataset
-from mpmcli.dataset.distributions import read_distribution
 from mpmcli.dataset.shard import LABELS, MOVING, TABLES
-from mpmcli.dataset.sweep import Placement, SweepTable
+from mpmcli.dataset.sweep import Placement, SweepTable, read_distribution
 
 PAGE = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
 # In place of the sweep of the workflow: eight trajectories of four steps, in shards of two.
@@ -44,8 +43,8 @@ sys.path.insert(0, {root!r})
 from mpmcli import cores
 cores.available_cores = lambda: 1
 from mpmcli.cli import main
-from mpmcli.dataset import sweep_folder
-sweep_folder._per_shard = lambda size: 2
+from mpmcli.dataset import sweep_run
+sweep_run._per_shard = lambda size: 2
 if __name__ == "__main__":
     main()
 """

@@ -11,9 +11,8 @@ import pytest
 from asked_process import CRASH, HANG, SILENCE, answering, running
 from command import ROOT, run_here
 
-from mpmcli.doctor import backends, drawing, examination, files, interpreter, machine, probe_result
-from mpmcli.doctor.examination import EXAMINATIONS, Examination, attempt, examine, judge
-from mpmcli.doctor.probe_result import ProbeResult
+from mpmcli.doctor import examination
+from mpmcli.doctor.examination import EXAMINATIONS, Examination, ProbeResult, attempt, examine, judge
 from mpmcli.errors import RunError
 from mpmcli.processes.questions import Reply
 
@@ -130,7 +129,7 @@ def test_a_library_that_the_system_lacks_is_named_with_its_package():
         "install the system's package of libX11.so.6, on Debian and Ubuntu by `apt-get install libx11-6`"
     )
     unknown = "/usr/lib/libfoo-1.2.so.3: file too short"
-    assert probe_result.library_remedy(unknown) == "install the system's package of libfoo-1.2.so.3"
+    assert examination.library_remedy(unknown) == "install the system's package of libfoo-1.2.so.3"
 
 
 def test_a_command_that_cannot_be_loaded_sends_to_the_doctor(monkeypatch):
@@ -144,27 +143,27 @@ def test_a_command_that_cannot_be_loaded_sends_to_the_doctor(monkeypatch):
 
 
 def test_a_part_of_mpmcli_that_is_missing_is_no_case_for_the_doctor(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mpmcli.cli.schema", None)
+    monkeypatch.setitem(sys.modules, "mpmcli.cli.materials", None)
     done = run_here("schema")
     assert done.status == 1 and done.stderr.rstrip().endswith("(a fault of mpmcli; --debug shows where)")
 
 
 def test_a_remedy_names_the_version_that_is_wanted(monkeypatch):
     listed = ["h5py>=3.11", "h5py-other>=1", "pytest>=8; extra == 'test'"]
-    monkeypatch.setattr(probe_result.importlib.metadata, "requires", lambda name: listed)
-    assert probe_result.package_remedy("h5py") == 'install it by `python -m pip install "h5py>=3.11"`'
-    assert probe_result.package_remedy("pytest") == 'install it by `python -m pip install "pytest"`'
+    monkeypatch.setattr(examination.importlib.metadata, "requires", lambda name: listed)
+    assert examination.package_remedy("h5py") == 'install it by `python -m pip install "h5py>=3.11"`'
+    assert examination.package_remedy("pytest") == 'install it by `python -m pip install "pytest"`'
 
 
 def test_gpus_are_not_here_where_taichi_has_none_or_is_not_here(monkeypatch):
-    from mpmcli.solver import trial
+    from mpmcli.solver.machine import backend
 
-    monkeypatch.setattr(trial, "backend_is_here", lambda arch: False)
-    assert backends.cuda() == ProbeResult("information", "not here")
+    monkeypatch.setattr(backend, "backend_is_here", lambda arch: False)
+    assert examination.gpu("cuda") == ProbeResult("information", "not here")
     # As if the module could not be loaded.
-    monkeypatch.setitem(sys.modules, "mpmcli.solver.trial", None)
-    assert backends.vulkan().status == "information"
-    assert backends.vulkan().detail.startswith("not tried")
+    monkeypatch.setitem(sys.modules, "mpmcli.solver.machine.backend", None)
+    assert examination.gpu("vulkan").status == "information"
+    assert examination.gpu("vulkan").detail.startswith("not tried")
 
 
 @pytest.mark.parametrize(
@@ -177,12 +176,12 @@ def test_gpus_are_not_here_where_taichi_has_none_or_is_not_here(monkeypatch):
 )
 def test_software_vulkan_is_named_as_such(monkeypatch, devices, status, detail):
     from mpmcli.doctor import devices as names
-    from mpmcli.solver import trial
+    from mpmcli.solver.machine import backend
 
-    monkeypatch.setattr(trial, "backend_is_here", lambda arch: True)
-    monkeypatch.setattr(trial, "try_backend", lambda arch: None)
+    monkeypatch.setattr(backend, "backend_is_here", lambda arch: True)
+    monkeypatch.setattr(backend, "try_backend", lambda arch: None)
     monkeypatch.setattr(names, "device_names", lambda arch: [names.Device(*device) for device in devices])
-    assert (backends.vulkan().status, backends.vulkan().detail) == (status, detail)
+    assert (examination.gpu("vulkan").status, examination.gpu("vulkan").detail) == (status, detail)
 
 
 def test_the_driver_of_vulkan_names_its_devices():
@@ -200,19 +199,19 @@ def test_the_driver_of_vulkan_names_its_devices():
 
 def test_the_versions_of_python_are_those_of_the_package():
     asked = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["requires-python"]
-    oldest, newest = interpreter.OLDEST, interpreter.NEWEST
+    oldest, newest = examination.OLDEST, examination.NEWEST
     assert asked == f">={oldest[0]}.{oldest[1]},<{newest[0]}.{newest[1] + 1}"
-    assert interpreter.python(oldest).status == interpreter.python(newest).status == "ok"
+    assert examination.python(oldest).status == examination.python(newest).status == "ok"
     for version in [(3, oldest[1] - 1), (3, newest[1] + 1), (2, 7)]:
-        assert interpreter.python(version).status == "broken"
-        assert "3.11 to 3.13" in interpreter.python(version).remedy
+        assert examination.python(version).status == "broken"
+        assert "3.11 to 3.13" in examination.python(version).remedy
 
 
 def test_files_and_surfaces_work_here():
     """As the tests of output and of pictures show at length; versions are in the line."""
-    assert files.hdf5().status == files.ffmpeg().status == drawing.pysplashsurf().status == "ok"
-    assert "filters gzip and shuffle" in files.hdf5().detail
-    assert "libx264" in files.ffmpeg().detail
+    assert examination.hdf5().status == examination.ffmpeg().status == examination.pysplashsurf().status == "ok"
+    assert "filters gzip and shuffle" in examination.hdf5().detail
+    assert "libx264" in examination.ffmpeg().detail
 
 
 def test_a_program_without_the_encoder_is_found_out(monkeypatch, tmp_path):
@@ -225,7 +224,7 @@ def test_a_program_without_the_encoder_is_found_out(monkeypatch, tmp_path):
     import imageio_ffmpeg
 
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(program))
-    found = files.ffmpeg()
+    found = examination.ffmpeg()
     assert found.status == "broken"
     assert "Unknown encoder" in found.detail
     assert "IMAGEIO_FFMPEG_EXE" in found.remedy
@@ -242,7 +241,7 @@ def test_a_program_of_the_user_that_is_no_ffmpeg_is_named(monkeypatch, tmp_path,
 
     monkeypatch.setattr(imageio_ffmpeg._utils, "get_ffmpeg_exe", lambda: str(program))
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(program))
-    found = files.ffmpeg()
+    found = examination.ffmpeg()
     assert found.status == "broken" and found.detail.startswith(f"{program} is no ffmpeg that runs (")
     assert reason in found.detail and "unset IMAGEIO_FFMPEG_EXE" in found.remedy
 
@@ -264,61 +263,61 @@ def refuse(place: Path) -> None:
 def test_an_unwritable_directory_is_a_fault_and_an_unwritable_cache_is_not(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    assert machine.current_directory().detail.startswith(f"{tmp_path}, writable, ")
-    assert machine.kernel_cache().status == "ok"
-    monkeypatch.setattr(machine, "_write", refuse)
-    assert machine.current_directory().status == "broken"
-    assert machine.kernel_cache().status == "information"
-    assert "XDG_CACHE_HOME" in machine.kernel_cache().remedy
+    assert examination.current_directory().detail.startswith(f"{tmp_path}, writable, ")
+    assert examination.kernel_cache().status == "ok"
+    monkeypatch.setattr(examination, "_writable_bytes", refuse)
+    assert examination.current_directory().status == "broken"
+    assert examination.kernel_cache().status == "information"
+    assert "XDG_CACHE_HOME" in examination.kernel_cache().remedy
 
 
 @pytest.mark.parametrize(("free", "status"), [(5e6, "broken"), (5e8, "information"), (5e10, "ok")])
 def test_a_full_disk_is_a_fault(monkeypatch, tmp_path, free, status):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(machine.shutil, "disk_usage", lambda place: type("Usage", (), {"free": free}))
-    assert machine.current_directory().status == status
+    monkeypatch.setattr(examination.shutil, "disk_usage", lambda place: type("Usage", (), {"free": free}))
+    assert examination.current_directory().status == status
 
 
 def test_limits_of_containers_are_read_in_both_versions(tmp_path):
-    assert machine.memory_limit(tmp_path) is machine.processor_limit(tmp_path) is None
+    assert examination.memory_limit(tmp_path) is examination.processor_limit(tmp_path) is None
     (tmp_path / "memory").mkdir()
     (tmp_path / "cpu").mkdir()
     (tmp_path / "memory" / "memory.limit_in_bytes").write_text("4000000000\n")
     (tmp_path / "cpu" / "cpu.cfs_quota_us").write_text("-1\n")
     (tmp_path / "cpu" / "cpu.cfs_period_us").write_text("100000\n")
-    assert machine.memory_limit(tmp_path) == 4_000_000_000
-    assert machine.processor_limit(tmp_path) is None
+    assert examination.memory_limit(tmp_path) == 4_000_000_000
+    assert examination.processor_limit(tmp_path) is None
     (tmp_path / "cpu" / "cpu.cfs_quota_us").write_text("150000\n")
-    assert machine.processor_limit(tmp_path) == 1.5
+    assert examination.processor_limit(tmp_path) == 1.5
     (tmp_path / "memory.max").write_text("max\n")
     (tmp_path / "cpu.max").write_text("max 100000\n")
-    assert machine.memory_limit(tmp_path) is machine.processor_limit(tmp_path) is None
+    assert examination.memory_limit(tmp_path) is examination.processor_limit(tmp_path) is None
     (tmp_path / "memory.max").write_text("2000\n")
     (tmp_path / "cpu.max").write_text("50000 100000\n")
-    assert (machine.memory_limit(tmp_path), machine.processor_limit(tmp_path)) == (2000, 0.5)
+    assert (examination.memory_limit(tmp_path), examination.processor_limit(tmp_path)) == (2000, 0.5)
 
 
 def test_a_container_with_less_time_than_cores_wants_fewer_threads(monkeypatch):
-    monkeypatch.setattr(machine, "processor_limit", lambda: 0.5)
-    assert machine.cores().status == "information"
-    assert machine.cores().remedy == "simulate with --threads 1"
-    monkeypatch.setattr(machine, "memory_limit", lambda: 10**8)
-    assert "the container may take 100 MB" in machine.memory().detail
-    assert machine.memory().status == "information"
+    monkeypatch.setattr(examination, "processor_limit", lambda: 0.5)
+    assert examination.cores().status == "information"
+    assert examination.cores().remedy == "simulate with --threads 1"
+    monkeypatch.setattr(examination, "memory_limit", lambda: 10**8)
+    assert "the container may take 100 MB" in examination.memory().detail
+    assert examination.memory().status == "information"
 
 
 def test_the_real_trial_of_the_processor_keeps_kernels_where_the_report_says(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     [(_, found)] = examine([examination_of("taichi cpu")])
     assert found.status == "ok", found
-    place = Path(machine.kernel_cache().detail.split(",")[0])
+    place = Path(examination.kernel_cache().detail.split(",")[0])
     assert place.is_relative_to(tmp_path)
     assert any(path.is_file() for path in place.rglob("*"))
 
 
 def test_the_table_is_light_to_load(run_python):
     heavy = {"taichi", "numpy", "h5py", "vtk", "vtkmodules", "pyvista", "matplotlib", "PIL", "psutil", "pysplashsurf"}
-    code = f"import sys, mpmcli.cli.doctor, mpmcli.doctor.examination\nprint(sorted({heavy!r} & set(sys.modules)))"
+    code = f"import sys, mpmcli.cli.inspection, mpmcli.doctor.examination\nprint(sorted({heavy!r} & set(sys.modules)))"
     assert run_python(code).stdout == "[]\n"
 
 

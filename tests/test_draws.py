@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kstest, qmc, truncnorm
 
-from mpmcli.dataset.distributions import Integers, LogUniform, Normal, Uniform, read_distribution
 from mpmcli.dataset.draw import draw
+from mpmcli.dataset.sweep import Integers, LogUniform, Normal, Uniform, read_distribution
 
 N = 1000
 LARGEST_U = 1 - 2.0**-53

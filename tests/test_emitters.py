@@ -1,4 +1,4 @@
-"""Particles that come and go: a jet against its closed form, runs of a batch against a solver's, what a file says."""
+"""Particles that come and go: a jet against its closed form, runs of a batch against those alone, what a file says."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,15 +9,13 @@ from command import run_here
 from solver_state import scene_of
 from state_run import MATERIALS
 from test_batch import Output, batch_of, outputs_of, same
+from test_deterministic import on_gpu_path
 
 from mpmcli.check.result_check import check_result
-from mpmcli.errors import InputError
 from mpmcli.output import open_result
 from mpmcli.scene import Scene, sample_bodies, scene_to_toml
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.batch import Batch
-from mpmcli.solver.batch_kind import Kind
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.machine.backend import Backend
 
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}
 SPEED, SPACING = 2.0, 0.0125
@@ -127,25 +125,25 @@ def test_the_jet_leaves_as_if_nothing_were_there(jet: Output) -> None:
     assert row.linear_momentum[0] == pytest.approx(SPEED * (row.emitted_mass - row.retired_mass), rel=1e-5)
 
 
-def test_runs_of_a_batch_have_the_bytes_of_a_solver(backend_of: Callable[..., Backend]) -> None:
+def test_runs_have_the_bytes_that_they_have_alone(backend_of: Callable[..., Backend]) -> None:
     """Of two laws and three emitters, one of them blocked, beside a run in which all numbers differ."""
     scenes = [mixed_scene(), mixed_scene(other=True)]
     backend = backend_of("f32", 1)
     found = outputs_of(batch_of(scenes, backend), scenes)
-    kept = Solver(scenes[0], backend)
-    start = kept.state.save()
+    kept = build_run(scenes[0], backend)
+    start = kept.save().copied()
     assert list(same(found[0], list(kept.frames()))) == []
     last = found[0][-1][1]
     assert last.blocked >= 1 and last.emitted > 300 and last.retired > 100
     # Saved in the middle, loaded and continued.
-    kept.state.load(start)
+    kept.load(start)
     for _ in range(60):
         kept.step(kept.stable_step()[0])
-    saved = kept.state.save()
+    saved = kept.save().copied()
     for _ in range(40):
         kept.step(kept.stable_step()[0])
     expected = kept.frame()
-    kept.state.load(saved)
+    kept.load(saved)
     for _ in range(40):
         kept.step(kept.stable_step()[0])
     again = kept.frame()
@@ -158,23 +156,40 @@ def test_all_runs_of_a_batch_do(backend_of: Callable[..., Backend]) -> None:
     backend = backend_of("f32", 1)
     found = outputs_of(batch_of(scenes, backend), scenes)
     for output, scene in zip(found, scenes, strict=True):
-        assert list(same(output, list(Solver(scene, backend).frames()))) == []
+        assert list(same(output, list(build_run(scene, backend).frames()))) == []
     shared = backend_of("f32", 3)
     (together,) = outputs_of(batch_of(scenes[1:2], shared), scenes[1:2])
     assert list(same(together, found[1])) == []
 
 
+def test_runs_of_a_batch_on_the_path_of_a_gpu_follow_those_on_the_cpu(backend_of: Callable[..., Backend]) -> None:
+    """As many particles come in at every frame, and the jet is where it is on the CPU."""
+    scenes = [mixed_scene(), mixed_scene(other=True)]
+    backend = backend_of("f32", 2)
+    found = outputs_of(batch_of(scenes, on_gpu_path(backend)), scenes)
+    for output, scene in zip(found, scenes, strict=True):
+        expected = list(build_run(scene, backend).frames())
+        for (frame, row), (other, other_row) in zip(output, expected, strict=True):
+            assert (row.emitted, row.blocked) == (other_row.emitted, other_row.blocked)
+            assert abs(row.steps - other_row.steps) <= 1
+            # When a sort retires what is beyond a face differs.
+            inside = [
+                (one.fields["status"] == 1) & (one.position[:, 0] <= 0.85) & (one.position[:, 1] >= 0.02)
+                for one in (frame, other)
+            ]
+            both = inside[0] & inside[1]
+            assert both.sum() > 0.99 * inside[1].sum()
+            assert np.median(np.abs(frame.position - other.position)[both]) < 1e-5
+        assert output[-1][1].blocked >= 1 and output[-1][1].emitted > 300
+
+
 @pytest.mark.slow
 @pytest.mark.gpu
 def test_a_gpu_does_the_same(backend_of: Callable[..., Backend], jet: Output) -> None:
-    """The same particles inside the domain, where they are on the CPU; a batch there says that it cannot."""
+    """The same particles inside the domain, where they are on the CPU."""
     scene = jet_scene()
     backend = backend_of("f32", 1, "vulkan")
-    # scripts/gpu --arch cpu takes a processor in its place.
-    if not backend.on_cpu:
-        with pytest.raises(InputError, match="no emitters and no open faces"):
-            Batch(Kind.of(scene, sample_bodies(scene)), backend)
-    for (frame, row), (other, other_row) in zip(Solver(scene, backend).frames(), jet, strict=True):
+    for (frame, row), (other, other_row) in zip(build_run(scene, backend).frames(), jet, strict=True):
         assert (row.emitted, row.blocked) == (other_row.emitted, other_row.blocked)
         # When a sort retires what is beyond the face differs.
         inside, other_inside = ((one.fields["status"] == 1) & (one.position[:, 0] <= 1.0) for one in (frame, other))

@@ -16,7 +16,7 @@ from made_result import write_made
 from test_dataset_statistics import agree, plain
 
 import mpmcli.dataset
-from mpmcli.dataset.export import FORMATS
+from mpmcli.dataset.formats import FORMATS
 from mpmcli.dataset.thinned import chosen_particles, joined_row
 from mpmcli.output import open_result
 
@@ -140,7 +140,7 @@ def test_metadata_of_learners(tmp_path, form, stride):
     assert [metadata[f"num_trajs_{split}"] for split in ("train", "valid", "test")] == [2, 1, 1]
     assert metadata["trajectories"] == {"train": [0, 1], "valid": [2], "test": [3]}
     found = {name: np.array(metadata[name]) for name in ("vel_mean", "vel_std", "acc_mean", "acc_std")}
-    agree(namedtuple("Found", found)(**found), plain(positions(path, "train", stride)))
+    agree(found, plain(positions(path, "train", stride)))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -359,7 +359,7 @@ def test_an_interrupted_export_leaves_what_was_there(tmp_path, monkeypatch, earl
     if earlier:
         assert run_here("export", path, "--to", "gns", "-o", target).status == 0
     before = everything(tmp_path)
-    monkeypatch.setattr("mpmcli.cli.export.interrupt_came", lambda: True)
+    monkeypatch.setattr("mpmcli.cli.dataset.interrupt_came", lambda: True)
     assert run_here("export", path, "--to", "npz", "-o", target, "--overwrite").status == 130
     assert everything(tmp_path) == before
 
@@ -375,10 +375,10 @@ def test_the_answer_is_a_line_on_stdout(tmp_path):
 def test_a_law_keeps_its_type_whatever_the_others_are(tmp_path):
     """Nine types hold all laws of mpmcli and one more for GNS, and all but one for LagrangeBench."""
     for form, taken in (("gns", {3}), ("lagrangebench", {1, 2, 3})):
-        module = FORMATS[form]
+        learner = FORMATS[form]
         free = set(range(9)) - taken
-        assert set(module.USUAL.values()) <= free and set(module.FREE) <= free
-        assert len(set(module.USUAL.values())) == len(module.USUAL)
+        assert set(learner.usual.values()) <= free and set(learner.free) <= free
+        assert len(set(learner.usual.values())) == len(learner.usual)
     for materials, types in {
         ("neo_hookean", "sand"): {"neo_hookean": 8, "sand": 4},
         ("fixed_corotated", "neo_hookean"): {"fixed_corotated": 8, "neo_hookean": 7},

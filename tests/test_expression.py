@@ -7,10 +7,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from mpmcli.scene.derivative import derivative
-from mpmcli.scene.expression import Expression, ExpressionError, evaluate
+from mpmcli.scene.expression import FUNCTIONS, OPERATORS, Expression, ExpressionError, derivative, evaluate
 from mpmcli.scene.expression_reader import MOST_CHARACTERS, MOST_NESTED, parse
-from mpmcli.scene.functions import FUNCTIONS, OPERATORS
 
 NAMES = ("t", "x", "y", "X", "Y")
 # What Python itself makes of the same text.

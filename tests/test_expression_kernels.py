@@ -7,12 +7,10 @@ import pytest
 import taichi as ti
 from test_expression import FUNCTION_CASES
 
+from mpmcli.scene.expression import FUNCTIONS, OPERATORS
 from mpmcli.scene.expression_reader import parse
-from mpmcli.scene.functions import FUNCTIONS, OPERATORS
-from mpmcli.solver.expression_functions import KERNELS
-from mpmcli.solver.expression_kernels import node_of
-from mpmcli.solver.forces import RECURSION
-from mpmcli.solver.run_values import DeviceValues, Entries, RunValues
+from mpmcli.solver.drive.expressions import KERNELS, DeviceValues, Entries, RunValues, node_of
+from mpmcli.solver.engine.batch import RECURSION
 
 NAMES = ("t", "x", "y", "X", "Y")
 MORE = {
@@ -26,7 +24,7 @@ ORIGIN = np.array([0.25, -0.5])
 TIME = 0.6
 
 
-def evaluated(real, constant):
+def evaluated(real):
     """Return values of all cases by kernel, (n, k), and by numpy, (n, k), at the same points, and their names."""
     sys.setrecursionlimit(RECURSION)
     texts = [*FUNCTION_CASES.values(), *MORE.values()]
@@ -37,7 +35,7 @@ def evaluated(real, constant):
     fields = [ti.Vector.field(2, float, shape=n) for _ in points]
     for field, values in zip(fields, points, strict=True):
         field.from_numpy(values)
-    entries = Entries(ORIGIN, constant=constant)
+    entries = Entries(ORIGIN)
     trees = [entries.placed(parse(text, NAMES).tree) for text in texts]
     values = DeviceValues(1, len(entries.found))
     nodes = tuple(enumerate(node_of(tree, values) for tree in trees))
@@ -64,16 +62,15 @@ def test_every_function_has_a_kernel():
     assert set(KERNELS) - {"blend"} == set(FUNCTIONS) | set(OPERATORS)
 
 
-@pytest.mark.parametrize("constant", [False, True], ids=["constants compiled", "constants read"])
 @pytest.mark.parametrize(("precision", "tolerance"), [("f64", 1e-13), ("f32", 1e-6)])
-def test_kernels_agree_with_numpy(backend_of, precision, tolerance, constant):
+def test_kernels_agree_with_numpy(backend_of, precision, tolerance):
     """To rounding, relative to 1 + |value|, and more where a large value has amplified it (powers, tan).
 
     Values beside a jump (floor, comparisons) may fall to either side in f32; no more than one in a hundred does.
     """
     real = np.float64 if precision == "f64" else np.float32
     backend_of(precision)
-    found, expected, names = evaluated(real, constant)
+    found, expected, names = evaluated(real)
     for k, name in enumerate(names):
         both = np.isnan(expected[:, k]) & np.isnan(found[:, k])
         error = np.where(both, 0.0, np.abs(found[:, k] - expected[:, k]) / (1 + np.abs(expected[:, k])))

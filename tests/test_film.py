@@ -1,6 +1,6 @@
 """Tests of films: what another reader finds in them, the same bytes for the same pictures, and what cannot be made."""
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -10,8 +10,9 @@ import pytest
 from PIL import Image
 
 from mpmcli.errors import InputError, RunError
-from mpmcli.render.files.film import write_film
-from mpmcli.render.files.picture_file import write_picture
+from mpmcli.render import film
+from mpmcli.render.film import write_film
+from mpmcli.render.picture_file import write_picture
 
 COUNT = 12
 HEIGHT, WIDTH = 48, 65  # odd on purpose
@@ -26,13 +27,16 @@ def picture(k: int) -> np.ndarray:
     return image
 
 
+def saved(folder: Path, images: Sequence[np.ndarray]) -> list[Path]:
+    paths = [folder / f"{k}.png" for k in range(len(images))]
+    for path, image in zip(paths, images, strict=True):
+        write_picture(path, image, "digest")
+    return paths
+
+
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    folder = tmp_path_factory.mktemp("pictures")
-    paths = [folder / f"{k}.png" for k in range(COUNT)]
-    for k, path in enumerate(paths):
-        write_picture(path, picture(k), "digest")
-    return paths
+    return saved(tmp_path_factory.mktemp("pictures"), [picture(k) for k in range(COUNT)])
 
 
 def read_mp4(path: Path) -> tuple[dict, list[np.ndarray]]:
@@ -96,7 +100,7 @@ def test_the_colours_of_a_gif_come_from_the_whole_film(tmp_path):
     """Each picture has another of 100 colours: those of the first alone would not do for the others."""
     rows = np.linspace(0, 255, 100)
     images = [np.full((20, 20, 3), (level, 255 - level, 128), np.uint8) for level in rows]
-    write_film(images, tmp_path / "film.gif", 20)
+    write_film(saved(tmp_path, images), tmp_path / "film.gif", 20)
     _, found = read_gif(tmp_path / "film.gif")
     error = [np.abs(image.astype(int) - shown).max() for image, shown in zip(images, found, strict=True)]
     # Twelve pictures are asked: the levels lie 255 / 11 apart.
@@ -104,39 +108,38 @@ def test_the_colours_of_a_gif_come_from_the_whole_film(tmp_path):
 
 
 def test_a_picture_like_the_one_before_it_is_a_frame_too(tmp_path):
-    write_film([picture(0), picture(0), picture(1)], tmp_path / "film.gif", 25)
+    write_film(saved(tmp_path, [picture(0), picture(0), picture(1)]), tmp_path / "film.gif", 25)
     durations, images = read_gif(tmp_path / "film.gif")
     assert durations == [40, 40, 40] and len(images) == 3
     assert np.array_equal(images[0], images[1]) and not np.array_equal(images[1], images[2])
 
 
 @pytest.mark.parametrize("end", ["mp4", "gif"])
-def test_the_same_pictures_give_the_same_bytes_however_they_come(pictures, tmp_path, end):
+def test_the_same_pictures_give_the_same_bytes(pictures, tmp_path, end):
     write_film(pictures, tmp_path / f"a.{end}", 24)
-    passing: Iterator[np.ndarray] = (picture(k) for k in range(COUNT))
-    write_film(passing, tmp_path / f"b.{end}", 24)
+    write_film(saved(tmp_path, [picture(k) for k in range(COUNT)]), tmp_path / f"b.{end}", 24)
     assert (tmp_path / f"a.{end}").read_bytes() == (tmp_path / f"b.{end}").read_bytes()
 
 
 @pytest.mark.parametrize("end", ["mp4", "gif"])
-def test_pictures_are_taken_in_one_at_a_time(tmp_path, end):
-    """Those that a film still holds are counted when the next one is made."""
+def test_pictures_are_taken_in_one_at_a_time(pictures, tmp_path, monkeypatch, end):
+    """Those that a film still holds are counted when the next one is read; a gif holds a few for its palette."""
     import weakref
 
     alive: list[weakref.ref] = []
-    most = 0
+    counts = []
+    read = film._image
 
-    def passing() -> Iterator[np.ndarray]:
-        nonlocal most
-        for k in range(COUNT):
-            image = picture(k)
-            alive.append(weakref.ref(image))
-            yield image
-            del image
-            most = max(most, sum(reference() is not None for reference in alive))
+    def counting(path: Path) -> np.ndarray:
+        counts.append(sum(reference() is not None for reference in alive))
+        image = read(path)
+        alive.append(weakref.ref(image))
+        return image
 
-    write_film(passing(), tmp_path / f"film.{end}", 24)
-    assert most <= 3
+    monkeypatch.setattr(film, "_image", counting)
+    monkeypatch.setattr(film, "FEW", 2)
+    write_film(pictures, tmp_path / f"film.{end}", 24)
+    assert len(counts) == COUNT + 2 * (end == "gif") and max(counts) <= 3 + 2 * (end == "gif")
 
 
 @pytest.mark.parametrize(
@@ -159,28 +162,30 @@ def test_pictures_that_make_no_film_leave_nothing(pictures, tmp_path, end):
     path = tmp_path / f"film.{end}"
     damaged = tmp_path / "damaged.png"
     damaged.write_bytes(pictures[0].read_bytes()[:80])
+    low = tmp_path / "low.png"
+    write_picture(low, picture(1)[1:], "digest")
     cases = [
         ([], "at least one picture"),
-        ([picture(0), picture(1)[1:]], "Picture 1 is 65x47 and those before it 65x48"),
+        ([pictures[0], low], "low.png is 65x47 and those before it 65x48"),
         ([pictures[0], damaged], "damaged.png cannot be read as a picture"),
         ([pictures[0], tmp_path / "none.png"], "none.png cannot be read as a picture"),
     ]
     for given, sentence in cases:
         with pytest.raises(InputError, match=sentence):
             write_film(given, path, 24)
-        assert [entry.name for entry in tmp_path.iterdir()] == ["damaged.png"]
+        assert sorted(entry.name for entry in tmp_path.iterdir()) == ["damaged.png", "low.png"]
 
 
 @pytest.mark.parametrize("end", ["mp4", "gif"])
-def test_an_interrupt_leaves_neither_a_file_nor_a_process(tmp_path, end):
-    def interrupted() -> Iterator[np.ndarray]:
-        yield from (picture(k) for k in range(3))
-        raise KeyboardInterrupt
+def test_an_interrupt_leaves_neither_a_file_nor_a_process(pictures, tmp_path, end):
+    def interrupt(done: int) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
 
     # Python's own helper of multiprocessing may be there, from another test.
     before = psutil.Process().children(recursive=True)
     with pytest.raises(KeyboardInterrupt):
-        write_film(interrupted(), tmp_path / f"film.{end}", 24)
+        write_film(pictures, tmp_path / f"film.{end}", 24, watch=interrupt)
     assert list(tmp_path.iterdir()) == [] and psutil.Process().children(recursive=True) == before
 
 

@@ -10,7 +10,7 @@ from law_tangent import largest_stiffness
 
 from mpmcli.materials.fixed_corotated import FixedCorotated, FixedCorotatedParameters
 from mpmcli.materials.law import StateBound
-from mpmcli.materials.polar import polar_rotation
+from mpmcli.materials.tensors import polar_rotation
 
 E, NU = 3e5, 0.3
 MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))

@@ -5,7 +5,7 @@ import pytest
 from scenes import block, stresses
 from solver_state import bodies_of, scene_of
 
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 # So soft that nothing but what drives it moves it.
 CLOUD = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e-6, "poissons_ratio": 0.3}
@@ -29,10 +29,10 @@ def driven(bodies, *, precision="f64", origin=(0.0, 0.0), gravity=(0.0, 0.0), fo
 
 
 def stepped(scene, backend, dt, count):
-    solver = Solver(scene, backend)
+    run = build_run(scene, backend)
     for _ in range(count):
-        solver.step(dt)
-    return solver, bodies_of(solver)
+        run.step(dt)
+    return run, bodies_of(run)
 
 
 @pytest.fixture(scope="module", params=["f64", pytest.param("f32", marks=pytest.mark.slow)])
@@ -54,16 +54,16 @@ def rounding(precision):
 def test_the_impulse_of_gravity_of_time_is_exact(backend, precision, rounding):
     """v = integral of g to the middle of the last step, to rounding, for steps of any size, and x = sum of dt v."""
     scene = driven([disc()], precision=precision, gravity=("2 * cos(5 * t)", "-3 + t"))
-    solver = Solver(scene, backend)
-    before = bodies_of(solver)["disc"].x
+    run = build_run(scene, backend)
+    before = bodies_of(run)["disc"].x
     x, rng = np.zeros(2), np.random.default_rng(0)
     for _ in range(200):
         dt = rng.uniform(1e-3, 2e-3)
-        solver.step(dt)
-        t = solver.state.velocity_time
+        run.step(dt)
+        t = run.state.velocity_time
         v = np.array([0.4 * np.sin(5 * t), -3 * t + 0.5 * t**2])
         x += dt * v
-    body, t = bodies_of(solver)["disc"], solver.time
+    body, t = bodies_of(run)["disc"], run.time
     np.testing.assert_allclose(body.momentum() / body.mass.sum(), v, atol=rounding)
     np.testing.assert_allclose(body.v, np.broadcast_to(v, body.v.shape), atol=10 * rounding)
     np.testing.assert_allclose(body.x - before, np.broadcast_to(x, body.x.shape), atol=10 * rounding)
@@ -80,16 +80,16 @@ def test_a_linear_force_swings_a_cloud(backend, precision, rounding):
     k, dt, count = 40.0, 1e-3, 150
     force = {"acceleration": [f"-{k} * (x - 2.5) + 7 * (y + 0.5)", f"-{k} * (y + 0.5)"]}
     cloud = disc(center=(2.6, -0.5))
-    solver = Solver(driven([cloud], precision=precision, origin=(2.0, -1.0), forces=[force]), backend)
-    place = bodies_of(solver)["disc"].x - 0.5
-    solver.step(dt)
-    body = bodies_of(solver)["disc"]
+    run = build_run(driven([cloud], precision=precision, origin=(2.0, -1.0), forces=[force]), backend)
+    place = bodies_of(run)["disc"].x - 0.5
+    run.step(dt)
+    body = bodies_of(run)["disc"]
     slope = np.array([[-k, 7], [0, -k]])
     np.testing.assert_allclose(body.v, dt / 2 * place @ slope.T, atol=rounding)
     np.testing.assert_allclose(body.C, np.broadcast_to(dt / 2 * slope, body.C.shape), atol=50 * rounding)
     for _ in range(count - 1):
-        solver.step(dt)
-    body = bodies_of(solver)["disc"]
+        run.step(dt)
+    body = bodies_of(run)["disc"]
     u, v = 0.1, 0.0
     for n in range(count):
         v -= (dt if n else dt / 2) * k * u
@@ -117,7 +117,7 @@ def test_a_force_on_one_body_leaves_the_other_alone(backend, precision):
     two = [disc("left", (0.25, 0.5)), disc("right", (0.75, 0.5))]
     forces = [{"body": "left", "acceleration": ["sin(t) + X", "-y"]}, {"body": "left", "acceleration": [0, "y"]}]
     state = stepped(driven(two, precision=precision, forces=forces), backend, 1e-3, 50)[1]
-    still = bodies_of(Solver(driven(two, precision=precision, forces=forces), backend))
+    still = bodies_of(build_run(driven(two, precision=precision, forces=forces), backend))
     for name in ("x", "v", "C", "deformation"):
         np.testing.assert_array_equal(getattr(state["right"], name), getattr(still["right"], name))
     # sum dt (sin t_n + X), the mean of X being the centre; the first step is a half one.
@@ -129,22 +129,22 @@ def test_a_force_on_one_body_leaves_the_other_alone(backend, precision):
 def test_steps_know_of_forces(backend, precision):
     """Before anything moves: dt^2 a = h / 2 with the margin of 1.5 on a, and dt^2 |da/dx| = 1 with the same."""
     h = 0.05
-    weak = Solver(driven([disc()], precision=precision, forces=[{"acceleration": ["30", 0]}]), backend)
+    weak = build_run(driven([disc()], precision=precision, forces=[{"acceleration": ["30", 0]}]), backend)
     limit = weak.nearest_limit
     assert (limit.name, limit.value) == ("speed", pytest.approx(np.sqrt(0.5 * h / 45), rel=1e-5))
-    steep = Solver(driven([disc()], precision=precision, forces=[{"acceleration": ["-9e4 * (x - X)", 0]}]), backend)
+    steep = build_run(driven([disc()], precision=precision, forces=[{"acceleration": ["-9e4 * (x - X)", 0]}]), backend)
     limit = steep.nearest_limit
     assert (limit.name, limit.value) == ("force", pytest.approx(1 / np.sqrt(1.5 * 9e4), rel=1e-3))
     # A pulse to come is seen before it comes, at one of the instants up to the next measurement.
     sudden = driven([disc()], precision=precision, forces=[{"acceleration": ["1e4 if t > 0.05 else 0", 0]}])
-    assert Solver(sudden, backend).nearest_limit.value == pytest.approx(np.sqrt(0.5 * h / 1.5e4), rel=1e-5)
+    assert build_run(sudden, backend).nearest_limit.value == pytest.approx(np.sqrt(0.5 * h / 1.5e4), rel=1e-5)
 
 
 def test_initial_deformation_is_a_stress(backend, precision, rounding):
     """Neo-Hookean, F = diag(a, 1): tau_xx = mu (a^2 - 1) + lambda ln a, tau_yy = lambda ln a; sigma = tau / a."""
     body = block("bar", JELLY, (0.25, 0.25), (0.75, 0.5), deformation=[["1 + X / 10", 0], [0, 1]])
     scene = driven([body], precision=precision, output={"fields": ["velocity", "stress", "initial_position"]})
-    frame, _ = Solver(scene, backend).frame()
+    frame, _ = build_run(scene, backend).frame()
     a = 1 + frame.fields["initial_position"][:, 0] / 10
     mu, lam = 1e4 / 2.6, 1e4 * 0.3 / (1.3 * 0.4)
     sigma = stresses(frame.fields)
@@ -160,14 +160,14 @@ def test_a_hydrostatic_column_stays_at_rest(backend, precision, exponent):
     water = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e5, "exponent": exponent}
     body = block("pool", water, (0.0, 0.0), (1.0, H), initial_pressure="hydrostatic")
     scene = driven([body], precision=precision, gravity=(0.0, -g), output={"fields": ["velocity", "pressure"]})
-    solver = Solver(scene, backend)
-    frame, _ = solver.frame()
+    run = build_run(scene, backend)
+    frame, _ = run.frame()
     # J p = density g depth.
-    J = bodies_of(solver)["pool"].deformation
+    J = bodies_of(run)["pool"].deformation
     np.testing.assert_allclose(J * frame.fields["pressure"], 1000.0 * g * (H - frame.position[:, 1]), atol=1e-6 * 2e5)
     fastest = 0.0
     for _ in range(30):
         for _ in range(10):
-            solver.step(solver.stable_step()[0])
-        fastest = max(fastest, np.abs(bodies_of(solver)["pool"].v).max())
+            run.step(run.stable_step()[0])
+        fastest = max(fastest, np.abs(bodies_of(run)["pool"].v).max())
     assert fastest < 2e-4 * np.sqrt(g * H)

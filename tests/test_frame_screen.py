@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from solver_state import scene_of
 
-from mpmcli.check import frame_screen, result_check
+from mpmcli.check import result_check, result_motion
 from mpmcli.check.result_check import ResultCheck, check_kept
 from mpmcli.check.result_entries import kept_entries
 from mpmcli.frames.frame import Frame
@@ -19,7 +19,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import scene_to_toml
-from mpmcli.solver.engine import build_engine
+from mpmcli.solver.engine.build import build_run
 
 FRAMES = 24
 
@@ -49,7 +49,7 @@ def run(backend_of: Callable) -> Run:
     )
     backend = {"arch": "cpu", "threads": 1, "precision": "f32"}
     header = RunHeader.of(scene, scene_to_toml(scene), [laws()["fluid"]], backend)
-    frames, rows = zip(*build_engine(scene, backend_of("f32", 1), batched=True).frames(lambda: False), strict=True)
+    frames, rows = zip(*build_run(scene, backend_of("f32", 1)).frames(), strict=True)
     return Run(header, list(frames), list(rows))
 
 
@@ -99,7 +99,7 @@ def assert_same(found: ResultCheck, expected: ResultCheck) -> None:
 
 
 def test_nearly_all_frames_of_a_sound_run_need_no_second_look(run: Run) -> None:
-    quiet = frame_screen.screen(run[0], kept_entries(*run).entries).quiet
+    quiet = result_motion.screen(run[0], kept_entries(*run).entries).quiet
     assert quiet.tolist() == [False] + [True] * FRAMES
     assert_same(check_kept(*run), one_by_one(run))
 
@@ -116,7 +116,7 @@ def test_nearly_all_frames_of_a_sound_run_need_no_second_look(run: Run) -> None:
 def test_what_is_wrong_is_found_wherever_it_is(run: Run, k: int, p: int, fault: str, at_once: int) -> None:
     faulty = changed(run, k, p, fault)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(frame_screen, "AT_ONCE", at_once)
+        patch.setattr(result_motion, "AT_ONCE", at_once)
         found = check_kept(*faulty)
     assert_same(found, one_by_one(faulty))
 
@@ -132,4 +132,4 @@ def test_each_fault_is_one(run: Run, fault: str) -> None:
 def test_a_run_with_fields_of_their_own_checks_is_not_screened(run: Run) -> None:
     header, frames, rows = run
     frames = [replace(frame, fields={**frame.fields, "mass": np.ones(len(frame.position))}) for frame in frames]
-    assert frame_screen.screen(header, kept_entries(header, frames, rows).entries) is None
+    assert result_motion.screen(header, kept_entries(header, frames, rows).entries) is None

@@ -264,7 +264,7 @@ def test_a_size_without_room_is_left_out(parts: Callable, monkeypatch: pytest.Mo
 
 
 def test_sizes_fit_32_bit_indices(parts: Callable) -> None:
-    from mpmcli.solver.plan import LARGEST_INDEX, WIDEST_FIELD
+    from mpmcli.solver.machine.plan import LARGEST_INDEX, WIDEST_FIELD
 
     for size in (*parts("bench").FULL, parts("largest").FULL):
         assert size.particles * WIDEST_FIELD < LARGEST_INDEX
@@ -330,6 +330,6 @@ def test_runs_at_once_are_counted(parts: Callable, tmp_path: Path) -> None:
     row = datasets.together(2, 1, GPU)
     assert (row["runs"], row["completed"], row["stable"], row["particles"]) == (2, 2, 2, 1444)
     assert row["steps"] == 10
-    from mpmcli.solver.backend import stop_backend
+    from mpmcli.solver.machine.backend import stop_backend
 
     stop_backend()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command import SCENE, run_here
 
-from mpmcli.materials.volume_relaxation import FULL
+from mpmcli.materials.fluid import FULL
 from mpmcli.output import open_result
 
 FALL = """\

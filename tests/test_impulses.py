@@ -7,8 +7,8 @@ import pytest
 from solver_state import scene_of
 
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.machine.backend import Backend
 
 JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e4, "poissons_ratio": 0.3}
 PUSH = {"start": 0.0107, "center": [0.5, 0.5], "radius": 0.1}
@@ -31,7 +31,7 @@ def test_the_momentum_is_the_integral(backend_of: Callable[..., Backend]) -> Non
     (body,) = sample_bodies(scene)
     r = np.linalg.norm(body.position - 0.5, axis=1) / 0.1
     linear, gauss = np.clip(1 - r, 0, None), np.exp(-4.5 * r**2) * (r < 1)
-    rows = [row for _, row in Solver(scene, backend_of("f64", 1)).frames()]
+    rows = [row for _, row in build_run(scene, backend_of("f64", 1)).frames()]
     assert rows[1].linear_momentum == (0.0, 0.0)
     expected = body.mass * np.array([linear.sum(), -0.5 * gauss.sum()])
     assert np.array(rows[2].linear_momentum) == pytest.approx(expected, rel=1e-6)

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mpmcli.scene.expression import evaluate
+from mpmcli.scene.expression import bounds_of, evaluate
 from mpmcli.scene.expression_reader import parse
-from mpmcli.scene.intervals import bounds_of
 from mpmcli.scene.quadrature import Mean, largest_of, telling_times
 
 EXPRESSIONS = (
@@ -20,7 +19,7 @@ EXPRESSIONS = (
     *("ceil(t) * sign(x)", "step(t - x)", "min(t, x, 0.2) + max(t, 0.1)", "clamp(t, -0.5, x)", "hypot(t, x)"),
     *("1 if t < x and not x > 0.5 else -t", "2 if t <= x or t >= 1 else x", "3 if t == x else 0", "1 if t != x else 2"),
 )
-END = st.floats(-3, 3)
+END = st.floats(-3, 3).map(lambda end: end + 0.0)  # no -0.0, which numpy takes for less than 0.0
 
 
 @given(text=st.sampled_from(EXPRESSIONS), ends=st.tuples(END, END, END, END), seed=st.integers(0, 2**31))

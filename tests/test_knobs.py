@@ -12,11 +12,11 @@ from mpmcli.check.scene_limits import scene_limits
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, SolverSettings, parse_scene, scene_bounds, scene_to_toml
-from mpmcli.scene.solver_settings import USUAL_FLIP
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.plan import make_plan
-from mpmcli.solver.snapshot import read_group
-from mpmcli.solver.solver import Solver
+from mpmcli.scene.schema import USUAL_FLIP
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.frames.diagnosis import read_group
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.machine.plan import make_plan
 from mpmcli.stability.transfer_factors import step_inertia
 
 H = 0.1
@@ -43,9 +43,9 @@ def test_a_scene_that_chooses_nothing_has_nothing_of_it(backend_of: Callable) ->
     assert small_scene().solver == SolverSettings(
         precision="f32", kernel="quadratic", transfer="apic", flip=None, walls="folded"
     )
-    solver = Solver(small_scene(), backend_of("f32", 1))
-    assert solver.grid.before is None and solver.grid.tile == 6
-    assert solver.grid.scheme.spline.nodes == 3 and solver.grid.nodes.n == 4
+    run = build_run(small_scene(), backend_of("f32", 1))
+    assert run.grid.before is None and run.grid.tile == 6
+    assert run.grid.scheme.spline.nodes == 3 and run.grid.nodes.n == 4
 
 
 def test_flip_belongs_to_aflip() -> None:
@@ -85,9 +85,9 @@ def test_the_effective_scene_says_every_knob() -> None:
 def test_the_plan_follows_the_knobs(backend_of: Callable, knobs: dict) -> None:
     """Nodes, their bytes and the passes, counted from the solver's own fields."""
     scene, backend = small_scene(**knobs), backend_of("f32", 2)
-    plan, solver = make_plan(scene, backend), Solver(scene, backend)
-    fields = [field for field in (solver.grid.nodes, solver.grid.before) if field is not None]
-    assert plan.nodes == solver.grid.node_count
+    plan, run = make_plan(scene, backend), build_run(scene, backend)
+    fields = [field for field in (run.grid.nodes, run.grid.before) if field is not None]
+    assert plan.nodes == run.grid.node_count
     assert plan.bytes_per_node == sum(4 * field.n for field in fields)
     assert ("find contact" in plan.passes) == (knobs.get("walls") != "zeroed")
 
@@ -103,20 +103,20 @@ def test_check_and_solver_take_the_same_step(backend_of: Callable, knobs: dict) 
     ]
     assert told[1].value == pytest.approx(factor * told[0].value, rel=1e-12)
     assert f"{factor:.3g} times that step" in told[1].why
-    taken = [limit for limit in Solver(scene, backend_of("f32", 1)).limits() if limit.name == "wave"]
+    taken = [limit for limit in build_run(scene, backend_of("f32", 1)).limits() if limit.name == "wave"]
     assert taken[0].value == pytest.approx(told[1].value, rel=1e-4)
 
 
 def momenta_lost(scene: Scene, backend: Backend, step: float, steps: int) -> tuple[float, float]:
     """Return by how much linear and angular momentum change, as the ledger sums them, over sum m |v| and m |x| |v|."""
-    solver = Solver(scene, backend)
-    states = bodies_of(solver).values()
+    run = build_run(scene, backend)
+    states = bodies_of(run).values()
     linear = sum(s.mass @ np.linalg.norm(s.v, axis=1) for s in states)
     angular = sum(s.mass @ (np.linalg.norm(s.x, axis=1) * np.linalg.norm(s.v, axis=1)) for s in states)
-    first = solver.frame()[1]
+    first = run.frame()[1]
     for _ in range(steps):
-        solver.step(step)
-    last = solver.frame()[1]
+        run.step(step)
+    last = run.frame()[1]
     pushed = np.subtract(last.linear_momentum, first.linear_momentum)
     turned = np.subtract(last.angular_momentum, first.angular_momentum)
     return float(np.abs(pushed).max() / linear), float(np.abs(turned).max() / angular)
@@ -163,12 +163,12 @@ def test_pull_reaches_the_own_velocities_of_aflip(backend_of: Callable) -> None:
             }
         ],
     )
-    solver = Solver(scene, backend_of("f64", 1))
+    run = build_run(scene, backend_of("f64", 1))
     # Velocities live half a step behind.
     dt, steps = 1e-3, 50
     for _ in range(steps):
-        solver.step(dt)
-    v = read_group(solver.groups[0]).v
+        run.step(dt)
+    v = read_group(run.groups[0]).v
     assert v == pytest.approx(np.tile([2.0, -1.0], (len(v), 1)) * dt * (steps - 0.5), rel=1e-9)
 
 
@@ -195,10 +195,10 @@ def test_a_force_of_any_kind_pulls_with_every_scheme(
         forces=[{"acceleration": [0.0, acceleration]}],
         bodies=[body],
     )
-    solver = Solver(scene, backend_of("f64", 1, fully_optimised=True))
-    block, dt = bodies_of(solver)["block"], 1e-4
+    run = build_run(scene, backend_of("f64", 1, fully_optimised=True))
+    block, dt = bodies_of(run)["block"], 1e-4
     for _ in range(3):
-        solver.step(dt)
+        run.step(dt)
     X, y = block.x.T
     push = -y if acceleration == "-y" else -1.0 * (X > 0.5)
-    assert bodies_of(solver)["block"].momentum()[1] == pytest.approx(2.5 * dt * block.mass @ push, rel=1e-6)
+    assert bodies_of(run)["block"].momentum()[1] == pytest.approx(2.5 * dt * block.mass @ push, rel=1e-6)

@@ -7,10 +7,10 @@ import pytest
 
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 from mpmcli.stability.transfer_factors import loss_per_step
+from mpmcli.validation.case import Setting
 from mpmcli.validation.cases.bar import LENGTH, PERIODS, Bar
-from mpmcli.validation.setting import Setting
 
 BAR = Bar("bar", "bar", 2, 0)
 KH = np.pi / 13
@@ -25,7 +25,7 @@ def measured(backend_of: Callable) -> Iterator[Callable[..., tuple[dict[str, flo
         key = (n, *sorted(knobs.items()))
         if key not in known:
             scene = parse_scene(BAR.scene_tables(n, Setting(**knobs)), laws=parameter_models()).scene
-            solver = Solver(scene, backend_of("f64", 1))
+            solver = build_run(scene, backend_of("f64", 1))
             known[key] = (BAR.measure(n, scene, solver.frames()), solver.step_count / PERIODS, scene)
         return known[key]
 
@@ -73,10 +73,10 @@ def test_a_free_transfer_of_pic_takes_a_quarter(backend_of: Callable) -> None:
     # So slow that nothing moves.
     tables["time"] |= {"end": 0.1, "frames": 1, "step": 0.005}
     scene = parse_scene(tables, laws=parameter_models()).scene
-    solver = Solver(scene, backend_of("f64", 1))
-    (before, _), (after, _) = solver.frames()
+    run = build_run(scene, backend_of("f64", 1))
+    (before, _), (after, _) = run.frames()
     first, last = (amplitude(frame.position, frame.fields, frame.velocity) for frame in (before, after))
-    assert 1 - (last / first) ** (1 / solver.step_count) == pytest.approx(0.25 * KH**2, rel=0.03)
+    assert 1 - (last / first) ** (1 / run.step_count) == pytest.approx(0.25 * KH**2, rel=0.03)
 
 
 def amplitude(position: np.ndarray, fields: dict[str, np.ndarray], velocity: np.ndarray) -> float:

@@ -11,9 +11,10 @@ from path_reference import Arrays, check_nodes, reference_groups
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
 from mpmcli.scene.schema import SolverSettings
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.solver import Solver
-from mpmcli.solver.splines import PAD
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.transfer.splines import PAD
 
 # As in test_solver_paths.
 TOLERANCE = {"f32": 1e-6, "f64": 1e-12}
@@ -38,11 +39,11 @@ def scene_of(dimension: int, precision: str, knobs: dict) -> Scene:
     return scene.model_copy(update={"solver": SolverSettings(precision=precision, **knobs), "bodies": bodies})
 
 
-def prepare(scene: Scene, backend: Backend) -> Solver:
-    """Return a solver of the scene with the random state of `path_run`."""
-    solver = Solver(scene, backend, path_run.stirred(scene))
-    path_run.deform(solver)
-    return solver
+def prepare(scene: Scene, backend: Backend) -> Run:
+    """Return a run of the scene with the random state of `path_run`."""
+    run = build_run(scene, backend, path_run.stirred(scene))
+    path_run.deform(run)
+    return run
 
 
 def check_steps(scene: Scene, arrays: Arrays, tolerance: float) -> None:
@@ -115,12 +116,12 @@ def test_bitwise_equal_for_any_number_of_threads(backend_of: Callable, dimension
     """State after 150 steps and many sorts: the tiles of a wider stencil are as disjoint when their colours run."""
     states = []
     for threads in (1, 2):
-        solver = prepare(scene_of(dimension, "f32", knobs), backend_of("f32", threads))
+        run = prepare(scene_of(dimension, "f32", knobs), backend_of("f32", threads))
         orders = set()
         for _ in range(150):
-            solver.step(0.75 * path_run.STEP)
-            orders.add(path_run.order_of(solver))
+            run.step(0.75 * path_run.STEP)
+            orders.add(path_run.order_of(run))
         assert len(orders) > 5
-        states.append(path_run.state(solver))
+        states.append(path_run.state(run))
     for name, value in states[0].items():
         assert np.array_equal(value, states[1][name]), name

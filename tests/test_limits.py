@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from solver_state import bodies_of, scene_of
 
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.stability.limits import COURANT, DEFORMATION, FIX, WHY, Limit, deformation_limit, mode_limit, speed_limit
 
 H, RHO = 0.1, 1000.0
@@ -64,13 +65,13 @@ def lone_particles(dimension: int) -> object:
     )
 
 
-def started(backend_of: Callable, dimension: int) -> Solver:
+def started(backend_of: Callable, dimension: int) -> Run:
     """Return a solver of the lone particles with C0 = START I, their most unstable mode."""
     scene = lone_particles(dimension)
     mode = START * np.eye(dimension)
     samples = [replace(s, affine=np.tile(mode, (s.count, 1, 1))) for s in sample_bodies(scene)]
     assert [s.count for s in samples] == [1, 1]
-    return Solver(scene, backend_of("f64", 1), samples)
+    return build_run(scene, backend_of("f64", 1), samples)
 
 
 def predicted(dimension: int) -> float:
@@ -95,16 +96,16 @@ def test_a_lone_particle_is_stable_just_below_its_limit(
     The step is a rotation in (C, tau dt / C scale) with trace 2 - 4 r^2 and determinant 1, so |C| stays below
     C0 / sqrt(1 - r^2) = 5.0 C0 at r = 0.98.
     """
-    solver = started(backend_of, dimension)
+    run = started(backend_of, dimension)
     dt = 0.98 * predicted(dimension)
-    for limit in solver.limits():
+    for limit in run.limits():
         if limit.name == "wave":
             assert limit.value == pytest.approx(predicted(dimension), rel=1e-6)
     largest = {"solid": 0.0, "liquid": 0.0}
     for n in range(steps):
-        solver.step(dt)
+        run.step(dt)
         if n % 997 < 16 or n > steps - 50:
-            for name, body in bodies_of(solver).items():
+            for name, body in bodies_of(run).items():
                 largest[name] = max(largest[name], float(np.abs(body.C).max()))
     for name, value in largest.items():
         record_property(f"{name} max |C|/C0", value / START)
@@ -116,17 +117,17 @@ def test_a_lone_particle_grows_just_above_its_limit(
     backend_of: Callable, dimension: int, record_property: Callable
 ) -> None:
     """At 1.02 of the limit |C| grows by |lambda| = 2 r^2 - 1 + 2 r sqrt(r^2 - 1) = 1.49 per step, past 1e3 (10.3)."""
-    solver = started(backend_of, dimension)
+    run = started(backend_of, dimension)
     r = 1.02
     growth = 2 * r * r - 1 + 2 * r * np.sqrt(r * r - 1)
     n = 10
     # Within these the state stays far inside the linear range: 1e-6 x 1.49^25 dt = 1e-4.
     for _ in range(25 - n):
-        solver.step(r * predicted(dimension))
-    middle = {name: float(np.abs(body.C).max()) for name, body in bodies_of(solver).items()}
+        run.step(r * predicted(dimension))
+    middle = {name: float(np.abs(body.C).max()) for name, body in bodies_of(run).items()}
     for _ in range(n):
-        solver.step(r * predicted(dimension))
-    for name, body in bodies_of(solver).items():
+        run.step(r * predicted(dimension))
+    for name, body in bodies_of(run).items():
         largest = float(np.abs(body.C).max())
         record_property(f"{name} growth/step", (largest / middle[name]) ** (1 / n))
         assert largest > 1e3 * START
@@ -135,10 +136,10 @@ def test_a_lone_particle_grows_just_above_its_limit(
 
 def test_an_unstable_particle_stops_the_run(backend_of: Callable) -> None:
     """Growth beyond the limit ends in an error that names a body, and never in numbers that are not finite."""
-    solver = started(backend_of, 2)
+    run = started(backend_of, 2)
     with pytest.raises(UnstableRunError) as stopped:
         for _ in range(2000):
-            solver.step(1.1 * predicted(2))
+            run.step(1.1 * predicted(2))
     assert stopped.value.diagnosis.body in ("solid", "liquid")
 
 

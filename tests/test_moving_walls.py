@@ -7,8 +7,7 @@ import pytest
 from solver_state import bodies_of, scene_of
 
 from mpmcli.scene import Scene
-from mpmcli.solver.engine import build_engine
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 from mpmcli.stability.limits import COURANT
 
 SOLID = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 2e4, "poissons_ratio": 0.3}
@@ -26,7 +25,7 @@ BLOCKS = {
 
 def pressed_block(name: str, speed: float) -> Scene:
     """Return a block that flies against a floor that moves at some speed, with a velocity of its own relative to it."""
-    word, friction, solver = BLOCKS[name]
+    word, friction, settings = BLOCKS[name]
     velocity = {} if speed == 0 else {"wall_velocity": {"y_min": [speed, 0.0]}}
     return scene_of(
         domain={
@@ -38,7 +37,7 @@ def pressed_block(name: str, speed: float) -> Scene:
         | velocity
         | ({"friction": {"y_min": friction}} if friction else {}),
         time={"end": 1.0, "frames": 4},
-        solver={"precision": "f64"} | solver,
+        solver={"precision": "f64"} | settings,
         bodies=[
             {
                 "name": "block",
@@ -62,10 +61,10 @@ def test_a_moving_wall_is_one_at_rest_in_its_own_frame(
     """
     backend, speed, found = backend_of("f64"), H / DT, []
     for own in (0.0, speed):
-        solver = Solver(pressed_block(name, own), backend)
+        run = build_run(pressed_block(name, own), backend)
         for _ in range(100):
-            solver.step(DT)
-        state = bodies_of(solver)["block"]
+            run.step(DT)
+        state = bodies_of(run)["block"]
         found.append((state.x - [own * 100 * DT, 0.0], state.v - [own, 0.0], state.deformation))
     (x, v, F), (other_x, other_v, other_F) = found
     size = 16 * H
@@ -105,7 +104,7 @@ def test_a_rough_wall_drags_a_block_along(backend_of: Callable, solids: str, rec
             }
         ],
     )
-    rows = [row for _, row in build_engine(scene, backend_of("f32"), batched=True).frames()]
+    rows = [row for _, row in build_run(scene, backend_of("f32")).frames()]
     found = np.array([row.linear_momentum[0] / row.mass for row in rows])
     times = np.array([row.time - row.step_max / 2 for row in rows])
     expected = np.minimum(friction * g * times, speed)
@@ -118,8 +117,8 @@ def test_a_rough_wall_drags_a_block_along(backend_of: Callable, solids: str, rec
 @pytest.mark.slow
 def test_a_wall_that_moves_bounds_the_first_step(backend_of: Callable) -> None:
     """Before anything else moves: half of a cell at the speed of the wall at most."""
-    engine = Solver(
+    run = build_run(
         pressed_block("stick", 1e4).model_copy(update={"bodies": pressed_block("stick", 0.0).bodies}), backend_of("f64")
     )
-    assert engine.stable_step()[1].name == "speed"
-    assert engine.stable_step()[0] <= COURANT * H / 1e4
+    assert run.stable_step()[1].name == "speed"
+    assert run.stable_step()[0] <= COURANT * H / 1e4

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 import state_run
 
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 # Two bodies, and FLIP; forces are slow to compile.
 USUAL = ("several bodies, FLIP",)
@@ -18,7 +18,7 @@ STEPS = 40
 def test_the_bytes_do_not_depend_on_the_optimisation(backend_of: Callable, name: str) -> None:
     states = []
     for fully_optimised in (True, False):
-        solver = Solver(state_run.scene_named(name), backend_of("f32", 1, fully_optimised=fully_optimised))
-        state_run.advance(solver, STEPS)
-        states.append(solver.state.save())
+        run = build_run(state_run.scene_named(name), backend_of("f32", 1, fully_optimised=fully_optimised))
+        state_run.advance(run, STEPS)
+        states.append(state_run.saved_of(run))
     assert state_run.differences(*states) == []

@@ -11,10 +11,8 @@ import pytest
 from mpmcli.errors import InputError
 from mpmcli.output import RunRecord, prepare_directory
 from mpmcli.output.directory import take_directory
-from mpmcli.output.lock import LOCK, lock_is_held, take_lock
-from mpmcli.output.owner import Owner, process_start
-from mpmcli.output.run_record import read_record
-from mpmcli.output.run_status import DIED, ELSEWHERE, run_status
+from mpmcli.output.lock import LOCK, Owner, lock_is_held, process_start, take_lock
+from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
 
 HOLD = """
 import sys

@@ -12,7 +12,6 @@ from mpmcli.errors import NoRoomError, RunError
 from mpmcli.output import SegmentStore, open_result
 from mpmcli.output import durable as durable_module
 from mpmcli.output import pack as pack_module
-from mpmcli.output import packed_beside as beside_module
 from mpmcli.output import segments as segments_module
 from mpmcli.output.segments import PACKED
 from mpmcli.output.vtkhdf import VtkhdfWriter
@@ -153,7 +152,7 @@ def test_without_room_for_both_it_is_not_begun(tmp_path, monkeypatch):
     def refuse(*_: object, **__: object) -> None:
         raise NoRoomError("full")
 
-    monkeypatch.setattr(beside_module, "require_free_space", refuse)
+    monkeypatch.setattr(segments_module, "require_free_space", refuse)
     store = begin(tmp_path, 5)
     assert not (tmp_path / TEMPORARY).exists()
     store.finish()

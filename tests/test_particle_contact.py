@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from elastic_bodies import DENSITY, E, bars, stirred
 
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.engine import build_engine
-from mpmcli.solver.solver import Solver
+from mpmcli.scene import sample_bodies
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.machine.backend import Backend
 
 
 @pytest.mark.parametrize("shift", [0.0, pytest.param(0.25, marks=pytest.mark.slow)])
@@ -17,7 +17,7 @@ def test_bars_collide_for_as_long_as_a_wave_takes(backend_of: Callable, shift: f
     """They meet within 0.3 cells of touching, stay for 2 L / c, and part at nearly the speed of approach."""
     n, speed = 32, 0.05
     scene = bars(n, shift)
-    found = list(Solver(scene, backend_of("f64", 1)).frames())
+    found = list(build_run(scene, backend_of("f64", 1)).frames())
     times = np.array([row.time for _, row in found])
     moving = np.array([frame.velocity[frame.body == 0, 0].mean() / speed for frame, _ in found])
     energy = np.array([row.kinetic + row.elastic for _, row in found])
@@ -39,22 +39,22 @@ def test_particles_of_two_bodies_push_as_the_formula_says(backend_of: Callable) 
     scene = bars(8, 0.3)
     spacing = scene.domain.spacing
 
-    def speeds(gap: float) -> tuple[Solver, dict[str, np.ndarray], np.ndarray]:
-        solver = Solver(scene, backend_of("f64", 1))
-        stirred(solver, 2)
-        group = solver.groups[0]
-        x = group.x.to_numpy()
-        x[group.body.to_numpy() == 1, 0] += gap
-        group.x.from_numpy(x)
-        solver.state_was_replaced()
-        before = group.to_numpy()
-        solver.step(1e-4)
-        after = group.to_numpy()
-        return solver, before, (after["v"] - before["v"])[np.argsort(after["id"])]
+    def speeds(gap: float) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        run = build_run(scene, backend_of("f64", 1))
+        stirred(run, 2)
+        group = run.groups[0]
+        x = group.read()["x"]
+        x[group.read()["body"] == 1, 0] += gap
+        group.replace(x=x)
+        run.state_was_replaced()
+        before = group.read()
+        run.step(1e-4)
+        after = group.read()
+        return before, (after["v"] - before["v"])[np.argsort(after["id"])]
 
-    solver, before, near = speeds(-4.3 * spacing)
-    *_, far = speeds(0.0)
-    sample = solver._particles[0]
+    before, near = speeds(-4.3 * spacing)
+    _, far = speeds(0.0)
+    sample = sample_bodies(scene)[0]
     s, k = sample.volume**0.5, (E * sample.volume) / (2 * sample.volume**0.5 * spacing)
     force = np.zeros_like(before["x"])
     for p in range(len(force)):
@@ -73,16 +73,15 @@ def test_particles_of_two_bodies_push_as_the_formula_says(backend_of: Callable) 
     assert np.allclose((near - far)[own].sum(axis=0), impulse[order][own].sum(axis=0), rtol=1e-9)
 
 
-def small_run(backend: Backend, *, batched: bool) -> tuple[np.ndarray, list]:
+def small_run(backend: Backend) -> tuple[np.ndarray, list]:
     """Return the last positions, and the ledger, of two bars that meet."""
     scene = bars(16, 0.25, precision=backend.precision, frames=5)
-    found = list(build_engine(scene, backend, batched=batched).frames(lambda: False))
+    found = list(build_run(scene, backend).frames())
     return found[-1][0].position, [row for _, row in found]
 
 
-@pytest.mark.parametrize("threads", [3, pytest.param(1, marks=pytest.mark.slow)])
-def test_batches_have_the_bytes_of_a_solver(backend_of: Callable, threads: int) -> None:
-    expected, rows = small_run(backend_of("f32", 1), batched=False)
-    found, own = small_run(backend_of("f32", threads), batched=True)
+def test_threads_change_no_byte(backend_of: Callable) -> None:
+    expected, rows = small_run(backend_of("f32", 1))
+    found, own = small_run(backend_of("f32", 3))
     assert found.tobytes() == expected.tobytes()
     assert own == rows

@@ -8,8 +8,7 @@ import pytest
 from solver_state import BodyState, bodies_of, scene_of
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
-from mpmcli.solver.engine import build_engine
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 H = 0.125
 SOLID = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 2e4, "poissons_ratio": 0.3}
@@ -57,10 +56,10 @@ def moved_by(scene: Scene, cells: tuple[int, ...]) -> list[BodyParticles]:
 
 def run(backend: object, scene: Scene, particles: list[BodyParticles], steps: int, dt: float) -> BodyState:
     """Return the only body after some steps."""
-    solver = Solver(scene, backend, particles)
+    run = build_run(scene, backend, particles)
     for _ in range(steps):
-        solver.step(dt)
-    return bodies_of(solver)["ball"]
+        run.step(dt)
+    return bodies_of(run)["ball"]
 
 
 def apart(scene: Scene, first: BodyState, second: BodyState, cells: tuple[int, ...]) -> float:
@@ -149,7 +148,7 @@ def test_a_uniform_flow_stays_uniform(backend_of: Callable, precision: str, reco
             }
         ],
     )
-    rows = list(build_engine(scene, backend_of(precision), batched=True).frames())
+    rows = list(build_run(scene, backend_of(precision)).frames())
     (first, _), *_, (last, row) = rows
     moved = (last.position - first.position - [10.0, -5.0] + 0.5) % 1.0 - 0.5
     worst = max(float(np.abs(moved).max()), float(np.abs(last.velocity - [1.0, -0.5]).max()))
@@ -162,7 +161,7 @@ def test_a_uniform_flow_stays_uniform(backend_of: Callable, precision: str, reco
 def test_momentum_is_conserved(backend_of: Callable, record_property: Callable) -> None:
     """Of a ball that crosses corners, with gravity M g t more: to round-off, as the frames of a batch say."""
     scene = ball("liquid", domain={"gravity": [0.5, -1.0]})
-    rows = [row for _, row in build_engine(scene, backend_of("f64"), moved_by(scene, (8, 8)), batched=True).frames()]
+    rows = [row for _, row in build_run(scene, backend_of("f64"), moved_by(scene, (8, 8))).frames()]
     expected = [
         np.array(rows[0].linear_momentum) + r.mass * np.array([0.5, -1.0]) * (r.time - r.step_max / 2) for r in rows
     ]
@@ -212,7 +211,7 @@ def test_poiseuille(backend_of: Callable, record_property: Callable) -> None:
                 }
             ],
         )
-        *_, (frame, row) = build_engine(scene, backend, batched=True).frames()
+        *_, (frame, row) = build_run(scene, backend).frames()
         exact = poiseuille(frame.position[:, 1], row.time - row.step_max / 2)
         errors.append(float(np.sqrt(((frame.velocity[:, 0] - exact) ** 2).mean() / (exact**2).mean())))
         # Nothing distinguishes one place along the channel from another.

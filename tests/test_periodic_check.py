@@ -9,9 +9,9 @@ from command import CONFIGS, run_here
 from scenes import volume_errors
 from solver_state import scene_of
 
-from mpmcli.check.distance import close_pairs
-from mpmcli.check.flight import arrivals
-from mpmcli.dataset.statistics import motion_statistics
+from mpmcli.check.facts import arrivals
+from mpmcli.check.geometry import close_pairs
+from mpmcli.dataset.metadata import motion_statistics
 from mpmcli.scene import Scene, scene_bounds
 
 JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5, "poissons_ratio": 0.3}
@@ -74,8 +74,8 @@ def test_statistics_of_motion_take_the_way_across_the_face() -> None:
     wrapped = path % np.array([1.0, 1e9])
     found = motion_statistics([[wrapped[:5], wrapped[5:]]], [np.array([1.0, np.inf])])
     expected = motion_statistics([[path]])
-    assert np.abs(found.vel_mean - expected.vel_mean).max() < 1e-12
-    assert (found.vel_std == 1.0).all() and np.abs(found.acc_mean).max() < 1e-12
+    assert np.abs(found["vel_mean"] - expected["vel_mean"]).max() < 1e-12
+    assert (found["vel_std"] == 1.0).all() and np.abs(found["acc_mean"]).max() < 1e-12
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 from scenes import GRAVITY, block, row_means, scene, tilted
 
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 DENSITY = 1000.0
 
@@ -37,16 +37,16 @@ def test_a_viscous_film_runs_down_with_its_profile(backend_of: Callable, record_
         walls={"default": "slip", "y_min": "stick"},
     )
     X, Y = sample_bodies(asked)[0].position.T
-    solver = Solver(asked, backend_of("f32"))
-    solver.groups[0].set_deformation(1 / (1 + DENSITY * GRAVITY * np.cos(theta) * (H - Y) / modulus))
-    step, limit = solver.stable_step()
+    run = build_run(asked, backend_of("f32"))
+    run.groups[0].replace(deformation=1 / (1 + DENSITY * GRAVITY * np.cos(theta) * (H - Y) / modulus))
+    step, limit = run.stable_step()
     assert (limit.name, limit.body) == ("viscosity", "oil")
     # That of shear, which sound has no part in (docs/theory.md, 6.2).
     assert step == pytest.approx(asked.time.safety * h**2 / (4 * nu))
     middle = (length * H / 3 < X) & (2 * length * H / 3 > X)
     y = np.unique(np.round(Y, 9))
     m = (np.arange(100)[:, None] + 0.5) * np.pi / H
-    for frame, _ in solver.frames():
+    for frame, _ in run.frames():
         late = np.sum(np.sin(m * y) * np.exp(-nu * m**2 * frame.time) / m**3, axis=0)
         exact = pull / (2 * nu) * (2 * H * y - y**2) - 2 * pull / (nu * H) * late
         if frame.index > 0:

@@ -11,7 +11,7 @@ import pytest
 from scenes import GRAVITY, block, scene
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 DENSITY, H = 1600.0, 0.2
 
@@ -52,7 +52,7 @@ def test_tossed_sand_gains_volume_unless_corrected(
     mean height of the deposit, level between walls, times its width.
     """
     asked, sample = tossed(uneven, 8, 0.75, 3, youngs_modulus=5e5, volume_correction=correction)
-    frames = [frame for frame, _ in Solver(asked, backend_of("f32"), [sample]).frames()]
+    frames = [frame for frame, _ in build_run(asked, backend_of("f32"), [sample]).frames()]
     heights = np.array([frame.position[:, 1].astype(np.float64).mean() for frame in frames])
     gain = heights[-1] / heights[0] - 1
     record_property("volume gained", float(gain))
@@ -93,7 +93,7 @@ def test_tossed_sand_keeps_its_volume(
     Strips an eighth of the layer wide fill twice their mean height: what is left of a heap counts in full.
     """
     asked, sample = tossed(throw, cells, end, tall, sampling=sampling, particles_per_cell=per_cell)
-    *_, (last, _) = Solver(asked, backend_of("f32"), [sample]).frames()
+    *_, (last, _) = build_run(asked, backend_of("f32"), [sample]).frames()
     x, y = last.position.astype(np.float64).T
     strip = np.minimum((x / (2 * H) * 8).astype(int), 7)
     gain = float(np.mean([2 * y[strip == k].mean() for k in range(8)]) / H - 1)

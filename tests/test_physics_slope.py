@@ -7,7 +7,8 @@ import pytest
 from scenes import GRAVITY, block, row_means, scene, stresses, tilted
 
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
 
 H = 0.1
 SAND, MUD = 1600.0, 1000.0
@@ -77,14 +78,14 @@ def test_sand_stays_on_a_gentle_slope_and_flows_on_a_steep_one(
     X, Y = sample_bodies(asked)[0].position.T
     weight = SAND * GRAVITY * (H - Y)
     pressure, shear = weight * np.cos(np.radians(SLOPE)), weight * np.sin(np.radians(SLOPE))
-    solver = Solver(asked, backend_of("f32"))
-    solver.groups[0].set_deformation(
-        hencky_stretch(np.stack([-pressure, shear, shear, -pressure], 1).reshape(-1, 2, 2))
+    run = build_run(asked, backend_of("f32"))
+    run.groups[0].replace(
+        deformation=hencky_stretch(np.stack([-pressure, shear, shear, -pressure], 1).reshape(-1, 2, 2))
     )
     middle = middle_third(X)
     low = middle & (H / 2 > Y)
     slips, speeds, ratios = [], [], []
-    for frame, _ in solver.frames():
+    for frame, _ in run.frames():
         slips.append((frame.position[middle, 0] - X[middle]).mean() / H)
         speeds.append(frame.velocity[middle, 0].mean() / np.sqrt(GRAVITY * H))
         mean = stresses(frame.fields)[low].mean(0)
@@ -121,12 +122,12 @@ def test_sand_stays_on_a_rough_floor_and_slides_on_a_smooth_one(
     weight = SAND * GRAVITY * (H - Y)
     pressure = weight * np.cos(np.radians(SLOPE))
     shear = min(friction, np.tan(np.radians(SLOPE))) * pressure
-    solver = Solver(asked, backend_of("f32"))
-    solver.groups[0].set_deformation(
-        hencky_stretch(np.stack([-pressure, shear, shear, -pressure], 1).reshape(-1, 2, 2))
+    run = build_run(asked, backend_of("f32"))
+    run.groups[0].replace(
+        deformation=hencky_stretch(np.stack([-pressure, shear, shear, -pressure], 1).reshape(-1, 2, 2))
     )
     middle = middle_third(X)
-    speeds = np.array([[frame.time, frame.velocity[middle, 0].mean()] for frame, _ in solver.frames()]).T
+    speeds = np.array([[frame.time, frame.velocity[middle, 0].mean()] for frame, _ in run.frames()]).T
     expected = GRAVITY * max(np.sin(np.radians(SLOPE)) - friction * np.cos(np.radians(SLOPE)), 0.0)
     found = float(np.polyfit(*speeds, 1)[0])
     record_property("acceleration / g", found / GRAVITY)
@@ -141,7 +142,7 @@ VISCOSITY = MUD * np.sqrt(GRAVITY * np.sin(np.radians(DEGREES)) * H**3 / (2 * RE
 UNIT = H**2 * MUD / VISCOSITY
 
 
-def mud_slope(backend_of: Callable, strength: float, times: float, frames: int) -> tuple[Solver, np.ndarray]:
+def mud_slope(backend_of: Callable, strength: float, times: float, frames: int) -> tuple[Run, np.ndarray]:
     """Return a layer of mud of yield stress strength rho g H sin(theta) in its stress at rest, and its X and Y.
 
     tau = K (J - 1) I + G dev(b): b has the shear of sigma_xy = rho g sin(theta) (H - y), cut off at the yield stress,
@@ -166,9 +167,9 @@ def mud_slope(backend_of: Callable, strength: float, times: float, frames: int) 
     F[:, 0, 0] = (1 + shear**2) ** 0.25
     F[:, 1, 0] = shear / F[:, 0, 0]
     F[:, 1, 1] = 1 / F[:, 0, 0]
-    solver = Solver(asked, backend_of("f32"))
-    solver.groups[0].set_deformation(F * np.sqrt(J)[:, None, None])
-    return solver, start
+    run = build_run(asked, backend_of("f32"))
+    run.groups[0].replace(deformation=F * np.sqrt(J)[:, None, None])
+    return run, start
 
 
 def test_mud_below_its_yield_stress_stays_for_ever(backend_of: Callable, record_property: Callable) -> None:
@@ -177,9 +178,9 @@ def test_mud_below_its_yield_stress_stays_for_ever(backend_of: Callable, record_
     It trembles about its place, since nothing damps elastic waves below yield; but the means over the second, third
     and last quarter of the run are the same to 5e-4 H.
     """
-    solver, start = mud_slope(backend_of, 1.1, 12, 16)
+    run, start = mud_slope(backend_of, 1.1, 12, 16)
     middle = middle_third(start[:, 0])
-    frames = [frame for frame, _ in solver.frames()]
+    frames = [frame for frame, _ in run.frames()]
     slips = np.array([(frame.position[middle, 0] - start[middle, 0]).mean() / H for frame in frames])
     speeds = [np.abs(frame.velocity[middle]).max() / np.sqrt(GRAVITY * H) for frame in frames]
     record_property("slip / H", str(np.round(slips, 5).tolist()))
@@ -196,10 +197,10 @@ def test_mud_above_its_yield_stress_flows_as_a_plug(backend_of: Callable, record
     The stress falls below tau_y at y = H_y = H - tau_y / (rho g sin(theta)), and the plug above rides at
     rho g sin(theta) H_y^2 / (2 eta) (Bingham 1922). Judged from 1.5 to 3 H^2 / nu, since elastic waves are left: 3 %.
     """
-    solver, start = mud_slope(backend_of, 0.5, 3, 10)
+    run, start = mud_slope(backend_of, 0.5, 3, 10)
     X, Y = start.T
     middle = middle_third(X)
-    frames = [frame for frame, _ in solver.frames()]
+    frames = [frame for frame, _ in run.frames()]
     u = np.mean([row_means(frame.velocity[:, 0], Y, middle) for frame in frames[5:]], axis=0)
     y = np.minimum(np.unique(np.round(Y, 9)), H / 2)
     exact = WEIGHT / H / (2 * VISCOSITY) * (H * y - y**2)
@@ -217,10 +218,10 @@ def test_mud_flows_just_above_its_yield_stress(backend_of: Callable, record_prop
 
     20 % of u in the mean of the last half: the sheared layer is less than one cell deep.
     """
-    solver, start = mud_slope(backend_of, 0.9, 20, 16)
+    run, start = mud_slope(backend_of, 0.9, 20, 16)
     middle = middle_third(start[:, 0])
     top = middle & (start[:, 1] > H / 2)
-    frames = [frame for frame, _ in solver.frames()]
+    frames = [frame for frame, _ in run.frames()]
     slips = [(frame.position[top, 0] - start[top, 0]).mean() / H for frame in frames]
     exact = WEIGHT / H / (2 * VISCOSITY) * (0.1 * H) ** 2
     u = (slips[-1] - slips[8]) * H / (frames[-1].time - frames[8].time)

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from mpmcli.errors import InputError, RunError
-from mpmcli.render.files import picture_file
-from mpmcli.render.files.picture_file import digest_of, settings_digest, write_picture
+from mpmcli.render import picture_file
+from mpmcli.render.picture_file import digest_of, settings_digest, write_picture
 
 DIGEST = settings_digest({"mode": "dots"})
 

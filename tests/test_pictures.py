@@ -12,7 +12,7 @@ import pytest
 from command import ROOT, run_here
 from PIL import Image
 
-from mpmcli.render.files.picture_file import digest_of
+from mpmcli.render.picture_file import digest_of
 
 PICTURES = ROOT / "docs" / "pictures"
 PAGE = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
@@ -51,7 +51,7 @@ def test_pictures_are_small_and_of_mpmcli() -> None:
 
 
 def test_a_smaller_file_has_the_same_pixels(script: ModuleType, tmp_path: Path) -> None:
-    from mpmcli.render.files.picture_file import write_picture
+    from mpmcli.render.picture_file import write_picture
 
     gradient = np.add.outer(np.arange(200), np.arange(300))[:, :, None] // np.array([2, 3, 4])
     image = gradient.astype(np.uint8)

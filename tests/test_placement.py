@@ -11,10 +11,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from mpmcli.check.distance import distance_between
-from mpmcli.dataset.draw import draw
-from mpmcli.dataset.placed_bodies import PlacementError
-from mpmcli.dataset.placement import NoPlace, RoundedBox, Wanted, distances, find_places, rounded_box
+from mpmcli.check.geometry import distance_between
+from mpmcli.dataset.draw import NoPlace, PlacementError, RoundedBox, Wanted, distances, draw, find_places, rounded_box
 from mpmcli.scene.shapes import Ball, Box, Polygon
 
 # Positions are of order 1 m: a few roundings.

@@ -14,12 +14,11 @@ from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
 from mpmcli.output import SegmentStore
 from mpmcli.scene import Scene
-from mpmcli.solver.backend import choose_backend, start, stop_backend
-from mpmcli.solver.device_memory import has_cuda_device
-from mpmcli.solver.engine import build_engine
-from mpmcli.solver.ordering import entry_count
-from mpmcli.solver.plan import LawPlan, Plan, make_plan, require_room
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.machine.backend import choose_backend, start, stop_backend
+from mpmcli.solver.machine.device_memory import has_cuda_device
+from mpmcli.solver.machine.plan import LawPlan, Plan, make_plan, require_room
+from mpmcli.solver.particles.sort import entry_count
 
 MATERIALS = {
     "fluid": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},
@@ -52,15 +51,15 @@ def test_the_plan_counts_every_field(
         ],
     )
     backend = backend_of(precision)
-    plan, solver = make_plan(scene, backend), Solver(scene, backend)
-    (group,) = solver.groups
+    plan, run = make_plan(scene, backend), build_run(scene, backend)
+    (group,) = run.groups
     real = {"f32": 4, "f64": 8}[precision]
-    widest = max(entry_count(field) for field in group.state)
-    state = real * sum(entry_count(field) for field in group.state)
-    assert plan.particles == solver.particle_count
-    assert plan.bytes_per_particle == state + 4 * len(group.labels) + widest * real + 4 + 4
-    assert plan.nodes == solver.grid.node_count
-    assert plan.bytes_per_node == real * solver.grid.nodes.n
+    widest = max(entry_count(field) for field in group.arrays.state)
+    state = real * sum(entry_count(field) for field in group.arrays.state)
+    assert plan.particles == run.particle_count
+    assert plan.bytes_per_particle == state + 4 * len(group.arrays.labels) + widest * real + 4 + 4
+    assert plan.nodes == run.grid.node_count
+    assert plan.bytes_per_node == real * run.grid.nodes.n
     if (dimension, material, bodies, precision) == (3, "fluid", 1, "f32"):
         assert plan.bytes_per_particle <= 160
 
@@ -90,9 +89,9 @@ def test_the_plan_counts_what_the_host_holds(tmp_path: Path, fields: list[str]) 
     assert plan.particles == 409_600
     tracemalloc.start()
     try:
-        engine = build_engine(scene, backend, batched=True)
+        run = build_run(scene, backend)
         store = SegmentStore(tmp_path, {"scene": "", "bodies": [], "materials": []})
-        for frame, row in engine.frames(lambda: False):
+        for frame, row in run.frames():
             store.write(frame, row)
             del frame
         peak = tracemalloc.get_traced_memory()[1]
@@ -129,7 +128,7 @@ def test_the_plan_counts_what_colliders_need(backend_of: Callable, dimension: in
     plane = {"name": "plane", "shape": {"plane": {"point": [0.7] * dimension, "normal": [-1.0] * dimension}}}
     plain = scene_with("fluid", dimension=dimension)
     scene, backend = with_colliders(plain, [union, plane]), backend_of("f32", 1)
-    colliders = Solver(scene, backend)._kernels.colliders.colliders
+    colliders = build_run(scene, backend).batch.device.colliders
     fields = 8 * colliders.taken.n * colliders.taken.shape[0] + 4 * colliders.samples.shape[0]
     more = make_plan(scene, backend).device_bytes - make_plan(plain, backend).device_bytes
     assert more == fields > 0
@@ -149,9 +148,9 @@ def test_a_scene_of_fluid_plans_nothing_of_other_laws(backend_of: Callable) -> N
     assert {"deformation_gradient", "plastic_volume_strain"} <= mixed.laws[1].fields.keys()
     assert [name for name in mixed.passes if "sand" in name] == ["scatter sand", "gather sand"]
     assert "body" not in mixed.laws[1].fields
-    solver = Solver(scene_with("fluid", "sand", "fluid"), backend)
-    for group, law in zip(solver.groups, mixed.laws, strict=True):
-        assert len(group.state) + len(group.labels) == len(law.fields)
+    run = build_run(scene_with("fluid", "sand", "fluid"), backend)
+    for group, law in zip(run.groups, mixed.laws, strict=True):
+        assert len(group.arrays.state) + len(group.arrays.labels) == len(law.fields)
         assert group.count == law.particles
 
 
@@ -172,9 +171,9 @@ def test_a_law_is_compiled_once_for_all_its_bodies_and_not_at_all_without_one(
 
     def compiled(*materials: str) -> Counter[str]:
         traced.clear()
-        solver = Solver(scene_with(*materials), backend_of("f32", 1))
-        next(solver.frames())
-        solver.step(1e-5)
+        run = build_run(scene_with(*materials), backend_of("f32", 1))
+        next(run.frames())
+        run.step(1e-5)
         return Counter(traced)
 
     alone = compiled("fluid")
@@ -186,7 +185,7 @@ def test_a_law_is_compiled_once_for_all_its_bodies_and_not_at_all_without_one(
 
 def test_more_than_an_index_reaches_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """3 x 4 numbers of 2^28 particles are 3 x 2^30 entries of one field."""
-    monkeypatch.setattr("mpmcli.solver.plan.MEMORY_SHARE", 1e6)
+    monkeypatch.setattr("mpmcli.solver.machine.plan.MEMORY_SHARE", 1e6)
     with pytest.raises(InputError, match="more than 32-bit indices can address"):
         require_room(Plan((LawPlan("fluid", 2**28, {"position": 140}),), 1000, 0, 16, 16000, 1, ()))
 
@@ -227,27 +226,30 @@ class FakeDriver:
 
 
 def test_a_run_on_cuda_needs_the_memory_of_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """10 GB on the device: not of 10 GB that are free there, nor of the 1 GB that this machine has."""
+    """10.1 GB on the device with its room: not of 10 GB that are free there, nor of the 1 GB that this machine has."""
     plan = Plan((LawPlan("fluid", 10**8, {"position": 100}),), 1000, 0, 16, 16000, 1, (), "cuda")
     driver = FakeDriver(10 * 10**9)
-    monkeypatch.setattr("mpmcli.solver.device_memory.ctypes.CDLL", lambda name: driver)
-    monkeypatch.setattr("mpmcli.solver.plan.psutil.virtual_memory", lambda: SimpleNamespace(available=10**9))
-    with pytest.raises(InputError, match="10 GB of memory on the cuda device, and 8 GB may be used there"):
+    monkeypatch.setattr("mpmcli.solver.machine.device_memory.ctypes.CDLL", lambda name: driver)
+    monkeypatch.setattr("mpmcli.solver.machine.plan.psutil.virtual_memory", lambda: SimpleNamespace(available=10**9))
+    with pytest.raises(InputError, match=r"10\.1 GB of memory on the cuda device, and 8 GB may be used there"):
         require_room(plan)
     driver.free *= 2
     require_room(plan)
     assert driver.uses == 0
-    with pytest.raises(InputError, match="10 GB of memory, and 800 MB may be used here"):
+    with pytest.raises(InputError, match=r"10\.1 GB of memory, and 800 MB may be used here"):
         require_room(replace(plan, arch="cpu"))
-    monkeypatch.setattr("mpmcli.solver.device_memory.ctypes.CDLL", lambda name: FakeDriver(0, present=False))
+    monkeypatch.setattr("mpmcli.solver.machine.device_memory.ctypes.CDLL", lambda name: FakeDriver(0, present=False))
     require_room(plan)
 
 
 def test_a_device_is_there_if_the_driver_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mpmcli.solver.device_memory.Path", lambda name: SimpleNamespace(glob=lambda pattern: []))
-    monkeypatch.setattr("mpmcli.solver.device_memory.os.path.exists", lambda name: False)
+    monkeypatch.setattr(
+        "mpmcli.solver.machine.device_memory.Path", lambda name: SimpleNamespace(glob=lambda pattern: [])
+    )
+    monkeypatch.setattr("mpmcli.solver.machine.device_memory.os.path.exists", lambda name: False)
     for present in (True, False):
         monkeypatch.setattr(
-            "mpmcli.solver.device_memory.ctypes.CDLL", lambda name, present=present: FakeDriver(1, present=present)
+            "mpmcli.solver.machine.device_memory.ctypes.CDLL",
+            lambda name, present=present: FakeDriver(1, present=present),
         )
         assert has_cuda_device() is present

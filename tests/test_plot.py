@@ -18,7 +18,7 @@ from mpmcli.plot import history
 from mpmcli.plot.history import read_history
 from mpmcli.plot.ledger_figure import draw_ledger, ledger_picture
 from mpmcli.plot.style import THEMES, drawing
-from mpmcli.render.files.picture_file import settings_digest, write_picture
+from mpmcli.render.picture_file import settings_digest, write_picture
 
 TIMES = PAUSE * np.arange(6)
 SIZE = ("--size", "400x300")

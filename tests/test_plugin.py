@@ -24,7 +24,7 @@ import taichi as ti
 from pydantic import Field
 
 from mpmcli.materials.law import Law, Mode
-from mpmcli.scene.knobs import Knob
+from mpmcli.scene.material import Knob
 from mpmcli.scene.material import MaterialParameters
 from mpmcli.scene.quantity import Positive
 

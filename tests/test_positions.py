@@ -1,6 +1,7 @@
 """Positions in single precision: a motion below the rounding of the coordinate is carried, not lost."""
 
 from collections.abc import Callable
+from copy import copy
 
 import numpy as np
 import pytest
@@ -12,8 +13,7 @@ from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_state import StateCheck
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import Scene
-from mpmcli.solver.engine import build_engine
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 # A block at 8.6 m that moves by a fifth of the spacing of the numbers there in a step, and one beside it that is fast.
 SPEED, STEP = 4e-4, 5e-4
@@ -54,19 +54,21 @@ def test_a_slow_block_beside_a_fast_one(
 ) -> None:
     """At 8.6 m it moves by v t, to half the spacing of the numbers there: 2.4e-4 of its 2 mm after 5 s."""
     scene = two_blocks(dimension, end, solids)
-    engine = build_engine(scene, backend_of("f32", 1, arch), batched=True)
-    first, last = (frame for frame, _ in engine.frames(lambda: False))
+    run = build_run(scene, backend_of("f32", 1, arch))
+    first, last = (frame for frame, _ in run.frames())
     slow = first.body == 0
     way = last.position[slow].astype(np.float64) - first.position[slow]
-    assert SPEED * STEP < BETWEEN / 4 and engine.step_count == round(end / STEP)
+    assert SPEED * STEP < BETWEEN / 4 and run.step_count == round(end / STEP)
     assert np.abs(way[:, 0] - SPEED * end).max() <= 0.51 * BETWEEN
     assert np.abs(way[:, 1:]).max() == 0.0
 
 
 def test_remainders(backend_of: Callable) -> None:
     """A move and its remainder sum to the way, in double precision; a particle that the domain holds has none."""
-    solver = Solver(two_blocks(2, 1.0), backend_of("f32", 1))
-    particles, group = solver._kernels.particles, solver.groups[0]
+    run = build_run(two_blocks(2, 1.0), backend_of("f32", 1))
+    # As the view of a run has it.
+    particles, group = copy(run.batch.device.particles), run.groups[0].arrays
+    particles.extent = run.scene.domain.size
     rng = np.random.default_rng(0)
     n = 200
     arrays = {
@@ -125,8 +127,8 @@ def test_folded_walls_hold_no_particle(backend_of: Callable, walls: str, setting
             }
         ],
     )
-    engine = build_engine(scene, backend_of("f32", 1), batched=True)
-    on_walls = [((f.position <= 0) | (f.position >= 1)).any(axis=1).sum() for f, _ in engine.frames(lambda: False)]
+    run = build_run(scene, backend_of("f32", 1))
+    on_walls = [((f.position <= 0) | (f.position >= 1)).any(axis=1).sum() for f, _ in run.frames()]
     assert (max(on_walls) > 0) == holds
 
 

@@ -13,8 +13,8 @@ from mpmcli.scene import LoadedScene, parse_scene
 from mpmcli.simulation import stored_run
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.simulate import simulate
-from mpmcli.solver import launch_budget
-from mpmcli.solver.backend import stop_backend
+from mpmcli.solver.engine import exchange
+from mpmcli.solver.machine.backend import stop_backend
 
 FRAMES, LATER = 4, 7
 # Of the run, and steps in a launch, after each of which it writes a checkpoint.
@@ -51,8 +51,8 @@ def run(
 def at_once() -> object:
     """Seal each frame at once, in a thread, and launch a few steps at a time, so that a short run has many files."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(launch_budget, "FIRST", PARTICLES * STEPS)
-        patch.setattr(launch_budget.LaunchBudget, "took", lambda *_: None)
+        patch.setattr(exchange, "FIRST", PARTICLES * STEPS)
+        patch.setattr(exchange.LaunchBudget, "took", lambda *_: None)
         patch.setattr(stored_run, "HOLD", 0.0)
         patch.setattr(store, "ASIDE", 0)
         yield

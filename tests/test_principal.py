@@ -9,7 +9,7 @@ import taichi as ti
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from mpmcli.materials.principal import from_principal, principal_stretches
+from mpmcli.materials.tensors import from_principal, principal_stretches
 
 BOTH = pytest.mark.parametrize("dimension", [2, 3])
 COUNT = 2000

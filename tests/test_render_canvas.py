@@ -10,15 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mpmcli.output import Result
-from mpmcli.render.color_by import color_by
-from mpmcli.render.coloring import Categories, Coloring
-from mpmcli.render.labels import cut, length_text, round_length, ticks_of, time_text
-from mpmcli.render.painter import set_up
-from mpmcli.render.picture_layout import PictureLayout
-from mpmcli.render.pictures import picture_digest
+from mpmcli.render.coloring import Categories, Coloring, color_by
+from mpmcli.render.picture_layout import PictureLayout, cut, length_text, round_length, ticks_of, time_text
+from mpmcli.render.pictures import picture_digest, set_up
 from mpmcli.render.render_scene import render_scene_of
-from mpmcli.render.settings import Settings
-from mpmcli.render.theme import THEMES, rgb_bytes
+from mpmcli.render.settings import THEMES, Settings, rgb_bytes
 from mpmcli.render.view import view_of
 
 LIGHT = THEMES["light"]

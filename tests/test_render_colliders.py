@@ -8,11 +8,10 @@ import pytest
 from drawn_results import JELLY, WATER, frame, header, lattice, write
 
 from mpmcli.output import Result
-from mpmcli.render.flat_colliders import FILLED
-from mpmcli.render.painter import set_up
+from mpmcli.render.colliders import FILLED
+from mpmcli.render.pictures import set_up
 from mpmcli.render.render_scene import render_scene_of
-from mpmcli.render.settings import Settings
-from mpmcli.render.theme import THEMES, rgb_bytes
+from mpmcli.render.settings import THEMES, Settings, rgb_bytes
 from mpmcli.render.view import View
 
 pytestmark = pytest.mark.usefixtures("drawing")

@@ -10,10 +10,9 @@ from drawn_results import JELLY, WATER, frame, header, write
 
 from mpmcli.errors import InputError
 from mpmcli.output import Result
-from mpmcli.render.color_by import color_by, color_map
-from mpmcli.render.coloring import Categories, Coloring
+from mpmcli.render.coloring import Categories, Coloring, color_by, color_map
 from mpmcli.render.render_scene import RenderScene, render_scene_of
-from mpmcli.render.theme import THEMES, rgb_bytes
+from mpmcli.render.settings import THEMES, rgb_bytes
 
 LIGHT = THEMES["light"]
 N = 400

@@ -7,10 +7,10 @@ import pytest
 from drawn_results import WATER, frame, header, lattice, write
 
 from mpmcli.output import Result
-from mpmcli.render.density import DensityPainter, Slice, density_colors, grid_density, slice_of
+from mpmcli.render.density import DensityPainter, density_colors, grid_density
 from mpmcli.render.render_scene import render_scene_of
-from mpmcli.render.theme import THEMES, rgb_bytes
-from mpmcli.render.view import view_of
+from mpmcli.render.settings import THEMES, rgb_bytes
+from mpmcli.render.view import Slice, slice_of, view_of
 
 LIGHT = THEMES["light"]
 H = 0.05

@@ -10,11 +10,10 @@ from drawn_results import WATER, frame, header, lattice, write
 
 from mpmcli.frames.frame import Frame
 from mpmcli.output import Result
-from mpmcli.render.color_by import color_by
-from mpmcli.render.dots import OVERLAP, DotsPainter, samples_of
-from mpmcli.render.hidden import hidden
+from mpmcli.render.coloring import color_by
+from mpmcli.render.dots import OVERLAP, DotsPainter, hidden, samples_of
 from mpmcli.render.render_scene import RenderScene, render_scene_of
-from mpmcli.render.theme import THEMES, rgb_bytes
+from mpmcli.render.settings import THEMES, rgb_bytes
 from mpmcli.render.view import View, view_of
 
 pytestmark = pytest.mark.usefixtures("drawing")

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from mpmcli.frames.frame import Frame
-from mpmcli.render.appearance import APPEARANCES
-from mpmcli.render.liquids.fluid import FluidPainter
-from mpmcli.render.render_scene import RenderScene
-from mpmcli.render.theme import THEMES
+from mpmcli.render.fluid import FluidPainter
+from mpmcli.render.render_scene import APPEARANCES, RenderScene
+from mpmcli.render.settings import THEMES
 from mpmcli.render.view import View, view_of
 
 pytestmark = pytest.mark.usefixtures("drawing")
@@ -23,14 +22,12 @@ SUBJECT = RenderScene(
     dimension=3,
     lower=(0.0, 0.0, 0.0),
     upper=(1.6, 0.8, 0.9),
-    spacing=SPACING,
     up=(0.0, 0.0, 1.0),
     bodies=("water", "jelly"),
     appearances=(APPEARANCES["water"], APPEARANCES["jelly"]),
     material_of=(0, 1),
     distances=(DISTANCE, DISTANCE),
     densities=(1000.0, 1000.0),
-    fields=(),
 )
 WATER, JELLY = 0, 1
 FRONT = view_of(SUBJECT, "front", SIZE)

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from mpmcli.frames.frame import Frame
-from mpmcli.render.appearance import APPEARANCES
 from mpmcli.render.coloring import Coloring
-from mpmcli.render.painter import Painter, surface_painter
-from mpmcli.render.render_scene import RenderScene
-from mpmcli.render.shading.lighting import lights_of
-from mpmcli.render.theme import THEMES
+from mpmcli.render.lighting import lights_of
+from mpmcli.render.pictures import Painter, surface_painter
+from mpmcli.render.render_scene import APPEARANCES, RenderScene
+from mpmcli.render.settings import THEMES
 from mpmcli.render.view import View, view_of
 
 pytestmark = pytest.mark.usefixtures("drawing")
@@ -42,14 +41,12 @@ def subject_with(dimension: int, *names: str) -> RenderScene:
         dimension=dimension,
         lower=(0.0, 0.0, 0.0),
         upper=upper,
-        spacing=2 * DISTANCE,
         up=up,
         bodies=names,
         appearances=appearances,
         material_of=tuple(range(count)),
         distances=(DISTANCE,) * count,
         densities=(1e3,) * count,
-        fields=(),
     )
 
 

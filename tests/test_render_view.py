@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mpmcli.errors import InputError
-from mpmcli.render.appearance import appearance_of
 from mpmcli.render.offscreen import OffscreenRenderer
-from mpmcli.render.render_scene import RenderScene
-from mpmcli.render.theme import THEMES
+from mpmcli.render.render_scene import RenderScene, appearance_of
+from mpmcli.render.settings import THEMES
 from mpmcli.render.view import CAMERAS, MARGIN, aspect_of, view_of
 
 SUBJECT = RenderScene(
@@ -20,14 +19,12 @@ SUBJECT = RenderScene(
     dimension=3,
     lower=(-1.0, 0.5, 2.0),
     upper=(2.0, 1.5, 3.2),
-    spacing=0.1,
     up=(0.0, 0.0, 1.0),
     bodies=("body",),
     appearances=(appearance_of("fluid", WATER),),
     material_of=(0,),
     distances=(0.05,),
     densities=(1000.0,),
-    fields=(),
 )
 FLAT = replace(SUBJECT, dimension=2, lower=(-1.0, 0.5, 0.0), upper=(2.0, 1.5, 0.0), up=(0.0, 1.0, 0.0))
 
@@ -52,7 +49,7 @@ def test_points_fall_where_vtk_puts_them(drawing: str, camera: str) -> None:
         vtk_x, vtk_y = coordinate.GetComputedDoubleDisplayValue(stage.plotter.renderer)
         # VTK counts to the middle of pixels, from the bottom.
         assert abs(x - vtk_x - 0.5) < 0.51 and abs(200 - y - vtk_y - 0.5) < 0.51
-    stage.close()
+    stage.plotter.close()
 
 
 @pytest.mark.parametrize("scene", [SUBJECT, FLAT], ids=["3d", "2d"])

@@ -22,10 +22,11 @@ from mpmcli.output.checkpoints import CHECKPOINTS, Checkpoint, read_checkpoints,
 from mpmcli.scene import Scene, load_scene, parse_scene
 from mpmcli.simulation.resume import find_resumption, require_same_run
 from mpmcli.simulation.simulate import RunSettings, simulate
-from mpmcli.solver import launch_budget
-from mpmcli.solver.backend import choose_backend, start, stop_backend
-from mpmcli.solver.engine import Engine, build_engine
-from mpmcli.solver.state import SavedState
+from mpmcli.solver.engine import exchange
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.saved_state import SavedState
+from mpmcli.solver.machine.backend import choose_backend, start, stop_backend
 
 # Sand, water from an emitter, a paddle that turns ever faster, gravity that swings, an open face.
 CHANGING = {
@@ -92,10 +93,10 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import load_scene
 from mpmcli.simulation import stored_run
 from mpmcli.simulation.simulate import RunSettings, simulate
-from mpmcli.solver import launch_budget
+from mpmcli.solver.engine import exchange
 scene, directory, form = sys.argv[1:]
-launch_budget.FIRST, stored_run.HOLD = 2000, 0.0
-launch_budget.LaunchBudget.took = lambda *_: None
+exchange.FIRST, stored_run.HOLD = 2000, 0.0
+exchange.LaunchBudget.took = lambda *_: None
 def told(row, summary):
     if summary.frames == 3:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -104,41 +105,40 @@ simulate(loaded, RunSettings(Path(directory), form=form, checkpoint_every=0.0), 
 """
 
 
-def engine_of(scene: Scene) -> Engine:
+def run_of(scene: Scene) -> Run:
     """Return a run of a scene on a fresh backend."""
     stop_backend()
     backend = replace(choose_backend("cpu", 1, "f32"), optimisation="few")
     start(backend)
-    return build_engine(scene, backend, batched=True)
+    return build_run(scene, backend)
 
 
 @pytest.fixture
 def short_launches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a run stop every few steps."""
-    monkeypatch.setattr(launch_budget, "FIRST", 2000)
-    monkeypatch.setattr(launch_budget.LaunchBudget, "took", lambda *_: None)
+    monkeypatch.setattr(exchange, "FIRST", 2000)
+    monkeypatch.setattr(exchange.LaunchBudget, "took", lambda *_: None)
 
 
 @pytest.mark.parametrize("data", [CHANGING, TOTAL], ids=["all that changes", "total"])
 def test_a_state_that_is_loaded_elsewhere_goes_on_with_the_same_bytes(data, short_launches):
     scene = parse_scene(data, laws=parameter_models(), source="<test>").scene
-    engine = engine_of(scene)
+    run = run_of(scene)
     saved: list[tuple[int, str, SavedState]] = []
     expected = []
 
     def keep() -> bool:
-        state = engine.save()
-        state = SavedState(state.numbers, dict(state.arrays))
+        state = run.save().copied()
         saved.append((len(expected), json.dumps(state.numbers), state))
         return False
 
-    expected.extend(engine.frames(keep))
+    expected.extend(run.frames(keep))
     assert len(saved) >= 4
     frames, numbers, state = saved[len(saved) // 2]
     assert 0 < frames < len(expected)
-    other = engine_of(scene)
+    other = run_of(scene)
     other.load(SavedState(json.loads(numbers), state.arrays))
-    found = list(other.frames(lambda: False))
+    found = list(other.frames())
     assert len(found) == len(expected) - frames
     for (frame, row), (before, same) in zip(found, expected[frames:], strict=True):
         assert repr(row) == repr(same)

@@ -103,7 +103,7 @@ def test_an_unstable_run_keeps_its_frames_and_says_where_it_failed(tmp_path):
     assert np.linalg.norm(place - record["failure"]["position"]) < 1.0
 
 
-class FakeSolver:
+class FakeRun:
     """Gives three frames of one particle without a device, and raises its fault before the last."""
 
     fault: BaseException | None = None
@@ -126,15 +126,15 @@ class FakeSolver:
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Return `run(fault)`: the summary of a run whose solver raises it after two frames."""
+    """Return `run(fault)`: the summary of a run whose engine raises it after two frames."""
     monkeypatch.setattr("mpmcli.simulation.simulate.start", lambda backend: backend)
-    monkeypatch.setattr("mpmcli.simulation.simulate.build_engine", FakeSolver)
+    monkeypatch.setattr("mpmcli.simulation.simulate.build_run", FakeRun)
     scene = tmp_path / "scene.toml"
     scene.write_text(SCENE, encoding="utf-8")
     loaded = load_scene(scene, laws=parameter_models())
 
     def run(fault: BaseException | None, on_frame=lambda row, summary: None):
-        monkeypatch.setattr(FakeSolver, "fault", fault)
+        monkeypatch.setattr(FakeRun, "fault", fault)
         return simulate(loaded, RunSettings(tmp_path / "result"), on_frame=on_frame)
 
     return run

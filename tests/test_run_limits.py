@@ -8,11 +8,12 @@ import click
 import pytest
 from command import SCENE, run_here
 
-from mpmcli.cli.limit_types import Duration, Size
+from mpmcli.cli.options import duration
+from mpmcli.cli.options import size as size_of
 from mpmcli.output import open_result
 from mpmcli.simulation import limits
 from mpmcli.simulation.limits import Halt, Limits
-from mpmcli.solver.device_memory import is_out_of_memory
+from mpmcli.solver.machine.device_memory import is_out_of_memory
 
 LONG = SCENE.replace("end = 0.05", "end = 5000.0").replace("frames = 4", "frames = 2000")
 
@@ -23,26 +24,26 @@ LONG = SCENE.replace("end = 0.05", "end = 5000.0").replace("frames = 4", "frames
      ("0:00:05", 5), ("1-12:00:00", 129600), ("100:00:00", 360000), ("1D", 86400)],
 )  # fmt: skip
 def test_times(text: str, seconds: float) -> None:
-    assert Duration().convert(text, None, None) == seconds
+    assert duration(text) == seconds
 
 
 @pytest.mark.parametrize(
     ("text", "size"), [("8GB", 8e9), ("8GiB", 2**33), ("500MB", 5e8), ("1.5 kB", 1500), ("2tib", 2**41)]
 )
 def test_sizes(text: str, size: float) -> None:
-    assert Size().convert(text, None, None) == size
+    assert size_of(text) == size
 
 
 @pytest.mark.parametrize("text", ["", "2", "h", "-2h", "0s", "1:30", "1:75:00", "2 hours", "nan", "1e400s", "2h x"])
 def test_what_is_no_time(text: str) -> None:
     with pytest.raises(click.BadParameter, match=r"is no time; give 2h.*1:30:00"):
-        Duration().convert(text, None, None)
+        duration(text)
 
 
 @pytest.mark.parametrize("text", ["", "8", "GB", "-1GB", "0MB", "8 bytes", "1e9GB", "8GB8"])
 def test_what_is_no_size(text: str) -> None:
     with pytest.raises(click.BadParameter, match=r"is no size; give 8GB"):
-        Size().convert(text, None, None)
+        size_of(text)
 
 
 class Clock:
@@ -142,11 +143,11 @@ def test_a_device_without_memory_is_a_sentence(start: Callable, tmp_path: Path, 
         raise error
 
     with monkeypatch.context() as patch:
-        patch.setattr("mpmcli.simulation.simulate.build_engine", refuse)
+        patch.setattr("mpmcli.simulation.simulate.build_run", refuse)
         outcome = start()
     assert outcome.status == 2 and outcome.stderr.splitlines()[-1].startswith("error: The memory of this machine does")
     assert not (tmp_path / "result").exists()
-    monkeypatch.setattr("mpmcli.solver.batch_run.BatchRun.frames", refuse)
+    monkeypatch.setattr("mpmcli.solver.engine.run.Run.frames", refuse)
     outcome = start()
     assert outcome.status == 1 and json.loads(outcome.stdout)["status"] == "failed"
     assert "does not suffice" in outcome.stderr and "a fault of mpmcli" not in outcome.stderr

@@ -6,16 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from mpmcli.check.distance import distance_between
-from mpmcli.check.extent import RESOLUTION, thickness
+from mpmcli.check.geometry import RESOLUTION, distance_between, thickness
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, Shape, parse_scene, sample_bodies, scene_to_toml
-from mpmcli.scene.enclosed_volume import enclosed_volume
-from mpmcli.scene.shapes import Form
+from mpmcli.scene.shapes import Form, enclosed_volume
 
 
 def form_of(dimension: int, **tables: Any) -> Form:
@@ -76,6 +74,11 @@ forms = discs | boxes
 
 
 @given(first=forms, added=st.lists(forms, max_size=2), removed=st.lists(forms, max_size=2))
+@example(
+    first={"box": {"min": [0.5, 0.5], "max": [1.35, 0.9]}},
+    added=[],
+    removed=[{"box": {"min": [0.5, 0.5], "max": [1.4, 0.9]}}],
+)
 @settings(max_examples=20)
 def test_a_composite_is_what_its_parts_say(first: dict, added: list, removed: list) -> None:
     """Inside: of any that is added and of none that is removed. Distance: its sign is the inside, and it is a bound.

@@ -7,7 +7,7 @@ from check_scenes import SOLID, box, check, loaded
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.scene import scene_bounds
-from mpmcli.scene.drive import gravity_drive
+from mpmcli.scene.bounds import gravity_drive
 from mpmcli.scene.schema import Force
 
 FREE = {"gravity": [0.0, 0.0]}
@@ -53,7 +53,7 @@ def test_places_that_nothing_reaches_do_not_count() -> None:
 
 def test_the_check_says_what_a_narrow_force_takes() -> None:
     """The speed that a force gives binds the step."""
-    without = check(domain=FREE, material=SOLID, shape=box([0.25, 0.25], [0.5, 0.5])).step
+    without = check(domain=FREE, material=SOLID, shape=box([0.25, 0.25], [0.5, 0.5])).facts.step
 
     facts = SceneFacts(forced("1e6 if abs(x - 0.3333) < 0.02 else 0", 0.0, material=SOLID))
     assert facts.step < 0.5 * without

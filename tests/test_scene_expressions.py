@@ -12,8 +12,8 @@ from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.scene import highest_speed, load_scene, parse_scene, sample_bodies, scene_bounds, scene_to_toml
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.plan import make_plan
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.machine.plan import make_plan
 
 LAWS = parameter_models()
 SCENE = """
@@ -174,7 +174,7 @@ def test_scenes_without_expressions_plan_as_before(tmp_path):
 def test_the_check_of_a_scene_takes_expressions(tmp_path):
     check = check_scene(loaded(tmp_path))
     assert check.passes() and check.forecast.steps > 0
-    gradient = next(limit for limit in check.limits if limit.name == "deformation" and limit.state == "rest")
+    gradient = next(limit for limit in check.facts.limits if limit.name == "deformation" and limit.state == "rest")
     assert gradient.value == pytest.approx(0.5 / (0.1 * np.pi), rel=1e-3)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from mpmcli.scene.locate import key_lines, line_of
+from mpmcli.scene.toml_file import key_lines, line_of
 
 AWKWARD = '''\
 # a comment with [brackets] and = signs

@@ -10,18 +10,16 @@ import pyvista as pv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mpmcli.check.distance import distance_between
-from mpmcli.check.extent import thickness
+from mpmcli.check.geometry import distance_between, thickness
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws, parameter_models
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import Ball, Scene, Shape, parse_scene, sample_bodies, scene_to_toml
-from mpmcli.scene.distance_grid import distance_grid
-from mpmcli.scene.mesh import Mesh, _surface_of
-from mpmcli.scene.mesh_file import MeshFileError, read_mesh
-from mpmcli.scene.triangles import Surface
+from mpmcli.scene.mesh import Mesh, MeshFileError, _surface_of, read_mesh
+from mpmcli.scene.shapes import distance_grid
+from mpmcli.scene.triangles import ClosedSurface
 
 R = 0.4
 
@@ -122,7 +120,9 @@ def test_a_mesh_is_scaled_then_turned_then_moved(tmp_path_factory, scale, axis, 
         pv.Cone(resolution=7).triangulate().save(path)
     plain, triangles = read_mesh(path)
     moved, _ = read_mesh(path, scale, axis, angle, shift)
-    assert Surface(moved, triangles).volume == pytest.approx(scale**3 * Surface(plain, triangles).volume, rel=1e-6)
+    assert ClosedSurface(moved, triangles).volume == pytest.approx(
+        scale**3 * ClosedSurface(plain, triangles).volume, rel=1e-6
+    )
     n = np.array(axis) / np.linalg.norm(axis)
     before, after = scale * plain, moved - shift
     assert np.allclose(before @ n, after @ n, rtol=0, atol=1e-9 * (scale + 10))

@@ -5,7 +5,7 @@ import pytest
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import parse_scene
-from mpmcli.scene.overrides import apply_overrides
+from mpmcli.scene.toml_file import apply_overrides
 
 DATA = {
     "title": "t",

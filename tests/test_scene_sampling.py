@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import estimate_particles, parse_scene, sample_bodies, sampling
-from mpmcli.scene.poisson_disk import disk_radius
+from mpmcli.scene.sampling import disk_radius
 
 FLUID = {"law": "fluid", "density": 800.0, "bulk_modulus": 1e5}
 

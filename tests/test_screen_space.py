@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mpmcli.render.hidden import hidden
-from mpmcli.render.liquids.screen_space import (
+from mpmcli.render.dots import hidden
+from mpmcli.render.liquid_surface import (
     NOTHING,
     blurred,
     normals,

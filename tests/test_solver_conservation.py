@@ -9,7 +9,8 @@ from scenes import restart
 from solver_state import BodyState, bodies_of, scene_of
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
 
 STEPS = 10_000
 # The block turns by some radians; the drop, which nothing holds together but its pressure, stays one drop.
@@ -65,18 +66,18 @@ def free_scene(dimension: int, precision: str, gravity: list[float] | None = Non
 
 
 @pytest.fixture(scope="module")
-def spinning(backend_of: Callable) -> Callable[..., Solver]:
-    """Return `start(precision, dimension, bodies)`: a solver of the free scene, the last one where it is of that kind.
+def spinning(backend_of: Callable) -> Callable[..., Run]:
+    """Return `start(precision, dimension, bodies)`: a run of the free scene, the last one where it is of that kind.
 
     The bodies are other particles than those of the scene, as many.
     """
-    last: dict[tuple[str, int], Solver] = {}
+    last: dict[tuple[str, int], Run] = {}
 
-    def start(precision: str, dimension: int, bodies: list[BodyParticles] | None = None) -> Solver:
+    def start(precision: str, dimension: int, bodies: list[BodyParticles] | None = None) -> Run:
         kind = (precision, dimension)
         if kind not in last:
             last.clear()
-            last[kind] = Solver(free_scene(dimension, precision), backend_of(precision, 1))
+            last[kind] = build_run(free_scene(dimension, precision), backend_of(precision, 1))
         restart(last[kind], bodies or sample_bodies(last[kind].scene), 1.0)
         return last[kind]
 
@@ -100,15 +101,15 @@ def test_free_fall(backend_of: Callable, precision: str) -> None:
     resting = [
         replace(s, velocity=np.full_like(s.velocity, 0.1), affine=np.zeros_like(s.affine)) for s in sample_bodies(scene)
     ]
-    solver = Solver(scene, backend_of(precision), resting)
-    before = bodies_of(solver)
+    run = build_run(scene, backend_of(precision), resting)
+    before = bodies_of(run)
     n, dt = 300, 0.002
     for _ in range(n):
-        solver.step(dt)
+        run.step(dt)
     g = np.array(gravity)
     # Each step rounds x, v and the sums behind them; round-off adds up over n steps.
     tolerance = 4 * n * EPSILON[precision]
-    for name, body in bodies_of(solver).items():
+    for name, body in bodies_of(run).items():
         start = before[name]
         fallen = start.x + start.v * n * dt + g * (n * dt) ** 2 / 2
         speed = np.abs(g).max() * n * dt
@@ -128,13 +129,13 @@ def test_momenta_over_ten_thousand_steps(
     spinning: Callable, precision: str, dimension: int, record_property: Callable
 ) -> None:
     """P and L stay, per body, to 1e-12 in f64 and 1e-5 in f32; so does the number of particles (9.1 to 9.3)."""
-    solver = spinning(precision, dimension)
-    before = bodies_of(solver)
+    run = spinning(precision, dimension)
+    before = bodies_of(run)
     dt = SECONDS / STEPS
-    assert dt < solver.stable_step()[0]
+    assert dt < run.stable_step()[0]
     for _ in range(STEPS):
-        solver.step(dt)
-    after = bodies_of(solver)
+        run.step(dt)
+    after = bodies_of(run)
     tolerance = {"f64": 1e-12, "f32": 1e-5}[precision]
     for name in ("block", "drop"):
         assert len(after[name].mass) == len(before[name].mass)
@@ -155,15 +156,15 @@ def test_rigid_translation(spinning: Callable, precision: str) -> None:
         replace(s, velocity=np.tile(velocity, (s.count, 1)), affine=np.zeros_like(s.affine))
         for s in sample_bodies(scene)
     ]
-    solver = spinning(precision, 2, moving)
-    before = bodies_of(solver)
+    run = spinning(precision, 2, moving)
+    before = bodies_of(run)
     n, dt = 100, 0.002
     for _ in range(n):
-        solver.step(dt)
+        run.step(dt)
     # x changes by dt v in numbers as large as the domain: half a unit in the last place per step (9.7).
     size = max(scene.domain.size)
     tolerance = 4 * n * EPSILON[precision]
-    for name, body in bodies_of(solver).items():
+    for name, body in bodies_of(run).items():
         assert np.abs(body.x - before[name].x - velocity * n * dt).max() < n * EPSILON[precision] * size * 2
         rest = np.eye(2) if body.deformation.ndim == 3 else 1.0
         assert np.abs(body.deformation - rest).max() < max(tolerance, 1e-13)
@@ -190,11 +191,11 @@ def test_affine_fields_are_transferred_exactly(spinning: Callable, dimension: in
                 affine=np.tile(L, (sample.count, 1, 1)),
             )
         )
-    solver = spinning("f64", dimension, bodies)
-    before = bodies_of(solver)
+    run = spinning("f64", dimension, bodies)
+    before = bodies_of(run)
     dt = 0.01
-    solver.step(dt)
-    for name, body in bodies_of(solver).items():
+    run.step(dt)
+    for name, body in bodies_of(run).items():
         assert np.abs(body.v - before[name].v).max() < 1e-13
         assert np.abs(body.C - L).max() < 1e-12
         if body.deformation.ndim == 3:

@@ -7,10 +7,11 @@ import pytest
 from solver_state import scene_of
 
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.solver import Solver
-from mpmcli.solver.state import SavedState
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.saved_state import SavedState
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import Backend
 
 H = 0.1
 STEP = 1e-3
@@ -41,38 +42,38 @@ def scene(dimension: int = 2, precision: str = "f32") -> Scene:
     )
 
 
-def by_id(solver: Solver, law: str) -> tuple[object, np.ndarray]:
+def by_id(run: Run, law: str) -> tuple[object, np.ndarray]:
     """Return the group of a law and where each of its particles, in the order of their ids, lies in memory."""
-    group = solver.groups[solver.laws.index(law)]
-    return group, np.argsort(group.id.to_numpy())
+    group = run.groups[run.laws.index(law)]
+    return group, np.argsort(group.read()["id"])
 
 
-def first_id(solver: Solver, body: str) -> int:
+def first_id(run: Run, body: str) -> int:
     """Return the id of the first particle of a body: ids count through the bodies in the order of the scene."""
-    counts = [sample.count for sample in sample_bodies(solver.scene)]
-    names = [b.name for b in solver.scene.bodies]
+    counts = [sample.count for sample in sample_bodies(run.scene)]
+    names = [b.name for b in run.scene.bodies]
     return sum(counts[: names.index(body)])
 
 
-def poison_velocity(solver: Solver, law: str, row: int, value: float) -> None:
-    group, place = by_id(solver, law)
-    v, C = group.motion_to_numpy()
+def poison_velocity(run: Run, law: str, row: int, value: float) -> None:
+    group, place = by_id(run, law)
+    v = group.read()["v"]
     v[place[row]] = value
-    group.set_motion(v, C)
+    group.replace(v=v)
 
 
-def poison_deformation(solver: Solver, law: str, row: int, value: object) -> None:
-    group, place = by_id(solver, law)
-    deformation = group.deformation_to_numpy()
+def poison_deformation(run: Run, law: str, row: int, value: object) -> None:
+    group, place = by_id(run, law)
+    deformation = group.read()["deformation"]
     deformation[place[row]] = value
-    group.set_deformation(deformation)
+    group.replace(deformation=deformation)
 
 
-def run_until_lost(solver: Solver, steps: int = 40) -> UnstableRunError:
+def run_until_lost(run: Run, steps: int = 40) -> UnstableRunError:
     """Return the error that ends the run."""
     with pytest.raises(UnstableRunError) as stopped:
         for _ in range(steps):
-            solver.step(STEP)
+            run.step(STEP)
     return stopped.value
 
 
@@ -82,29 +83,29 @@ def backend(backend_of: Callable) -> Backend:
 
 
 @pytest.fixture(scope="module")
-def started(backend: Backend) -> tuple[Solver, SavedState, SavedState]:
-    """Return a solver on two threads, its state at the start, and that after some steps and sorts."""
-    solver = Solver(scene(), backend)
-    start = solver.state.save()
+def started(backend: Backend) -> tuple[Run, SavedState, SavedState]:
+    """Return a run on two threads, its state at the start, and that after some steps and sorts."""
+    run = build_run(scene(), backend)
+    start = run.save().copied()
     for _ in range(30):
-        solver.step(STEP)
-    return solver, start, solver.state.save()
+        run.step(STEP)
+    return run, start, run.save().copied()
 
 
 @pytest.fixture
-def fresh(started: tuple[Solver, SavedState, SavedState]) -> Solver:
-    """Return the solver as it was at the start."""
-    solver, start, _ = started
-    solver.state.load(start)
-    return solver
+def fresh(started: tuple[Run, SavedState, SavedState]) -> Run:
+    """Return the run as it was at the start."""
+    run, start, _ = started
+    run.load(start)
+    return run
 
 
 @pytest.fixture
-def running(started: tuple[Solver, SavedState, SavedState]) -> Solver:
-    """Return the solver as it was after some steps and sorts."""
-    solver, _, later = started
-    solver.state.load(later)
-    return solver
+def running(started: tuple[Run, SavedState, SavedState]) -> Run:
+    """Return the run as it was after some steps and sorts."""
+    run, _, later = started
+    run.load(later)
+    return run
 
 
 @pytest.mark.parametrize(
@@ -118,7 +119,7 @@ def running(started: tuple[Solver, SavedState, SavedState]) -> Solver:
     ],
     ids=["J NaN", "J negative", "J zero", "F NaN", "F inverted"],
 )
-def test_a_lost_deformation_names_its_particle(running: Solver, law: str, body: str, value: object, cause: str) -> None:
+def test_a_lost_deformation_names_its_particle(running: Run, law: str, body: str, value: object, cause: str) -> None:
     """The very particle is named, before its stress spreads over its neighbours, one step later at most."""
     names = [b.name for b in running.scene.bodies if b.material.law == law]
     counts = {s.name: s.count for s in sample_bodies(running.scene)}
@@ -144,7 +145,7 @@ def test_a_lost_deformation_names_its_particle(running: Solver, law: str, body: 
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e30], ids=["NaN", "infinite", "1e30"])
-def test_a_lost_velocity_names_its_body(running: Solver, value: float) -> None:
+def test_a_lost_velocity_names_its_body(running: Run, value: float) -> None:
     """What a velocity does reaches its neighbours in the same step: one of them is named, of the same body."""
     poison_velocity(running, "neo_hookean", 7, value)
     before = running.step_count
@@ -170,15 +171,17 @@ def test_a_particle_that_leaves_is_named_with_its_speed(backend: Backend) -> Non
             }
         ],
     )
-    diagnosis = run_until_lost(Solver(lone, backend)).diagnosis
+    diagnosis = run_until_lost(build_run(lone, backend)).diagnosis
     assert (diagnosis.particle, diagnosis.body, diagnosis.step) == (0, "bullet", 1)
     assert diagnosis.cause == "left the domain at 900 m/s"
     assert diagnosis.position == pytest.approx((1.05, 0.75), abs=1e-5)
     assert diagnosis.limit == "speed"
 
 
-def test_frames_before_the_end_stay(fresh: Solver) -> None:
+def test_frames_before_the_end_stay(fresh: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that is lost between two frames has yielded the earlier ones, all of them finite and complete."""
+    # One frame in a launch.
+    monkeypatch.setattr("mpmcli.solver.frames.recorder.ROOM", 1)
     frames = fresh.frames()
     kept = [next(frames) for _ in range(4)]
     poison_deformation(fresh, "fluid", 3, np.nan)
@@ -194,13 +197,13 @@ def test_frames_before_the_end_stay(fresh: Solver) -> None:
         assert np.isfinite(row.energy)
 
 
-def test_no_frame_holds_a_crushed_particle(fresh: Solver) -> None:
+def test_no_frame_holds_a_crushed_particle(fresh: Run) -> None:
     """A particle that is pressed to nothing is seen before that state becomes a frame."""
     group, place = by_id(fresh, "fluid")
-    v, C = group.motion_to_numpy()
+    C = group.read()["C"]
     # A fifth shorter along each axis in the first step, and so on until nothing is left.
     C[place[: sample_bodies(fresh.scene)[0].count]] = -2e5 * np.eye(2)
-    group.set_motion(v, C)
+    group.replace(C=C)
     fresh.restart()
     limits = [limit for limit in fresh.limits() if limit.name == "deformation"]
     assert min(limits).value == pytest.approx(0.5 / 4e5)
@@ -210,7 +213,7 @@ def test_no_frame_holds_a_crushed_particle(fresh: Solver) -> None:
             assert row.volume_ratio_min > 0, frame.index
 
 
-def test_the_number_of_particles_never_changes(running: Solver) -> None:
+def test_the_number_of_particles_never_changes(running: Run) -> None:
     """Every id from 0 to n - 1 is there once, after many sorts."""
-    ids = np.concatenate([group.id.to_numpy() for group in running.groups])
+    ids = np.concatenate([group.read()["id"] for group in running.groups])
     assert np.array_equal(np.sort(ids), np.arange(running.particle_count))

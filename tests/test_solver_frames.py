@@ -5,15 +5,17 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scenes import sums
+import taichi as ti
 from solver_state import bodies_of, scene_of
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver.frame_arrays import FrameArrays, FrameColumns
-from mpmcli.solver.snapshot import read_group
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.columns import FrameArrays, FrameColumns, RunConstants
+from mpmcli.solver.frames.diagnosis import read_group
+from mpmcli.solver.frames.ledger_sums import ledger_sums, sums_of_rows
 
 H = 0.1
 FIELDS = [
@@ -28,7 +30,7 @@ FIELDS = [
 ]
 E, NU, K = 2e4, 0.3, 3e4
 GRAVITY = [0.3, -9.81]
-Run = list[tuple[Frame, LedgerRow]]
+Frames = list[tuple[Frame, LedgerRow]]
 
 
 def tumbling() -> Scene:
@@ -60,32 +62,41 @@ def tumbling() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def solver(backend_of: Callable) -> Solver:
-    """Return the solver of the tumbling scene, after all of its frames."""
-    return Solver(tumbling(), backend_of("f64", 2))
+def run(backend_of: Callable) -> Run:
+    """Return the run of the tumbling scene, after all of its frames."""
+    return build_run(tumbling(), backend_of("f64", 2))
 
 
 @pytest.fixture(scope="module")
-def frames(solver: Solver) -> Run:
+def frames(run: Run) -> Frames:
     """Return every frame of the tumbling scene."""
-    return list(solver.frames())
+    return list(run.frames())
 
 
-def test_one_launch_reads_what_the_fields_hold(solver: Solver, frames: Run) -> None:
+def test_one_launch_reads_what_the_fields_hold(run: Run, frames: Frames) -> None:
     """Every array of a group, against Taichi's own copy of each field."""
     assert frames
-    for group in solver.groups:
-        found = group.to_numpy()
-        v, C = group.motion_to_numpy()
-        internal = [values.to_numpy() for values in group.internal]
-        place = np.zeros(group.count, int) if group.body is None else group.body.to_numpy()
+    for group in run.groups:
+        found = group.read()
+        fields, d = group.arrays, group.dimension
+
+        def own(field: ti.Field) -> np.ndarray:
+            """Return what a field holds of the particles; there is room for more."""
+            return field.to_numpy()[: group.count]  # noqa: B023
+
+        internal = [own(values) for values in fields.internal]
+        place = np.zeros(group.count, int) if fields.body is None else own(fields.body)
+        if fields.displacement_gradient is None:
+            deformation = 1 + own(fields.J_minus_1)
+        else:
+            deformation = np.eye(d) + own(fields.displacement_gradient)
         expected = {
-            "x": group.x.to_numpy(),
-            "v": v,
-            "C": C,
-            "deformation": group.deformation_to_numpy(),
+            "x": own(fields.x),
+            "v": own(fields.v),
+            "C": own(fields.gradient)[:, :, :d].transpose(0, 2, 1),
+            "deformation": deformation,
             "internal": np.array(internal).reshape(len(internal), group.count).T,
-            "id": group.id.to_numpy(),
+            "id": own(fields.id),
             "body": np.array(group.bodies)[place],
         }
         assert found.keys() == expected.keys()
@@ -93,30 +104,35 @@ def test_one_launch_reads_what_the_fields_hold(solver: Solver, frames: Run) -> N
             assert found[name].shape == array.shape and np.array_equal(found[name], array), name
 
 
-def test_a_kernel_sums_and_orders_as_numpy_does(solver: Solver, frames: Run) -> None:
+def test_a_kernel_sums_and_orders_as_numpy_does(run: Run, frames: Frames) -> None:
     """The frame by one launch against the arrays of the groups, and the ledger against sums in numpy."""
-    frame, row = solver.frame(7)
-    names = ("stress", "affine", "deformation_gradient")
-    columns = FrameColumns(2, 2, names)
-    by_kernel, by_numpy = (FrameArrays(columns, np.zeros((1, len(frame.body), columns.count))) for _ in range(2))
-    solver._observe(by_numpy)
-    solver._read(by_kernel)
-    assert max(len(group.law.internal) for group in solver.groups) <= 2
-    scale = np.abs(by_numpy.reals[0]).max(axis=0)
-    assert (scale[[0, 1, 2, 3, columns.first["tau"]]] > 0).all()
-    np.testing.assert_allclose(by_kernel.reals / (scale + 1e-300), by_numpy.reals / (scale + 1e-300), atol=1e-13)
-    assert np.array_equal(frame.velocity, by_numpy["v"][0])
-    assert np.array_equal(frame.position, by_numpy["x"][0] + np.array(solver.scene.domain.origin))
-    for group in solver.groups:
+    frame, row = run.frame(7)
+    columns = FrameColumns(2, 2, ("affine", "deformation_gradient"))
+    shown = FrameArrays(columns, np.zeros((1, len(frame.body), columns.count)))
+    run._read(shown)
+    assert np.array_equal(frame.velocity, shown["v"][0])
+    assert np.array_equal(frame.position, shown["x"][0] + np.array(run.scene.domain.origin))
+    for group in run.groups:
         own = read_group(group)
         assert np.array_equal(frame.body[own.id], own.body)
-        assert {solver.laws[m] for m in frame.material[own.id]} == {group.law.name}
-    for name, expected in sums(solver).items():
-        np.testing.assert_allclose(getattr(row, name), expected, rtol=1e-12, err_msg=name)
+        assert {run.laws[m] for m in frame.material[own.id]} == {group.law.name}
+        for name, values in (("x", own.x), ("v", own.v), ("affine", own.C.reshape(-1, 4))):
+            assert np.array_equal(shown[name][0, own.id], values), name
+        J = own.deformation if own.deformation.ndim == 1 else np.linalg.det(own.deformation)
+        F = np.sqrt(J)[:, None, None] * np.eye(2) if own.deformation.ndim == 1 else own.deformation
+        np.testing.assert_allclose(shown["J"][0, own.id], J, rtol=1e-13)
+        np.testing.assert_allclose(shown["gradient"][0, own.id], F.reshape(-1, 4), atol=1e-13)
+    constants = RunConstants(run.groups, [body.count for body in sample_bodies(run.scene)])
+    sums = sums_of_rows(shown, constants.of_rows(slice(0, len(frame.body))), total=False)
+    gravity, last_step = np.array([run.scene.domain.gravity]), np.array([run.last_step])
+    for name, expected in ledger_sums(sums, gravity, run.spacing, last_step).items():
+        np.testing.assert_allclose(getattr(row, name), expected[0], rtol=1e-12, err_msg=name)
+    ratios = shown["J"][0]
+    assert (row.volume_ratio_min, row.volume_ratio_max) == pytest.approx((ratios.min(), ratios.max()), rel=1e-12)
     assert np.abs(frames[-1][1].angular_momentum[0]) > 0 and row.elastic > 0
 
 
-def test_frames_land_on_their_times(frames: Run) -> None:
+def test_frames_land_on_their_times(frames: Frames) -> None:
     """t_k = end k / frames, exactly, from 0 on; the steps of an interval sum to it."""
     assert [frame.index for frame, _ in frames] == list(range(8))
     assert [frame.time for frame, _ in frames] == [0.6 * k / 7 for k in range(8)]
@@ -130,14 +146,14 @@ def test_frames_land_on_their_times(frames: Run) -> None:
             assert row.step_max >= 0.6 / 7 / row.steps * (1 - 1e-9)
 
 
-def test_every_row_is_the_same_particle_in_every_frame(frames: Run, solver: Solver) -> None:
+def test_every_row_is_the_same_particle_in_every_frame(frames: Frames, run: Run) -> None:
     """Rows start at the lattice of the bodies in the scene's order, and move by less than v dt between frames."""
-    samples = sample_bodies(solver.scene)
+    samples = sample_bodies(run.scene)
     first = frames[0][0]
     assert np.array_equal(first.position, np.concatenate([s.position for s in samples]))
     assert np.array_equal(first.velocity, np.concatenate([s.velocity for s in samples]))
     body = np.repeat(np.arange(4), [s.count for s in samples])
-    law = np.array([solver.laws.index(b.material.law) for b in solver.scene.bodies])
+    law = np.array([run.laws.index(b.material.law) for b in run.scene.bodies])
     for (before, _), (frame, _) in pairwise(frames):
         assert np.array_equal(frame.body, body)
         assert np.array_equal(frame.material, law[body])
@@ -147,10 +163,10 @@ def test_every_row_is_the_same_particle_in_every_frame(frames: Run, solver: Solv
         assert moved.max() < 5 * 0.6 / 7
         assert np.isfinite(frame.position).all()
     # The sort did move particles in memory, or this would show nothing.
-    assert any((np.diff(group.id.to_numpy()) < 0).any() for group in solver.groups)
+    assert any((np.diff(group.read()["id"]) < 0).any() for group in run.groups)
 
 
-def test_neighbours_of_a_lattice_stay_neighbours_in_a_solid(frames: Run, solver: Solver) -> None:
+def test_neighbours_of_a_lattice_stay_neighbours_in_a_solid(frames: Frames, run: Run) -> None:
     """In an elastic body x_q - x_p = F_p (X_q - X_p) to second order: rows, positions and F belong together."""
     first, last = frames[0][0], frames[-1][0]
     for body in (1, 3):
@@ -165,11 +181,11 @@ def test_neighbours_of_a_lattice_stay_neighbours_in_a_solid(frames: Run, solver:
         assert error.max() < 0.5
 
 
-def test_fields_are_their_formulas(frames: Run, solver: Solver) -> None:
+def test_fields_are_their_formulas(frames: Frames, run: Run) -> None:
     """density = rho0 / J, p = -tr(sigma) / 3, sigma of each law, J = det F, mass = rho0 V0."""
-    samples = sample_bodies(solver.scene)
+    samples = sample_bodies(run.scene)
     counts = [s.count for s in samples]
-    rho0 = np.repeat([b.material.density for b in solver.scene.bodies], counts)
+    rho0 = np.repeat([b.material.density for b in run.scene.bodies], counts)
     for frame, _ in frames:
         fields = frame.fields
         assert set(fields) == set(FIELDS) - {"velocity"}
@@ -200,11 +216,11 @@ def test_fields_are_their_formulas(frames: Run, solver: Solver) -> None:
         assert np.abs(sigma - expected)[~fluid].max() < 1e-9 * E
 
 
-def test_the_ledger_adds_up(frames: Run, solver: Solver) -> None:
+def test_the_ledger_adds_up(frames: Frames, run: Run) -> None:
     """Mass, energies and momenta are the sums over the frame's own particles; nothing gains energy (9.9)."""
     for frame, row in frames:
         m, v = frame.fields["mass"], frame.velocity
-        x = frame.position - np.array(solver.scene.domain.origin)
+        x = frame.position - np.array(run.scene.domain.origin)
         C = frame.fields["affine"].reshape(-1, 2, 2)
         kinetic = m @ ((v**2).sum(1) + H * H / 4 * (C**2).sum((1, 2))) / 2
         spin = m @ (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0] + H * H / 4 * (C[:, 1, 0] - C[:, 0, 1]))
@@ -249,7 +265,7 @@ def test_courant_number_is_that_of_the_fastest_particle(backend_of: Callable) ->
             }
         ],
     )
-    for _, row in list(Solver(scene, backend_of("f64")).frames())[1:]:
+    for _, row in list(build_run(scene, backend_of("f64")).frames())[1:]:
         assert row.courant_max == pytest.approx(speed * row.step_max / H, rel=1e-9)
 
 
@@ -258,7 +274,7 @@ def test_a_step_given_in_the_scene_is_a_maximum(backend_of: Callable) -> None:
     data = tumbling().model_dump()
     data["time"] |= {"step": 1e-3, "end": 0.01, "frames": 3}
     del data["domain"]["cells"]
-    rows = [row for _, row in Solver(scene_of(**data), backend_of("f64", 2)).frames()]
+    rows = [row for _, row in build_run(scene_of(**data), backend_of("f64", 2)).frames()]
     assert [row.steps for row in rows[1:]] == [4, 4, 4]
     assert all(row.step_max <= 1e-3 * (1 + 1e-6) for row in rows)
     assert all(row.limit == "maximum" for row in rows[1:])
@@ -274,11 +290,11 @@ def test_energies_of_bodies_at_rest(backend_of: Callable) -> None:
         body["velocity"] = [0.0, 0.0]
         body["velocity_gradient"] = None
     data["solver"]["precision"] = "f32"
-    solver = Solver(scene_of(**data), backend_of("f32", 2))
-    start = bodies_of(solver)
+    run = build_run(scene_of(**data), backend_of("f32", 2))
+    start = bodies_of(run)
     for _ in range(500):
-        solver.step(2e-3)
-    for name, body in bodies_of(solver).items():
+        run.step(2e-3)
+    for name, body in bodies_of(run).items():
         assert np.array_equal(body.x, start[name].x)
         assert np.array_equal(body.deformation, start[name].deformation)
         assert not body.v.any()
@@ -306,7 +322,7 @@ def test_the_energy_of_free_fall_is_constant(backend_of: Callable) -> None:
     That is v = g (t - dt/2), and x + v dt/2 = x_0 - g t^2/2 + (g dt/2) (t - dt/2). With the positions as they are, the
     sum would be off by m g^2 t dt / 2.
     """
-    rows = [row for _, row in Solver(scene_of(**falling()), backend_of("f64")).frames()]
+    rows = [row for _, row in build_run(scene_of(**falling()), backend_of("f64")).frames()]
     fallen = rows[0].potential - rows[-1].potential
     weight = rows[-1].mass * 9.81**2
     assert fallen == pytest.approx(weight * (0.2 - rows[-1].step_min / 2) ** 2 / 2, rel=1e-4)
@@ -316,20 +332,21 @@ def test_the_energy_of_free_fall_is_constant(backend_of: Callable) -> None:
 
 def test_a_forced_step_is_taken_above_the_stable_one(backend_of: Callable) -> None:
     data = scene_of(**falling(end=0.01, frames=1, step=2e-3))
-    _, (_, row) = Solver(data, backend_of("f64"), force=True).frames()
+    _, (_, row) = build_run(data, backend_of("f64"), force=True).frames()
     assert (row.steps, row.step_max, row.limit) == (5, pytest.approx(2e-3), "forced")
-    _, (_, row) = Solver(data, backend_of("f64")).frames()
+    _, (_, row) = build_run(data, backend_of("f64")).frames()
     assert row.limit == "wave" and row.step_max < 2e-3
 
 
-def test_a_run_can_be_stopped_between_two_frames(backend_of: Callable) -> None:
-    """A frame may take hours: an interrupt does not wait for it, only for the step."""
-    solver, asked = Solver(scene_of(**falling(frames=1)), backend_of("f64")), []
+def test_a_run_can_be_stopped_between_two_frames(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame may take hours: an interrupt does not wait for it, only for the launch, the first of which is a step."""
+    monkeypatch.setattr("mpmcli.solver.engine.exchange.FIRST", 1)
+    run, asked = build_run(scene_of(**falling(frames=1)), backend_of("f64")), []
 
-    def at_the_second_step() -> bool:
-        asked.append(solver.step_count)
+    def at_the_second_launch() -> bool:
+        asked.append(run.step_count)
         return len(asked) == 2
 
     with pytest.raises(KeyboardInterrupt):
-        list(solver.frames(at_the_second_step))
-    assert asked == [1, 2]
+        list(run.frames(at_the_second_launch))
+    assert asked == [0, 1]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import taichi as ti
 
-from mpmcli.solver.splines import PAD, SPLINES
+from mpmcli.solver.transfer.splines import PAD, SPLINES
 
 CELLS = 40
 SPACING = 0.025

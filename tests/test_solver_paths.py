@@ -17,7 +17,7 @@ from conftest import GPU, PythonRun
 from path_reference import Arrays, check_nodes, reference_groups
 
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver.splines import PAD
+from mpmcli.solver.transfer.splines import PAD
 
 CPU_THREADS = (1, 3)
 PATHS = [("cpu", threads) for threads in CPU_THREADS] + [(GPU, 1)]

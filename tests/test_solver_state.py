@@ -13,7 +13,7 @@ from scenes import block, scene
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 RUN = Path(state_run.__file__)
 
@@ -32,7 +32,7 @@ USUAL = ("total", "forces")
     ids=["3 threads", "all, 1 thread", "all, 3 threads"],
 )
 def test_a_loaded_run_has_the_bytes_of_one_that_went_on(threads: int, names: tuple[str, ...]) -> None:
-    """Save, 50 steps, load, 50 steps; and the same in another solver of the scene, by a route through JSON."""
+    """Save, 50 steps, load, 50 steps; and the same in another run of the scene, by a route through JSON."""
     done = subprocess.run(
         [sys.executable, str(RUN), str(threads), *names],
         capture_output=True,
@@ -43,9 +43,9 @@ def test_a_loaded_run_has_the_bytes_of_one_that_went_on(threads: int, names: tup
     found = json.loads(done.stdout)
     assert found.keys() == set(names)
     for name in names:
-        assert found[name]["same solver"] == [], name
-        assert found[name].get("other solver", []) == [], name
-        assert ("other solver" in found[name]) == (name in state_run.TWICE)
+        assert found[name]["same run"] == [], name
+        assert found[name].get("other run", []) == [], name
+        assert ("other run" in found[name]) == (name in state_run.TWICE)
 
 
 def test_there_is_a_scene_for_every_law() -> None:
@@ -55,14 +55,14 @@ def test_there_is_a_scene_for_every_law() -> None:
 
 def test_a_state_of_another_scene_is_refused(backend_of) -> None:
     backend = backend_of("f32")
-    saved = Solver(state_run.scene_named("fluid"), backend).state.save()
+    saved = build_run(state_run.scene_named("fluid"), backend).save().copied()
     with pytest.raises(InputError, match="belongs to another scene"):
-        Solver(state_run.scene_named("sand"), backend).state.load(saved)
+        build_run(state_run.scene_named("sand"), backend).load(saved)
 
 
 def test_the_numbers_are_plain(backend_of) -> None:
     """JSON can hold the numbers, and the arrays are numpy's."""
-    saved = Solver(state_run.scene_named("fluid"), backend_of("f32")).state.save()
+    saved = build_run(state_run.scene_named("fluid"), backend_of("f32")).save().copied()
     assert json.loads(json.dumps(saved.numbers, allow_nan=True)).keys() == saved.numbers.keys()
     assert all(isinstance(array, np.ndarray) for array in saved.arrays.values())
 
@@ -71,12 +71,12 @@ def test_particles_are_read_in_parts(backend_of: Callable, monkeypatch: pytest.M
     """The same, whether one launch reads all of them or each seven, as with more than 32-bit indices reach."""
     jelly = {"law": "neo_hookean", "density": 800.0, "youngs_modulus": 6000.0}
     body = block("jelly", jelly, (0.1, 0.1), (0.4, 0.3), velocity_gradient=[[0.0, 1.0], [0.5, 0.0]])
-    solver = Solver(scene((5, 5), 0.1, [body], 0.1), backend_of("f32", 1))
+    run = build_run(scene((5, 5), 0.1, [body], 0.1), backend_of("f32", 1))
     for _ in range(5):
-        solver.step(1e-3)
-    whole = solver.groups[0].to_numpy()
-    monkeypatch.setattr("mpmcli.solver.particle_exchange.MOST_READ", 7)
-    parts = solver.groups[0].to_numpy()
+        run.step(1e-3)
+    whole = run.groups[0].read()
+    monkeypatch.setattr("mpmcli.solver.particles.arrays.MOST_READ", 7)
+    parts = run.groups[0].read()
     assert len(whole["id"]) > 14 and parts.keys() == whole.keys()
     for name, values in whole.items():
         assert np.array_equal(values, parts[name]), name

@@ -1,4 +1,4 @@
-"""What a solver must not overlook between two measurements of its state, on the CPU and on a GPU."""
+"""What a run must not overlook between two measurements of its state, on the CPU and on a GPU."""
 
 import json
 from collections.abc import Callable
@@ -13,8 +13,8 @@ from conftest import GPU
 from scenes import block, restart, scene
 
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.snapshot import read_group
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.frames.diagnosis import read_group
 from mpmcli.stability.limits import COURANT
 
 ARCHES = ["cpu", pytest.param(GPU, marks=pytest.mark.gpu)]
@@ -74,14 +74,14 @@ def test_no_step_exceeds_the_limit_of_its_moment(law: str, backend_of: Callable,
             "bulk_modulus": stiffness,
         }
     body = block("block", material, [0.65, 0.05], [0.95, 0.25], velocity=[wave_speed / 5, 0.0])
-    solver = Solver(scene([32, 16], 1 / 32, [body], end=1.0), backend_of("f32", 1))
-    largest, at_start = 0.0, min(solver.state.step_control.limits_now()).value
+    run = build_run(scene([32, 16], 1 / 32, [body], end=1.0), backend_of("f32", 1))
+    largest, at_start = 0.0, min(run.limits_now()).value
     smallest = at_start
-    while solver.time < 0.06:
-        dt, _ = solver.stable_step()
-        limit = min(solver.state.step_control.limits_now()).value
+    while run.time < 0.06:
+        dt, _ = run.stable_step()
+        limit = min(run.limits_now()).value
         largest, smallest = max(largest, dt / limit), min(smallest, limit)
-        solver.step(dt)
+        run.step(dt)
     record_property("step over limit", largest)
     record_property("limit over first", smallest / at_start)
     assert largest <= 1.0
@@ -103,12 +103,12 @@ def test_the_step_does_not_drive_what_it_follows(law: str, backend_of: Callable)
     asked = scene([16, 16], 1 / 16, [body], end=100.0, precision="f64")
     sample = sample_bodies(asked)[0]
     lone = replace(sample, position=np.full((1, 2), 0.513), velocity=np.zeros((1, 2)), affine=np.zeros((1, 2, 2)))
-    solver = Solver(asked, backend_of("f64", 1), [lone])
-    group = solver.groups[0]
+    run = build_run(asked, backend_of("f64", 1), [lone])
+    group = run.groups[0]
     for J in (0.8, 1.1, 1.2):
-        restart(solver, [lone], 100.0)
-        group.set_deformation(np.full(1, J) if group.law.deformation == "J" else np.eye(2)[None] * J**0.5)
-        solver.state_was_replaced()
+        restart(run, [lone], 100.0)
+        group.replace(deformation=np.full(1, J) if group.law.deformation == "J" else np.eye(2)[None] * J**0.5)
+        run.state_was_replaced()
         for _ in range(1000):
-            solver.step(solver.stable_step()[0])
+            run.step(run.stable_step()[0])
         assert 0.2 < read_group(group).volume_ratio[0] < 3, J

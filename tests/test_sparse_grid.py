@@ -15,13 +15,12 @@ from mpmcli.boundaries.walls import REACH
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver import batch
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.engine import build_engine
-from mpmcli.solver.plan import make_plan, require_room
-from mpmcli.solver.sparse_choice import wants_sparse
-from mpmcli.solver.splines import PAD
-from mpmcli.solver.tile_reach import first_nodes_of, reach_along, tiles_reached
+from mpmcli.solver.engine import batch
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.grid.sparse_grid import first_nodes_of, reach_along, tiles_reached, wants_sparse
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.machine.plan import make_plan, require_room
+from mpmcli.solver.transfer.splines import PAD
 
 FLUID = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}
 # Every part of a step that reads or writes nodes: images, friction, faces that repeat and move, colliders, volumes that
@@ -37,8 +36,8 @@ def changed(start: Scene, **solver: object) -> Scene:
 
 def frames_of(start: Scene, backend: Backend) -> list[Frame]:
     """Run a scene."""
-    engine = build_engine(start, backend, sample_bodies(start), batched=True)
-    return [frame for frame, _row in engine.frames(lambda: False)]
+    run = build_run(start, backend, sample_bodies(start))
+    return [frame for frame, _row in run.frames()]
 
 
 def largest_difference(found: Sequence[Frame], expected: Sequence[Frame]) -> float:
@@ -96,10 +95,10 @@ def test_tiles_reached_are_those_around_particles() -> None:
 def test_the_kernel_numbers_the_same_tiles(backend_of: Callable) -> None:
     """As numpy does, from the positions of the sort, in the order of the domain."""
     start = drop()
-    engine = build_engine(start, backend_of("f32", 2), sample_bodies(start), batched=True)
-    grid = engine.batch.device.grid
+    run = build_run(start, backend_of("f32", 2), sample_bodies(start))
+    grid = run.batch.device.grid
     before = grid.occupied()
-    engine.advance(1)
+    run.advance(1)
     position = np.concatenate([body.position for body in sample_bodies(start)])
     assert np.array_equal(grid.occupied(), tiles_reached(first_nodes_of(position, start), grid.tile, grid.reach))
     assert np.array_equal(grid.occupied(), before)
@@ -108,7 +107,7 @@ def test_the_kernel_numbers_the_same_tiles(backend_of: Callable) -> None:
     volumes = [body.volume * body.count for body in sample_bodies(start)]
     assert nodes[:, 2].sum() == pytest.approx(1000.0 * sum(volumes), rel=1e-5)
     assert not nodes[: grid.block].any()
-    engine.advance(40)
+    run.advance(40)
     assert not np.array_equal(grid.occupied(), before)
 
 
@@ -139,15 +138,14 @@ def test_a_grid_grows_with_what_particles_reach(backend_of: Callable, monkeypatc
 def test_a_loaded_run_goes_on_with_the_same_bytes(
     backend_of: Callable, monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
-    """In an engine with more or less room for blocks, and another number of threads."""
-    engine = build_engine(drop(), backend_of("f32", 2), sample_bodies(drop()), batched=True)
-    engine.advance(30)
-    state = engine.save()
-    saved = type(state)(state.numbers, dict(state.arrays))
-    engine.advance(30)
-    expected = engine.frame()[0]
+    """In a run with more or less room for blocks, and another number of threads."""
+    run = build_run(drop(), backend_of("f32", 2), sample_bodies(drop()))
+    run.advance(30)
+    saved = run.save().copied()
+    run.advance(30)
+    expected = run.frame()[0]
     monkeypatch.setattr(batch, "room_for_blocks", lambda particles: room)
-    other = build_engine(drop(), backend_of("f32", 3), sample_bodies(drop()), batched=True)
+    other = build_run(drop(), backend_of("f32", 3), sample_bodies(drop()))
     other.load(saved)
     other.advance(30)
     found = other.frame()[0]

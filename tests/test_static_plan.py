@@ -9,21 +9,22 @@ from solver_state import scene_of
 from taichi.lang import impl, kernel_impl
 
 from mpmcli.scene import Scene
-from mpmcli.solver.engine import build_engine
-from mpmcli.solver.plan import make_plan
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.machine.plan import make_plan
 
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5}
-# The modules whose fields, functions and kernels only a feature needs, and what it is called in the passes of the plan.
+# The modules, classes or functions that only a feature needs, and what it is called in the passes of the plan.
 MODULES = {
-    "colliders": {"boundaries.colliders", "boundaries.collider_motion", "boundaries.distances"},
-    "friction": {"boundaries.wall_friction", "boundaries.rough_faces"},
-    "emitters": {"solver.activity"},
-    "forces": {"solver.expression_kernels", "solver.expression_functions", "solver.time_tables"},
-    "moving walls": {"boundaries.moving_faces"},
-    "periodic faces": {"solver.period"},
+    "colliders": {"boundaries.colliders", "boundaries.colliders.ColliderMotion", "boundaries.distances"},
+    "friction": {"boundaries.mirror_images.find_friction", "boundaries.walls.RoughFaces"},
+    "emitters": {"solver.particles.inflow"},
+    "forces": {"solver.drive.expressions.Application", "solver.drive.expressions.TimeTables"},
+    "moving walls": {"boundaries.walls.MovingFaces"},
+    "periodic faces": {"solver.grid.period.Period"},
     # Not asked for by the scene with features either.
-    "grids of distances": {"boundaries.grid_distance"},
-    "means of volume": {"solver.volume_average"},
+    "grids of distances": {"boundaries.distances.GridDistance"},
+    "means of volume": {"solver.transfer.volume_average"},
 }
 
 
@@ -52,7 +53,7 @@ def scene(*, with_features: bool) -> Scene:
 
 @pytest.fixture
 def given(monkeypatch: pytest.MonkeyPatch) -> Counter:
-    """How many functions, kernels and fields Taichi was given, by word and module of mpmcli."""
+    """How many functions, kernels and fields Taichi was given, by word and place in mpmcli, of kernels the module."""
     found = Counter()
     call, materialize, make = kernel_impl.Func.__call__, kernel_impl.Kernel.materialize, impl.create_field_member
 
@@ -60,7 +61,7 @@ def given(monkeypatch: pytest.MonkeyPatch) -> Counter:
         return module.removeprefix("mpmcli.")
 
     def called(self: kernel_impl.Func, *arguments: object, **named: object) -> object:
-        found["function", name(self.func.__module__)] += 1
+        found["function", name(f"{self.func.__module__}.{self.func.__qualname__}")] += 1
         return call(self, *arguments, **named)
 
     def compiled(self: kernel_impl.Kernel, *arguments: object, **named: object) -> None:
@@ -72,7 +73,7 @@ def given(monkeypatch: pytest.MonkeyPatch) -> Counter:
         frame = sys._getframe(1)
         while not frame.f_globals["__name__"].startswith("mpmcli."):
             frame = frame.f_back
-        found["field", name(frame.f_globals["__name__"])] += 1
+        found["field", name(f"{frame.f_globals['__name__']}.{frame.f_code.co_qualname}")] += 1
         return make(*arguments, **named)
 
     monkeypatch.setattr(kernel_impl.Func, "__call__", called)
@@ -81,54 +82,51 @@ def given(monkeypatch: pytest.MonkeyPatch) -> Counter:
     return found
 
 
-def step(asked: Scene, backend: object, *, batched: bool) -> object:
-    """Take a step and read a frame, and return the engine."""
-    engine = build_engine(asked, backend, batched=batched)
-    engine.begin()
-    engine.advance(1)
-    engine.frame()
-    return engine
+def step(asked: Scene, backend: object) -> Run:
+    """Take a step and read a frame, and return the run."""
+    run = build_run(asked, backend)
+    run.begin()
+    run.advance(1)
+    run.frame()
+    return run
 
 
-def modules(found: Counter) -> set[str]:
-    return {module for _, module in found}
+def among(found: Counter, places: set[str]) -> set[str]:
+    """Return those places that something was found in."""
+    return {place for place in places if any(f"{name}.".startswith(f"{place}.") for _, name in found)}
 
 
-@pytest.mark.parametrize("batched", [True, False], ids=["batch", "solver"])
-def test_a_plain_scene_has_nothing_of_features(backend_of: Callable, given: Counter, batched: bool) -> None:
-    """No field, function or kernel of theirs; and no more kernels than a step, a sort, a frame and a start need."""
+def test_a_plain_scene_has_nothing_of_features(backend_of: Callable, given: Counter) -> None:
+    """No field, function or kernel of theirs; and no more kernels than one, and one that fills the device."""
     plain, backend = scene(with_features=False), backend_of("f32", 1)
     plan = make_plan(plain, backend)
     assert plan.passes == ("clear grid", "scatter fluid", "find contact", "update grid", "gather fluid")
     assert plan.laws[0].fields.keys() == {"position", "velocity", "velocity_gradient", "volume_ratio", "id"}
-    engine = step(plain, backend, batched=batched)
+    run = step(plain, backend)
     # What is counted is not blind to what there is.
-    assert {("field", "solver.grid"), ("function", "boundaries.walls")} <= given.keys()
-    assert modules(given).isdisjoint(set().union(*MODULES.values()))
+    for word, place in (("field", "solver.grid."), ("function", "boundaries.walls.")):
+        assert any(what == word and name.startswith(place) for what, name in given)
+    assert not among(given, set().union(*MODULES.values()))
     kernels = {module: count for (what, module), count in given.items() if what == "kernel" and "." in module}
     kernels.pop("taichi._kernels", None)
-    if batched:
-        assert kernels == {"solver.batch_kernel": 1, "solver.particle_exchange": 1}
-        kind, device = engine.batch.kind, engine.batch.device
-        assert (kind.rough, kind.moving, kind.colliders.count, kind.comings.any) == ((), (), 0, False)
-        assert (device.colliders, device.motion, engine.batch.pushes) == (None, None, [None])
-        assert (device.friction.faces, device.moving.faces, device.emission) == ((), (), None)
-    else:
-        assert sum(kernels.values()) == 11
+    assert kernels == {"solver.engine.cpu_launch": 1, "solver.particles.arrays": 1}
+    kind, device = run.batch.kind, run.batch.device
+    assert (kind.rough, kind.moving, kind.colliders.count, kind.inflow.any) == ((), (), 0, False)
+    assert (device.colliders, device.motion, run.batch.pushes) == (None, None, [None])
+    assert (device.friction.faces, device.moving.faces, device.emission) == ((), (), None)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("batched", [True, False], ids=["batch", "solver"])
-def test_a_scene_with_features_has_their_modules(backend_of: Callable, given: Counter, batched: bool) -> None:
+def test_a_scene_with_features_has_their_modules(backend_of: Callable, given: Counter) -> None:
     """So that the names above are those of what features need; grids and means stay out."""
     asked, backend = scene(with_features=True), backend_of("f32", 1)
     plan = make_plan(asked, backend)
     assert {"scatter fluid with forces", "find friction", "update grid with colliders"} <= set(plan.passes)
     assert "activity" in plan.laws[0].fields
-    step(asked, backend, batched=batched)
+    step(asked, backend)
     for feature, own in MODULES.items():
-        found = modules(given) & own
+        found = among(given, own)
         if feature in ("grids of distances", "means of volume"):
             assert not found
         else:
-            assert found == own - (set() if batched else {"solver.time_tables"})
+            assert found == own

@@ -13,8 +13,7 @@ from mpmcli.check.finding import passes
 from mpmcli.check.scene_check import check_scene
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.sweep_file import load_sweep
-from mpmcli.dataset.sweep_run import run_sweep
-from mpmcli.dataset.sweep_state import SweepSettings
+from mpmcli.dataset.sweep_run import SweepSettings, run_sweep
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import estimate_particles, load_scene
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from good_sweep import BARE, BASE, LAWS, SWEEP, refusal, sweep_of, varied
 
-from mpmcli.dataset.distributions import Choice, Constant, Grid, Normal, Uniform
+from mpmcli.dataset.sweep import Choice, Constant, Grid, Normal, Uniform
 from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.errors import InputError
 

@@ -26,9 +26,7 @@ from mpmcli.dataset.compute import Task, compute
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import status_of, verify
-from mpmcli.dataset.sweep_folder import taken_folder
-from mpmcli.dataset.sweep_run import run_sweep
-from mpmcli.dataset.sweep_state import SweepSettings, SweepState
+from mpmcli.dataset.sweep_run import SweepSettings, SweepState, run_sweep, taken_folder
 from mpmcli.errors import InputError
 from mpmcli.output import open_result
 from mpmcli.scene import Time
@@ -333,7 +331,7 @@ def test_bad_input_has_one_sentence(truth: Path, tmp_path: Path, monkeypatch: py
     assert "3/2 is no part" in refused("-o", tmp_path / "d", "--shard", "3/2")
     assert "exists and is not empty" in refused("-o", tmp_path)
     assert "no scheduler answers there" in refused("-o", tmp_path / "d", "--scheduler", "tcp://127.0.0.1:1")
-    monkeypatch.setattr("mpmcli.dataset.sweep_folder.shutil.disk_usage", lambda _: SimpleNamespace(free=5))
+    monkeypatch.setattr("mpmcli.dataset.sweep_run.shutil.disk_usage", lambda _: SimpleNamespace(free=5))
     assert "but the dataset needs about" in refused("-o", tmp_path / "d")
     assert run_here("dataset", "status", tmp_path).status == 2
 

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from mpmcli.scene.expression import Tree, evaluate
 from mpmcli.scene.expression_reader import parse
 from mpmcli.scene.quadrature import BOUND, HALF, MIDDLE, Mean
-from mpmcli.solver.time_tables import ROOM, TimeTables, thinned
+from mpmcli.solver.drive.expressions import ROOM, TimeTables, thinned
 
 END = 2.0
 # The last one has more parts in a window than a table has rows for it where all windows must find room.

@@ -2,9 +2,8 @@
 
 from dataclasses import replace
 
-from mpmcli.validation.choice import outcome, reason, takes_its_place
-from mpmcli.validation.comparison import Compared, Ratios
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.case import Setting
+from mpmcli.validation.comparison import Compared, Ratios, outcome, reason, takes_its_place
 
 CUBIC = Compared(
     Setting(kernel="cubic"),

@@ -134,7 +134,7 @@ def test_a_case_out_of_tolerance_is_exit_code_1(
     """The bounds of the same runs are made too tight."""
     directory, _ = ran
     case = all_cases()[BAR]
-    tight = [type(measure)(measure.name, measure.unit, measure.text, lambda n: 1e-9) for measure in case.measures]
+    tight = [type(measure)(measure.definition, 1e-9) for measure in case.measures]
     monkeypatch.setattr(case, "measures", tuple(tight))
     outcome = run_here("validate", BAR, "--levels", "coarse", "-o", directory, "--resume", "--quiet", "--json")
     assert outcome.status == 1 and outcome.stderr == ""
@@ -165,7 +165,8 @@ CASE_FILE = '''\
 
 import numpy as np
 
-from mpmcli.validation.case import Case, Measure, elastic
+from mpmcli.validation.case import Case, Measure
+from mpmcli.validation.tables import body, box, elastic, problem
 
 
 class Drift(Case):
@@ -174,21 +175,12 @@ class Drift(Case):
     name, title, group = "drift", "A block that drifts", "invariants"
     source, resolution = "Newton's first law", "cells along the box"
     levels = {"coarse": (8,), "default": (8, 16), "fine": (8, 16)}
-    measures = (Measure("velocity error", "m/s", "Largest change of a velocity.", bound=lambda n: 1e-12),)
+    measures = (Measure("velocity error (m/s): Largest change of a velocity.", 1e-12),)
 
     def tables(self, n):
-        return {
-            "domain": {"size": [1.0, 1.0], "cells": [n, n]},
-            "time": {"end": 0.1, "frames": 2},
-            "bodies": [
-                {
-                    "name": "block",
-                    "material": elastic("neo_hookean", 1000.0, 1e5, 0.3),
-                    "shape": {"box": {"min": [0.25, 0.375], "max": [0.5, 0.625]}},
-                    "velocity": [1.0, 0.0],
-                }
-            ],
-        }
+        square = box([0.25, 0.375], [0.5, 0.625])
+        block = body("block", elastic("neo_hookean", 1000.0, 1e5, 0.3), square, velocity=[1.0, 0.0])
+        return problem({"size": [1.0, 1.0], "cells": [n, n]}, (0.1, 2), "velocity", [block])
 
     def measure(self, n, scene, frames):
         return {"velocity error": max(float(np.abs(f.velocity - [1.0, 0.0]).max()) for f, _ in frames)}

@@ -15,15 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from invented_case import CASE, SINGLE, results, second_order
 
-from mpmcli.validation.case import Measure
-from mpmcli.validation.environment import describe_environment
-from mpmcli.validation.figure_axes import number_text
-from mpmcli.validation.figure_style import STYLES, style_of
-from mpmcli.validation.figures import draw_case
-from mpmcli.validation.matrix import KNOBS, Run, runs_of, variants
+from mpmcli.validation.case import Measure, Setting
+from mpmcli.validation.figures import STYLES, draw_case, number_text, style_of
 from mpmcli.validation.report import CaseReport, Report
-from mpmcli.validation.report_files import write_report
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.report_page import write_report
+from mpmcli.validation.runs import KNOBS, Run, runs_of, variants
+from mpmcli.validation.study import describe_environment
 
 LOST = [Run("invented", n, Setting(transfer="pic")) for n in (8, 16, 32)] + [Run("invented", 16, Setting(safety=0.95))]
 SVG = "{http://www.w3.org/2000/svg}"
@@ -153,7 +150,7 @@ def test_odd_errors_are_drawn_too(error: float) -> None:
 
 def test_one_resolution_makes_a_report(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(type(CASE), "levels", {"coarse": (8,)})
-    monkeypatch.setattr(type(CASE), "measures", (Measure("error", "m", "A length."), CASE.measures[1]))
+    monkeypatch.setattr(type(CASE), "measures", (Measure("error (m): A length."), CASE.measures[1]))
     report = Report("coarse", describe_environment(1), (CASE,), results(level="coarse"))
     write_report(report, tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["figures", "report.html", "report.json", "report.md"]

@@ -11,23 +11,21 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from invented_case import CASE, result
 
 from mpmcli.errors import InputError
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError
-from mpmcli.validation import fingerprint, study
+from mpmcli.solver.frames.diagnosis import Diagnosis, UnstableRunError
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.validation import study
 from mpmcli.validation.carry_out import carry_out
-from mpmcli.validation.case import Measure
+from mpmcli.validation.case import Measure, Setting
 from mpmcli.validation.cases import all_cases
-from mpmcli.validation.fingerprint import case_files, code_digest, run_key
-from mpmcli.validation.journal import Journal
-from mpmcli.validation.matrix import Run, runs_of
-from mpmcli.validation.run_result import RunResult, failure
+from mpmcli.validation.journal import PACKAGE, Journal, case_files, code_digest, run_key
 from mpmcli.validation.runner import carry_out_all, case_command
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.runs import Run, RunResult, failure, runs_of
 
 RUNS = runs_of(CASE, "coarse")
 BAR = all_cases()["bar_fixed_free"]
@@ -157,25 +155,25 @@ def test_the_key_tells_scenes_settings_machines_and_programs_apart(monkeypatch: 
     monkeypatch.setattr("mpmcli.validation.cases.bar.SPEED", 0.02)
     keys.add(run_key(BAR, BAR_RUN, "a processor"))
     monkeypatch.undo()
-    monkeypatch.setattr(fingerprint, "code_digest", lambda files: "changed")
+    monkeypatch.setattr("mpmcli.validation.journal.code_digest", lambda files: "changed")
     keys.add(run_key(BAR, BAR_RUN, "a processor"))
     assert len(keys) == 6
 
 
 def test_the_digest_is_of_the_code_that_a_run_depends_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Solver, laws, the case and what it imports are in it; the report and other cases are not."""
+    """The solver, laws, the case and what it imports are in it; the report and other cases are not."""
     read = []
     monkeypatch.setattr(Path, "read_bytes", lambda path, real=Path.read_bytes: (read.append(path), real(path))[1])
     code_digest.__wrapped__(case_files(BAR))
-    names = {str(path.relative_to(fingerprint.PACKAGE)) for path in read}
+    names = {str(path.relative_to(PACKAGE)) for path in read}
     assert {
-        "solver/step_cpu.py",
+        "solver/engine/step_size.py",
         "materials/sand.py",
         "scene/sampling.py",
         "validation/carry_out.py",
         "validation/cases/bar.py",
-        "validation/oscillation.py",
-        "validation/setting.py",
+        "validation/measuring.py",
+        "validation/tables.py",
     } <= names
     assert not {name for name in names if "report" in name or "figure" in name or name.startswith(("cli", "check"))}
     assert {name for name in names if name.startswith("validation/cases/")} <= {
@@ -184,19 +182,19 @@ def test_the_digest_is_of_the_code_that_a_run_depends_on(monkeypatch: pytest.Mon
     }
     # Every room that these files import is in it too; `processes` starts a run, and computes nothing of it.
     found = {room for path in read if path.suffix == ".py" for room in re.findall(r"\bmpmcli\.(\w+)", path.read_text())}
-    rooms = {room for room in found if (fingerprint.PACKAGE / room).is_dir()}
+    rooms = {room for room in found if (PACKAGE / room).is_dir()}
     assert rooms - {"processes"} <= {name.partition("/")[0] for name in names}
 
 
 class Still:
-    """In place of a solver: three frames of nothing."""
+    """In place of a timed run: three frames of nothing."""
 
-    particle_count = 7
+    run = SimpleNamespace(particle_count=7)
 
     def __init__(self, scene: object, backend: object) -> None:
         pass
 
-    def timed_frames(self) -> Iterator[tuple[None, None]]:
+    def frames(self) -> Iterator[tuple[None, None]]:
         yield from [(None, None)] * 3
 
     def facts(self) -> dict[str, float]:
@@ -208,7 +206,7 @@ class Broken(type(BAR)):
 
     def __init__(self, found: Callable[[], dict]) -> None:
         super().__init__("broken", "Broken", 1, 4)
-        self.measures = tuple(Measure(name, "", "Some number.") for name in ("period error", "energy loss"))
+        self.measures = tuple(Measure(f"{name}: Some number.") for name in ("period error", "energy loss"))
         self.found = found
 
     def measure(self, n: int, scene: object, frames: Iterable) -> dict[str, float]:
@@ -238,7 +236,7 @@ def lost() -> dict:
 def test_what_cannot_be_measured_is_a_failure(
     monkeypatch: pytest.MonkeyPatch, found: Callable, status: str, message: str
 ) -> None:
-    monkeypatch.setattr("mpmcli.validation.carry_out.TimedSolver", Still)
+    monkeypatch.setattr("mpmcli.validation.carry_out.TimedRun", Still)
     entry = carry_out(Broken(found), 13, Setting(), BACKEND)
     assert (entry.status, entry.values) == (status, {}) and message in entry.message
     assert (entry.particles, entry.steps, entry.compile_seconds, entry.threads) == (7, 4, 0.5, 1)

@@ -7,11 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from invented_case import CASE, SINGLE, result, results, second_order
 
-from mpmcli.validation.comparison import cheapest, compare_settings
-from mpmcli.validation.convergence import Point, cost_to_reach, observed_order
-from mpmcli.validation.matrix import Run, label_of, matrix, runs_of, sweep_resolution, variants
-from mpmcli.validation.setting import Setting
-from mpmcli.validation.verdict import judge, verdict_of_run
+from mpmcli.validation.case import Setting
+from mpmcli.validation.comparison import Point, cheapest, compare_settings, cost_to_reach
+from mpmcli.validation.runs import Run, matrix, runs_of, sweep_resolution, variants
+from mpmcli.validation.verdict import judge, observed_order, verdict_of_run
 
 SINGLE_ERROR = "f32, error"
 
@@ -29,7 +28,7 @@ def test_further_levels_try_every_knob_one_at_a_time(level: str) -> None:
     at = {}
     for run in runs:
         assert len(run.setting.changed_from(Setting())) <= 1
-        at.setdefault(label_of(run.setting), []).append(run.n)
+        at.setdefault(run.setting.label, []).append(run.n)
     everywhere = list(CASE.levels[level])
     swept = {label: [16] for label in at if label.startswith("Courant")}
     assert len(swept) == 4
@@ -40,7 +39,7 @@ def test_further_levels_try_every_knob_one_at_a_time(level: str) -> None:
 
 def test_a_knob_that_means_nothing_to_a_case_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(type(CASE), "varies", ("transfer",))
-    assert {label_of(run.setting) for run in runs_of(CASE, "default")} == {"default", "PIC", "AFLIP"}
+    assert {run.setting.label for run in runs_of(CASE, "default")} == {"default", "PIC", "AFLIP"}
     assert {run.setting for run in runs_of(CASE, "coarse")} == {Setting()}
 
 
@@ -133,7 +132,7 @@ def test_the_cheapest_setting_saves_a_tenth_or_is_the_default_one() -> None:
             for setting, factor in ((Setting(), 1e-6), (SINGLE, 1e-6 * (1 - saved)))
         }
         best = cheapest(CASE, found)
-        assert best.label == wanted
+        assert best.setting.label == wanted
         assert best.cost.n == pytest.approx(8 * math.sqrt(50))
     assert cheapest(CASE, results(lambda run: 0.02)) is None
 
@@ -151,7 +150,7 @@ def test_settings_are_compared_with_the_default_one() -> None:
     for run in list(found):
         if run.setting == cubic:
             found[run] = result(law(run), run.n**2, run.n + 1, 2e-6 * run.n**3)
-    compared = {entry.label: entry for entry in compare_settings([CASE], found)}
+    compared = {entry.setting.label: entry for entry in compare_settings([CASE], found)}
     entry = compared["cubic kernel"]
     assert (entry.error.mean, entry.seconds.mean, entry.to_equal.mean) == pytest.approx((0.25, 2.0, 0.25))
     assert (compared["PIC"].error, compared["PIC"].failed, compared["PIC"].runs) == (None, 3, 3)

@@ -3,6 +3,7 @@
 import json
 import tomllib
 from collections.abc import Callable
+from copy import deepcopy
 from functools import cache
 
 import pytest
@@ -13,12 +14,10 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import parse_scene, scene_to_toml
 from mpmcli.validation.carry_out import carry_out, scene_of
+from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases
-from mpmcli.validation.convergence import ROUND_OFF
-from mpmcli.validation.matrix import KNOBS, Run
-from mpmcli.validation.run_result import RunResult
-from mpmcli.validation.setting import Setting
-from mpmcli.validation.verdict import judge
+from mpmcli.validation.runs import KNOBS, Run, RunResult
+from mpmcli.validation.verdict import ROUND_OFF, judge
 
 CASES = all_cases()
 COARSE = {name: sorted(case.levels["coarse"]) for name, case in CASES.items()}
@@ -105,6 +104,24 @@ def test_the_scene_of_a_case_is_a_public_one(name: str) -> None:
     assert again.scene == loaded.scene
     findings = check_scene(loaded).findings
     assert passes(findings), [finding.what for finding in findings if finding.severity == "error"]
+
+
+def emptied(tables: object) -> None:
+    """Clear tables and lists, from the innermost on."""
+    for part in tables.values() if isinstance(tables, dict) else tables:
+        if isinstance(part, dict | list):
+            emptied(part)
+    tables.clear()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_a_caller_does_to_tables_does_not_reach_the_case(name: str) -> None:
+    """Tables that two cases share would carry a change from the one to the other."""
+    case = CASES[name]
+    tables = case.tables(COARSE[name][0])
+    as_it_was = deepcopy(tables)
+    emptied(tables)
+    assert case.tables(COARSE[name][0]) == as_it_was
 
 
 @pytest.mark.parametrize("name", CASES)

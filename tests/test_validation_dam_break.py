@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mpmcli.validation.martin_moyce import SHIFTS, best_shift, mean_error, measured
+from mpmcli.validation.cases.dam_break import SHIFTS, best_shift, mean_error, measured
 
 
 def test_the_data_are_three_fronts_and_a_height() -> None:

@@ -5,8 +5,19 @@ import math
 import numpy as np
 import pytest
 
-from mpmcli.validation.cases.dam_break_obstacle import DAM, DEPTH, GRAVITY
-from mpmcli.validation.kleefsman import FACE, IMPACT, MIDDLE, WET, arrival, impact, measured, water_height
+from mpmcli.validation.cases.dam_break_obstacle import (
+    DAM,
+    DEPTH,
+    FACE,
+    GRAVITY,
+    IMPACT,
+    MIDDLE,
+    WET,
+    arrival,
+    impact,
+    measured,
+    water_height,
+)
 
 
 def test_the_data_are_four_gauges_of_one_flow() -> None:

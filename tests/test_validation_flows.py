@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from solver_state import scene_of
 
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.engine import build_engine
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import taylor_green
 from mpmcli.validation.cases.channel import PULL, VISCOSITY, WIDTH, plugged, started
 from mpmcli.validation.cases.elliptical_drop import half_axis
 from mpmcli.validation.cases.sloshing import standing_wave_frequency
-from mpmcli.validation.setting import Setting
-from mpmcli.validation.transfer_loss import apic_factor
+from mpmcli.validation.cases.taylor_green import apic_factor
 
 
 @pytest.mark.parametrize(("time", "a"), [(0.2, 0.82082616), (0.76, 0.51426647), (1.0, 0.43946077), (2.0, 0.27181408)])
@@ -107,7 +107,7 @@ def decay_error(backend: Backend, n: int, monkeypatch: pytest.MonkeyPatch, sound
 
     def counted() -> Iterator:
         nonlocal steps
-        for frame, row in build_engine(scene, backend, batched=True).frames(lambda: False):
+        for frame, row in build_run(scene, backend).frames():
             steps += row.steps
             yield frame, row
 

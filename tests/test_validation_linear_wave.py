@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mpmcli.validation.linear_wave import discrete_wave
+from mpmcli.validation.cases.bar import discrete_wave
 
 
 def spectrum(kh: float, aliases: int = 400) -> tuple[np.ndarray, np.ndarray]:

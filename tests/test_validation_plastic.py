@@ -8,9 +8,10 @@ import pytest
 
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import parse_scene
-from mpmcli.solver.solver import Solver
-from mpmcli.validation import plastic_paths as paths
+from mpmcli.solver.engine.build import build_run
+from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases
+from mpmcli.validation.cases import plastic_blocks as paths
 from mpmcli.validation.cases.snow_oedometer import (
     COMPRESSION,
     DENSITY,
@@ -20,7 +21,6 @@ from mpmcli.validation.cases.snow_oedometer import (
     confined_height,
     confined_stress,
 )
-from mpmcli.validation.setting import Setting
 
 
 def test_the_closed_form_of_confined_snow_is_the_table() -> None:
@@ -94,7 +94,7 @@ def test_steep_sand_is_rejected_by_the_band_of_the_column(backend_of: Callable, 
     tables = case.scene_tables(n, setting)
     tables["bodies"][0]["material"]["friction_angle"] = 63.0
     asked = parse_scene(tables, laws=parameter_models()).scene
-    found = case.measure(n, asked, Solver(asked, backend_of("f64")).frames())
+    found = case.measure(n, asked, build_run(asked, backend_of("f64")).frames())
     record_property("run-out", found["run-out"])
     error = case.measures[0]
     assert found["run-out"] < 1.5
@@ -110,6 +110,6 @@ def test_sand_of_another_friction_angle_runs_out_otherwise(backend_of: Callable,
     tables = case.scene_tables(n, setting)
     tables["bodies"][0]["material"]["friction_angle"] = angle
     asked = parse_scene(tables, laws=parameter_models()).scene
-    found = case.measure(n, asked, Solver(asked, backend_of("f64")).frames())
+    found = case.measure(n, asked, build_run(asked, backend_of("f64")).frames())
     refined = next(measure for measure in case.measures if measure.name == "run-out against refinement")
     assert abs(found[refined.name]) > refined.bound(n)

@@ -10,10 +10,10 @@ import pytest
 from conftest import ROOT
 from small_plants import SMALL_PLANTS, SmallPlant
 
+from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases
-from mpmcli.validation.matrix import Run
 from mpmcli.validation.runner import carry_out_all
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.runs import Run
 from mpmcli.validation.verdict import judge
 
 FEWEST = 40
@@ -27,7 +27,7 @@ def first_run(package: Path, name: str) -> str:
     """
     run = Run(name, min(CASES[name].levels["coarse"]), Setting())
     # -P: without it the package in the present directory would be taken.
-    process = ["env", f"PYTHONPATH={package}", sys.executable, "-P", "-m", "mpmcli.validation.case_process"]
+    process = ["env", f"PYTHONPATH={package}", sys.executable, "-P", "-m", "mpmcli.validation.runner"]
     ((_, result),) = carry_out_all([run], 1, command=lambda run: [*process, run.case, str(run.n), "{}"])
     # A run may become unstable or give no number; any other failure would be a plant that does not even compile.
     assert result.status in ("finished", "unstable") or "came to its end" in result.message, result.message

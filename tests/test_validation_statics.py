@@ -8,8 +8,9 @@ import pytest
 from mpmcli.scene.entry import value_of
 from mpmcli.scene.expression_reader import parse
 from mpmcli.validation.cases import column_dynamic, column_static, spinning_disc
-from mpmcli.validation.elastica import Beam
-from mpmcli.validation.quasi_static import smooth_ramp, window_weights
+from mpmcli.validation.cases.cantilever import Beam
+from mpmcli.validation.measuring import window_weights
+from mpmcli.validation.tables import smooth_ramp
 
 # P L^2 / EI, shortening / L, deflection / L, angle of the tip in degrees (docs/theory.md, 10).
 ELASTICA = [
@@ -33,15 +34,15 @@ SETTLED = [
 @pytest.mark.parametrize(("load", "shortening", "deflection", "degrees"), ELASTICA)
 def test_elastica_is_that_of_the_table(load: float, shortening: float, deflection: float, degrees: float) -> None:
     bent = Beam(load).bent()
-    assert bent.tip == pytest.approx([1 - shortening, deflection], abs=1e-6)
-    assert math.degrees(bent.tip_angle) == pytest.approx(degrees, abs=1e-3)
+    assert bent(1.0)[:2] == pytest.approx([1 - shortening, deflection], abs=1e-6)
+    assert math.degrees(bent(1.0)[2]) == pytest.approx(degrees, abs=1e-3)
 
 
 def test_bent_beam_keeps_its_first_integral() -> None:
     """M^2/2 + P sin theta + P^2/4 (1/kGA - 1/EA) cos 2 theta is the same all along a beam loaded at its end."""
     load, axial, shear = 2.0, 300.0, 125.0
     for a, s in ((math.inf, math.inf), (axial, shear)):
-        _, _, theta, moment = Beam(load, 0.0, a, s).bent().states.T
+        _, _, theta, moment = Beam(load, 0.0, a, s).bent()(np.linspace(0.0, 1.0, 201))
         kept = moment**2 / 2 + load * np.sin(theta) + load**2 / 4 * (1 / s - 1 / a) * np.cos(2 * theta)
         assert np.ptp(kept) < 1e-8
 
@@ -52,11 +53,10 @@ def test_small_deflection_is_timoshenkos() -> None:
     s = np.linspace(1 - spread, 1, 20001)
     bending = np.trapezoid(s**2 * (3 - s) / 6, s) / spread
     bent = Beam(load, spread, 300.0, shear).bent()
-    assert bent.tip[1] / load == pytest.approx(bending + (1 - spread / 2) / shear, rel=1e-6)
-    # The cubic between two states is of fourth order in their distance.
+    assert bent(1.0)[1] / load == pytest.approx(bending + (1 - spread / 2) / shear, rel=1e-6)
     s = 0.5003
     clamped = s**2 * (3 * (1 - spread / 2) - s) / 6 + s / shear
-    assert bent.at(s)[1] / load == pytest.approx(clamped, rel=1e-6)
+    assert bent(s)[1] / load == pytest.approx(clamped, rel=1e-6)
 
 
 def test_smooth_ramp_leaves_little_swinging() -> None:

@@ -9,20 +9,19 @@ import pytest
 from made_result import made_row
 from scenes import block, scene, volume_errors
 
-from mpmcli.materials.fluid import RELAXATION
+from mpmcli.materials.fluid import BESIDE, DEAD_BAND, FULL, LARGEST_LACK, OPENED, RELAXATION, SLACK
 from mpmcli.materials.registry import parameter_models
 from mpmcli.materials.sand import BAND
 from mpmcli.materials.sand import RELAXATION as GRAINS_RELAXATION
-from mpmcli.materials.volume_relaxation import BESIDE, DEAD_BAND, FULL, LARGEST_LACK, OPENED, SLACK
 from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_columns, ledger_csv, ledger_rows, parse_ledger_csv
-from mpmcli.scene import Scene, parse_scene
-from mpmcli.solver.plan import make_plan
-from mpmcli.solver.solver import Solver
-from mpmcli.solver.splines import PAD
-from mpmcli.solver.volume_relaxation import INTERVAL
+from mpmcli.scene import Scene, parse_scene, sample_bodies
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.machine.plan import make_plan
+from mpmcli.solver.transfer.splines import PAD
+from mpmcli.solver.transfer.volume_relaxation import INTERVAL
 from mpmcli.validation.carry_out import scene_of
+from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases
-from mpmcli.validation.setting import Setting
 
 BULK, H = 4e4, 0.1
 
@@ -104,16 +103,15 @@ def test_openings_are_remembered(backend_of: Callable) -> None:
         )
         for k, kind in enumerate(kinds)
     ]
-    solver = Solver(scene([13, 5], H, bodies, 1.0, precision="f64"), backend_of("f64"))
-    (group,) = solver.groups
+    run = build_run(scene([13, 5], H, bodies, 1.0, precision="f64"), backend_of("f64"))
+    (group,) = run.groups
     before = np.random.default_rng(5).choice([0.99, 1 + 0.6 * SLACK, 1 + 2 * SLACK, 1.5, 1.999, 3.0], group.count)
     for sign in (1, -1):
-        group.set_deformation(before)
-        v, C = group.motion_to_numpy()
-        group.set_motion(sign * v, sign * C)
-        solver.state_was_replaced()
-        solver.step(dt := 1e-3)
-        after = group.to_numpy()
+        moving = group.read()
+        group.replace(v=sign * moving["v"], C=sign * moving["C"], deformation=before)
+        run.state_was_replaced()
+        run.step(dt := 1e-3)
+        after = group.read()
         J, C, body = after["deformation"], after["C"], after["body"]
         free = before * np.linalg.det(np.eye(2) + dt * C)
         assert J[body == 0] == pytest.approx(grown(before, C, dt)[body == 0], rel=1e-14)
@@ -137,26 +135,25 @@ def test_volume_follows_the_grid(backend_of: Callable, densities: tuple[float, .
 
     The same step without relaxation differs by that alone: positions, velocities and gradients have the same bytes.
     """
-    solver = Solver(pool(*densities, walls=walls, d=d), backend_of("f64"))
-    (group,) = solver.groups
+    run = build_run(pool(*densities, walls=walls, d=d), backend_of("f64"))
+    (group,) = run.groups
     # Too dense by a seventh, on average.
-    group.x.from_numpy((group.x.to_numpy() * ([1.0, 0.85, 1.0][:d])).astype(group.real))
     random = np.random.default_rng(3)
-    group.set_deformation(random.uniform(0.9, 1.2, group.count))
-    solver.state_was_replaced()
-    solver.step(1e-4)
-    saved = solver.state.save()
-    before = group.to_numpy()
+    group.replace(x=group.read()["x"] * [1.0, 0.85, 1.0][:d], deformation=random.uniform(0.9, 1.2, group.count))
+    run.state_was_replaced()
+    run.step(1e-4)
+    saved = run.save().copied()
+    before = group.read()
     found = []
     for steps in (INTERVAL - 1, 0):
-        solver.state.load(saved)
-        solver.state.unrelaxed_steps = steps
-        solver.state.unrelaxed = time = 2e-3
-        solver.step(1e-4)
-        found.append(group.to_numpy())
+        run.load(saved)
+        run.state.unrelaxed_steps = steps
+        run.state.unrelaxed = time = 2e-3
+        run.step(1e-4)
+        found.append(group.read())
     relaxed, plain = found
-    volume = np.array([b.volume for b in solver._particles])[before["body"]]
-    seen, least, beside = seen_ratio(before["x"], volume, solver.grid.cells)
+    volume = np.array([b.volume for b in sample_bodies(run.scene)])[before["body"]]
+    seen, least, beside = seen_ratio(before["x"], volume, run.scene.domain.cells)
     crossings = np.sqrt(BULK / np.array(densities))[before["body"]] * (time + 1e-4) / H
     J = before["deformation"]
     moves = (least > FULL) & ((seen < J) | (beside * seen > BESIDE))
@@ -192,33 +189,32 @@ def test_sand_follows_the_grid(backend_of: Callable) -> None:
         )
         for k in (0, 1)
     ]
-    solver = Solver(scene([12, 8], H, bodies, 1.0, walls="slip", precision="f64"), backend_of("f64"))
-    (group,) = solver.groups
+    run = build_run(scene([12, 8], H, bodies, 1.0, walls="slip", precision="f64"), backend_of("f64"))
+    (group,) = run.groups
     # Too thin by an eighth, on average.
-    group.x.from_numpy((group.x.to_numpy() * [1.0, 1.15]).astype(group.real))
-    solver.state_was_replaced()
+    group.replace(x=group.read()["x"] * [1.0, 1.15])
+    run.state_was_replaced()
     # Sorts the particles.
-    solver.step(1e-5)
+    run.step(1e-5)
     random = np.random.default_rng(3)
     strain = np.where(random.uniform(size=group.count) < 0.5, -0.02, 0.0)
-    group.set_deformation(np.exp(strain / 2)[:, None, None] * np.eye(2))
     opened = np.where(strain < 0, 0.0, random.uniform(0, 0.3, group.count))
-    group.internal[0].from_numpy(opened)
+    group.replace(deformation=np.exp(strain / 2)[:, None, None] * np.eye(2), internal=opened[:, None])
     # What is at rest stays as it is.
-    group.set_motion(np.zeros((group.count, 2)), random.normal(size=(group.count, 2, 2)))
-    saved = solver.state.save()
-    before = group.to_numpy()
+    group.replace(v=np.zeros((group.count, 2)), C=random.normal(size=(group.count, 2, 2)))
+    saved = run.save().copied()
+    before = group.read()
     found = []
     for steps in (INTERVAL - 1, 0):
-        solver.state.load(saved)
-        solver.state.unrelaxed_steps = steps
-        solver.state.unrelaxed = time = 2e-3
-        solver.step(1e-5)
-        found.append(group.to_numpy())
+        run.load(saved)
+        run.state.unrelaxed_steps = steps
+        run.state.unrelaxed = time = 2e-3
+        run.step(1e-5)
+        found.append(group.read())
     relaxed, plain = found
     x, body = before["x"], before["body"]
-    volume = np.array([b.volume for b in solver._particles])[body]
-    seen, least, beside = seen_ratio(x, volume, solver.grid.cells)
+    volume = np.array([b.volume for b in sample_bodies(run.scene)])[body]
+    seen, least, beside = seen_ratio(x, volume, run.scene.domain.cells)
     gap = np.log(seen) - opened - strain
     crossings = np.sqrt(sound_modulus(1e6, 0.3) / 1600.0) * (time + 1e-5) / H
     share = np.where(strain < 0, GRAINS_RELAXATION * crossings / (1 + GRAINS_RELAXATION * crossings), 1.0)
@@ -253,7 +249,7 @@ def test_nodes_keep_volume_only_where_densities_differ(backend_of: Callable) -> 
     )
     one = make_plan(pool(1000.0, 1000.0), backend).bytes_per_node
     assert [make_plan(each, backend).bytes_per_node / one for each in (held, off)] == [2, 1]
-    assert [Solver(each, backend).grid.filling is not None for each in (held, off)] == [True, False]
+    assert [build_run(each, backend).grid.filling is not None for each in (held, off)] == [True, False]
 
 
 def uncorrected(tables: dict) -> Scene:
@@ -276,7 +272,7 @@ def test_a_case_of_volume_fails_without_the_correction(
     """Nothing else keeps it; the cases hold 2 % (test_validation_cases)."""
     case = all_cases()[name]
     asked = uncorrected(case.scene_tables(1, Setting()))
-    error = case.measure(1, asked, Solver(asked, backend_of("f64", 1)).frames())["volume error"]
+    error = case.measure(1, asked, build_run(asked, backend_of("f64", 1)).frames())["volume error"]
     record_property("volume error", error)
     assert abs(error) > least
 
@@ -292,7 +288,7 @@ def test_shorter_steps_change_nothing(backend_of: Callable) -> None:
     errors = []
     for safety in (0.8, 0.2):
         asked = scene_of(case, 1, Setting(safety=safety))
-        errors.append(case.measure(1, asked, Solver(asked, backend_of("f64", 1)).frames())["volume error"])
+        errors.append(case.measure(1, asked, build_run(asked, backend_of("f64", 1)).frames())["volume error"])
     assert np.abs(errors).max() < 0.02
 
 

@@ -7,7 +7,7 @@ import pytest
 from solver_state import BodyState, bodies_of, scene_of
 
 from mpmcli.scene import BodyParticles, Scene
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 G, DENSITY = 10.0, 1000.0
 # Of the block: its length and height, m.
@@ -35,10 +35,10 @@ def stepped(backend: object, scene: Scene, velocity: list[float]) -> tuple[np.nd
     particles = BodyParticles(
         "block", random.uniform(low, high, (n, d)), np.tile(velocity, (n, 1)), zero, volume, DENSITY * volume
     )
-    solver = Solver(scene, backend, [particles])
-    before = bodies_of(solver)["block"].momentum()
-    solver.step(1e-4)
-    after = bodies_of(solver)["block"]
+    run = build_run(scene, backend, [particles])
+    before = bodies_of(run)["block"].momentum()
+    run.step(1e-4)
+    after = bodies_of(run)["block"]
     return after.momentum() - before, after
 
 
@@ -90,11 +90,11 @@ def test_friction_takes_energy(backend_of: Callable) -> None:
         volume,
         DENSITY * volume,
     )
-    rough, smooth = Solver(scene, backend, [particles]), Solver(thrown(0.0, "slip", 2), backend, [particles])
-    for solver in (rough, smooth):
-        solver.step(1e-4)
+    rough, smooth = build_run(scene, backend, [particles]), build_run(thrown(0.0, "slip", 2), backend, [particles])
+    for run in (rough, smooth):
+        run.step(1e-4)
     h = scene.domain.spacing
-    energies = [bodies_of(solver)["block"].kinetic_energy(h) for solver in (rough, smooth)]
+    energies = [bodies_of(run)["block"].kinetic_energy(h) for run in (rough, smooth)]
     assert energies[0] < energies[1]
 
 
@@ -133,11 +133,11 @@ def block_on_floor(
 
 def history(backend: object, scene: Scene) -> np.ndarray:
     """Return t, and the mean of x and of v_x, after each step."""
-    solver, found = Solver(scene, backend), []
-    while solver.time < scene.time.end - 1e-12:
-        solver.step(min(solver.stable_step()[0], scene.time.end - solver.time))
-        block = bodies_of(solver)["block"]
-        found.append((solver.time, block.x[:, 0].mean(), block.v[:, 0].mean()))
+    run, found = build_run(scene, backend), []
+    while run.time < scene.time.end - 1e-12:
+        run.step(min(run.stable_step()[0], scene.time.end - run.time))
+        block = bodies_of(run)["block"]
+        found.append((run.time, block.x[:, 0].mean(), block.v[:, 0].mean()))
     return np.array(found).T
 
 
@@ -221,17 +221,17 @@ def test_faces_have_coefficients_of_their_own(backend_of: Callable, dimension: i
 
 def test_slip_is_saved(backend_of: Callable) -> None:
     """With solids = "total" a run that is loaded half-way goes on with the bytes of one that never stopped."""
-    solver = Solver(block_on_floor(30.0, 0.3, "separate", 1.0, speed=1.0, solids="total"), backend_of("f64", 1))
+    run = build_run(block_on_floor(30.0, 0.3, "separate", 1.0, speed=1.0, solids="total"), backend_of("f64", 1))
 
     def ahead() -> bytes:
         for _ in range(30):
-            solver.step(1e-4)
-        block = bodies_of(solver)["block"]
+            run.step(1e-4)
+        block = bodies_of(run)["block"]
         return block.x.tobytes() + block.v.tobytes()
 
     ahead()
-    saved = solver.state.save()
+    saved = run.save().copied()
     expected = ahead()
-    solver.state.load(saved)
+    run.load(saved)
     assert ahead() == expected
-    assert np.abs(solver.groups[0].slip.to_numpy()).max() > 0
+    assert np.abs(run.groups[0].arrays.slip.to_numpy()).max() > 0

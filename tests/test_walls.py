@@ -13,7 +13,7 @@ import pytest
 from solver_state import BodyState, bodies_of, scene_of
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
 
 H = 0.1
 SOLID = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 2e4, "poissons_ratio": 0.3}
@@ -76,10 +76,10 @@ def run(
     backend_of: Callable, scene: Scene, particles: list[BodyParticles], steps: int, dt: float
 ) -> dict[str, BodyState]:
     """Return the bodies after some steps."""
-    solver = Solver(scene, backend_of("f64"), particles)
+    run = build_run(scene, backend_of("f64"), particles)
     for _ in range(steps):
-        solver.step(dt)
-    return bodies_of(solver)
+        run.step(dt)
+    return bodies_of(run)
 
 
 @pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
@@ -204,11 +204,11 @@ def test_sticking_walls_hold(backend_of: Callable) -> None:
     samples = sample_bodies(scene)
     start = samples[0].position
     mu = 2e4 / 2.6
-    solver = Solver(scene, backend_of("f64"), samples)
+    run = build_run(scene, backend_of("f64"), samples)
     most = lowest = 0.0
     for _ in range(200):
-        solver.step(0.004)
-        moved = np.abs((bodies_of(solver)["block"].x - start)[:, 0])
+        run.step(0.004)
+        moved = np.abs((bodies_of(run)["block"].x - start)[:, 0])
         most, lowest = max(most, moved.mean()), max(lowest, moved[start[:, 1] < H / 2].max())
     static = 1000.0 * 0.5 * 0.3**2 / (3 * mu)
     assert static / 2 < most < 4 * static
@@ -261,14 +261,14 @@ def test_balls_leave_the_walls_that_they_hit(backend_of: Callable, record_proper
         velocity=np.concatenate([sample.velocity @ R.T for R in turns]),
         affine=np.tile(sample.affine, (4, 1, 1)),
     )
-    solver = Solver(scene, backend_of("f64"), [balls])
+    run = build_run(scene, backend_of("f64"), [balls])
     nearest = np.inf
-    dt = 0.5 * solver.stable_step()[0]
+    dt = 0.5 * run.stable_step()[0]
     steps = round(0.7 / dt)
     for _ in range(steps):
-        solver.step(dt)
-        nearest = min(nearest, bodies_of(solver)["ball"].x[:n, 1].min())
-    after = bodies_of(solver)["ball"]
+        run.step(dt)
+        nearest = min(nearest, bodies_of(run)["ball"].x[:n, 1].min())
+    after = bodies_of(run)["ball"]
     # It touched the floor and is well clear of it now.
     assert nearest < H / 2
     assert after.x[:n, 1].min() > 1.5 * H
@@ -303,17 +303,17 @@ def test_resting_fluid_stays_on_a_separating_floor(backend_of: Callable, record_
     sample = sample_bodies(scene)[0]
     Y = sample.position[:, 1]
     pressure = rho * g * (height - Y)
-    solver = Solver(scene, backend_of("f64"), [sample])
-    solver.groups[0].set_deformation(1 / (1 + pressure / K))
+    run = build_run(scene, backend_of("f64"), [sample])
+    run.groups[0].replace(deformation=1 / (1 + pressure / K))
     c = np.sqrt(K / rho)
-    dt = solver.stable_step()[0]
+    dt = run.stable_step()[0]
     fastest = 0.0
     steps = round(20 * 4 * height / c / dt)
     for n in range(steps):
-        solver.step(dt)
+        run.step(dt)
         if n > steps // 2:
-            fastest = max(fastest, float(np.abs(bodies_of(solver)["column"].v).max()))
-    column = bodies_of(solver)["column"]
+            fastest = max(fastest, float(np.abs(bodies_of(run)["column"].v).max()))
+    column = bodies_of(run)["column"]
     moved = np.abs(column.x - sample.position).max() / h
     found = K * (1 / column.deformation - 1)
     error = float(np.sqrt(((found - pressure) ** 2).sum() / (pressure**2).sum()))

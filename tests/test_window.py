@@ -11,8 +11,18 @@ from asked_process import CRASH, HANG, answering, running
 
 from mpmcli.errors import InputError
 from mpmcli.render import window
-from mpmcli.render.window import EGL, HANDED_DOWN, OSMESA, SETTING, X, choose_window, try_windows
-from mpmcli.render.window_probe import BLUE, RED, picture_problem
+from mpmcli.render.window import (
+    BLUE,
+    EGL,
+    HANDED_DOWN,
+    OSMESA,
+    RED,
+    SETTING,
+    X,
+    choose_window,
+    picture_problem,
+    try_windows,
+)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere VTK has one window, and no choice")
 
@@ -98,13 +108,6 @@ def test_none_is_one_sentence_with_the_packages(probe):
     )
 
 
-def test_an_old_vtk_is_to_be_updated(probe, monkeypatch):
-    probe(CRASH)
-    monkeypatch.setattr(window.importlib.metadata, "version", lambda package: "9.3.1")
-    with pytest.raises(InputError, match=r'VTK 9\.3 needs a screen; update it by `python -m pip install "vtk>=9\.4"`'):
-        choose_window()
-
-
 def test_what_the_user_wants_is_kept_and_alone_tried(probe, monkeypatch):
     monkeypatch.setenv(SETTING, "vtkMine")
     # No class has to come: VTK may have another one for it.
@@ -165,7 +168,7 @@ def test_the_real_window_draws_here_and_in_a_child(run_python):
         "import json, subprocess, sys\n"
         "from mpmcli.errors import InputError\n"
         "from mpmcli.render.window import choose_window\n"
-        "from mpmcli.render.window_probe import draw_point\n"
+        "from mpmcli.render.window import draw_point\n"
         "try:\n"
         "    chosen = choose_window()\n"
         "except InputError as error:\n"

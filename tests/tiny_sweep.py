@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mpmcli.dataset.manifest import Manifest, Row
+from mpmcli.dataset.folder import Manifest, Row
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.materials.registry import parameter_models
@@ -58,8 +58,8 @@ def tiny_sweep(directory: Path, count: int = 12, base: str = BASE, more: str = "
 
 def small_shards(monkeypatch: pytest.MonkeyPatch, trajectories: int = 4) -> None:
     """Let a shard hold a few trajectories."""
-    monkeypatch.setattr("mpmcli.dataset.sweep_folder.trajectory_bytes", lambda *_: 1000)
-    monkeypatch.setattr("mpmcli.dataset.sweep_folder.SHARD_BYTES", 1000 * trajectories)
+    monkeypatch.setattr("mpmcli.dataset.sweep_run.trajectory_bytes", lambda *_: 1000)
+    monkeypatch.setattr("mpmcli.dataset.sweep_run.SHARD_BYTES", 1000 * trajectories)
 
 
 def contents(directory: Path) -> dict[str, str]:

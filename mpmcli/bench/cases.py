@@ -19,14 +19,7 @@ EDGE = 0.4
 
 @dataclass(frozen=True)
 class BenchCase:
-    """One size of the falling block, the same for both contestants.
-
-    Attributes:
-        dimension: 2 or 3.
-        cells: grid cells along each edge of the unit box, a power of two (mpm3d needs it).
-        particles: number of particles in the block, each with an equal share of its mass.
-        step: time step, s, equal for both.
-    """
+    """One size for all contestants: cells along an edge, a power of two for mpm3d, particles, and time step, s."""
 
     dimension: int
     cells: int
@@ -55,6 +48,18 @@ class BenchCase:
     def velocity(self) -> np.ndarray:
         """Return the initial velocity, (dimension,) float64, m/s."""
         return np.array([0.0, -SPEED, 0.0][: self.dimension])
+
+    def scene(self, title: str, bodies: list[dict], gravity: float, end: float = 1.0, **solver: str | bool) -> dict:
+        """Return bodies in the unit box as the dictionary of a scene file."""
+        d = self.dimension
+        domain = {"size": [1.0] * d, "cells": [self.cells] * d, "gravity": [0.0, -gravity, 0.0][:d]}
+        return {
+            "title": f"{title}, {self.name}",
+            "domain": domain | {"walls": "separate"},
+            "time": {"end": end, "frames": 1, "step": self.step},
+            "bodies": bodies,
+            "solver": solver,
+        }
 
 
 # Steps are the examples' own where they give one: 4e-4, 2e-4, 8e-5 at 32, 64, 128 cells for mpm3d,

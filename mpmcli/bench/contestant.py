@@ -18,7 +18,7 @@ For laws, the contestant is the column of `mpmcli.bench.materials`, which has th
                                                      takes STEPS steps from that state, repeated until the time is up
     flowing                 {"share": 0.93}          of the particles
 
-With "profile:" before the name of a law, the contestant is the column of `mpmcli.bench.profiled_column`, which answers
+With "profile:" before the name of a law, the contestant is the column of `mpmcli.bench.profile`, which answers
 to `phases`, as the yardstick does. For a feature, a scene of `mpmcli.bench.features`, `repeat` goes on from where the
 scene is.
 
@@ -26,25 +26,25 @@ A failure is answered by {"error": "a sentence"} and ends the process with statu
 """
 
 import argparse
-import json
-import os
 import sys
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import IO, Protocol
+from typing import Protocol, get_type_hints
 
 from mpmcli.bench.cases import BLOCKS, BenchCase
 from mpmcli.errors import MpmcliError
+from mpmcli.processes.questions import answering
 
 
 class Contestant(Protocol):
-    """A simulation that can be measured."""
+    """A simulation that can be measured; only those of mpmcli can repeat steps, and have `watch_seconds`."""
 
     particles: int
     bytes_per_particle: int | None
     threads: int
     smallest_step: float
+    watch_seconds: float
 
     def advance(self, count: int) -> int:
         """Take about `count` time steps and return how many; may return before the device is done."""
@@ -55,9 +55,21 @@ class Contestant(Protocol):
     def is_sound(self) -> bool:
         """Whether every particle is in the domain."""
 
+    def keep(self) -> None:
+        """Save the state."""
+
+    def rewind(self) -> None:
+        """Restore the saved state."""
+
+    def flowing(self) -> float:
+        """Return the share of particles that flow."""
+
+    def phases(self) -> dict[str, float]:
+        """Return the time in each phase of a step since the last call, s."""
+
 
 def run_block(contestant: Contestant, seconds: float) -> tuple[int, float]:
-    """Step for about `seconds` and return (steps taken, seconds taken), device included."""
+    """Step for about `seconds` and return (steps, seconds taken), device included."""
     steps, chunk, elapsed = 0, 1, 0.0
     start = time.perf_counter()
     while elapsed < seconds:
@@ -70,28 +82,8 @@ def run_block(contestant: Contestant, seconds: float) -> tuple[int, float]:
     return steps, elapsed
 
 
-class Rewinding(Contestant, Protocol):
-    """A contestant that can repeat steps."""
-
-    watch_seconds: float
-
-    def keep(self) -> None:
-        """Save the state."""
-
-    def rewind(self) -> None:
-        """Restore the saved state."""
-
-    def flowing(self) -> float:
-        """Return the share of particles that flow."""
-
-
-def repeat_stretch(contestant: Rewinding, stretch: int, seconds: float) -> dict[str, float]:
-    """Take `stretch` steps from the state that was kept, until the steps have taken `seconds`, at least once.
-
-    Returns:
-        "steps" taken, and without those of the rewinding "seconds", "watch_seconds", which are the part of them that
-        went into measuring the state for the limits, and "processor_seconds", of all threads of this process.
-    """
+def repeat_stretch(contestant: Contestant, stretch: int, seconds: float) -> dict[str, float]:
+    """Repeat `stretch` steps from the kept state for `seconds`, at least once; rewinding does not count."""
     steps, elapsed, busy, watching = 0, 0.0, 0.0, 0.0
     while not steps or elapsed < seconds:
         contestant.rewind()
@@ -122,17 +114,11 @@ def peak_memory() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # macOS: bytes
 
 
-def serve(start: Callable[[], Contestant], commands: Iterable[str], answers: IO[str]) -> int:
+def serve(start: Callable[[], Contestant], commands: Iterable[str], answer: Callable[..., None]) -> int:
     """Start a contestant and obey the commands until `finish` or their end; return the exit status."""
-
-    def answer(**values: object) -> None:
-        answers.write(json.dumps(values) + "\n")
-        answers.flush()
-
     try:
         contestant = start()
-        facts = ("particles", "bytes_per_particle", "threads")
-        answer(**{name: getattr(contestant, name) for name in facts})
+        answer(**{name: getattr(contestant, name) for name in ("particles", "bytes_per_particle", "threads")})
         for command in commands:
             match command.split():
                 case ["first"]:
@@ -156,12 +142,9 @@ def serve(start: Callable[[], Contestant], commands: Iterable[str], answers: IO[
                 case ["phases"]:
                     answer(**contestant.phases())
                 case ["finish"]:
-                    answer(
-                        sound=contestant.is_sound(),
-                        smallest_step=contestant.smallest_step,
-                        peak_memory=peak_memory(),
-                    )
-                    return 0
+                    end = {"sound": contestant.is_sound(), "smallest_step": contestant.smallest_step}
+                    answer(**end, peak_memory=peak_memory())
+                    break
     except MpmcliError as error:
         answer(error=str(error))
         return 1
@@ -169,21 +152,19 @@ def serve(start: Callable[[], Contestant], commands: Iterable[str], answers: IO[
 
 
 def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
-    if who in ("peer", *case.other_peers):
-        from mpmcli.bench.peers import Peer
+    if who in ("peer", "yardstick", *case.other_peers):
+        from mpmcli.bench.peers import Peer, block_in_c
 
+        if who == "yardstick":
+            return block_in_c(case, **options)
         return Peer(case, None if who == "peer" else who, **options)
-    if who == "yardstick":
-        from mpmcli.bench.yardstick import falling_block as block_in_c
-
-        return block_in_c(case, **options)
     if who in BLOCKS:
         from mpmcli.bench.ours import falling_block
 
         return falling_block(case, who, **options)
     from mpmcli.bench.features import FEATURES, Pool
     from mpmcli.bench.materials import Column
-    from mpmcli.bench.profiled_column import PROFILE, ProfiledColumn
+    from mpmcli.bench.profile import PROFILE, ProfiledColumn
 
     if who.startswith(PROFILE):
         return ProfiledColumn(who.removeprefix(PROFILE), case, **options)
@@ -192,27 +173,19 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
     return Column(who.split(","), case, **options)
 
 
-def _parse(arguments: list[str] | None) -> argparse.Namespace:
+def main() -> int:
+    """Run one contestant."""
     parser = argparse.ArgumentParser(prog="python -m mpmcli.bench.contestant")
     parser.add_argument("who", help="see above")
-    parser.add_argument("--dimension", type=int, choices=[2, 3], required=True)
-    parser.add_argument("--cells", type=int, required=True)
-    parser.add_argument("--particles", type=int, required=True)
-    parser.add_argument("--step", type=float, required=True)
+    for name, kind in get_type_hints(BenchCase).items():
+        parser.add_argument(f"--{name}", type=kind, required=True)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--precision", choices=["f32", "f64"], default="f32")
     parser.add_argument("--arch", default="cpu")
-    return parser.parse_args(arguments)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run one contestant; taichi's own lines on stdout go to stderr."""
-    parsed = _parse(arguments)
-    case = BenchCase(parsed.dimension, parsed.cells, parsed.particles, parsed.step)
-    options = {"threads": parsed.threads, "precision": parsed.precision, "arch": parsed.arch}
-    with os.fdopen(os.dup(1), "w", encoding="utf-8") as answers:
-        os.dup2(2, 1)
-        return serve(lambda: _contestant(parsed.who, case, **options), sys.stdin, answers)
+    options = vars(parser.parse_args())
+    who, case = options.pop("who"), BenchCase(*(options.pop(name) for name in get_type_hints(BenchCase)))
+    with answering() as answer:
+        return serve(lambda: _contestant(who, case, **options), sys.stdin, answer)
 
 
 if __name__ == "__main__":

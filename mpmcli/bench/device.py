@@ -3,17 +3,16 @@
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mpmcli.bench.report import describe_machine
-from mpmcli.plain_text import counted, text_table
+from mpmcli.bench.report import describe_machine, page, rows_text
+from mpmcli.plain_text import counted
 
 if TYPE_CHECKING:
-    from mpmcli.solver.backend import Backend
-    from mpmcli.solver.device_speed import DeviceKernels
+    from mpmcli.solver.machine.backend import Backend
+    from mpmcli.solver.machine.device_speed import DeviceKernels
 
 # Numbers of 4 bytes in a table that no cache holds, and in one that the last cache of a processor or a GPU holds.
 LARGE, SMALL = 1 << 25, 1 << 21
@@ -33,62 +32,41 @@ ROWS = (
 )
 
 
-@dataclass(frozen=True)
-class DeviceReport:
-    """What `measure_device` found, on which machine."""
+def device_record(found: dict) -> dict:
+    """Return what `measure_device` found, and on which machine, for JSON."""
+    return {"machine": describe_machine(), "device": found}
 
-    found: dict
-    machine: dict = field(default_factory=describe_machine)
 
-    def as_dict(self) -> dict:
-        """Return everything measured, ready for JSON."""
-        return {"machine": self.machine, "device": self.found}
-
-    def table(self) -> str:
-        """Return the report as text: rates of both tables, then launches."""
-        found = self.found
-        tables = [*found["tables"].values()]
-        head = ("", *(f"{table['bytes'] / 2**20:.3g} MiB" for table in tables), "")
-        rows = [
-            (name, *(f"{table[key]:.3g}" for table in tables), unit) for name, key, unit in ROWS if key in tables[0]
-        ]
-        loops = ", ".join(f"{counted(int(count), 'loop')} {us:.1f}" for count, us in found["launch_us"].items())
-        lines = [
-            f"{self.machine['processor']}, {found['arch']}, {counted(found['threads'], 'thread')}, "
-            f"taichi {self.machine['taichi']}",
-            "",
-            text_table(head, rows, left={0, len(head) - 1}),
-            "",
-            f"Launch of a kernel, us: {loops}; with a number from the host {found['launch_with_argument_us']:.1f}; and",
-            f"waiting for it {found['launch_and_wait_us']:.1f}.",
-            *(
-                [f"Copy by the C library on one thread: {found['memcpy_gb_per_s']:.3g} GB/s, read and written."]
-                if "memcpy_gb_per_s" in found
-                else []
-            ),
-            "sorted: eight neighbours at each place; same: all at one place; plain: load, add, store, on one thread.",
-        ]
-        return "\n".join(lines)
+def device_table(record: dict) -> str:
+    """Return the record of a device as text: rates of both tables, then launches."""
+    found, machine = record["device"], record["machine"]
+    threads = counted(found["threads"], "thread")
+    tables = [*found["tables"].values()]
+    columns = [
+        ("", lambda row: row[0]),
+        *((f"{table['bytes'] / 2**20:.3g} MiB", lambda row, t=table: f"{t[row[1]]:.3g}") for table in tables),
+        ("", lambda row: row[2]),
+    ]
+    rates = rows_text([row for row in ROWS if row[1] in tables[0]], columns, left={0, len(columns) - 1})
+    loops = ", ".join(f"{counted(int(count), 'loop')} {us:.1f}" for count, us in found["launch_us"].items())
+    notes = [
+        f"Launch of a kernel, us: {loops}; with a number from the host {found['launch_with_argument_us']:.1f}; and",
+        f"waiting for it {found['launch_and_wait_us']:.1f}.",
+        "sorted: eight neighbours at each place; same: all at one place; plain: load, add, store, on one thread.",
+    ]
+    if "memcpy_gb_per_s" in found:
+        copied = f"{found['memcpy_gb_per_s']:.3g} GB/s"
+        notes.insert(2, f"Copy by the C library on one thread: {copied}, read and written.")
+    return page(f"{machine['processor']}, {found['arch']}, {threads}, taichi {machine['taichi']}", [rates], notes)
 
 
 def measure_device(backend: "Backend", seconds: float = 0.05, large: int = LARGE, small: int = SMALL) -> dict:
-    """Measure the device of a backend that was started, and return the figures, ready for JSON.
+    """Measure a started backend for JSON: the best of TRIES rates, and launches of kernels of 1 to 4 short loops.
 
-    Rates are the best of TRIES measurements, of at least `seconds` each. A launch is one of a kernel of 1 to 4 loops of
-    1,024 iterations; many follow each other before the host waits, except for `launch_and_wait_us`. The additions are
-    atomic f32 additions, as P2G makes on a GPU: at random places, eight neighbours at each place (sorted particles of a
-    cell), and all at one place. On the CPU `plain_add_*` is load, add and store on one thread.
-
-    Args:
-        backend: that runs.
-        seconds: length of a measurement.
-        large, small: numbers in the tables, powers of two; Vulkan takes at most LARGEST_ON_VULKAN.
-
-    Returns:
-        Of each table its bytes, GB/s of a copy (read and written), and rates in 1e9/s; of launches their time, us.
-        All of its memory is given back.
+    Tables have `large` and `small` numbers, powers of two. Additions are atomic in f32, at random places, eight
+    neighbours at each (sorted) and all at one; on the CPU `plain_add_*` is load, add and store on one thread.
     """
-    from mpmcli.solver.device_speed import build_device_kernels
+    from mpmcli.solver.machine.device_speed import build_device_kernels
 
     if backend.arch == "vulkan":
         large = min(large, LARGEST_ON_VULKAN)
@@ -108,11 +86,7 @@ def measure_device(backend: "Backend", seconds: float = 0.05, large: int = LARGE
 
 
 def best_seconds(run: Callable[[], object], wait: Callable[[], object], seconds: float, at_once: int = 1) -> float:
-    """Return the least time of one call, s, of TRIES series of at least `seconds`; the first call does not count.
-
-    Args:
-        run: what is called; wait: called after each `at_once` calls, and within the time.
-    """
+    """Return the least time of a call, s, in TRIES series of `seconds`, each `at_once` calls and a `wait`."""
     run()
     wait()
     found = []
@@ -129,7 +103,7 @@ def best_seconds(run: Callable[[], object], wait: Callable[[], object], seconds:
 
 
 def _measure_table(kernels: "DeviceKernels", places: int, seconds: float) -> dict:
-    from mpmcli.solver.device_speed import EQUAL, RANDOM, SORTED
+    from mpmcli.solver.machine.device_speed import EQUAL, RANDOM, SORTED
 
     def rate(run: Callable[[], None]) -> float:
         return places / best_seconds(run, kernels.wait, seconds) / 1e9
@@ -146,17 +120,15 @@ def _measure_table(kernels: "DeviceKernels", places: int, seconds: float) -> dic
 
 
 def _measure_launches(kernels: "DeviceKernels", seconds: float) -> dict:
-    series = {
-        count: best_seconds(launch, kernels.wait, seconds, LAUNCHES) for count, launch in kernels.launches.items()
-    }
-    each = statistics.linear_regression(list(series), list(series.values())).slope
-    alone = best_seconds(kernels.launches[1], kernels.wait, seconds)
-    argued = best_seconds(lambda: kernels.launch_with_argument(0.0), kernels.wait, seconds, LAUNCHES)
+    def microseconds(launch: Callable[[], None], at_once: int = LAUNCHES) -> float:
+        return 1e6 * best_seconds(launch, kernels.wait, seconds, at_once)
+
+    series = {count: microseconds(launch) for count, launch in kernels.launches.items()}
     return {
-        "launch_us": {f"{count}": 1e6 * value for count, value in series.items()},
-        "launch_us_per_loop": 1e6 * each,
-        "launch_with_argument_us": 1e6 * argued,
-        "launch_and_wait_us": 1e6 * alone,
+        "launch_us": {f"{count}": value for count, value in series.items()},
+        "launch_us_per_loop": statistics.linear_regression(list(series), list(series.values())).slope,
+        "launch_with_argument_us": microseconds(lambda: kernels.launch_with_argument(0.0)),
+        "launch_and_wait_us": microseconds(kernels.launches[1], at_once=1),
     }
 
 

@@ -1,12 +1,18 @@
-"""The contestants from the taichi package: its MPM examples, read from the installed files.
+"""The other contestants: MPM examples of the taichi package, and the yardstick, the same block in C.
 
-Only settings change: backend, threads, precision, grid, particles and step. The window at the end of each
-example is left out. Every line that is changed must be found exactly once, so that another version of the
-package is noticed rather than measured wrongly.
+Examples are read from the installed files. Only settings change: backend, threads, precision, grid, particles and step.
+The window at the end of each is left out. Every line that is changed must be found exactly once, so that another
+version of the package is noticed rather than measured wrongly.
+
+The yardstick is compiled where gcc is, and tells how far the limit of a processor is.
 """
 
+import ctypes
 import importlib.util
 import linecache
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +20,7 @@ from types import ModuleType
 
 import numpy as np
 
-from mpmcli.bench.cases import BULK_MODULUS, GRAVITY, BenchCase
+from mpmcli.bench.cases import BULK_MODULUS, DENSITY, EDGE, GRAVITY, BenchCase
 from mpmcli.errors import RunError
 
 _SHAPE = "n_particles, n_grid = 9000 * quality**2, 128 * quality"
@@ -31,13 +37,7 @@ _YOUNGS = BULK_MODULUS * (1 + _NU) * (1 - 2 * _NU) / _NU
 
 @dataclass(frozen=True)
 class Example:
-    """How an example is adapted.
-
-    Attributes:
-        changes: lines, and what replaces them; fields of a case in braces.
-        drawing: first line of what is left out: everything from here on draws.
-        begin: name of the function that places the particles; position, velocity: of its fields.
-    """
+    """How an example is adapted: changed lines, where `drawing` begins, and names; `begin` places the particles."""
 
     changes: dict[str, str]
     drawing: str
@@ -90,14 +90,22 @@ EXAMPLES = {
 _INIT = "ti.init(arch=ti.gpu)"
 # The same line with a comment, as two examples have it.
 _INITS = (_INIT, f"{_INIT}  # Try to run on GPU")
+YARDSTICK = Path(__file__).with_name("yardstick.c")
+# Those of -ffast-math but without it: a library linked with that flushes denormal numbers of its process to zero.
+FAST_MATH = (
+    *("-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math", "-freciprocal-math"),
+    "-ffinite-math-only",
+)
+FLAGS = ("-O3", "-march=native", *FAST_MATH, "-fopenmp", "-std=gnu11", "-shared", "-fPIC")
+# Phases in the order of the source; P2G includes clearing.
+PHASES = ("sort", "p2g", "grid", "g2p")
+# Share of a cell by which a particle may be behind a wall: velocities are zero on nodes alone.
+BEHIND = 0.5
+ABSENT = "gcc is not here: the table has no column of the yardstick in C."
 
 
 def example_path(name: str) -> Path:
-    """Return the path of an example of the installed taichi package, without importing taichi.
-
-    Raises:
-        RunError: taichi is not installed, or this version has no such example.
-    """
+    """Return the path of an example of the installed taichi package, without importing taichi."""
     package = importlib.util.find_spec("taichi")
     if package is None or package.origin is None:
         raise RunError("The taichi package is not installed, so its examples cannot be measured.")
@@ -108,13 +116,7 @@ def example_path(name: str) -> Path:
 
 
 def adapted_source(text: str, case: BenchCase, name: str, *, threads: int, precision: str, arch: str) -> str:
-    """Return the source of an example with its settings replaced and its drawing removed.
-
-    `text` is the source of the example `name`, `precision` "f32" or "f64", `arch` a name in taichi like "cpu".
-
-    Raises:
-        RunError: a line that has to change is not there exactly once.
-    """
+    """Return an example with its settings and without its drawing; RunError: a line is not there exactly once."""
     example = EXAMPLES[name]
     options = f"arch=ti.{arch}, default_fp=ti.{precision}, cpu_max_num_threads={threads}, offline_cache=False"
     lines = text.splitlines()
@@ -187,3 +189,94 @@ def _run_source(source: str, filename: str) -> ModuleType:
     linecache.cache[filename] = (len(source), None, source.splitlines(keepends=True), filename)
     exec(compile(source, filename, "exec"), module.__dict__)
     return module
+
+
+def is_here() -> bool:
+    """Return whether gcc is on the PATH."""
+    return shutil.which("gcc") is not None
+
+
+def load_yardstick(dimension: int) -> ctypes.CDLL:
+    """Compile the yardstick for a dimension in a temporary directory, and load it."""
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "yardstick.so"
+        command = ["gcc", *FLAGS, f"-DD={dimension}", "-o", str(library), str(YARDSTICK)]
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        except OSError as error:
+            raise RunError(f"The yardstick in C needs gcc, which cannot be run ({error.strerror}).") from error
+        if done.returncode:
+            said = (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1]
+            raise RunError(f"gcc cannot compile the yardstick in C: {said}")
+        try:
+            loaded = ctypes.CDLL(str(library))
+        except OSError as error:
+            raise RunError(f"The yardstick in C cannot be loaded: {error}") from error
+    whole, real, pointer = ctypes.c_int, ctypes.c_float, ctypes.c_void_p
+    arguments = {"advance": [whole], "read": [pointer, pointer], "seconds": [pointer], "bytes": [], "free": []}
+    for name, others in arguments.items():
+        getattr(loaded, f"yardstick_{name}").argtypes = [pointer, *others]
+    loaded.yardstick_new.argtypes = [*[whole] * 4, *[real] * 6, pointer, pointer]
+    loaded.yardstick_new.restype, loaded.yardstick_bytes.restype = pointer, ctypes.c_long
+    return loaded
+
+
+class Yardstick:
+    """A block of fluid, in f32, between walls that slip."""
+
+    def __init__(
+        self, case: BenchCase, *, threads: int, position: np.ndarray, velocity: np.ndarray, tension: bool = False
+    ) -> None:
+        """Compile, and put particles, (particles, dimension), into a unit box; the fluid may take tension."""
+        self._library = load_yardstick(case.dimension)
+        self.particles, self.threads, self.smallest_step = case.particles, threads, case.step
+        volume = EDGE**case.dimension / case.particles
+        self._before = np.zeros(len(PHASES))
+        self._spacing = 1 / case.cells
+        self._shape = (case.particles, case.dimension)
+        arrays = [np.ascontiguousarray(array, dtype=np.float32) for array in (position, velocity)]
+        numbers = (self._spacing, case.step, GRAVITY, DENSITY * volume, volume, BULK_MODULUS)
+        self._handle = self._library.yardstick_new(
+            case.particles, case.cells, threads, tension, *numbers, *(array.ctypes.data for array in arrays)
+        )
+        if not self._handle:
+            raise RunError(f"The memory does not suffice for {case.particles} particles in the yardstick.")
+        self.bytes_per_particle: int = self._library.yardstick_bytes(self._handle)
+
+    def advance(self, count: int) -> int:
+        """Take `count` steps."""
+        self._library.yardstick_advance(self._handle, count)
+        return count
+
+    def sync(self) -> None:
+        """Do nothing: every step waits."""
+
+    def phases(self) -> dict[str, float]:
+        """Return the time in each of PHASES since the last call, s: processor time on one thread, else wall time."""
+        found = np.zeros(len(PHASES))
+        self._library.yardstick_seconds(self._handle, found.ctypes.data)
+        since, self._before = found - self._before, found
+        return dict(zip(PHASES, since.tolist(), strict=True))
+
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and velocities, (particles, dimension) float32, in their initial order."""
+        position, velocity = np.empty(self._shape, np.float32), np.empty(self._shape, np.float32)
+        self._library.yardstick_read(self._handle, position.ctypes.data, velocity.ctypes.data)
+        return position, velocity
+
+    def is_sound(self) -> bool:
+        """Whether every particle is in the box, or less than BEHIND cells behind a wall."""
+        position, beyond = self.state()[0], BEHIND * self._spacing
+        return bool(((position > -beyond) & (position < 1 + beyond)).all())
+
+    def close(self) -> None:
+        """Give the memory back."""
+        self._library.yardstick_free(self._handle)
+
+
+def block_in_c(case: BenchCase, *, threads: int, precision: str, arch: str) -> Yardstick:
+    """Return the falling block in the yardstick, which has one precision and one device."""
+    if (precision, arch) != ("f32", "cpu"):
+        raise RunError(f"The yardstick computes in f32 on the CPU, not in {precision} on {arch}.")
+    velocity = np.tile(case.velocity(), (case.particles, 1))
+    return Yardstick(case, threads=threads, position=case.positions(), velocity=velocity)

@@ -1,140 +1,113 @@
 """What the phases of a step take, for each law, and in C: sort, P2G, grid, G2P, volumes, and measuring the state."""
 
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
 
 from mpmcli.bench.cases import EDGE, BenchCase
-from mpmcli.bench.compare import BLOCKS, Setting, Worker, start_worker
-from mpmcli.bench.costs import Start, lasting
-from mpmcli.bench.materials import MATERIAL_CASES, steps_of
-from mpmcli.bench.profiled_column import PROFILE
-from mpmcli.bench.report import describe_machine, heading
+from mpmcli.bench.materials import Column, steps_of
+from mpmcli.bench.report import head, heading, number, page, rows_text
+from mpmcli.bench.side import BenchOptions, Setting, Side, Turns
 from mpmcli.materials.registry import laws
-from mpmcli.plain_text import text_table
 
 # In the order of a table; what neither of two has is left empty.
 PHASES = ("sort", "p2g", "grid", "g2p", "volumes", "measure")
 IN_C = "fluid in C"
+# Before the name of a law, in the name of a contestant.
+PROFILE = "profile:"
 
 
-@dataclass(frozen=True)
-class ProfileResult:
-    """The phases of one law, or of the yardstick, at one case.
+# Phases of a step, and what is done beside it, by their names in the solver; all others are of the grid.
+COLUMN_OF = {
+    "scatter": "p2g",
+    "advance": "g2p",
+    "average": "volumes",
+    "relax": "volumes",
+    "sort": "sort",
+    "measure": "measure",
+}
 
-    Attributes:
-        name: the law, or IN_C.
-        particles: number of them.
-        phases: ns per particle and step of each phase and block.
-        total: the same of whole steps, with launches and what the host does between them.
+
+class ProfiledColumn(Column):
+    """The column of a law, whose phases are launched one by one, and timed."""
+
+    def __init__(self, law: str, case: BenchCase, **options: int | str) -> None:
+        super().__init__([law], case, **options)
+        self.run.batch.profile = Counter()
+
+    def phases(self) -> dict[str, float]:
+        """Return the time in each of PHASES since the last call, s."""
+        found = dict.fromkeys(PHASES, 0.0)
+        for name, seconds in self.run.batch.profile.items():
+            if name != "frame":
+                found[COLUMN_OF.get(name, "grid")] += seconds
+        self.run.batch.profile.clear()
+        return found
+
+
+def profile_table(record: dict) -> str:
+    """Return the record of the phases as text: one line per law and case."""
+
+    def phase(name: str) -> tuple:
+        return name, lambda row: number(row["ns_per_particle_step"].get(name), ".1f")
+
+    columns = [
+        ("case", lambda row: row["case"]),
+        ("law", lambda row: row["name"]),
+        ("particles", lambda row: f"{row['particles']:,}"),
+        *map(phase, (*PHASES, "rest", "total")),
+    ]
+    notes = (
+        "ns per particle and step, median of the blocks, of steps whose phases are launched one by one: the",
+        "kernel of mpmcli simulate has the same functions without launches between them. P2G and G2P contain",
+        "the law. grid: clearing, and the update of nodes; volumes: their relaxation, or average; measure: for",
+        "the limits of steps; rest: launches, and what the host does between them.",
+    )
+    table = rows_text(record["profile"], columns, left={0, 1})
+    return page(heading(record, [record["threads"]]), [table], notes, record["flaws"])
+
+
+def profile_record(figures: Sequence[dict], flaws: list[str], options: BenchOptions) -> dict:
+    """Return the phases of every law, and of the block in C, at every case, for JSON."""
+    rows = [_result_dict(one) for one in figures]
+    return head(options, threads=options.threads[0]) | {"profile": rows, "flaws": flaws}
+
+
+def _result_dict(one: dict) -> dict:
+    """Return the phases, the total, and the rest, which is the total less all phases; ns of each block, and medians."""
+    blocks = one["phases"] | {"total": one["ns_per_particle_step_blocks"]}
+    rests = [total - sum(parts) for *parts, total in zip(*blocks.values(), strict=True)]
+    medians = {name: statistics.median(spent) for name, spent in (one["phases"] | {"rest": rests}).items()}
+    return {
+        "case": one["case"],
+        "name": IN_C if one["who"] == "yardstick" else one["who"].removeprefix(PROFILE),
+        "particles": one["particles"],
+        "ns_per_particle_step": medians | {"total": one["ns_per_particle_step"]},
+        "ns_per_particle_step_blocks": blocks,
+    }
+
+
+def run_profile(cases: Iterable[BenchCase], options: BenchOptions, *, names: Sequence[str] | None = None) -> dict:
+    """Measure the phases of each law, one after the other, and return the record.
+
+    A law that cannot start, or fails, is left out; the record gives the reason. The options have one number of threads;
+    `names` are by default those of every law of the package. The block in C has as many particles per cell.
     """
-
-    case: BenchCase
-    name: str
-    particles: int
-    phases: dict[str, tuple[float, ...]]
-    total: tuple[float, ...]
-
-    @property
-    def rest(self) -> float:
-        """Total less all phases, median of the blocks, ns."""
-        return statistics.median(
-            whole - sum(parts) for whole, *parts in zip(self.total, *self.phases.values(), strict=True)
-        )
-
-    def as_dict(self) -> dict:
-        """Return it for JSON."""
-        return {
-            "case": self.case.name,
-            "name": self.name,
-            "particles": self.particles,
-            "ns_per_particle_step": {phase: statistics.median(found) for phase, found in self.phases.items()}
-            | {"rest": self.rest, "total": statistics.median(self.total)},
-            "ns_per_particle_step_blocks": {phase: list(found) for phase, found in self.phases.items()}
-            | {"total": list(self.total)},
-        }
-
-
-@dataclass(frozen=True)
-class ProfileReport:
-    """Every law at every case; `flaws` says what could not be measured."""
-
-    results: tuple[ProfileResult, ...]
-    flaws: tuple[str, ...]
-    threads: int
-    seconds: float
-    machine: dict = field(default_factory=describe_machine)
-
-    def as_dict(self) -> dict:
-        """Return everything measured, ready for JSON."""
-        return {
-            "machine": self.machine,
-            "threads": self.threads,
-            "precision": "f32",
-            "block_s": self.seconds,
-            "profile": [result.as_dict() for result in self.results],
-            "flaws": list(self.flaws),
-        }
-
-    def table(self) -> str:
-        """Return the report as text: one line per law and case."""
-        head = ("case", "law", "particles", *PHASES, "rest", "total")
-        rows = []
-        for result in self.results:
-            found = result.as_dict()["ns_per_particle_step"]
-            cells = [f"{found[name]:.1f}" if name in found else "" for name in (*PHASES, "rest", "total")]
-            rows.append((result.case.name, result.name, f"{result.particles:,}", *cells))
-        notes = [
-            "ns per particle and step, median of the blocks, of steps whose phases are launched one by one: the",
-            "kernel of mpmcli simulate has the same functions without launches between them. P2G and G2P contain",
-            "the law. grid: clearing, and the update of nodes; volumes: their relaxation, or average; measure: for",
-            "the limits of steps; rest: launches, and what the host does between them.",
-            *(f"Beware: {flaw}" for flaw in self.flaws),
-        ]
-        title = heading(self.machine, "cpu", [self.threads], "f32")
-        return "\n".join([title, "", text_table(head, rows, left={0, 1}), "", *notes])
-
-
-def run_profile(
-    cases: Iterable[BenchCase] = MATERIAL_CASES,
-    threads: int = 1,
-    seconds: float = 1.0,
-    progress: Callable[[str], None] = lambda line: None,
-    *,
-    names: Sequence[str] | None = None,
-    blocks: int = BLOCKS,
-    yardstick: bool = False,
-    start: Start = start_worker,
-) -> ProfileReport:
-    """Measure the phases of each law, one after the other, and return the report.
-
-    Args:
-        cases: of mpmcli.bench.materials.
-        threads: of the processor; times are wall times.
-        seconds: length of one block.
-        progress: called with a line of text for each law.
-        names: laws to measure; by default every law of the package.
-        blocks: measured blocks of each law.
-        yardstick: whether the block in C, with as many particles per cell, is measured too.
-        start: makes the process of a law; tests replace it.
-
-    A law that cannot start, or fails, is left out; the report gives the reason.
-    """
-    results: list[ProfileResult] = []
+    figures: list[dict] = []
     flaws: list[str] = []
+    setting = Setting(options.threads[0])
     for case in cases:
-        contenders = [_Profile(case, name, f"{PROFILE}{name}") for name in (sorted(laws()) if names is None else names)]
-        if yardstick:
-            contenders.append(_Profile(block_of(case), IN_C, "yardstick"))
-        for contender in contenders:
-            progress(f"{case.name}: {contender.name}")
-            lasting(
-                [contender],
-                lambda one: results.append(one.measure(Setting(threads), seconds, blocks, start)),
-                flaws,
-            )
-    return ProfileReport(tuple(results), tuple(flaws), threads, seconds)
+        sides = [Side(f"{PROFILE}{law}", case, setting, law) for law in (sorted(laws()) if names is None else names)]
+        for side in sides:
+            side.clock = "seconds"
+        if options.yardstick:
+            # It measures the phases of one thread by processor time.
+            sides.append(Side("yardstick", block_of(case), setting, IN_C))
+        for side in sides:
+            options.progress(f"{case.name}: {side.name}")
+            figures += Turns([side], flaws).take(lambda one: _measure(one, options))
+    return profile_record(figures, flaws, options)
 
 
 def block_of(case: BenchCase) -> BenchCase:
@@ -143,33 +116,17 @@ def block_of(case: BenchCase) -> BenchCase:
     return BenchCase(d, case.cells, round(2**d * (EDGE * case.cells) ** d), case.step)
 
 
-class _Profile:
-    """One law at one case."""
-
-    def __init__(self, case: BenchCase, name: str, who: str) -> None:
-        self.case, self.name, self.who = case, name, who
-
-    def measure(self, setting: Setting, seconds: float, blocks: int, start: Start) -> ProfileResult:
-        """Start, step to where the column flows, and measure."""
+def _measure(side: Side, options: BenchOptions) -> dict:
+    """Start, step to where the column flows, and measure."""
+    with ExitStack() as stack:
+        side.begin(stack, options.start)
+        if side.who.startswith(PROFILE):
+            side.worker.ask(f"keep {steps_of(side.case)[0]}")
+        side.worker.ask(f"run {options.seconds}")
+        side.worker.ask("phases")
         phases: dict[str, list[float]] = {}
-        total: list[float] = []
-        with ExitStack() as stack:
-            worker: Worker = stack.enter_context(start(self.who, self.case, setting))
-            particles = worker.ready["particles"]
-            worker.ask("first")
-            # As the phases: the yardstick measures those of one thread by processor time.
-            clock = "processor_seconds" if self.who == "yardstick" and setting.threads == 1 else "seconds"
-            if self.who.startswith(PROFILE):
-                worker.ask(f"keep {steps_of(self.case)[0]}")
-            worker.ask(f"run {seconds}")
-            worker.ask("phases")
-            for _ in range(blocks):
-                found = worker.ask(f"run {seconds}")
-                scale = 1e9 / found["steps"] / particles
-                total.append(scale * found[clock])
-                for phase, spent in worker.ask("phases").items():
-                    phases.setdefault(phase, []).append(scale * spent)
-            worker.ask("finish")
-        return ProfileResult(
-            self.case, self.name, particles, {name: tuple(found) for name, found in phases.items()}, tuple(total)
-        )
+        for _ in range(options.blocks):
+            steps = side.measure(f"run {options.seconds}")["steps"]
+            for phase, spent in side.worker.ask("phases").items():
+                phases.setdefault(phase, []).append(1e9 * spent / steps / side.particles)
+        return side.finish(phases=phases)

@@ -6,26 +6,94 @@ the forms that occur (docs/theory.md, 3.8).
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
-import taichi as ti
 
-from mpmcli.boundaries.collider_kind import (
-    BOX,
-    FORMS,
-    GRID,
-    REACH,
-    SLIP,
-    STICK,
-    WALLS,
-    ColliderKind,
-    form_code,
-    numbers_of,
-    reach_of,
-)
-from mpmcli.boundaries.distances import DISTANCES, BoxDistance
-from mpmcli.boundaries.grid_distance import GridDistance, samples_of
+from mpmcli.boundaries.distances import DISTANCES, BoxDistance, GridDistance, samples_of
+from mpmcli.boundaries.doubles import double_field
+from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
+from mpmcli.scene.colliders import Collider
+from mpmcli.scene.expression import evaluate
+from mpmcli.scene.primitives import Box, Polygon
+
+# Cells outside of a surface up to which it acts on nodes: the outermost of them lies between a quarter of a cell inside
+# and three quarters outside, where fluids neither enter nor lose pressure, and what is rough sticks (docs/theory.md,
+# 3.8). A little more, so that no node is at that distance by rounding.
+REACH = 0.76
+# Codes of what a surface does.
+SLIP, STICK, SEPARATE = range(3)
+WALLS = {"slip": SLIP, "stick": STICK, "separate": SEPARATE}
+FORMS = tuple(DISTANCES)
+# Of all other forms, by their distances on a grid.
+GRID = len(FORMS)
+BOX = FORMS.index(Box)
+# 2 pi in two parts, as literals have the precision of particles: the first is exact, the second 1e-10.
+TURN = (6.28125, 2 * math.pi - 6.28125)
+
+
+@dataclass(frozen=True)
+class ColliderKind:
+    """What is compiled for the colliders of a run, and how much room they need."""
+
+    forms: tuple[int, ...]  # indices into FORMS of the forms that occur, in order, GRID among them
+    moving: tuple[int, ...]  # which of the colliders move
+    count: int  # upper bounds: of the colliders, and of the numbers and the samples of their forms
+    numbers: int
+    samples: int
+
+    @staticmethod
+    def of(scene: Scene) -> "ColliderKind":
+        """Return the kind of the colliders of a scene."""
+        found, h = scene.colliders, scene.domain.spacing
+        return ColliderKind(
+            tuple(sorted({form_code(collider) for collider in found})),
+            tuple(k for k, collider in enumerate(found) if collider.motion.moves),
+            len(found),
+            sum(len(numbers_of(collider, h)) for collider in found),
+            sum(samples_of(collider.form, h)[0].size for collider in found if form_code(collider) == GRID),
+        )
+
+    def bytes_needed(self, dimension: int, rows: int) -> int:
+        """Return the bytes that loads and distances on grids take on the device, with `rows` of nodes (last axis)."""
+        return 8 * self.count * rows * (3 if dimension == 2 else 6) + 4 * self.samples
+
+    def joined(self, other: "ColliderKind") -> "ColliderKind | None":
+        """Return the kind that has room for both, None where they need other kernels."""
+        if (self.moving, self.count > 0) != (other.moving, other.count > 0):
+            return None
+        forms = tuple(sorted({*self.forms, *other.forms}))
+        rooms = (max(getattr(self, name), getattr(other, name)) for name in ("count", "numbers", "samples"))
+        return ColliderKind(forms, self.moving, *rooms)
+
+
+def form_code(collider: Collider) -> int:
+    """Return the index of the form of a collider in FORMS, or GRID."""
+    kind = type(collider.form)
+    # In the corners of a polygon around the material the normals of a grid are those of both edges.
+    around = kind is Polygon and collider.side == "inside"
+    return FORMS.index(kind) if kind in FORMS and not around else GRID
+
+
+def numbers_of(collider: Collider, h: float) -> list[float]:
+    """Return the numbers of the form of a collider, relative to its pivot, in a scene with cells of h metres."""
+    d, pivot = len(collider.velocity), np.array(collider.center)
+    if form_code(collider) == GRID:
+        return GridDistance.numbers(collider.form, pivot, h)
+    return DISTANCES[type(collider.form)](d).numbers(collider.form, pivot)
+
+
+def reach_of(collider: Collider, h: float) -> np.ndarray:
+    """Return where nodes lie on which a collider may act, relative to its pivot, lower and upper, (2, d), m."""
+    d, motion = len(collider.velocity), collider.motion
+    radius = np.inf if collider.side == "inside" else collider.radius
+    found = np.array([[-radius] * d, [radius] * d])
+    if np.isfinite(radius) and not motion.turns and motion.angle == 0.0:
+        found = np.array(collider.form.bounds()) - np.array(collider.center)
+    found[0] -= h * (REACH + 0.01)
+    found[1] += h * (REACH + 0.01)
+    return found
 
 
 @ti.data_oriented
@@ -56,6 +124,7 @@ class Colliders:
         d, n = dimension, runs * kind.count
         self.kind, self.dimension, self.shape, self.first, self.on_cpu = kind, d, tuple(shape), first, on_cpu
         self.room, self.run, self.spacing = kind.count, 0, 0.0
+        self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.turns = 1 if d == 2 else 3
         self.loads = d + self.turns
         self.rows = math.prod(shape[:-1])
@@ -91,7 +160,7 @@ class Colliders:
         for k, collider in enumerate(scene.colliders):
             i = run * self.room + k
             numbers = numbers_of(collider, h)
-            self._write_numbers(used, np.array(numbers))
+            self._write_numbers(used, np.array(numbers, self.real))
             if form_code(collider) == GRID:
                 values = samples_of(collider.form, h)[0].ravel()
                 self._write_samples(sampled, values)
@@ -110,9 +179,9 @@ class Colliders:
         self.clear_taken(run)
 
     @ti.kernel
-    def _write_numbers(self, first: int, numbers: ti.types.ndarray(ti.f64, 1)):
+    def _write_numbers(self, first: int, numbers: ti.types.ndarray(ndim=1)):
         for k in range(numbers.shape[0]):
-            self.numbers[first + k] = ti.cast(numbers[k], float)
+            self.numbers[first + k] = numbers[k]
 
     @ti.kernel
     def _write_samples(self, first: int, values: ti.types.ndarray(ti.f32, 1)):
@@ -123,7 +192,7 @@ class Colliders:
     def clear_taken(self, run: int):
         """Forget what the colliders of a run have taken."""
         for q in range(self.rows * self.room):
-            self.taken[run * self.rows * self.room + q] = ti.Vector.zero(ti.f64, self.loads)
+            self.taken[run * self.rows * self.room + q] = ti.Vector.zero(float, self.loads)
 
     @ti.func
     def sum_up(self, run: int, frame: int, column: int, notes: ti.template()):
@@ -185,22 +254,25 @@ class Colliders:
             a = ti.static(d - 2 - b)
             x[a] = ti.cast(rest % ti.static(self.shape[a]) - self.first, float) * self.spacing
             rest = rest // ti.static(self.shape[a])
-        if k < self.count[0]:
+        i, nodes_before = self.run * self.room + k, self.run * self.rows * nodes
+        if k < self.count[self.run]:
             near = True
             for a in ti.static(range(d - 1)):
-                arm = x[a] - self.place[k][a]
-                near = near and arm >= self.reach[k][0, a] and arm <= self.reach[k][1, a]
+                arm = x[a] - self.place[i][a]
+                near = near and arm >= self.reach[i][0, a] and arm <= self.reach[i][1, a]
             if near:
                 total = ti.Vector.zero(float, ti.static(self.loads))
                 for n in range(nodes):
                     x[ti.static(d - 1)] = ti.cast(n - self.first, float) * self.spacing
-                    load = self.load_of(self.given[(first + n) * self.room + k], x - self.place[k])
+                    given = (nodes_before + first + n) * self.room + k
+                    load = self.load_of(self.given[given], x - self.place[i])
                     for a in ti.static(range(self.loads)):
                         total[a] += load[a]
                     for a in ti.static(range(d)):
-                        self.given[(first + n) * self.room + k][a] = 0.0
+                        self.given[given][a] = 0.0
                 for a in ti.static(range(self.loads)):
-                    self.taken[q][a] = self.taken[q][a] + total[a]
+                    row = self.run * self.rows * self.room + q
+                    self.taken[row][a] = self.taken[row][a] + total[a]
 
     @ti.func
     def constrain(self, node: ti.template(), velocity: ti.template(), mass: float):
@@ -223,7 +295,8 @@ class Colliders:
                     if phi <= REACH * self.spacing:
                         after = self.met(i, arm, normal, result)
                         if ti.static(self.deterministic):
-                            place = (self.row_of(node) * ti.static(self.shape[-1]) + node[d - 1]) * self.room + k
+                            row = self.run * self.rows + self.row_of(node)
+                            place = (row * ti.static(self.shape[-1]) + node[d - 1]) * self.room + k
                             for a in ti.static(range(d)):
                                 self.given[place][a] = self.given[place][a] + mass * (result[a] - after[a])
                         else:
@@ -288,3 +361,85 @@ class Colliders:
             if push > 0.0 and self.friction[i] > 0.0:
                 kept = ti.max(1.0 - self.friction[i] * push / size, 0.0) if size > 0.0 else 0.0
         return own + kept * along + away * normal
+
+
+@ti.data_oriented
+class ColliderMotion:
+    """The colliders of some runs that move: where they are in a step, and how fast their points move in it.
+
+    A collider stands where it is at the start of a step. Its points have the mean velocity of the step, so that
+    material that moves with it keeps its place on it exactly. Sums are in double precision.
+
+    Attributes:
+        moving: their indices.
+        rates: means in the step of the velocity, m/s, and the spin, rad/s: the host sets those that are constant.
+    """
+
+    def __init__(self, colliders: Colliders, runs: int) -> None:
+        d = colliders.dimension
+        self.colliders, self.dimension, self.moving = colliders, d, colliders.kind.moving
+        n = runs * len(self.moving)
+        self.rates = double_field(n, d + 1)
+        # Where the pivot is, relative to the lower corner, m, and the angle, rad.
+        self.pose = double_field(n, d + 1)
+        self.axis = double_field(n, width=3)
+
+    def write(self, scene: Scene, run: int = 0) -> None:
+        """Set the motions of a run, at time 0."""
+        for m, k in enumerate(self.moving):
+            motion, row = scene.colliders[k].motion, run * len(self.moving) + m
+            place = np.array(motion.pivot) + motion.offset - np.array(scene.domain.origin)
+            for a, value in enumerate([*place, motion.angle]):
+                self.pose[row, a] = value
+            self.axis[row] = list(motion.axis)
+            self.write_rates(run, m, [float(evaluate(tree, {"t": 0.0})) for tree in motion.rates])
+
+    def write_rates(self, run: int, m: int, rates: Sequence[float]) -> None:
+        """Set the rates of the m-th of them in a step, d + 1 numbers."""
+        for a, value in enumerate(rates):
+            self.rates[run * len(self.moving) + m, a] = value
+
+    @ti.func
+    def advance(self, run: int, dt: ti.f64):
+        """Begin a step of dt seconds: put colliders where they are, and find where they will be."""
+        d = ti.static(self.dimension)
+        for m, k in ti.static(enumerate(self.moving)):
+            row = run * ti.static(len(self.moving)) + m
+            i = run * self.colliders.room + k
+            angle, change = self.pose[row, d], dt * self.rates[row, d]
+            turned, turning = self.rotation(row, angle), self.rotation(row, change)
+            for a in ti.static(range(d)):
+                self.colliders.place[i][a] = ti.cast(self.pose[row, a], float)
+                self.colliders.velocity[i][a] = ti.cast(self.rates[row, a], float)
+                self.pose[row, a] = self.pose[row, a] + dt * self.rates[row, a]
+                for b in ti.static(range(d)):
+                    own = 1.0 if ti.static(a == b) else 0.0
+                    self.colliders.turned[i][a, b] = own + turned[a, b]
+                    self.colliders.turning[i][a, b] = turning[a, b] / ti.cast(dt, float)
+            self.pose[row, d] = angle + change
+
+    @ti.func
+    def rotation(self, row: int, angle: ti.f64):
+        """Return R - I, R the rotation by an angle about the axis, d x d; formula of Rodrigues."""
+        d = ti.static(self.dimension)
+        result = ti.Matrix.zero(float, d, d)
+        # Vulkan has sines in single precision only: of a part of a turn they are as good as the result.
+        turns = ti.cast(ti.cast(angle * ti.static(0.5 / math.pi), int), ti.f64)
+        part = ti.cast((angle - turns * TURN[0]) - turns * TURN[1], float)
+        # 1 - cos without cancellation.
+        half = ti.sin(0.5 * part)
+        s, versine = ti.sin(part), 2.0 * half * half
+        if ti.static(d == 2):
+            result[0, 0], result[0, 1], result[1, 0], result[1, 1] = -versine, -s, s, -versine
+        else:
+            axis = ti.cast(self.axis[row], float)
+            for a in ti.static(range(3)):
+                for b in ti.static(range(3)):
+                    result[a, b] = versine * axis[a] * axis[b]
+                    if ti.static(a == b):
+                        result[a, b] -= versine
+                    elif ti.static((a + 1) % 3 == b):
+                        result[a, b] -= s * axis[ti.static(3 - a - b)]
+                    else:
+                        result[a, b] += s * axis[ti.static(3 - a - b)]
+        return result

@@ -4,27 +4,31 @@ Points are relative to the pivot of the collider, and turned back. Distances are
 normals are their gradients, which point out of it.
 """
 
-from typing import Protocol
+from functools import lru_cache
 
 import numpy as np
-import taichi as ti
 
+from mpmcli.quick_taichi import ti
 from mpmcli.scene.colliders import Plane
-from mpmcli.scene.polygon import Polygon
-from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder
+from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon
+from mpmcli.scene.shapes import Form, distance_grid
 
 # Distances below this share of a length have no direction.
 TINY = 1e-12
+# Nodes of a grid of distances per cell of the scene, cells that it reaches beyond the form, and the nodes above which
+# it has one per cell.
+FINE, MARGIN, MANY = 2, 2, 8_000_000
 
 
-class Distance(Protocol):
-    """The distance from a form."""
+class Distance:
+    """The distance from a form.
 
-    def numbers(self, form: object, pivot: np.ndarray) -> list[float]:
-        """Return what a kernel needs of a form."""
+    `numbers` returns what a kernel needs of a form. `at`, a ti.func, returns the signed distance of y from the form
+    with these numbers, from the first on, and the normal.
+    """
 
-    def at(self, numbers: object, first: int, y: object) -> tuple[float, object]:
-        """Return the signed distance of y from the form with these numbers, and the normal; a ti.func."""
+    def __init__(self, dimension: int) -> None:
+        self.dimension = dimension
 
 
 @ti.func
@@ -45,11 +49,8 @@ def first_axis(y: ti.template()):
 
 
 @ti.data_oriented
-class PlaneDistance:
+class PlaneDistance(Distance):
     """A half space: its normal, and the distance of the plane from the pivot."""
-
-    def __init__(self, dimension: int) -> None:
-        self.dimension = dimension
 
     def numbers(self, form: Plane, pivot: np.ndarray) -> list[float]:
         normal = form.direction
@@ -66,11 +67,8 @@ class PlaneDistance:
 
 
 @ti.data_oriented
-class BoxDistance:
+class BoxDistance(Distance):
     """A box: its centre and its half lengths."""
-
-    def __init__(self, dimension: int) -> None:
-        self.dimension = dimension
 
     def numbers(self, form: Box, pivot: np.ndarray) -> list[float]:
         lower, upper = form.bounds()
@@ -116,11 +114,8 @@ class BoxDistance:
 
 
 @ti.data_oriented
-class BallDistance:
+class BallDistance(Distance):
     """A ball: its centre and its radius."""
-
-    def __init__(self, dimension: int) -> None:
-        self.dimension = dimension
 
     def numbers(self, form: Ball, pivot: np.ndarray) -> list[float]:
         return [*(np.array(form.center) - pivot), form.radius]
@@ -135,11 +130,8 @@ class BallDistance:
 
 
 @ti.data_oriented
-class CapsuleDistance:
+class CapsuleDistance(Distance):
     """All points within a radius of a segment: its start, its end less its start, and the radius."""
-
-    def __init__(self, dimension: int) -> None:
-        self.dimension = dimension
 
     def numbers(self, form: Capsule, pivot: np.ndarray) -> list[float]:
         start, end = np.array(form.start), np.array(form.end)
@@ -161,11 +153,8 @@ class CapsuleDistance:
 
 
 @ti.data_oriented
-class CylinderDistance:
+class CylinderDistance(Distance):
     """A round cylinder with flat ends: its base, its direction, its height and its radius."""
-
-    def __init__(self, dimension: int) -> None:
-        self.dimension = dimension
 
     def numbers(self, form: Cylinder, pivot: np.ndarray) -> list[float]:
         return [*(np.array(form.base) - pivot), *form.direction, form.height, form.radius]
@@ -195,11 +184,8 @@ class CylinderDistance:
 
 
 @ti.data_oriented
-class PolygonDistance:
+class PolygonDistance(Distance):
     """A polygon: the number of its vertices, and their coordinates, counterclockwise."""
-
-    def __init__(self, dimension: int) -> None:
-        self.dimension = dimension
 
     def numbers(self, form: Polygon, pivot: np.ndarray) -> list[float]:
         vertices = np.array(form.vertices) - pivot
@@ -247,3 +233,68 @@ DISTANCES = {
     Cylinder: CylinderDistance,
     Polygon: PolygonDistance,
 }
+
+
+@lru_cache(maxsize=8)
+def samples_of(form: Form, h: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the signed distances from a form for a scene with cells of h metres, see `distance_grid`."""
+    lower, upper = form.bounds()
+    cells = float(np.prod((upper - lower) / h + 2 * MARGIN))
+    fine = FINE if cells * FINE ** len(lower) <= MANY else 1
+    return distance_grid(form, h / fine, MARGIN * h)
+
+
+@ti.data_oriented
+class GridDistance:
+    """A mesh, union or difference of forms by distances at the nodes of a grid, multilinear between them.
+
+    Its numbers are the first node, the spacing, and the nodes per axis. Beyond the grid the distance to it is added.
+    """
+
+    def __init__(self, dimension: int, samples: ti.Field) -> None:
+        self.dimension, self.samples = dimension, samples
+
+    @staticmethod
+    def numbers(form: Form, pivot: np.ndarray, h: float) -> list[float]:
+        """Return what a kernel needs beside the samples."""
+        values, origin, spacing = samples_of(form, h)
+        return [*(origin - pivot), spacing, *map(float, values.shape)]
+
+    @ti.func
+    def at(self, numbers: ti.template(), first: int, sample: int, y: ti.template()):
+        """Return the signed distance of y from the form, and the normal; its samples begin at `sample`."""
+        d = ti.static(self.dimension)
+        spacing = numbers[first + d]
+        base = ti.Vector.zero(int, d)
+        share = ti.Vector.zero(float, d)
+        beyond = 0.0
+        for a in ti.static(range(d)):
+            last = numbers[first + d + 1 + a] - 1.0
+            u = (y[a] - numbers[first + a]) / spacing
+            clamped = ti.min(ti.max(u, 0.0), last)
+            beyond += (u - clamped) ** 2
+            base[a] = ti.cast(ti.min(ti.floor(clamped), last - 1.0), int)
+            share[a] = clamped - ti.cast(base[a], float)
+        phi = 0.0
+        slope = ti.Vector.zero(float, d)
+        for corner in range(ti.static(2**d)):
+            index = 0
+            weight = 1.0
+            for a in ti.static(range(d)):
+                up = corner >> a & 1
+                index = index * ti.cast(numbers[first + d + 1 + a], int) + base[a] + up
+                weight *= share[a] if up == 1 else 1.0 - share[a]
+            value = self.samples[sample + index]
+            phi += weight * value
+            for a in ti.static(range(d)):
+                part = value if corner >> a & 1 == 1 else -value
+                for b in ti.static(range(d)):
+                    if ti.static(b != a):
+                        part *= share[b] if corner >> b & 1 == 1 else 1.0 - share[b]
+                slope[a] += part
+        size = slope.norm()
+        normal = slope * 0.0
+        normal[0] = 1.0
+        if size > 0:
+            normal = slope / size
+        return phi + spacing * ti.sqrt(beyond), normal

@@ -1,27 +1,95 @@
-"""The walls of the domain: slip, stick and separate, the first and the last with or without friction.
+"""The faces of the domain: walls that slip, stick or separate, with or without friction, and move along themselves.
 
 A wall lies on a plane of nodes. `Walls` holds where the walls are, which of them act on a node, and what they do to its
-velocity. What particles scatter beyond them is folded back by `mirror_images` (docs/theory.md, 3).
+velocity; what particles scatter beyond them is folded back by `mirror_images` (docs/theory.md, 3). `ZeroedWalls` are
+walls in the usual way, for comparison.
 """
 
 import math
 from collections.abc import Sequence
 from copy import copy
 
-import taichi as ti
-
-from mpmcli.boundaries.moving_faces import STILL, MovingFaces
-from mpmcli.boundaries.rough_faces import RoughFaces
+from mpmcli.quick_taichi import ti
+from mpmcli.scene import Scene
+from mpmcli.scene.domain import PERIODIC
 from mpmcli.scene.schema import SolverSettings
-from mpmcli.scene.wall_rules import PERIODIC
 
 # Nodes on each side of a wall that can hold mass from particles of the other side.
 REACH = 2
 # Nodes beyond a periodic face that particles write until they are put back into the domain: all that the grid has.
 PERIODIC_REACH = 3
-SMOOTH = RoughFaces(())
 # The word of a face that is no wall.
 OPEN = "open"
+
+
+def moving_faces(scene: Scene) -> tuple[tuple[int, int], ...]:
+    """Return (axis, side) of every face of a scene that moves (docs/theory.md, 3.7)."""
+    found = scene.domain.wall_velocities
+    return tuple((a, side) for a, pair in enumerate(found) for side in (0, 1) if any(pair[side]))
+
+
+@ti.data_oriented
+class MovingFaces:
+    """Velocities of the faces that move. They are data: runs that differ in them share kernels.
+
+    Attributes:
+        faces: (axis, side) of every such face.
+        velocity: of each run and face, m/s; first: row of the first face of a run.
+    """
+
+    def __init__(self, faces: Sequence[tuple[int, int]], dimension: int = 0, runs: int = 1) -> None:
+        self.faces = tuple(faces)
+        self.first = 0
+        if faces:
+            self.velocity = ti.Vector.field(dimension, float, shape=runs * len(self.faces))
+
+    def write(self, scene: Scene, run: int = 0) -> None:
+        """Set the velocities of a run."""
+        for f, (axis, side) in enumerate(self.faces):
+            self.velocity[run * len(self.faces) + f] = scene.domain.wall_velocities[axis][side]
+
+    @ti.func
+    def of(self, face: ti.template()):
+        """Return the velocity of a face, by its number in `faces`."""
+        return self.velocity[self.first + face]
+
+
+STILL = MovingFaces(())
+
+
+def rough_faces(scene: Scene) -> tuple[tuple[int, int], ...]:
+    """Return (axis, side) of every face of a scene that has friction (docs/theory.md, 3.4)."""
+    found = scene.domain.frictions
+    return tuple((a, side) for a, pair in enumerate(found) for side in (0, 1) if pair[side] > 0)
+
+
+@ti.data_oriented
+class RoughFaces:
+    """Coefficients of friction of the faces that have any. They are data: runs that differ in them share kernels.
+
+    Attributes:
+        faces: (axis, side) of every such face.
+        coefficient: of each run and face; first: row of the first face of a run.
+    """
+
+    def __init__(self, faces: Sequence[tuple[int, int]], runs: int = 1) -> None:
+        self.faces = tuple(faces)
+        self.first = 0
+        if faces:
+            self.coefficient = ti.field(float, shape=runs * len(self.faces))
+
+    def write(self, scene: Scene, run: int = 0) -> None:
+        """Set the coefficients of a run."""
+        for f, (axis, side) in enumerate(self.faces):
+            self.coefficient[run * len(self.faces) + f] = scene.domain.frictions[axis][side]
+
+    @ti.func
+    def of(self, face: ti.template()):
+        """Return the coefficient of a face, by its number in `faces`."""
+        return self.coefficient[self.first + face]
+
+
+SMOOTH = RoughFaces(())
 
 
 def faces_on_grid(faces: Sequence[tuple[str, str]], settings: SolverSettings) -> tuple[tuple[str, str], ...]:
@@ -44,8 +112,8 @@ class Walls:
         faces: per axis the words of the lower and the upper face: "slip", "stick", "separate", PERIODIC, or OPEN for
             none. periodic: the axes of periodic ones; reach: nodes on each side of any face that may have images.
         first: index of the wall's node plane at the lower faces; `last`, per axis, at the upper ones.
+        shape: nodes of the grid per axis; lateral: per axis, the other axes.
         separating: (axis, side) of every face whose word is "separate".
-        lateral: per axis, the other axes.
         axes: those whose faces are asked for: all, or fewer for nodes that are near no others, see `along`.
         contact: (planes, nodes) int, per separating face and node of its plane, whether the material presses on it.
         first_plane: row of `contact` of the first separating face.
@@ -67,13 +135,7 @@ class Walls:
         friction: RoughFaces = SMOOTH,
         moving: MovingFaces = STILL,
     ) -> None:
-        """Allocate.
-
-        Args:
-            first: index of the wall's node plane at the lower faces.
-            shape: nodes of the grid per axis.
-            runs: sets of planes in `contact`.
-        """
+        """Allocate, with one set of planes in `contact` and `impulse` for each of some runs."""
         self.dimension, self.axes = len(faces), tuple(range(len(faces)))
         self.faces = tuple(tuple(pair) for pair in faces)
         self.periodic = tuple(a for a, pair in enumerate(self.faces) if PERIODIC in pair)
@@ -238,9 +300,7 @@ class Walls:
     def holding(self, node: ti.template(), depth: ti.template(), upper: ti.template(), rubbed: ti.template()):
         """Return, per axis, whether the wall within reach lets nothing slip along it: by its word, or by friction.
 
-        Args:
-            node: one that is no image, or lies on the wall.
-            rubbed: whether friction was found.
+        The node is no image, or lies on the wall; `rubbed` says whether friction was found.
         """
         holds = ti.Vector.zero(int, self.dimension)
         for a in ti.static(self.axes):
@@ -257,11 +317,7 @@ class Walls:
     def stopped(
         self, value: ti.template(), axis: ti.template(), holds: ti.template(), upper: ti.template(), mass: float
     ):
-        """Return momentum or velocity on a wall that acts: no normal part, and the wall's own where it holds.
-
-        Args:
-            mass: kg, of momentum; 1 of velocity.
-        """
+        """Return momentum, or velocity with mass 1, on a wall that acts: no normal part, its own where it holds."""
         result = value
         for c in ti.static(range(self.dimension)):
             if ti.static(c == axis):
@@ -291,4 +347,77 @@ class Walls:
                 if upper == ti.static(self.moving.faces[f][1]):
                     for c in ti.static(range(self.dimension)):
                         result[c] = self.moving.of(f)[c]
+        return result
+
+
+@ti.data_oriented
+class ZeroedWalls:
+    """All faces of the domain, as a boundary that sets velocities of nodes on and behind it to zero.
+
+    First-order accurate, where folded walls are second-order (docs/theory.md, 3.3). Slip and separate stop the normal
+    velocity, stick all. A separating face stops only what moves into it, a periodic one nothing. Nothing is mirrored.
+    What nodes hold from before stress and forces is not stopped: FLIP's change of velocity contains the wall's.
+    Friction takes from the velocity along a wall at most the coefficient times what the wall stops. Of a wall that
+    moves it is the velocity relative to it.
+    """
+
+    def __init__(
+        self,
+        faces: Sequence[tuple[str, str]],
+        first: int,
+        cells: Sequence[int],
+        friction: RoughFaces,
+        moving: MovingFaces = STILL,
+    ) -> None:
+        self.dimension = len(faces)
+        self.faces = tuple(tuple(pair) for pair in faces)
+        self.friction, self.moving = friction, moving
+        self.first = first
+        self.last = tuple(first + n for n in cells)
+
+    @ti.func
+    def constrain(self, node: ti.template(), velocity: ti.template()):
+        """Return the velocity of a node after the walls."""
+        result = velocity
+        for a in ti.static(range(self.dimension)):
+            if ti.static(self.faces[a][0] != PERIODIC):
+                if node[a] <= self.first:
+                    result = self.stopped(result, a, 0)
+                if node[a] >= self.last[a]:
+                    result = self.stopped(result, a, 1)
+        return result
+
+    @ti.func
+    def stopped(self, velocity: ti.template(), axis: ti.template(), side: ti.template()):
+        """Return the velocity at a node on or behind the lower (side 0) or the upper (1) face of an axis."""
+        result = velocity
+        along_wall = ti.Vector.zero(float, self.dimension)
+        for f in ti.static(range(len(self.moving.faces))):
+            if ti.static(self.moving.faces[f] == (axis, side)):
+                for c in ti.static(range(self.dimension)):
+                    along_wall[c] = self.moving.of(f)[c]
+                    result[c] -= along_wall[c]
+        for c in ti.static(range(self.dimension)):
+            if ti.static(self.faces[axis][side] == "stick" or (self.faces[axis][side] == "slip" and c == axis)):
+                result[c] = 0.0
+            elif ti.static(c == axis):
+                outward = velocity[c] if ti.static(side == 1) else -velocity[c]
+                if outward > 0:
+                    result[c] = 0.0
+        for f in ti.static(range(len(self.friction.faces))):
+            if ti.static(self.friction.faces[f] == (axis, side)):
+                along = 0.0
+                for c in ti.static(range(self.dimension)):
+                    if ti.static(c != axis):
+                        along += result[c] ** 2
+                push = velocity[axis] if ti.static(side == 1) else -velocity[axis]
+                if push > 0 and along > 0:
+                    kept = ti.max(1.0 - self.friction.of(f) * push / ti.sqrt(along), 0.0)
+                    for c in ti.static(range(self.dimension)):
+                        if ti.static(c != axis):
+                            result[c] *= kept
+        for f in ti.static(range(len(self.moving.faces))):
+            if ti.static(self.moving.faces[f] == (axis, side)):
+                for c in ti.static(range(self.dimension)):
+                    result[c] += along_wall[c]
         return result

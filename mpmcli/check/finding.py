@@ -1,7 +1,7 @@
 """Findings of a check: each states what is wrong, the number that shows it, and what to change."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from mpmcli.plain_text import counted
@@ -56,23 +56,12 @@ def passes(findings: Iterable[Finding], *, strict: bool = False) -> bool:
     return not any(finding.severity in refused for finding in findings)
 
 
-@dataclass
-class _Seen:
-    severity: Severity
-    rule: str
-    frame: int | None
-    what: str
-    fix: str
-    value: float | None
-    body: str
-    frames: set[int] = field(default_factory=set)
-
-
 class FrameFindings:
     """Findings of a result by rule. A fault that persists over frames is one finding, at its first frame."""
 
     def __init__(self) -> None:
-        self._seen: dict[tuple[str, str, str], _Seen] = {}
+        # By severity, rule and kind: the first finding, and the numbers of all frames that have it.
+        self._seen: dict[tuple[str, str, str], tuple[Finding, set[int]]] = {}
 
     def add(
         self,
@@ -85,31 +74,21 @@ class FrameFindings:
         body: str = "",
         kind: str = "",
     ) -> None:
-        """Add a fault.
-
-        Args:
-            what: a sentence without its period.
-            kind: distinguishes faults of one rule that are reported separately, such as the name of an array.
-        """
-        key = (severity, rule, kind)
-        if key not in self._seen:
-            self._seen[key] = _Seen(severity, rule, frame, what, fix, value, body)
+        """Add a fault; `what` has no period, and `kind` separates faults of one rule, as by the name of an array."""
+        first = Finding(severity, rule, what, fix, value, body, frame)
+        _, frames = self._seen.setdefault((severity, rule, kind), (first, set()))
         if frame is not None:
-            self._seen[key].frames.add(frame)
+            frames.add(frame)
 
     def frames_of(self, rule: str) -> set[int]:
         """Return the numbers of the frames with findings of a rule."""
-        return set().union(*(seen.frames for seen in self._seen.values() if seen.rule == rule))
+        return set().union(*(frames for first, frames in self._seen.values() if first.rule == rule))
 
     def found(self) -> tuple[Finding, ...]:
         """Return all findings by severity, and by frame within a severity."""
-        ordered = sorted(self._seen.values(), key=lambda seen: -1 if seen.frame is None else seen.frame)
-        return gravest_first(_finding(seen) for seen in ordered)
-
-
-def _finding(seen: _Seen) -> Finding:
-    more = len(seen.frames) - 1
-    suffix = f"; the same is found in {counted(more, 'more frame')}" if more > 0 else ""
-    return Finding(
-        seen.severity, seen.rule, f"{seen.what}{suffix}.", seen.fix, value=seen.value, body=seen.body, frame=seen.frame
-    )
+        complete = []
+        for first, frames in self._seen.values():
+            more = len(frames) - 1
+            suffix = f"; the same is found in {counted(more, 'more frame')}" if more > 0 else ""
+            complete.append(replace(first, what=f"{first.what}{suffix}."))
+        return gravest_first(sorted(complete, key=lambda finding: -1 if finding.frame is None else finding.frame))

@@ -1,18 +1,25 @@
-"""Forecast of the steps, time, memory and disk space of a run."""
+"""Forecast of the steps, time, memory and disk space of a run, and the rules on frames, disk and memory."""
 
 import math
+import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from mpmcli.check.facts import SceneFacts
+from mpmcli.check.finding import Finding
 from mpmcli.check.probe import Probe
+from mpmcli.errors import InputError
+from mpmcli.output.durable import largest_file
 from mpmcli.output.layout import POSITION, ArrayLayout, FrameLayout
 from mpmcli.output.store import HOLD
+from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene, scene_to_toml
 from mpmcli.scene.schema import SolverSettings
-from mpmcli.solver.frame_builder import POSITION_ERROR
-from mpmcli.solver.plan import Plan
+from mpmcli.solver.frames.builder import POSITION_ERROR
+from mpmcli.solver.machine.plan import Plan, require_room
 from mpmcli.stability.transfer_factors import loss_per_step
 
 # Bytes of a packed file without particles, measured on files of 51 to 151 frames in 2D and 3D: headers of the data
@@ -30,38 +37,34 @@ FRAME_SECONDS = 0.0005
 DISK_BYTES_PER_SECOND = 4e8
 # A frame is written once as a segment, read, written into the packed file, and compared: four passes.
 DISK_PASSES = 4
+# During a run each frame is a file; more than this take hours to write.
+MOST_FRAMES = 100_000
+# While the frames are packed, two copies are on the disk.
+COPIES = 2
 # Default solver settings.
 USUAL = SolverSettings()
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Forecast of a run.
+    """Forecast of a run."""
 
-    Attributes:
-        steps: expected number of time steps.
-        steps_range: number of steps with the step of the start, and with the step of the stiffest state.
-        frames: number of stored frames, including the first.
-        seconds: wall time of the run, None without a probe.
-        compile_seconds: part of it for the compilation of kernels, None without a probe.
-        step_seconds: wall time of a step, None without a probe.
-        device_bytes: size of all fields on the device.
-        host_bytes: size of a frame and of what it is made of, or of the initial state.
-        file_bytes: size of the packed file without compression.
-        vtk_bytes: size of the series of --format vtk.
-        dissipation: share of energy per second lost by a wave twice as long as the thinnest body, 1/s.
-    """
-
+    # Expected number, and the numbers with the step of the start and with that of the stiffest state.
     steps: int
     steps_range: tuple[int, int]
+    # Those stored, including the first.
     frames: int
+    # Wall time of the run, part of it for the compilation of kernels, and that of a step; None without a probe.
     seconds: float | None
     compile_seconds: float | None
     step_seconds: float | None
+    # All fields on the device; a frame and what it is made of, or the initial state; the packed file without
+    # compression; the series of --format vtk.
     device_bytes: int
     host_bytes: int
     file_bytes: int
     vtk_bytes: int
+    # Share of energy per second lost by a wave twice as long as the thinnest body, 1/s.
     dissipation: float
 
     def as_dict(self) -> dict:
@@ -87,6 +90,7 @@ def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
             + min(frames, 1 + computing / HOLD) * SEAL_SECONDS
             + DISK_PASSES * file_bytes / DISK_BYTES_PER_SECOND
         )
+    thinnest = min(body.thickness for body in facts.bodies)
     return Forecast(
         steps=steps,
         steps_range=(steps_at(facts, facts.step_at_start), steps_at(facts, facts.step)),
@@ -98,12 +102,7 @@ def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
         host_bytes=plan.host_bytes,
         file_bytes=file_bytes,
         vtk_bytes=series_bytes(scene, plan.particles),
-        dissipation=wave_loss(
-            min(body.thickness for body in facts.bodies),
-            scene.domain.spacing,
-            facts.taken(facts.step_at_start),
-            scene.solver,
-        ),
+        dissipation=wave_loss(thinnest, scene.domain.spacing, facts.taken(facts.step_at_start), scene.solver),
     )
 
 
@@ -140,13 +139,9 @@ def layout_of(scene: Scene) -> FrameLayout:
     real = "float64" if scene.solver.precision == "f64" else "float32"
     far = float(np.abs([scene.domain.origin, scene.domain.upper]).max())
     coarse = far * np.finfo(np.float32).eps > POSITION_ERROR * scene.domain.spacing
-    shapes: dict[str, tuple[str, tuple[int, ...]]] = {
-        POSITION: ("float64" if coarse else real, (d,)),
-        "id": ("int32", ()),
-        "body": ("int32", ()),
-        "material": ("int32", ()),
-        "velocity": (real, (d,)),
-    }
+    shapes: dict[str, tuple[str, tuple[int, ...]]] = {POSITION: ("float64" if coarse else real, (d,))}
+    shapes |= {name: ("int32", ()) for name in ("id", "body", "material")}
+    shapes["velocity"] = (real, (d,))
     tensors = {"stress": (9,), "affine": (d * d,), "deformation_gradient": (d * d,)}
     shapes |= {name: (real, tensors.get(name, ())) for name in scene.output.fields if name != "velocity"}
     if "initial_position" in shapes:
@@ -166,3 +161,40 @@ def series_bytes(scene: Scene, particles: int) -> int:
     """Return the bytes of the .vtu files of --format vtk, not compressed."""
     each = BASE64 * particles * (layout_of(scene).bytes_per_particle + CELL_BYTES) + VTU_BYTES
     return round((scene.time.frames + 1) * each)
+
+
+def output_findings(facts: SceneFacts, plan: Plan, forecast: Forecast, directory: Path) -> Iterator[Finding]:
+    """Yield the findings on frames, disk and memory; `directory` is where results would be written."""
+    scene = facts.scene
+    if facts.interval < facts.step_at_start:
+        what = (
+            f"Frames are {facts.interval:.3g} s apart, less than the stable step of {facts.step_at_start:.3g} s: every "
+            "step is stored, and steps are shorter than they need be."
+        )
+        fix = f"Set time.frames to {max(1, int(scene.time.end / facts.step_at_start))} or fewer."
+        yield Finding("note", "frames", what, fix, facts.interval)
+    if scene.time.frames > MOST_FRAMES:
+        what = f"The run stores {forecast.frames:,} frames, each a file while it goes on."
+        yield Finding("warning", "frames", what, f"Set time.frames to {MOST_FRAMES:,} or fewer.", forecast.frames)
+    # The directory need not exist yet.
+    there = next(place for place in (directory.absolute(), *directory.absolute().parents) if place.exists())
+    disk, largest = shutil.disk_usage(there), largest_file()
+    takes = f"The result takes {size_text(forecast.file_bytes)}"
+    # File systems without a disk, such as /proc, have no size.
+    if COPIES * forecast.file_bytes > disk.free and disk.total > 0:
+        what = f"{takes}, twice that while it is packed, and the disk has {size_text(disk.free)} left."
+        fix = "Store fewer frames or output.fields, or write to another disk with -o."
+        yield Finding("warning", "disk", what, fix, forecast.file_bytes)
+    if largest is not None and forecast.file_bytes > largest:
+        what = f"{takes}, and a file may have {size_text(largest)} here."
+        fix = "Raise the limit on the size of a file (ulimit -f), or store fewer frames or output.fields."
+        yield Finding("warning", "disk", what, fix, forecast.file_bytes)
+    try:
+        require_room(plan)
+    except InputError as error:
+        what, _, fix = str(error).rstrip(".").rpartition("; ")
+        total = plan.device_bytes + plan.host_bytes
+        yield Finding("error", "memory", f"{what[:1].upper()}{what[1:]}.", f"{fix[:1].upper()}{fix[1:]}.", total)
+    if facts.bounds.speed == 0 and facts.bounds.gravity == 0:
+        what = "Nothing moves: there is no gravity, and no body has a velocity."
+        yield Finding("note", "at-rest", what, "Give domain.gravity, or a velocity to a body.")

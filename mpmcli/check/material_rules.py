@@ -21,18 +21,15 @@ STEEP = 10.0
 
 def material_findings(facts: SceneFacts) -> Iterator[Finding]:
     """Yield the findings on materials."""
-    flowing = any(body.flows for body in facts.bodies)
     for body in facts.bodies:
-        yield from _impact(facts, body, flowing=flowing)
-        yield from _soft(facts, body)
-        yield from _locking(body, averages=facts.scene.solver.f_bar is not False)
-        yield from _friction(facts, body)
+        for rule in (_impact, _soft, _locking, _friction):
+            yield from rule(facts, body)
     yield from _density(facts)
 
 
-def _impact(facts: SceneFacts, body: BodyFacts, *, flowing: bool) -> Iterator[Finding]:
+def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     """Yield impact speeds near the wave speed; in scenes with flow any body may be hit at the highest speed."""
-    speed = facts.bounds.speed if flowing else body.arrival.speed
+    speed = facts.bounds.speed if facts.flowing else body.arrival.speed
     if body.wave_speed == 0 or speed <= FAST * body.wave_speed:
         return
     ratio = speed / body.wave_speed
@@ -42,15 +39,14 @@ def _impact(facts: SceneFacts, body: BodyFacts, *, flowing: bool) -> Iterator[Fi
         said = f"{ratio:.2g} of its speed of sound: its density varies by up to {100 * ratio**2:.0f} % in smooth flow"
     else:
         said = f"{ratio:.2g} of its wave speed: impacts crush it by about as much"
-    name, value = _stiffness(body)
-    yield Finding(
-        "warning",
-        "impact-speed",
-        f'Body "{body.name}" may be hit at {speed:.3g} m/s and its waves run at {body.wave_speed:.3g} m/s, so {said}.',
-        f"Raise {name} from {value:.3g} to {value * (ratio / FAST) ** 2:.2g} Pa or more, or slow the scene down.",
-        ratio,
-        body.name,
+    what = (
+        f'Body "{body.name}" may be hit at {speed:.3g} m/s and its waves run at {body.wave_speed:.3g} m/s, so {said}.'
     )
+    stiffness = body.law.first_set(body.body.material, body.law.stiffness_parameters)
+    name, value = stiffness or ("its stiffness", body.stiffness)
+    needed = value * (ratio / FAST) ** 2
+    fix = f"Raise {name} from {value:.3g} to {needed:.2g} Pa or more, or slow the scene down."
+    yield Finding("warning", "impact-speed", what, fix, ratio, body.name)
 
 
 def _soft(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
@@ -59,40 +55,28 @@ def _soft(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         return
     weight = body.body.material.density * facts.bounds.gravity * body.height
     if weight > SOFT * modulus:
-        yield Finding(
-            "warning",
-            "soft",
+        what = (
             f'Body "{body.name}" is so soft that its own weight, {weight:.3g} Pa at its foot, is '
-            f"{weight / modulus:.2g} of its modulus of {modulus:.3g} Pa: it collapses.",
-            f"Raise the modulus above {weight / SOFT:.2g} Pa, or make the body lower than "
-            f"{body.height * SOFT * modulus / weight:.2g} m.",
-            weight / modulus,
-            body.name,
+            f"{weight / modulus:.2g} of its modulus of {modulus:.3g} Pa: it collapses."
         )
+        lower = f"make the body lower than {body.height * SOFT * modulus / weight:.2g} m."
+        fix = f"Raise the modulus above {weight / SOFT:.2g} Pa, or {lower}"
+        yield Finding("warning", "soft", what, fix, weight / modulus, body.name)
 
 
-def _locking(body: BodyFacts, *, averages: bool) -> Iterator[Finding]:
+def _locking(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     ratio = getattr(body.body.material, "poissons_ratio", 0.0)
-    if ratio > LOCKING and averages and not body.flows:
-        yield Finding(
-            "note",
-            "locking",
-            f'Body "{body.name}" has a Poisson\'s ratio of {ratio:g}: its steps are small, and as each of them damps '
-            "what moves, it swings less far than it should.",
-            f"Set poissons_ratio = {LOCKING:g} or less, where the difference does not matter.",
-            ratio,
-            body.name,
-        )
-    elif ratio > LOCKING:
-        yield Finding(
-            "warning",
-            "locking",
-            f'Body "{body.name}" has a Poisson\'s ratio of {ratio:g}: above {LOCKING:g} it bends too stiffly, its '
-            "pressure varies from particle to particle, and its steps are small.",
-            f"Set solver.f_bar = true, poissons_ratio = {LOCKING:g} or less, or model it as a fluid.",
-            ratio,
-            body.name,
-        )
+    if ratio <= LOCKING:
+        return
+    has = f'Body "{body.name}" has a Poisson\'s ratio of {ratio:g}'
+    if facts.scene.solver.f_bar is not False and not body.flows:
+        lost = "its steps are small, and as each of them damps what moves, it swings less far than it should."
+        fix = f"Set poissons_ratio = {LOCKING:g} or less, where the difference does not matter."
+        yield Finding("note", "locking", f"{has}: {lost}", fix, ratio, body.name)
+        return
+    lost = f"above {LOCKING:g} it bends too stiffly, its pressure varies from particle to particle, and its steps are "
+    fix = f"Set solver.f_bar = true, poissons_ratio = {LOCKING:g} or less, or model it as a fluid."
+    yield Finding("warning", "locking", f"{has}: {lost}small.", fix, ratio, body.name)
 
 
 def _friction(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
@@ -103,15 +87,12 @@ def _friction(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     s, root = math.sin(math.radians(angle)), 2 * math.sqrt(3)
     compression = math.degrees(math.asin(3 * s / (root + s)))
     extension = math.degrees(math.asin(min(1.0, 3 * s / (root - s))))
-    yield Finding(
-        "warning" if extension - angle > STEEP else "note",
-        "friction",
+    what = (
         f'The friction angle of body "{body.name}", {angle:g} degrees in plane strain, acts as {compression:.1f} '
-        f"degrees in triaxial compression and as {extension:.1f} degrees in extension.",
-        "Give the angle of plane strain; where compression from all sides decides, as in a cone's middle, give more.",
-        angle,
-        body.name,
+        f"degrees in triaxial compression and as {extension:.1f} degrees in extension."
     )
+    fix = "Give the angle of plane strain; where compression from all sides decides, as in a cone's middle, give more."
+    yield Finding("warning" if extension - angle > STEEP else "note", "friction", what, fix, angle, body.name)
 
 
 def _density(facts: SceneFacts) -> Iterator[Finding]:
@@ -119,18 +100,9 @@ def _density(facts: SceneFacts) -> Iterator[Finding]:
     heavy = max(facts.bodies, key=lambda body: body.body.material.density)
     ratio = heavy.body.material.density / light.body.material.density
     if ratio > DENSITY_RATIO:
-        yield Finding(
-            "warning",
-            "density-ratio",
+        what = (
             f'Body "{heavy.name}" is {ratio:.3g} times as dense as body "{light.name}": on the nodes that they share '
-            "the light one is carried along.",
-            f"Keep the ratio of densities under {DENSITY_RATIO:g}, or leave the light body out.",
-            ratio,
-            light.name,
+            "the light one is carried along."
         )
-
-
-def _stiffness(body: BodyFacts) -> tuple[str, float]:
-    """Return the name of the parameter that sets the stiffness of a body, and its value, Pa."""
-    found = body.law.first_set(body.body.material, body.law.stiffness_parameters)
-    return found or ("its stiffness", body.stiffness)
+        fix = f"Keep the ratio of densities under {DENSITY_RATIO:g}, or leave the light body out."
+        yield Finding("warning", "density-ratio", what, fix, ratio, light.name)

@@ -4,10 +4,11 @@ import time
 from dataclasses import dataclass
 
 from mpmcli.scene import LoadedScene
-from mpmcli.solver.backend import Arch, Backend, start
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.engine import Engine, build_engine, choose_engine
-from mpmcli.solver.plan import Plan, make_plan, require_room
+from mpmcli.solver.engine.build import backend_for, build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import Arch, Backend, start
+from mpmcli.solver.machine.plan import Plan, make_plan, require_room
 
 # Steps that are not counted: the first compiles, and the next fill the caches of the processor.
 WARM_UP = 3
@@ -15,17 +16,7 @@ WARM_UP = 3
 
 @dataclass(frozen=True)
 class Probe:
-    """Measured cost of the start of a run.
-
-    Attributes:
-        backend: backend of the probe.
-        start_seconds: time to start the backend, sample and allocate.
-        compile_seconds: time of the first step and frame in excess of later ones.
-        step_seconds: wall time of a step, None if the run became unstable before one was measured.
-        frame_seconds: time to build a frame and its ledger row.
-        steps: number of steps taken.
-        failure: message of an unstable run, "" otherwise.
-    """
+    """Measured cost of a run's start: seconds to start, to compile, of a step (None: unstable before) and a frame."""
 
     backend: Backend
     start_seconds: float
@@ -39,53 +30,40 @@ class Probe:
 def probe_scene(
     loaded: LoadedScene, steps: int, *, arch: Arch = "auto", threads: int | None = None, seconds: float = 2.0
 ) -> tuple[Probe, Plan]:
-    """Run a scene as `mpmcli simulate` would; it starts Taichi in this process and writes nothing.
-
-    Args:
-        steps: expected number of steps of the whole run.
-        seconds: wall time of the steps that are measured.
-
-    Returns:
-        The measured cost, and the plan of a run on the backend that was started.
-
-    Raises:
-        InputError: the backend is not available, or the scene does not fit into memory.
-    """
+    """Run a scene for `seconds` of its `steps`; return cost and plan. InputError: no backend, or little memory."""
     scene = loaded.scene
     began = time.perf_counter()
-    backend, batched = choose_engine(scene, lambda: steps, arch, threads)
+    backend = backend_for(scene, lambda: steps, arch, threads)
     start(backend)
     plan = make_plan(scene, backend)
     require_room(plan)
-    engine = build_engine(scene, backend, batched=batched)
+    run = build_run(scene, backend)
     started = time.perf_counter() - began
-    engine.begin()
-    engine.frame()
+    run.begin()
+    run.frame()
     first_frame = time.perf_counter() - began - started
     # The smallest of three: the second frame allocates memory, later ones reuse it.
-    frame = min(_seconds_of_a_frame(engine) for _ in range(3))
+    frame = min(_seconds_of_a_frame(run) for _ in range(3))
     compiled = max(0.0, first_frame - frame)
     measured, spent, failure = 0, 0.0, ""
     try:
         warm = time.perf_counter()
-        engine.advance(WARM_UP)
-        engine.wait()
+        run.advance(WARM_UP)
         compiled += time.perf_counter() - warm
         # A run launches and waits at least once for each frame.
         chunk, most = 1, max(1, round(steps / scene.time.frames))
         since = time.perf_counter()
-        while measured == 0 or (spent < seconds and engine.time < scene.time.end):
-            measured += engine.advance(chunk)[0]
-            engine.wait()
+        while measured == 0 or (spent < seconds and run.time < scene.time.end):
+            measured += run.advance(chunk)[0]
             spent = time.perf_counter() - since
             chunk = max(1, min(most, int(measured / spent * (seconds - spent))))
     except UnstableRunError as error:
         failure = str(error)
     step_seconds = spent / measured if measured else None
-    return Probe(backend, started, compiled, step_seconds, frame, engine.step_count, failure), plan
+    return Probe(backend, started, compiled, step_seconds, frame, run.step_count, failure), plan
 
 
-def _seconds_of_a_frame(engine: Engine) -> float:
+def _seconds_of_a_frame(run: Run) -> float:
     since = time.perf_counter()
-    engine.frame()
+    run.frame()
     return time.perf_counter() - since

@@ -7,14 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from mpmcli.check.finding import Finding, FrameFindings, Verdict, passes
-from mpmcli.check.frame_screen import screen
-from mpmcli.check.result_agreement import AgreementCheck
-from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, arrays_of, kept_entries, open_entries
-from mpmcli.check.result_ledger import check_ledger
-from mpmcli.check.result_motion import MomentumCheck, MotionCheck
-from mpmcli.check.result_order import check_order, frames_expected
-from mpmcli.check.result_state import StateCheck
-from mpmcli.check.result_stretch import StretchCheck
+from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, arrays_of, check_order, kept_entries, open_entries
+from mpmcli.check.result_ledger import AgreementCheck, check_ledger
+from mpmcli.check.result_motion import MomentumCheck, MotionCheck, screen
+from mpmcli.check.result_state import StateCheck, StretchCheck
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -44,26 +40,11 @@ TOLD = {
 
 @dataclass(frozen=True)
 class ResultCheck:
-    """Result of the check of a run.
+    """Result of the check of a run; `path` and `kind` are those of `OpenedResult`, `status` is that of its record.
 
-    Attributes:
-        path: file or directory read.
-        kind: "packed", "segments", "series", "memory", or "none" if nothing can be read.
-        status: status of the run in its record, "unknown" without one.
-        findings: by decreasing severity.
-        first_bad_frame: number of the first frame with an error or a warning, or None.
-        limit: name of the bound on the step that was smallest at that frame, "" if it is not known.
-        frames: number of frames read.
-        frames_expected: number of frames of the whole run, None if it is not known.
-        particles: number of particles.
-        figures: numbers by name, None if not available: energy_growth and energy_lost (relative to the
-            energy turned over), mass_change (relative), momentum_drift (relative, far from walls), momentum_frames
-            (number of frames compared), collider_impulse (momentum that colliders took, kg m/s), courant_max (cells),
-            deformation_max (in a step, if affine is stored), displacement_ratio (largest displacement between frames
-            over the largest that the ledger allows),
-            ledger_difference (largest relative difference between ledger and frames), speed_max (m/s),
-            volume_ratio_min, volume_ratio_max, volume_error (that lasts to the end), step_min, step_max (s), step_ratio
-            (smallest over first), bytes (of particle data read).
+    `limit` is the bound on the step that was smallest at the first frame with an error or a warning, "" if not known.
+    None are figures that are not available: those of TOLD, momentum_frames (compared), ledger_difference (largest
+    relative one of ledger and frames), step_ratio (smallest over first), bytes (of particle data read).
     """
 
     path: Path
@@ -96,9 +77,7 @@ class ResultCheck:
             "first_bad_frame": self.first_bad_frame,
             "limit": self.limit,
             "findings": [finite_json(finding.as_dict()) for finding in self.findings],
-            "frames": self.frames,
-            "frames_expected": self.frames_expected,
-            "particles": self.particles,
+            **{name: getattr(self, name) for name in ("frames", "frames_expected", "particles")},
             "figures": finite_json(self.figures),
             "kind": self.kind,
             "status": self.status,
@@ -122,14 +101,7 @@ class ResultCheck:
 
 
 def check_result(path: Path) -> ResultCheck:
-    """Check the ledger and the frames of a result, one frame at a time.
-
-    Args:
-        path: a packed file, a directory, its segments, or the .pvd of a series. The run need not have ended.
-
-    Raises:
-        InputError: there is nothing at `path`, or nothing that this version of mpmcli wrote.
-    """
+    """Check ledger and frames of a result, packed, segments or .pvd, whose run may go on; InputError: none of ours."""
     findings = FrameFindings()
     opened = open_entries(path, findings)
     check = _check(opened, findings)
@@ -140,20 +112,15 @@ def check_result(path: Path) -> ResultCheck:
 
 
 def check_kept(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[LedgerRow]) -> ResultCheck:
-    """Check a finished run in memory, as `check_result` checks its files, but not for changes since the run.
-
-    Args:
-        frames, ledger: all of the run.
-    """
+    """Check all frames of a finished run in memory, as `check_result` checks files, but not for changes since."""
     return _check(kept_entries(header, frames, ledger), FrameFindings())
 
 
 def _check(opened: OpenedResult, findings: FrameFindings) -> ResultCheck:
-    header = opened.header
-    check_order(opened, header, findings)
-    figures = check_ledger(opened.entries, header, findings)
+    check_order(opened, findings)
+    figures = check_ledger(opened.entries, opened.header, findings)
     if opened.entries:
-        figures |= _check_frames(opened, header, findings)
+        figures |= _check_frames(opened, findings)
     found = findings.found()
     bad = [f.frame for f in found if f.severity != "note" and f.frame is not None]
     first_bad = min(bad, default=None)
@@ -165,14 +132,15 @@ def _check(opened: OpenedResult, findings: FrameFindings) -> ResultCheck:
         first_bad_frame=first_bad,
         limit="" if first_bad is None else _limit_at(opened, first_bad),
         frames=len(opened.entries) - len(findings.frames_of("unreadable") & {e.number for e in opened.entries}),
-        frames_expected=frames_expected(opened, header),
+        frames_expected=opened.frames_expected,
         particles=opened.entries[0].count if opened.entries else 0,
         figures=figures,
     )
 
 
-def _check_frames(opened: OpenedResult, header: RunHeader, findings: FrameFindings) -> dict[str, float | None]:
+def _check_frames(opened: OpenedResult, findings: FrameFindings) -> dict[str, float | None]:
     """Read each frame once; check its values, and compare it with the previous frame and the ledger."""
+    header = opened.header
     # Only a file can have been changed since the run.
     stored = opened.kind != "memory"
     state, motion = StateCheck(header, findings, stored=stored), MotionCheck(header, findings)

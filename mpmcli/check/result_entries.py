@@ -1,4 +1,4 @@
-"""Opens a result that may be damaged: the frames that can be read, and findings for the others."""
+"""Opens a result that may be damaged, and checks that it holds each frame once, at its time, and how the run ended."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,47 +11,41 @@ from mpmcli.check.finding import FrameFindings
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.damage import DAMAGE, first_line
-from mpmcli.output.hdf5_items import DamageError
+from mpmcli.output.guarded_read import DAMAGE, DamageError, first_line
 from mpmcli.output.header import RunHeader
 from mpmcli.output.result import Result, open_result
-from mpmcli.output.run_record import read_record
-from mpmcli.output.run_status import run_status
+from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_HEADER
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 RUN_AGAIN = "Copy the file again from where it was made, or run the scene again."
+# Tolerance of times, relative to the duration of the run.
+TIME_ERROR = 1e-9
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One frame of a result, not yet read.
+    """One frame of a result, not yet read: frame k of `result`, which is None where it is in memory."""
 
-    Attributes:
-        number: number of the frame, from the name of its file if it has its own.
-        said: number of the frame in its content.
-        time: time listed in the file, s.
-        row: row of the ledger.
-        count: number of particles listed in the file.
-        result: result that holds the frame, None where it is in memory.
-        k: index of the frame in `result`.
-    """
-
+    # From the name of its file if it has its own, and by its content.
     number: int
     said: int
+    # Time, s, row of the ledger and number of particles that the file lists.
     time: float
     row: LedgerRow
     count: int
     result: Result | None
     k: int
 
-    def read(self) -> tuple[Frame, np.ndarray]:
-        """Read the frame and its ids.
+    @classmethod
+    def of(cls, result: Result, k: int, number: int) -> "Entry":
+        """Return frame k of a result."""
+        time, count = float(result.times[k]), int(result.particle_counts[k])
+        return cls(number, int(result.numbers[k]), time, result.ledger[k], count, result, k)
 
-        Raises:
-            InputError: it cannot be read.
-        """
+    def read(self) -> tuple[Frame, np.ndarray]:
+        """Read the frame and its ids; raise InputError if it cannot be read."""
         try:
             frame, ids = self.result.numbered_frame(self.k)
         except DAMAGE as error:
@@ -67,11 +61,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class KeptEntry(Entry):
-    """A frame in memory, all of which is known.
-
-    Attributes:
-        frame: the frame.
-    """
+    """A frame in memory, all of which is known."""
 
     frame: Frame
 
@@ -81,27 +71,25 @@ class KeptEntry(Entry):
 
 @dataclass(frozen=True)
 class OpenedResult:
-    """The readable part of a result.
-
-    Attributes:
-        path: file or directory read.
-        kind: "packed", "segments", "series", "memory", or "none" if nothing can be read.
-        header: header of the run.
-        record: content of run.json, or None.
-        entries: frames in the order of the files.
-    """
+    """The readable part of a result, its frames in the order of the files."""
 
     path: Path
+    # "packed", "segments", "series", "memory", or "none" if nothing can be read.
     kind: str
     header: RunHeader
+    # Content of run.json.
     record: dict[str, Any] | None
     entries: list[Entry]
 
     @property
     def status(self) -> str:
         """How the run stands, see `run_status`."""
-        directory = self.path if self.path.is_dir() else self.path.parent
-        return run_status(directory, self.record)
+        return run_status(_directory(self.path), self.record)
+
+    @property
+    def frames_expected(self) -> int | None:
+        """Number of frames of the whole run, None if it is not known."""
+        return (self.record or {}).get("frames_expected") or self.header.frames
 
 
 def arrays_of(frame: Frame, ids: np.ndarray) -> dict[str, np.ndarray]:
@@ -120,11 +108,7 @@ def kept_entries(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[Le
 
 
 def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
-    """Open the readable part of a result.
-
-    Raises:
-        InputError: there is nothing at `path`, or nothing that this version of mpmcli wrote.
-    """
+    """Open what can be read of a result, and note the rest; InputError: nothing is there, or nothing of ours."""
     path = Path(path)
     if path.name == SEGMENTS and path.is_dir():
         path = path.parent
@@ -135,14 +119,13 @@ def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
     except DAMAGE as error:
         if not _is_damage(path, error):
             raise
-        directory = path if path.is_dir() else path.parent
         findings.add("error", "unreadable", 0, f"No frame can be read: {first_line(error)}", RUN_AGAIN)
-        return OpenedResult(path, "none", RunHeader.read({}), read_record(directory), [])
+        return OpenedResult(path, "none", RunHeader.read({}), read_record(_directory(path)), [])
     listed = min(len(result.ledger), len(result.numbers), len(result.particle_counts))
     if listed < result.frame_count:
         what = f"The ledger has {listed} rows for {result.frame_count} frames"
         findings.add("error", "ledger-missing", listed, what, RUN_AGAIN)
-    entries = [_entry(result, k, int(result.numbers[k])) for k in range(min(listed, result.frame_count))]
+    entries = [Entry.of(result, k, int(result.numbers[k])) for k in range(min(listed, result.frame_count))]
     return OpenedResult(result.path, result.kind, result.header, result.record, entries)
 
 
@@ -153,7 +136,7 @@ def _open_segments(directory: Path, findings: FrameFindings) -> OpenedResult:
         number = int(segment.stem.split("_")[1])
         try:
             result = open_result(segment)
-            entries += [_entry(result, k, number + k) for k in range(result.frame_count)]
+            entries += [Entry.of(result, k, number + k) for k in range(result.frame_count)]
         except DAMAGE as error:
             what = f"The segment of frame {number} cannot be read ({first_line(error)})"
             findings.add("error", "unreadable", number, what, RUN_AGAIN)
@@ -161,24 +144,15 @@ def _open_segments(directory: Path, findings: FrameFindings) -> OpenedResult:
     return OpenedResult(directory, "segments", header, read_record(directory), entries)
 
 
-def _entry(result: Result, k: int, number: int) -> Entry:
-    return Entry(
-        number,
-        int(result.numbers[k]),
-        float(result.times[k]),
-        result.ledger[k],
-        int(result.particle_counts[k]),
-        result,
-        k,
-    )
+def _directory(path: Path) -> Path:
+    return path if path.is_dir() else path.parent
 
 
 def _is_damage(path: Path, error: Exception) -> bool:
     """Return whether mpmcli wrote the file, so that it is damaged rather than of another kind."""
-    directory = path if path.is_dir() else path.parent
     if not path.exists() or path.suffix == ".vtu":
         return False
-    ours = read_record(directory) is not None
+    ours = read_record(_directory(path)) is not None
     if path.is_dir():
         packed = path / PACKED
         if not packed.exists() and not (path / SERIES).exists():
@@ -193,3 +167,95 @@ def _is_damage(path: Path, error: Exception) -> bool:
         return True
     with path.open("rb") as file:
         return file.read(8) == HDF5_SIGNATURE
+
+
+def check_order(opened: OpenedResult, findings: FrameFindings) -> None:
+    """Check the numbers and times of the frames, and that a finished run has all of them."""
+    entries, expected = opened.entries, opened.frames_expected
+    _numbers(entries, findings)
+    _times(entries, opened.header, findings)
+    status = (opened.record or {}).get("status")
+    numbers = {entry.number for entry in entries} | {entry.said for entry in entries}
+    if expected is not None and entries and max(numbers) >= expected:
+        what = f"There is a frame {max(numbers)}, where the scene has frames 0 to {expected - 1} only"
+        findings.add("error", "extra-frames", expected, what, "Remove what was added to the result.")
+    # Frames missing at the end of a run that did not finish are reported by its status.
+    whole = expected if expected is not None and status in (None, "finished") else max(numbers, default=-1) + 1
+    there = {entry.number for entry in entries} | findings.frames_of("unreadable")
+    first, count = _missing(there, whole if expected is None else min(whole, expected))
+    if count and entries:
+        named = f"Frame {first} is" if count == 1 else f"Frame {first} and {count - 1} more of {whole} are"
+        findings.add("error", "missing-frames", first, f"{named} missing", RUN_AGAIN, value=count)
+    _status(opened, findings)
+
+
+def _missing(there: set[int], whole: int) -> tuple[int, int]:
+    # A damaged file may state any number, so that a loop over all of them could be endless.
+    known = sorted(number for number in there if 0 <= number < whole)
+    first = next((k for k, number in enumerate(known) if k != number), len(known))
+    return first, whole - len(known)
+
+
+def _numbers(entries: Sequence[Entry], findings: FrameFindings) -> None:
+    seen: set[int] = set()
+    highest = -1
+    for entry in entries:
+        if entry.said != entry.number:
+            what = f"The file of frame {entry.number} holds frame {entry.said}"
+            findings.add("error", "frame-number", entry.number, what, RUN_AGAIN, value=entry.said)
+        elif entry.said in seen:
+            what = f"Frame {entry.said} is there more than once"
+            findings.add("error", "duplicated-frames", entry.said, what, "Remove the second one.", value=entry.said)
+        elif entry.said < highest:
+            what = f"Frame {entry.said} comes after frame {highest}"
+            findings.add("error", "frame-order", entry.said, what, "Put the frames in order.", value=entry.said)
+        seen.add(entry.said)
+        highest = max(highest, entry.said)
+
+
+def _times(entries: Sequence[Entry], header: RunHeader, findings: FrameFindings) -> None:
+    before = None
+    for entry in entries:
+        allowed = TIME_ERROR * max(abs(entry.time), header.end or 0.0)
+        if not abs(entry.time - entry.row.time) <= allowed:
+            what = f"Frame {entry.number} is listed at {entry.time:.6g} s and its ledger row at {entry.row.time:.6g} s"
+            findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time, kind="ledger")
+        elif before is not None and not entry.time > before:
+            what = f"Frame {entry.number}, at {entry.time:.6g} s, is not later than the one before it"
+            findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time, kind="order")
+        elif header.end is not None and header.frames is not None:
+            planned = header.end * entry.number / (header.frames - 1)
+            if not abs(entry.time - planned) <= allowed:
+                what = f"Frame {entry.number} is at {entry.time:.6g} s, where the scene has it at {planned:.6g} s"
+                findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time, kind="scene")
+        before = entry.time
+
+
+def _status(opened: OpenedResult, findings: FrameFindings) -> None:
+    count, expected = max((entry.number for entry in opened.entries), default=-1) + 1, opened.frames_expected
+    far = f"{count} of {expected} frames" if expected is not None else f"{count} frames"
+    record = opened.record
+    if record is None:
+        what = "No run.json lies beside the frames, so how the run ended is not known"
+        findings.add("note", "no-record", None, what, "Keep run.json together with the frames.")
+        return
+    status = opened.status
+    message = ((record.get("failure") or {}).get("message") or "").rstrip(".")
+    said = f": {message}" if message else ""
+    if status == "unstable":
+        fix = "Change what the sentence names and run it again."
+        findings.add("error", "unstable-run", count, f"After {far} {message or 'the run became unstable'}", fix)
+    elif status == "failed":
+        findings.add("error", "failed-run", count, f"The run failed after {far}{said}", "Run it again.")
+    elif status == "interrupted":
+        what = f"The run was interrupted after {far}"
+        findings.add("warning", "interrupted-run", count, what, "Run it again to have all frames.")
+    elif status == "stopped":
+        findings.add("warning", "stopped-run", count, f"The run stopped after {far}{said}", "Run it again.")
+    elif status == DIED:
+        what = f"The run died after {far}: its process has ended and left no word"
+        findings.add("warning", "died-run", count, what, "Run it again to have all frames.")
+    elif status in ("running", ELSEWHERE):
+        still = "and it goes on" if status == "running" else "and whether it goes on cannot be seen from here"
+        what = f"The run has not ended; there are {far}, {still}"
+        findings.add("warning", "running", count, what, "Wait for it, or run it again.")

@@ -1,13 +1,20 @@
-"""Checks the motion between two frames: largest displacement, and conservation of momentum away from walls."""
+"""Checks the motion between two frames: largest displacement, and conservation of momentum away from walls.
 
+The checks of a frame of a thousand particles take longer than its steps do. So the frames of a run in memory are looked
+at together first (`screen`), and those in which nothing can be found are left out.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from mpmcli.check.deformation import deformation_rate
 from mpmcli.check.finding import FrameFindings
+from mpmcli.check.result_entries import KeptEntry
 from mpmcli.check.result_ledger import LOWER_SAFETY, MARGIN
-from mpmcli.check.result_state import TOUCHED, extent
+from mpmcli.check.result_state import BLOWN_UP, CRUSHED, TOUCHED, FrameCheck, extent
+from mpmcli.check.scene_limits import deformation_rate
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.header import RunHeader
@@ -20,70 +27,56 @@ GPU_FACTOR = 2.0
 OUTLIER_CELLS, OUTLIER_PART = 1.0, 0.2
 NEIGHBOURS = 3
 CANDIDATES = 8
+# Numbers of an array that are screened at once.
+AT_ONCE = 2**18
+# Room for the rounding of what single frames compute otherwise.
+ROUNDING = 1e-4
+# Fields with checks of their own.
+CHECKED = ("affine", "mass", "volume_ratio")
 
 
-@dataclass(frozen=True)
-class _Moment:
-    number: int
-    frame: Frame
-
-
-class MotionCheck:
-    """Checks the displacements of frames, in order.
-
-    Attributes:
-        largest_ratio: largest displacement between two frames over the largest that the ledger allows.
-        deformation: largest deformation in a step, from the velocity gradients; None if they are not stored.
-    """
+class MotionCheck(FrameCheck):
+    """Checks displacements: `largest_ratio` over what the ledger allows, `deformation` in a step, None if unknown."""
 
     def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
-        self._header = header
-        self._findings = findings
-        self._before: _Moment | None = None
+        super().__init__(header, findings)
+        self._before: tuple[int, Frame] | None = None
         self.largest_ratio = 0.0
         self.deformation: float | None = None
 
     def check(self, number: int, frame: Frame, row: LedgerRow, sound: np.ndarray | None) -> None:
-        """Compare a frame with the previous one, if that is known.
-
-        Args:
-            number: number of the frame.
-            frame: the frame.
-            row: row of the ledger for the steps between the two.
-            sound: which particles have finite values, (n,) bool; None for all.
-        """
-        before, self._before = self._before, _Moment(number, frame)
+        """Compare a frame with the one before; `row` is of the steps between, `sound` (n,) of finite values or None."""
+        last, before = self._before or (None, frame)
+        self._before = (number, frame)
         if "affine" in frame.fields and sound is None and len(frame.position) > 0:
             self._deformation(number, frame, row)
-        if before is None or before.number + 1 != number or len(before.frame.position) != len(frame.position):
+        if last != number - 1 or len(before.position) != len(frame.position) or len(frame.position) == 0:
             return
-        if len(frame.position) == 0:
-            return
-        moved = self._header.way(before.frame.position, frame.position)
+        moved = self._header.way(before.position, frame.position)
         squares = np.einsum("ij,ij->i", moved, moved)
         squares = np.where(np.isfinite(squares), squares, 0.0) if sound is not None else squares
-        allowed = reach(self._header, row, frame.position.dtype)
+        allowed = _reach(self._header, row, frame.position.dtype)
         p = int(np.argmax(squares))
         farthest = float(np.sqrt(float(squares[p])))
         if farthest == 0.0:
-            self._repeated(number, frame, before.frame, row)
+            self._repeated(number, frame, before, row)
         if allowed is None:
             return
         ratio = farthest / allowed if allowed > 0 else (np.inf if farthest > 0 else 0.0)
         self.largest_ratio = max(self.largest_ratio, ratio)
         if ratio > 1:
-            body = self._header.body_name(int(frame.body[p]))
+            body = self._body(frame, p)
             what = (
                 f'Up to frame {number} particle {p} of body "{body}" moved by {farthest:.4g} m since the one before, '
                 f"where {row.steps} steps at a Courant number of {row.courant_max:.3g} reach {allowed:.4g} m"
             )
             self._findings.add("error", "teleported", number, what, TOUCHED, value=ratio, body=body)
         elif sound is None:
-            self._outlier(number, frame, before.frame, row.time - before.frame.time, allowed)
+            self._outlier(number, frame, before, row.time - before.time, allowed)
 
     def passed(self, number: int, frame: Frame, ratio: float) -> None:
-        """Note a frame that was looked at with others (`frame_screen`), and its displacement over the reach."""
-        self._before = _Moment(number, frame)
+        """Note a frame that was screened with others, and its displacement over the largest allowed."""
+        self._before = (number, frame)
         self.largest_ratio = max(self.largest_ratio, ratio)
 
     def forget(self) -> None:
@@ -104,11 +97,9 @@ class MotionCheck:
         self.deformation = max(self.deformation or 0.0, deformation)
         if deformation > DEFORMATION * MARGIN:
             severity = "error" if deformation > 1 else "warning"
-            body = self._header.body_name(int(frame.body[p]))
-            what = (
-                f'In frame {number} particle {p} of body "{body}" deforms by {deformation:.3g} in a step, '
-                f"{DEFORMATION:g} is safe"
-            )
+            body = self._body(frame, p)
+            deforms = f"deforms by {deformation:.3g} in a step, {DEFORMATION:g} is safe"
+            what = f'In frame {number} particle {p} of body "{body}" {deforms}'
             self._findings.add(severity, "deformation", number, what, LOWER_SAFETY, value=deformation, body=body)
 
     def _repeated(self, number: int, frame: Frame, before: Frame, row: LedgerRow) -> None:
@@ -128,9 +119,9 @@ class MotionCheck:
         h = self._header.spacing
         if h is None:
             return
-        own = self._header.way(before.position, frame.position) - 0.5 * time * (before.velocity + frame.velocity)
-        threshold = outlier_threshold(h, allowed)
-        squares = np.einsum("ij,ij->i", own, own)
+        stray = self._header.way(before.position, frame.position) - 0.5 * time * (before.velocity + frame.velocity)
+        threshold = _outlier_threshold(h, allowed)
+        squares = np.einsum("ij,ij->i", stray, stray)
         if squares.max() <= threshold**2:
             return
         change = frame.velocity - before.velocity
@@ -143,10 +134,10 @@ class MotionCheck:
             if len(near) < NEIGHBOURS:
                 continue
             # The median is not affected by a second displaced particle nearby.
-            apart = float(np.linalg.norm(own[p] - np.median(own[near], axis=0)))
+            apart = float(np.linalg.norm(stray[p] - np.median(stray[near], axis=0)))
             apart -= 0.5 * time * float(np.linalg.norm(change[p] - np.median(change[near], axis=0)))
             if apart > threshold:
-                body = self._header.body_name(int(frame.body[p]))
+                body = self._body(frame, p)
                 what = (
                     f'Up to frame {number} particle {p} of body "{body}" moved since the one before by '
                     f"{apart / h:.3g} cells more than its velocities and its neighbours account for"
@@ -155,17 +146,13 @@ class MotionCheck:
                 return
 
 
-def outlier_threshold(spacing: float, allowed: float | np.ndarray) -> float | np.ndarray:
+def _outlier_threshold(spacing: float, allowed: float | np.ndarray) -> float | np.ndarray:
     """Return how far a displacement may be from that of the velocities, m; `allowed` is the largest displacement, m."""
     return OUTLIER_CELLS * spacing + OUTLIER_PART * allowed
 
 
-def reach(header: RunHeader, row: LedgerRow, stored: np.dtype) -> float | None:
-    """Return the largest possible displacement since the previous frame, m: steps times Courant number times h.
-
-    Each step rounds the position, and so does the file, whose type of positions is `stored`. None if the ledger or
-    the header lacks a number.
-    """
+def _reach(header: RunHeader, row: LedgerRow, stored: np.dtype) -> float | None:
+    """Return the largest displacement in a row's steps, m, with rounding in steps and file; None: not known."""
     if header.spacing is None or not np.isfinite(row.courant_max):
         return None
     factor = GPU_FACTOR if header.on_gpu else 1.0
@@ -173,27 +160,20 @@ def reach(header: RunHeader, row: LedgerRow, stored: np.dtype) -> float | None:
     return factor * row.steps * row.courant_max * header.spacing * (1 + 1e-3) + rounding
 
 
-class MomentumCheck:
+class MomentumCheck(FrameCheck):
     """Compares the momentum of the ledger with P0 + M g (t - dt/2) while no wall can have acted.
 
-    What colliders took, of which the ledger tells, counts as still there.
-
-    Velocities are those in the middle of the last step, whose length is between the smallest and the largest.
-    The momentum along an axis is conserved while no particle is near a wall normal to the axis or a wall with
-    "stick". The angular momentum is conserved without gravity and far from all walls, if the transfer conserves it
-    (docs/theory.md, 9.2) and the domain does not repeat.
-
-    Attributes:
-        drift: largest difference, relative to sqrt(2 M E_kin), a bound on sum m |v|; None if never compared.
-        frames: number of frames compared along at least one axis.
+    What colliders took counts as there; velocities are those in the middle of the last step. Along an axis momentum is
+    conserved while no particle is near a wall normal to it or one with "stick"; angular momentum without gravity, far
+    from all walls, if the transfer conserves it (docs/theory.md, 9.2). `drift` is relative to sqrt(2 M E_kin), a bound
+    on sum m |v|; `frames` were compared.
     """
 
     # A particle acts on nodes up to 1.5 cells away, and the first plane of nodes of a wall is the wall itself.
     MARGIN = 2.0
 
     def __init__(self, header: RunHeader, findings: FrameFindings, first: LedgerRow) -> None:
-        self._header = header
-        self._findings = findings
+        super().__init__(header, findings)
         self._first = first
         self._steps = 0
         self._kinetic = 0.0
@@ -219,7 +199,7 @@ class MomentumCheck:
             return
         self._taken += np.sum(row.collider_force, axis=0) * (row.time - self._time)
         self._time = row.time
-        allowed = reach(header, row, frame.position.dtype)
+        allowed = _reach(header, row, frame.position.dtype)
         if number > 0:
             near = self.MARGIN * header.spacing
             gone = self._distance is None or allowed is None
@@ -259,7 +239,72 @@ class MomentumCheck:
         if drift > 1e-3 + self._steps * header.epsilon:
             what = (
                 f"By frame {number} momentum has drifted by {drift:.3g} of what moves, though no wall was near and "
-                f"nothing but gravity{' and colliders' if self._header.collider_names else ''} acted"
+                f"nothing but gravity{' and colliders' if header.collider_names else ''} acted"
             )
             fix = 'Run it with solver.precision = "f64" to see whether it is rounding.'
             self._findings.add("warning", "momentum", number, what, fix, value=drift)
+
+
+@dataclass(frozen=True)
+class Screened:
+    """What was seen of T frames."""
+
+    # Whether no check of the values of a frame, or of the motion up to it, finds anything, (T,) bool.
+    quiet: np.ndarray
+    # The largest displacement over the largest that the ledger allows, (T,); 0 where a frame is not quiet.
+    ratio: np.ndarray
+    # Corners of the particles, (T, d), m.
+    lowest: np.ndarray
+    highest: np.ndarray
+
+
+def screen(header: RunHeader, entries: Sequence[KeptEntry]) -> Screened | None:
+    """Look at all frames of a run; None where they are not alike, particles come and go, or a field is of CHECKED."""
+    frames = [entry.frame for entry in entries]
+    counts = {len(frame.position) for frame in frames}
+    bounded = header.origin is not None and header.spacing is not None and not any(header.open_axes)
+    known = bounded and not header.comes_and_goes and not header.drops
+    if not known or len(counts) != 1 or 0 in counts or not set(CHECKED).isdisjoint(frames[0].fields):
+        return None
+    T, d = len(frames), header.dimension
+    screened = Screened(np.zeros(T, bool), np.zeros(T), np.empty((T, d)), np.empty((T, d)))
+    step = max(1, AT_ONCE // (counts.pop() * d))
+    with np.errstate(invalid="ignore", over="ignore"):
+        for first in range(0, T, step):
+            part = slice(first, min(first + step, T))
+            _screen(header, entries[max(0, first - 1) : part.stop], part, screened)
+    return screened
+
+
+def _screen(header: RunHeader, entries: Sequence[KeptEntry], part: slice, screened: Screened) -> None:
+    """Look at some frames; the first of `entries` is the one before them, unless they begin with frame 0."""
+    frames, rows = [entry.frame for entry in entries], [entry.row for entry in entries]
+    new = slice(1 if part.start else 0, None)
+    x, v = (np.stack([getattr(frame, name) for frame in frames]) for name in ("position", "velocity"))
+    columns = np.ascontiguousarray(x[new].transpose(0, 2, 1))
+    lowest, highest = columns.min(axis=2), columns.max(axis=2)
+    # Written so that a NaN is not quiet.
+    quiet = (lowest > header.origin).all(axis=1) & (highest < header.upper).all(axis=1)
+    quiet &= np.isfinite(v[new]).all(axis=(1, 2))
+    for name in frames[0].fields:
+        values = np.stack([frame.fields[name] for frame in frames[new]])
+        if values.dtype.kind == "f":
+            quiet &= np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+    J = np.array([(row.volume_ratio_min, row.volume_ratio_max) for row in rows[new]])
+    quiet &= (J[:, 0] > CRUSHED * (1 + ROUNDING)) & (J[:, 1] < BLOWN_UP * (1 - ROUNDING))
+    follows = np.array([b.number == a.number + 1 for a, b in pairwise(entries)], bool)
+    allowed = np.array([_reach(header, row, x.dtype) or 0.0 for row in rows[1:]])
+    moved = header.way(x[:-1], x[1:])
+    farthest = np.sqrt(np.einsum("tij,tij->ti", moved, moved).max(axis=1, initial=0.0))
+    times = np.array([row.time for row in rows])
+    moved -= (0.5 * np.diff(times)).astype(x.dtype)[:, None, None] * (v[:-1] + v[1:])
+    stray = np.sqrt(np.einsum("tij,tij->ti", moved, moved).max(axis=1, initial=0.0))
+    follows &= (farthest > 0) & (farthest < allowed * (1 - ROUNDING))
+    follows &= stray < _outlier_threshold(header.spacing, allowed) * (1 - ROUNDING)
+    ratio = np.divide(farthest, allowed, out=np.zeros(len(allowed)), where=follows)
+    if not part.start:
+        # Nothing is before the first frame.
+        follows, ratio = np.append(False, follows), np.append(0.0, ratio)
+    screened.lowest[part], screened.highest[part] = lowest, highest
+    screened.quiet[part] = quiet & follows
+    screened.ratio[part] = np.where(screened.quiet[part], ratio, 0.0)

@@ -1,4 +1,6 @@
-"""Checks the values of a frame: finite numbers, particles inside the domain, labels, volumes."""
+"""Checks the values of a frame: finite numbers, inside the domain, labels, volumes, distances of neighbours."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,24 +15,37 @@ CRUSHED, BLOWN_UP = 0.1, 10.0
 HELD = 0.01
 LOOK = "Look at this particle, and lower time.safety or refine the domain where it is."
 TOUCHED = "The file was changed after the run; copy it again or run the scene again."
+SOFTER = "Make its material stiffer, the domain finer, or time.safety lower."
+# Distance of neighbours, in cells, above which the grid hardly sees their relative motion; with one particle per cell,
+# which stand a cell apart at rest, that at which they are stretched by SPARSE.
+STRETCHED, SPARSE = 0.9, 1.25
+# Distance, in cells, that a kernel reaches.
+TORN = 1.5
+# Distance at the start, over that of a lattice, up to which two particles count as neighbours; the diagonal is at 1.41.
+NEIGHBOUR = 1.2
 
 
-class StateCheck:
-    """Checks frames in order; quantities that are constant in a run are compared with the first frame."""
+class FrameCheck:
+    """One of the checks that look at the frames of a run in their order."""
 
-    def __init__(self, header: RunHeader, findings: FrameFindings, *, stored: bool = True) -> None:
-        """Begin; `stored` is whether the frames come from a file, which may have been changed."""
-        self._stored = stored
+    def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
         self._header = header
         self._findings = findings
+
+    def _body(self, frame: Frame, p: int) -> str:
+        return self._header.body_name(int(frame.body[p]))
+
+
+class StateCheck(FrameCheck):
+    """Checks values, constant ones against the first frame; `stored` ones are of a file, which may be changed."""
+
+    def __init__(self, header: RunHeader, findings: FrameFindings, *, stored: bool = True) -> None:
+        super().__init__(header, findings)
+        self._stored = stored
         self._first: Frame | None = None
 
     def check(self, number: int, frame: Frame, ids: np.ndarray, count: int) -> np.ndarray | None:
-        """Check a frame, given the ids of its rows and the number of particles that the file lists.
-
-        Returns:
-            Which particles have finite values only, (n,) bool; None if all have.
-        """
+        """Check a frame of `count` listed particles; return which have finite values only, (n,) bool, None if all."""
         n = len(frame.position)
         first = self._first if self._first is not None else frame
         if n != count or (len(first.position) != n and not self._header.drops):
@@ -68,49 +83,38 @@ class StateCheck:
             if array.dtype.kind != "f" or np.isfinite(array).all():
                 continue
             rows = np.isfinite(array).reshape(len(array), -1).all(1)
-            p = int(np.flatnonzero(~rows)[0])
+            p, lost = int(np.flatnonzero(~rows)[0]), len(rows) - int(rows.sum())
             body = self._body(frame, p)
-            lost = counted(len(rows) - int(rows.sum()), "particle")
-            what = f'In frame {number} {name} is not finite at {lost}, the first of them number {p} of body "{body}"'
+            first = f'the first of them number {p} of body "{body}"'
+            what = f"In frame {number} {name} is not finite at {counted(lost, 'particle')}, {first}"
             fix = "Leave out the frames from here on, and run the scene again with a lower time.safety."
-            self._findings.add(
-                "error", "not-finite", number, what, fix, value=len(rows) - int(rows.sum()), body=body, kind=name
-            )
+            self._findings.add("error", "not-finite", number, what, fix, value=lost, body=body, kind=name)
             sound = rows if sound is None else sound & rows
         return sound
 
     def _inside(self, number: int, frame: Frame) -> None:
-        header = self._header
+        header, frame = self._header, frame.of_present
         if header.origin is None or len(frame.position) == 0:
             return
-        frame = frame.of_present
-        if len(frame.position) == 0:
-            return
-        tolerance = np.full(header.dimension, 4 * header.place_error(frame.position.dtype))
-        for axis, is_open in enumerate(header.open_axes):
-            # There they stay until the next sort.
-            tolerance[axis] += 2 * header.spacing * is_open
-        low, high = header.origin - tolerance, header.upper + tolerance
-        # A NaN fails both comparisons and is ignored below; it has its own finding.
+        # At an open face particles stay outside until the next sort.
+        late = 2 * header.spacing * np.array(header.open_axes) if any(header.open_axes) else 0.0
+        tolerance = np.full(header.dimension, 4 * header.place_error(frame.position.dtype)) + late
+        # A NaN fails all comparisons and is ignored below; it has its own finding.
         lowest, highest = extent(frame.position)
-        if (
-            number > 0
-            and not any(header.open_axes)
-            and not ((lowest > header.origin).all() and (highest < header.upper).all())
-        ):
+        strictly = (lowest > header.origin).all() and (highest < header.upper).all()
+        if number > 0 and not any(header.open_axes) and not strictly:
             self._held(number, frame)
-        if (lowest >= low).all() and (highest <= high).all():
+        if (lowest >= header.origin - tolerance).all() and (highest <= header.upper + tolerance).all():
             return
         out = np.fmax(header.origin - frame.position, frame.position - header.upper)
         beyond = np.where(out > tolerance, out, -np.inf).max(1)
         if not np.isfinite(beyond.max()):
             return
-        p, body = int(beyond.argmax()), self._body(frame, int(beyond.argmax()))
+        p = int(beyond.argmax())
+        body = self._body(frame, p)
         outside = counted(int(np.isfinite(beyond).sum()), "particle")
-        what = (
-            f"In frame {number} {outside} out of the domain, the farthest "
-            f'of them, number {p} of body "{body}", by {beyond[p]:.4g} m'
-        )
+        farthest = f'the farthest of them, number {p} of body "{body}", by {beyond[p]:.4g} m'
+        what = f"In frame {number} {outside} out of the domain, {farthest}"
         self._findings.add("error", "escaped", number, what, LOOK, value=float(beyond[p]), body=body)
 
     def _held(self, number: int, frame: Frame) -> None:
@@ -127,35 +131,30 @@ class StateCheck:
             self._findings.add("note", "held-positions", number, what, fix, value=held / len(on_wall))
 
     def _labels(self, number: int, frame: Frame, first: Frame, ids: np.ndarray) -> None:
-        n = len(frame.position)
-        labels = {"id": (ids, np.arange(n)), "body": (frame.body, first.body)}
-        labels["material"] = (frame.material, first.material)
-        for name, (found, expected) in labels.items():
-            if len(found) != len(expected):
+        for name, labels, expected in (
+            ("id", ids, np.arange(len(frame.position))),
+            ("body", frame.body, first.body),
+            ("material", frame.material, first.material),
+        ):
+            if len(labels) != len(expected):
                 continue  # a finding of the count
-            changed = np.flatnonzero(found != expected)
+            changed = np.flatnonzero(labels != expected)
             if len(changed):
                 p = int(changed[0])
-                what = (
-                    f"In frame {number} the {name} of particle {p} is {found[p]} instead of {expected[p]}"
-                    f"{f', and {len(changed) - 1} more differ' if len(changed) > 1 else ''}"
-                )
+                what = f"In frame {number} the {name} of particle {p} is {labels[p]} instead of {expected[p]}"
+                what += f", and {len(changed) - 1} more differ" if len(changed) > 1 else ""
                 self._findings.add("error", "label", number, what, TOUCHED, value=len(changed), kind=name)
-        for name, found, known in (
-            ("body", frame.body, self._header.bodies),
-            ("material", frame.material, self._header.laws),
-        ):
-            if known and not _within(found, len(known)):
-                what = f"In frame {number} a particle has {name} {found.max()}, where there are {len(known)}"
+        known = {"body": self._header.bodies, "material": self._header.laws}
+        for name, labels in (("body", frame.body), ("material", frame.material)):
+            if known[name] and not _within(labels, len(known[name])):
+                what = f"In frame {number} a particle has {name} {labels.max()}, where there are {len(known[name])}"
                 self._findings.add("error", "label", number, what, TOUCHED, kind=f"{name} range")
 
     def _twins(self, number: int, frame: Frame) -> None:
         """Find particles of equal position and velocity, except on walls, where several may coincide."""
         frame = frame.of_present
-        n = len(frame.position)
-        keys = _hashes(frame.position)
-        ordered = np.sort(keys)
-        if n < 2 or not (ordered[1:] == ordered[:-1]).any():
+        hashes = np.sort(_hashes(frame.position))
+        if not (hashes[1:] == hashes[:-1]).any():
             return
         order = np.lexsort((*frame.velocity.T, *frame.position.T))
         same = (frame.position[order[1:]] == frame.position[order[:-1]]).all(1)
@@ -176,11 +175,9 @@ class StateCheck:
             changed = np.flatnonzero(mass != first.fields["mass"])
             if len(changed):
                 p = int(changed[0])
-                body = self._body(frame, p)
-                was = first.fields["mass"][p]
-                what = (
-                    f'In frame {number} particle {p} of body "{body}" weighs {mass[p]:.6g} kg instead of {was:.6g} kg'
-                )
+                body, was = self._body(frame, p), first.fields["mass"][p]
+                weighs = f"weighs {mass[p]:.6g} kg instead of {was:.6g} kg"
+                what = f'In frame {number} particle {p} of body "{body}" {weighs}'
                 self._findings.add("error", "mass", number, what, TOUCHED, float(mass[p]), body, kind="particle")
         densities = np.array(self._header.densities)
         both = {"density", "volume_ratio"} <= frame.fields.keys()
@@ -208,18 +205,13 @@ class StateCheck:
                 p = int(rows[0] if severity == "error" else rows[np.abs(np.log(J[rows])).argmax()])
                 body = self._body(frame, p)
                 what = f'In frame {number} particle {p} of body "{body}" {word}: its J is {J[p]:.4g}'
-                fix = "Make its material stiffer, the domain finer, or time.safety lower."
-                self._findings.add(severity, "volume", number, what, fix, float(J[p]), body, kind=word)
+                self._findings.add(severity, "volume", number, what, SOFTER, float(J[p]), body, kind=word)
 
     def _holds_together(self, frame: Frame) -> np.ndarray:
-        """Return whether the law of each particle is coherent, (n,) bool."""
         coherent = [law.coherent for law in self._header.laws]
         if not _within(frame.material, len(coherent)):
             return np.zeros(len(frame.material), bool)
         return np.array(coherent)[frame.material]
-
-    def _body(self, frame: Frame, p: int) -> str:
-        return self._header.body_name(int(frame.body[p]))
 
 
 def extent(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -233,12 +225,87 @@ def _within(labels: np.ndarray, count: int) -> bool:
 
 
 def _hashes(position: np.ndarray) -> np.ndarray:
-    """Return a hash of each row, (n,) uint64."""
-    # Adding 0.0 turns -0.0 into 0.0.
-    columns = [np.ascontiguousarray(column + 0.0).view(f"u{column.itemsize}") for column in position.T]
-    result = np.zeros(len(position), np.uint64)
-    for column in columns:
-        result ^= column.astype(np.uint64)
-        result *= np.uint64(0x9E3779B97F4A7C15)
-        result ^= result >> np.uint64(29)
-    return result
+    hashes = np.zeros(len(position), np.uint64)
+    for column in position.T:
+        # Adding 0.0 turns -0.0 into 0.0.
+        hashes ^= np.ascontiguousarray(column + 0.0).view(f"u{column.itemsize}").astype(np.uint64)
+        hashes *= np.uint64(0x9E3779B97F4A7C15)
+        hashes ^= hashes >> np.uint64(29)
+    return hashes
+
+
+@dataclass(frozen=True)
+class _Neighbours:
+    """Pairs of particles of a body, by their rows, (k,) each, and the distance in cells that they may have."""
+
+    body: int
+    first: np.ndarray
+    second: np.ndarray
+    allowed: float
+
+
+class StretchCheck(FrameCheck):
+    """Follows neighbours in elastic bodies, which the grid must see; `largest` distance in cells, None without any."""
+
+    def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
+        super().__init__(header, findings)
+        self._pairs: list[_Neighbours] | None = None
+        self.largest: float | None = None
+
+    def check(self, number: int, frame: Frame) -> None:
+        """Check a frame of finite values."""
+        h = self._header.spacing
+        if self._pairs is None:
+            self._pairs = [] if h is None else self._neighbours(frame, h)
+            self._count = len(frame.position)
+        if len(frame.position) != self._count:
+            return
+        for pair in self._pairs:
+            apart = frame.position[pair.second] - frame.position[pair.first]
+            squares = np.einsum("ij,ij->i", apart, apart)
+            cells = float(np.sqrt(float(squares.max()))) / h
+            self.largest = max(self.largest or 0.0, cells)
+            if cells > pair.allowed:
+                self._tell(number, pair, cells, int((squares > (pair.allowed * h) ** 2).sum()))
+
+    def _tell(self, number: int, pair: _Neighbours, cells: float, count: int) -> None:
+        body, d = self._header.bodies[pair.body], self._header.dimension
+        enough = int(np.ceil(body.particles_per_cell ** (1 / d) * cells / STRETCHED)) ** d
+        pairs = f'{count} pairs of neighbours of body "{body.name}"'
+        what = f"In frame {number} {pairs} stand up to {cells:.3g} cells apart"
+        if cells > TORN:
+            severity = "warning"
+            what += f", farther than {TORN:g}, which a kernel reaches: it has torn, which its material cannot"
+        else:
+            severity = "note"
+            what += f", above {pair.allowed:.3g}: the grid hardly sees what moves between them, noise grows, "
+            what += "and gaps open"
+        fix = f"Set particles_per_cell = {enough}, or stretch it less."
+        self._findings.add(severity, "stretch", number, what, fix, cells, body.name, kind=body.name)
+
+    def _neighbours(self, frame: Frame, h: float) -> list[_Neighbours]:
+        """Return pairs along axes of a lattice in each elastic body; on the grid of rest none matter."""
+        pairs = []
+        for label, body in enumerate(() if self._header.total else self._header.bodies):
+            rows = np.flatnonzero(frame.body == label)
+            if len(rows) < 2 or not self._elastic(int(frame.material[rows[0]])):
+                continue
+            x = frame.position[rows].astype(np.float64)
+            distance = h * body.particles_per_cell ** (-1 / self._header.dimension)
+            places = np.round((x - x.min(0)) / distance)
+            ends = []
+            for axis in range(x.shape[1]):
+                order = np.lexsort((x[:, axis], *np.delete(places, axis, axis=1).T))
+                apart = np.linalg.norm(np.diff(x[order], axis=0), axis=1)
+                near = apart <= NEIGHBOUR * distance
+                ends.append(np.stack([order[:-1][near], order[1:][near]]))
+            first, second = rows[np.concatenate(ends, axis=1)]
+            if len(first):
+                pairs.append(_Neighbours(label, first, second, max(STRETCHED, SPARSE * distance / h)))
+        return pairs
+
+    def _elastic(self, material: int) -> bool:
+        if not 0 <= material < len(self._header.laws):
+            return False
+        law = self._header.laws[material]
+        return law.deformation == "F" and law.coherent and not law.projects

@@ -6,21 +6,17 @@ from pathlib import Path
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import SEVERITIES, Finding, gravest_first, passes
-from mpmcli.check.forecast import Forecast, forecast_of
-from mpmcli.check.loss_rules import loss_findings
+from mpmcli.check.forecast import Forecast, forecast_of, output_findings
 from mpmcli.check.material_rules import material_findings
-from mpmcli.check.output_rules import output_findings
 from mpmcli.check.probe import Probe
-from mpmcli.check.rounding_rules import rounding_findings
-from mpmcli.check.scene_limits import SceneLimit
 from mpmcli.check.shape_rules import shape_findings
-from mpmcli.check.step_rules import step_findings
+from mpmcli.check.step_rules import loss_findings, rounding_findings, step_findings
 from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.plain_text import counted, size_text, text_table
 from mpmcli.scene import LoadedScene
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.plan import Plan, make_plan
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.machine.plan import Plan, make_plan
 
 # A scene of more steps is rejected; the counts of a forecast are exact below 2^53.
 MOST_STEPS = 1e15
@@ -32,31 +28,13 @@ MOST_ALIKE = 5
 
 @dataclass(frozen=True)
 class SceneCheck:
-    """Result of the check of a scene.
+    """Result of the check of a scene: its facts with bounds on the step, findings by severity, plan, and forecast."""
 
-    Attributes:
-        source: file of the scene.
-        title: title of the scene.
-        limits: all bounds on the step, in the order of the bodies, those of motion last.
-        binding, binding_at_start: smallest bound in any state, and at the start.
-        step, step_at_start: safety times these, s.
-        findings: by decreasing severity.
-        plan: fields and passes.
-        forecast: steps, time, memory and disk space.
-        notes: values chosen for "auto" when the scene was loaded.
-    """
-
-    source: str
-    title: str
-    limits: tuple[SceneLimit, ...]
-    binding: SceneLimit
-    binding_at_start: SceneLimit
-    step: float
-    step_at_start: float
+    loaded: LoadedScene
+    facts: SceneFacts
     findings: tuple[Finding, ...]
     plan: Plan
     forecast: Forecast
-    notes: tuple[str, ...]
 
     def passes(self, *, strict: bool = False) -> bool:
         """Return whether there is no error; with `strict` no warning either."""
@@ -64,40 +42,45 @@ class SceneCheck:
 
     def text(self) -> str:
         """Return the check as text: limits, findings, plan, forecast, and the outcome."""
-        return scene_text(self)
+        counts = Counter(finding.severity for finding in self.findings)
+        counted_findings = [counted(counts[word], word) for word in SEVERITIES if counts[word]]
+        parts = [
+            "\n".join(filter(None, [self.loaded.scene.title, *self.loaded.notes])),
+            _limits_text(self.facts),
+            _steps_text(self.facts),
+            _findings_text(self.findings),
+            _plan_text(self.plan),
+            _forecast_text(self.forecast),
+            f"{'ok' if self.passes() else 'not ok'}: {', '.join(counted_findings) or 'nothing found'}",
+        ]
+        return "\n\n".join(part for part in parts if part)
 
     def as_dict(self) -> dict:
         """Return the check as a dictionary for JSON; `ok` is whether it passes."""
+        facts, (always, at_start) = self.facts, (self.facts.binding, self.facts.binding_at_start)
         return {
             "ok": self.passes(),
-            "scene": self.source,
-            "title": self.title,
-            "step": self.step,
-            "step_at_start": self.step_at_start,
+            "scene": self.loaded.source,
+            "title": self.loaded.scene.title,
+            "step": facts.step,
+            "step_at_start": facts.step_at_start,
             "limits": [
-                {**limit.as_dict(), "binds": limit is self.binding, "binds_at_start": limit is self.binding_at_start}
-                for limit in self.limits
+                {**limit.as_dict(), "binds": limit is always, "binds_at_start": limit is at_start}
+                for limit in facts.limits
             ],
             "findings": [finding.as_dict() for finding in self.findings],
             "plan": {**self.plan.as_dict(), "bytes_per_particle": self.plan.bytes_per_particle},
             "forecast": self.forecast.as_dict(),
-            "notes": list(self.notes),
+            "notes": list(self.loaded.notes),
         }
 
 
 def check_scene(
     loaded: LoadedScene, *, plan: Plan | None = None, probe: Probe | None = None, directory: Path = Path()
 ) -> SceneCheck:
-    """Check a scene; Taichi is not started and nothing is written.
+    """Check a scene, without Taichi; the plan is by default for all cores, the probe measures the cost of a step.
 
-    Args:
-        plan: plan of the run or of the probe; None for a run on all cores of the CPU.
-        probe: measured cost of a step, for the forecast of time.
-        directory: where results would be written, for the free space of its disk.
-
-    Raises:
-        InputError: no step is stable, for example because gravity is infinite at some time, or more than MOST_STEPS are
-            needed.
+    `directory` is where results would go. InputError: no step is stable, or more than MOST_STEPS are needed.
     """
     scene = loaded.scene
     facts = SceneFacts(scene)
@@ -110,97 +93,50 @@ def check_scene(
     if plan is None:
         plan = make_plan(scene, Backend("cpu", available_cores(), scene.solver.precision, compile_cache=True))
     forecast = forecast_of(facts, plan, probe)
-    findings = [
-        *step_findings(facts),
-        *shape_findings(facts),
-        *material_findings(facts),
-        *loss_findings(facts),
-        *rounding_findings(facts),
-        *output_findings(facts, plan, forecast, directory),
-    ]
+    rules = (step_findings, shape_findings, material_findings, loss_findings, rounding_findings)
+    findings = [finding for rule in rules for finding in rule(facts)]
+    findings += output_findings(facts, plan, forecast, directory)
     if probe is not None and probe.failure:
-        findings.append(
-            Finding(
-                "error",
-                "probe",
-                f"The run became unstable within {probe.steps} steps of the probe: {probe.failure.rstrip('.')}.",
-                "Use slower bodies, a stiffer material, or a lower time.safety.",
-                probe.steps,
-            )
-        )
-    return SceneCheck(
-        source=loaded.source,
-        title=scene.title,
-        limits=facts.limits,
-        binding=facts.binding,
-        binding_at_start=facts.binding_at_start,
-        step=facts.step,
-        step_at_start=facts.step_at_start,
-        findings=gravest_first(findings),
-        plan=plan,
-        forecast=forecast,
-        notes=loaded.notes,
-    )
+        unstable = f"The run became unstable within {probe.steps} steps of the probe"
+        what = f"{unstable}: {probe.failure.rstrip('.')}."
+        fix = "Use slower bodies, a stiffer material, or a lower time.safety."
+        findings.append(Finding("error", "probe", what, fix, probe.steps))
+    return SceneCheck(loaded, facts, gravest_first(findings), plan, forecast)
 
 
-def scene_text(check: SceneCheck) -> str:
-    """Return the limits, the findings, the plan and the forecast, and a last line with the outcome."""
-    parts = [
-        "\n".join(filter(None, [check.title, *check.notes])),
-        _limits(check),
-        _steps(check),
-        _findings(check),
-        _plan(check),
-        _forecast(check),
-        _outcome(check),
-    ]
-    return "\n\n".join(part for part in parts if part)
-
-
-def _limits(check: SceneCheck) -> str:
+def _limits_text(facts: SceneFacts) -> str:
     """Return one row for each bound, in the order of the scene; one row only if the stiffest state has the same."""
-    shown, left_out = _rows(check)
-    table = text_table(
-        ("body", "limit", "state", "largest step", ""),
-        [
-            (limit.body or "any", limit.name, limit.meaning, f"{limit.value:.4g} s", _mark(check, limit))
-            for limit in shown
-        ],
-        left={0, 1, 2, 4},
-    )
-    more = f"\nand {left_out} that bind less" if left_out else ""
-    return table + more
-
-
-def _rows(check: SceneCheck) -> tuple[list[SceneLimit], int]:
-    at_rest = {(limit.name, limit.body): limit.value for limit in check.limits if limit.state == "rest"}
+    at_rest = {(limit.name, limit.body): limit.value for limit in facts.limits if limit.state == "rest"}
     told = [
         limit
-        for limit in check.limits
-        if limit.state == "rest" or limit.value != at_rest.get((limit.name, limit.body)) or limit is check.binding
+        for limit in facts.limits
+        if limit.state == "rest" or limit.value != at_rest.get((limit.name, limit.body)) or limit is facts.binding
     ]
     nearest = sorted(told, key=lambda limit: limit.value)[:MOST_ROWS]
-    return [limit for limit in told if limit in nearest], len(told) - len(nearest)
+    rows = []
+    for limit in told:
+        if limit in nearest:
+            marks = {"binds at the start": facts.binding_at_start, "binds throughout": facts.binding}
+            said = [word for word, binding in marks.items() if binding is limit]
+            mark = "binds" if len(said) == 2 else " ".join(said)
+            rows.append((limit.body or "any", limit.name, limit.meaning, f"{limit.value:.4g} s", mark))
+    table = text_table(("body", "limit", "state", "largest step", ""), rows, left={0, 1, 2, 4})
+    left_out = len(told) - len(nearest)
+    return table + (f"\nand {left_out} that bind less" if left_out else "")
 
 
-def _mark(check: SceneCheck, limit: SceneLimit) -> str:
-    marks = [(check.binding_at_start, "binds at the start"), (check.binding, "binds throughout")]
-    said = [word for binding, word in marks if binding is limit]
-    return "binds" if len(said) == 2 else " ".join(said)
-
-
-def _steps(check: SceneCheck) -> str:
-    first, later = check.binding_at_start, check.binding
-    lines = [f"Step that is safe throughout: {check.step:.4g} s. {later.why} {later.fix}"]
+def _steps_text(facts: SceneFacts) -> str:
+    first, later = facts.binding_at_start, facts.binding
+    lines = [f"Step that is safe throughout: {facts.step:.4g} s. {later.why} {later.fix}"]
     if first is not later:
-        lines.append(f"Step at the start: {check.step_at_start:.4g} s. {first.why} {first.fix}")
+        lines.append(f"Step at the start: {facts.step_at_start:.4g} s. {first.why} {first.fix}")
     return "\n".join(lines)
 
 
-def _findings(check: SceneCheck) -> str:
+def _findings_text(findings: tuple[Finding, ...]) -> str:
     """Return one line for each finding, and of each rule the first MOST_ALIKE only."""
     lines, told = [], Counter[str]()
-    for finding in check.findings:
+    for finding in findings:
         told[finding.rule] += 1
         if told[finding.rule] <= MOST_ALIKE:
             lines.append(finding.line)
@@ -208,8 +144,7 @@ def _findings(check: SceneCheck) -> str:
     return "\n".join([*lines, *([f"and {', '.join(more)}"] if more else [])])
 
 
-def _plan(check: SceneCheck) -> str:
-    plan = check.plan
+def _plan_text(plan: Plan) -> str:
     lines = [
         f"{law.law}: {law.particles:,} particles of {sum(law.fields.values()) + plan.scratch_bytes} bytes "
         f"({', '.join(law.fields)}, and {plan.scratch_bytes} bytes for the sort)"
@@ -221,13 +156,12 @@ def _plan(check: SceneCheck) -> str:
     return "\n".join(lines)
 
 
-def _forecast(check: SceneCheck) -> str:
-    forecast = check.forecast
+def _forecast_text(forecast: Forecast) -> str:
     low, high = sorted(forecast.steps_range)
     steps = f"{forecast.steps:,} steps" + (f" ({low:,} to {high:,})" if low != high else "")
     took = ""
     if forecast.seconds is not None:
-        took = f", {_time(forecast.seconds)} here, {forecast.compile_seconds:.2g} s of it compilation"
+        took = f", {_time_text(forecast.seconds)} here, {forecast.compile_seconds:.2g} s of it compilation"
     return (
         f"{steps}, {forecast.frames:,} frames{took}\n"
         f"{size_text(forecast.device_bytes)} on the device, {size_text(forecast.host_bytes)} for frames beside it, "
@@ -236,13 +170,7 @@ def _forecast(check: SceneCheck) -> str:
     )
 
 
-def _outcome(check: SceneCheck) -> str:
-    counts = Counter(finding.severity for finding in check.findings)
-    found = [counted(counts[word], word) for word in SEVERITIES if counts[word]]
-    return ("ok" if check.passes() else "not ok") + (f": {', '.join(found)}" if found else ": nothing found")
-
-
-def _time(seconds: float) -> str:
+def _time_text(seconds: float) -> str:
     if seconds < 120:
         return f"about {seconds:.2g} s"
     return f"about {seconds / 60:.2g} min" if seconds < 7200 else f"about {seconds / 3600:.2g} h"

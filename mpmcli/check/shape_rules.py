@@ -5,13 +5,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mpmcli.check.distance import close_pairs
 from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
-from mpmcli.check.result_stretch import STRETCHED, TORN
+from mpmcli.check.geometry import close_pairs
+from mpmcli.check.result_state import STRETCHED, TORN
 from mpmcli.scene.bounds import body_points
-from mpmcli.scene.initial import initial_deformation, initial_motion, moves_unevenly
 from mpmcli.scene.quantity import AXES
+from mpmcli.scene.sampling import initial_deformation, initial_motion, moves_unevenly
 
 # Cells across a body below which internal motion is not resolved. The stencil is three nodes wide, so that with three
 # cells one row of particles is not affected by the surface (docs/hard-cases.md, H12).
@@ -29,11 +29,8 @@ FEWEST_PER_AXIS, MOST_PER_AXIS = 2, 4
 
 def shape_findings(facts: SceneFacts) -> Iterator[Finding]:
     """Yield the findings on shapes and their particles."""
-    yield from _thin(facts)
-    yield from _gaps(facts)
-    yield from _walls(facts)
-    yield from _particles(facts)
-    yield from _stretched(facts)
+    for rule in (_thin, _gaps, _walls, _particles, _stretched):
+        yield from rule(facts)
 
 
 def _thin(facts: SceneFacts) -> Iterator[Finding]:
@@ -43,15 +40,12 @@ def _thin(facts: SceneFacts) -> Iterator[Finding]:
         # The tolerance allows for rounding of the corners.
         if cells < FEWEST_CELLS * (1 - 1e-6):
             lost = "at best its motion as a whole is correct" if cells < 1 else "it is too stiff in bending and waves"
-            yield Finding(
-                "warning",
-                "thin-body",
+            what = (
                 f'Body "{body.name}" is {cells:.3g} cells thick at its thinnest, and fewer than {FEWEST_CELLS:g} do '
-                f"not resolve it: {lost}.",
-                f"Make it {FEWEST_CELLS * h:.3g} m thick, or domain.spacing {body.thickness / FEWEST_CELLS:.3g} m.",
-                cells,
-                body.name,
+                f"not resolve it: {lost}."
             )
+            fix = f"Make it {FEWEST_CELLS * h:.3g} m thick, or domain.spacing {body.thickness / FEWEST_CELLS:.3g} m."
+            yield Finding("warning", "thin-body", what, fix, cells, body.name)
 
 
 def _gaps(facts: SceneFacts) -> Iterator[Finding]:
@@ -65,15 +59,12 @@ def _gaps(facts: SceneFacts) -> Iterator[Finding]:
         first, second = bodies[i], bodies[j]
         # Bodies with equal velocity would come to rest in contact; those that pass each other are dragged along.
         passing = not np.array_equal(first.velocity, second.velocity)
-        yield Finding(
-            "warning" if passing else "note",
-            "gap",
+        what = (
             f'Bodies "{first.name}" and "{second.name}" are {cells:.2g} cells apart and already act on each other, as '
-            f"the grid couples particles closer than {reach:g} cells.",
-            f"Set them {reach * h:.3g} m apart, or make the spacing {distance / reach:.3g} m, to keep them apart.",
-            cells,
-            first.name,
+            f"the grid couples particles closer than {reach:g} cells."
         )
+        fix = f"Set them {reach * h:.3g} m apart, or make the spacing {distance / reach:.3g} m, to keep them apart."
+        yield Finding("warning" if passing else "note", "gap", what, fix, cells, first.name)
 
 
 def _walls(facts: SceneFacts) -> Iterator[Finding]:
@@ -82,22 +73,13 @@ def _walls(facts: SceneFacts) -> Iterator[Finding]:
     for body in facts.bodies:
         lower, upper = body.body.shape.form.bounds()
         for a, axis in enumerate(AXES[: facts.scene.dimension]):
-            if domain.periodic[a]:
-                continue
-            for face, gap in (
-                (f"{axis}_min", lower[a] - domain.origin[a]),
-                (f"{axis}_max", domain.upper[a] - upper[a]),
-            ):
-                cells = gap / h
-                if 1e-3 < cells < WALL_REACH * (1 - 1e-6):
-                    yield Finding(
-                        "note",
-                        "wall-margin",
-                        f'Body "{body.name}" begins {cells:.2g} cells from the wall {face}, which already acts on it.',
-                        f"Let it touch the wall, or set it {WALL_REACH * h:.3g} m or more from it.",
-                        float(cells),
-                        body.name,
-                    )
+            gaps = {f"{axis}_min": lower[a] - domain.origin[a], f"{axis}_max": domain.upper[a] - upper[a]}
+            for face, gap in gaps.items():
+                if not domain.periodic[a] and 1e-3 < gap / h < WALL_REACH * (1 - 1e-6):
+                    begins = f'Body "{body.name}" begins {gap / h:.2g} cells from the wall {face}'
+                    what = f"{begins}, which already acts on it."
+                    fix = f"Let it touch the wall, or set it {WALL_REACH * h:.3g} m or more from it."
+                    yield Finding("note", "wall-margin", what, fix, float(gap / h), body.name)
 
 
 def _particles(facts: SceneFacts) -> Iterator[Finding]:
@@ -105,32 +87,21 @@ def _particles(facts: SceneFacts) -> Iterator[Finding]:
     fewest, most = FEWEST_PER_AXIS**d, MOST_PER_AXIS**d
     for body in facts.bodies:
         count = body.body.particles_per_cell
+        has = f'Body "{body.name}" has {"one particle" if count == 1 else f"{count} particles"} per cell'
         if count < fewest:
-            what = (
-                f'Body "{body.name}" has one particle per cell: stretched by half it tears, and its volume and '
-                "pressure depend on where its particles lie in their cells."
-                if count == 1
-                else f'Body "{body.name}" has {count} particles per cell: under large stretch gaps open between them, '
-                "and it tears where the material would not."
-            )
-            yield Finding(
-                "warning",
-                "particles-per-cell",
-                what,
-                f"Set particles_per_cell = {fewest} or more.",
-                count,
-                body.name,
-            )
+            lost = "under large stretch gaps open between them, and it tears where the material would not."
+            if count == 1:
+                lost = "stretched by half it tears, and its volume and pressure depend on where its particles lie in "
+                lost += "their cells."
+            fix = f"Set particles_per_cell = {fewest} or more."
+            yield Finding("warning", "particles-per-cell", f"{has}: {lost}", fix, count, body.name)
         elif count > most:
-            yield Finding(
-                "note",
-                "particles-per-cell",
-                f'Body "{body.name}" has {count} particles per cell, which cost {count / fewest:.3g} times the usual '
-                f"{fewest}; the resolution is that of the grid, not of the particles.",
-                f"Set particles_per_cell = {most} or fewer, and spend the time on a finer grid.",
-                count,
-                body.name,
+            what = (
+                f"{has}, which cost {count / fewest:.3g} times the usual {fewest}; the resolution is that of the grid, "
+                "not of the particles."
             )
+            fix = f"Set particles_per_cell = {most} or fewer, and spend the time on a finer grid."
+            yield Finding("note", "particles-per-cell", what, fix, count, body.name)
 
 
 def _stretched(facts: SceneFacts) -> Iterator[Finding]:
@@ -141,23 +112,19 @@ def _stretched(facts: SceneFacts) -> Iterator[Finding]:
     for body in facts.bodies:
         if not body.law.coherent or body.law.projects or body.law.deformation == "J":
             continue
-        count = body.body.particles_per_cell
         stretch = _stretch_to_come(facts, body)
-        cells = stretch * count ** (-1 / d)
+        cells = stretch * body.body.particles_per_cell ** (-1 / d)
         # Of one particle per cell there is a finding anyway.
         if not STRETCHED < cells < math.inf or stretch * STRETCHED <= 1:
             continue
-        more = f"Set particles_per_cell = {math.ceil(stretch / STRETCHED) ** d}, or start" if stretch < 10 else "Start"
-        yield Finding(
-            "warning" if cells > TORN else "note",
-            "stretch",
+        what = (
             f'The start of body "{body.name}" stretches it by about {stretch:.3g}, so that its particles come to stand '
             f"{cells:.3g} cells apart: above {STRETCHED:g} the grid hardly sees what moves between them, noise grows, "
-            f"and above {TORN:g} it tears.",
-            f"{more} it slower or less deformed.",
-            cells,
-            body.name,
+            f"and above {TORN:g} it tears."
         )
+        more = f"Set particles_per_cell = {math.ceil(stretch / STRETCHED) ** d}, or start" if stretch < 10 else "Start"
+        fix = f"{more} it slower or less deformed."
+        yield Finding("warning" if cells > TORN else "note", "stretch", what, fix, cells, body.name)
 
 
 def _stretch_to_come(facts: SceneFacts, body: BodyFacts) -> float:

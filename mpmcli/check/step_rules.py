@@ -1,11 +1,18 @@
-"""Rules on the time step of a scene."""
+"""Rules on the time step, on what the transfers take in each step, and on single precision."""
 
 import math
 from collections.abc import Iterator
 
-from mpmcli.check.facts import SceneFacts
+import numpy as np
+
+from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
-from mpmcli.stability.transfer_factors import step_inertia
+from mpmcli.check.forecast import expected_steps, steps_at, wave_loss
+from mpmcli.check.geometry import spanned_axes, touched_walls
+from mpmcli.scene.bounds import highest_speed
+from mpmcli.scene.schema import USUAL_FLIP, SolverSettings, Time
+from mpmcli.scene.shapes import Ball, Box, Form, Points
+from mpmcli.stability.transfer_factors import impact_loss, loss_per_step, step_inertia
 
 # Ratio to the stable step below which a step is reported: four times the cost and loss of energy (docs/hard-cases.md,
 # H19).
@@ -19,68 +26,224 @@ CONSEQUENCE = {
     "deformation": "particles are inverted",
     "collider": "colliders pass the material by",
 }
+# Share of energy that a wave loses in the run, and that viscosity takes, above which they matter.
+NOTED_LOSS = 0.1
+# Share of the viscosity asked, or of the energy of an impact, above which the scheme's own loss is noted.
+NOTED_SHARE = 0.02
+# Largest relative rounding error of a number of 32 bits.
+HALF_ULP = 2.0**-24
+# Rounding of a position in a frame over the way of its body in the run. A step loses nothing: particles carry what
+# rounding takes from their positions (docs/theory.md, 8.3).
+LOST_MOTION = 0.1
+# Ratio of the stress from rounding of F to the stress from gravity or speed (docs/hard-cases.md, H9).
+STRESS_NOISE = 0.01
 
 
 def step_findings(facts: SceneFacts) -> Iterator[Finding]:
     """Yield the findings on time.step."""
-    step = facts.scene.time.step
-    if step != "auto":
-        yield from _asked(facts, step)
-
-
-def _asked(facts: SceneFacts, step: float) -> Iterator[Finding]:
-    rest, throughout = facts.binding_at_start, facts.binding
-    safety = facts.scene.time.safety
-    whose = f' of body "{rest.body}"' if rest.body else ""
+    step, safety = facts.scene.time.step, facts.scene.time.safety
+    if step == "auto":
+        return
+    start, throughout = facts.binding_at_start, facts.binding
+    asked = f"A time.step of {step:.4g} s is"
     fix = f'Set time.step to {facts.step:.4g} s or less, or to "auto".'
-    if step > rest.value:
-        yield Finding(
-            "error",
-            "step-above-limit",
-            f"A time.step of {step:.4g} s is above {rest.value:.4g} s, the {rest.name} limit{whose} at the start"
-            f"{_courant(facts, step)}: {CONSEQUENCE[rest.name]}.",
-            fix,
-            step / rest.value,
-            rest.body,
+    if step > start.value:
+        courant = ""
+        if start.name == "wave":
+            # c dt / h, c = sqrt(S / (d density)).
+            most = math.sqrt(step_inertia(facts.scene.solver) / facts.scene.dimension)
+            courant = f" (Courant number c dt / h = {most * step / start.value:.3f}, the limit is {most:.3f})"
+        whose = f' of body "{start.body}"' if start.body else ""
+        limit = f"{start.value:.4g} s, the {start.name} limit{whose} at the start{courant}"
+        what = f"{asked} above {limit}: {CONSEQUENCE[start.name]}."
+        yield Finding("error", "step-above-limit", what, fix, step / start.value, start.body)
+        return
+    for limit, state in ((start, ""), (throughout, f" that the scene can reach ({throughout.meaning})")):
+        if step > safety * limit.value:
+            whose = f' of body "{limit.body}"' if limit.body else ""
+            what = (
+                f"{asked} above {safety * limit.value:.4g} s, which time.safety = {safety:g} leaves of the "
+                f"{limit.name} limit{whose}{state}: the run will take smaller steps than asked."
+            )
+            yield Finding("warning", "step-above-safety", what, fix, step / limit.value, limit.body)
+            return
+    if step < SMALL_STEP * facts.step:
+        what = (
+            f"{asked} {facts.step / step:.3g} times smaller than the stable step, {facts.step:.4g} s: the run takes as "
+            f"many times longer and loses as many times the energy, as {facts.scene.solver.transfer.upper()} damps per "
+            "step."
         )
-    elif step > safety * rest.value:
-        yield Finding(
-            "warning",
-            "step-above-safety",
-            f"A time.step of {step:.4g} s is above {safety * rest.value:.4g} s, which time.safety = {safety:g} leaves "
-            f"of the {rest.name} limit{whose}: the run will take smaller steps than asked.",
-            fix,
-            step / rest.value,
-            rest.body,
-        )
-    elif step > safety * throughout.value:
-        where = f' of body "{throughout.body}"' if throughout.body else ""
-        yield Finding(
-            "warning",
-            "step-above-safety",
-            f"A time.step of {step:.4g} s is above {safety * throughout.value:.4g} s, which time.safety = {safety:g} "
-            f"leaves of the {throughout.name} limit{where} that the scene can reach ({throughout.meaning}): the run "
-            "will take smaller steps than asked.",
-            fix,
-            step / throughout.value,
-            throughout.body,
-        )
-    elif step < SMALL_STEP * facts.step:
-        yield Finding(
-            "warning",
-            "small-step",
-            f"A time.step of {step:.4g} s is {facts.step / step:.3g} times smaller than the stable step, "
-            f"{facts.step:.4g} s: the run takes as many times longer and "
-            f"loses as many times the energy, as {facts.scene.solver.transfer.upper()} damps per step.",
-            f'Set time.step to {facts.step:.4g} s, or to "auto".',
-            step / facts.step,
-        )
+        fix = f'Set time.step to {facts.step:.4g} s, or to "auto".'
+        yield Finding("warning", "small-step", what, fix, step / facts.step)
 
 
-def _courant(facts: SceneFacts, step: float) -> str:
-    """Return the Courant number c dt / h, c = sqrt(S / (d density)), in brackets if a wave limit binds, else ""."""
-    rest = facts.binding_at_start
-    if rest.name != "wave":
-        return ""
-    limit = math.sqrt(step_inertia(facts.scene.solver) / facts.scene.dimension)
-    return f" (Courant number c dt / h = {limit * step / rest.value:.3f}, the limit is {limit:.3f})"
+def loss_findings(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield the findings on the loss by the transfers: energy of waves and of impacts, and viscosity that is added."""
+    for body in facts.bodies:
+        # No wave across less than a cell is on the grid.
+        resolved = body.thickness >= facts.scene.domain.spacing
+        added = list(_viscosity(facts, body)) if resolved else []
+        yield from added or _dissipation(facts, body)
+        # What flows loses its energy anyway, and what it hits may be carried along. Known for the grid on which bodies
+        # move: on that of their state at rest they lose a third of it.
+        if resolved and not facts.flowing and facts.scene.solver.solids == "updated":
+            yield from _impact(facts, body)
+
+
+def _dissipation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
+    """Yield the loss of a wave in the run, unless plastic flow or viscosity of the body dissipates more."""
+    step = facts.taken(facts.step_at_start)
+    h, end = facts.scene.domain.spacing, facts.scene.time.end
+    # The loss per step is of order (k h)^4, with PIC (k h)^2, in twice as many steps.
+    part = "a half" if facts.scene.solver.transfer == "pic" else "an eighth"
+    rate = wave_loss(body.thickness, h, step, facts.scene.solver)
+    lost = -math.expm1(-rate * end)
+    if lost < NOTED_LOSS or body.own_loss > rate:
+        return
+    what = (
+        f"At a step of {step:.3g} s the transfers take {100 * -math.expm1(-rate):.2g} % of the energy of a wave across "
+        f'body "{body.name}", {body.thickness / h:.3g} cells thick, in a second, and {100 * lost:.2g} % in the run.'
+    )
+    fix = f"The largest stable step, {facts.step_at_start:.3g} s, loses least; half the spacing loses {part}."
+    yield Finding("note", "dissipation", what, fix, rate, body.name)
+
+
+def _viscosity(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
+    """Yield the viscosity that the transfers add to that of a fluid, where the latter matters within the run."""
+    scene = facts.scene
+    viscosity = getattr(body.body.material, "viscosity", 0.0)
+    if body.law.deformation != "J" or not isinstance(viscosity, int | float) or viscosity == 0:
+        return
+    width = flow_width(facts, body)
+    k, own = math.pi / width, viscosity / body.body.material.density
+    if facts.bounds.speed == 0 or -math.expm1(-2 * own * k * k * scene.time.end) < NOTED_LOSS:
+        return
+    step = scene.time.end / expected_steps(facts)
+
+    def share(settings: SolverSettings, spacing: float, step: float) -> float:
+        """nu_num / nu: a wave of a free transfer loses its amplitude as an elastic one its energy."""
+        return loss_per_step(settings, k * spacing) / (step * (own * k * k))
+
+    h = scene.domain.spacing
+    added = share(scene.solver, h, step)
+    if not added >= NOTED_SHARE:
+        return
+    # With half the spacing waves allow half the step, viscosity a quarter.
+    finer = share(scene.solver, h / 2, step / (4 if facts.binding.name == "viscosity" else 2))
+    what = (
+        f'On a flow across body "{body.name}", half a wave of {width / h:.3g} cells, the transfers act as '
+        f"{_percent(added)} of its viscosity in addition, at steps of {step:.3g} s: driven, it is "
+        f"{_percent(added / (1 + added))} too slow."
+    )
+    fix = _cure(facts, finer, share(_aflip(scene.solver), h, step))
+    yield Finding("note", "numerical-viscosity", what, fix, added, body.name)
+
+
+def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
+    scene, velocity = facts.scene, np.array(body.arrival.impact)
+    speed = float(np.linalg.norm(velocity))
+    # A body whose stiffness vanishes has no waves.
+    if speed == 0 or body.stiffness == 0:
+        return
+    waves = math.sqrt(body.stiffness / body.body.material.density)
+    h, mach = scene.domain.spacing, speed / waves
+    courant = waves * scene.time.end / steps_at(facts, facts.step_expected) / h
+    if not (courant > 0 and math.isfinite(speed)):
+        return
+    length, share = chord(body.body.shape.form, velocity / speed), _flat_share(body.body.shape.form, h, mach)
+
+    def lost(settings: SolverSettings, spacing: float) -> float:
+        # Waves cross as many cells in a step with any spacing.
+        return share * impact_loss(settings, length / spacing, mach, courant)
+
+    now = lost(scene.solver, h)
+    if not now >= NOTED_SHARE:
+        return
+    what = (
+        f'In its impact at {speed:.3g} m/s, {mach:.2g} of its wave speed, body "{body.name}", {length / h:.3g} cells '
+        f"long, loses about {_percent(now)} of the energy to the transfers, at steps of {courant * h / waves:.3g} s."
+    )
+    fix = _cure(facts, lost(scene.solver, h / 2), lost(_aflip(scene.solver), h))
+    yield Finding("note", "impact-loss", what, fix, now, body.name)
+
+
+def _cure(facts: SceneFacts, finer: float, aflip: float) -> str:
+    """Return what lowers a loss, given what half the spacing and AFLIP leave of it."""
+    ways = [f"Half the spacing leaves {_percent(finer)}"]
+    if facts.scene.solver.transfer != "aflip":
+        ways.append(f'solver.transfer = "aflip" {_percent(aflip)}')
+    time, usual = facts.scene.time, Time.model_fields["safety"].default
+    if time.step != "auto" and time.step < facts.step_expected:
+        ways.append('time.step = "auto" less, as the loss is per step')
+    elif time.safety < usual:
+        ways.append(f"time.safety = {usual:g} about {time.safety / usual:.2g} of it, as the loss is per step")
+    return ", ".join(ways) + "."
+
+
+def _aflip(settings: SolverSettings) -> SolverSettings:
+    return settings.model_copy(update={"transfer": "aflip", "flip": settings.flip or USUAL_FLIP})
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 1 else f"{100 * share:.0f} %"
+
+
+def flow_width(facts: SceneFacts, body: BodyFacts) -> float:
+    """Return half the longest wave of a flow along walls, m: of a box its width, twice that with one "stick" side."""
+    scene, form = facts.scene, body.body.shape.form
+    if not isinstance(form, Box):
+        return body.thickness
+    endless = spanned_axes(scene, form)
+    widths = [
+        (form.max[a] - form.min[a]) * (2 if faces.count("stick") == 1 else 1)
+        for a, faces in enumerate(touched_walls(scene, form))
+        if a not in endless
+    ]
+    return min(widths, default=max(scene.domain.size))
+
+
+def chord(form: Form, direction: np.ndarray) -> float:
+    """Return the mean length of a shape along a unit vector, m: volume over projection, of no ball that of its box."""
+    if isinstance(form, Ball):
+        return form.radius * (math.pi / 2 if len(direction) == 2 else 4 / 3)
+    # The bounding box of points ends at their centres.
+    edges = np.ptp(form.bounds(), axis=0) + (form.edge if isinstance(form, Points) else 0.0)
+    return float(form.volume / (np.prod(edges) * np.sum(np.abs(direction) / edges)))
+
+
+def _flat_share(form: Form, spacing: float, mach: float) -> float:
+    """Return the share that an impact of a ball brings together, sqrt(2 h / R + 4 mach) a side; 1 of other shapes."""
+    if not isinstance(form, Ball):
+        return 1.0
+    return min(1.0, (2 * spacing / form.radius + 4 * mach) ** ((len(form.center) - 1) / 2))
+
+
+def rounding_findings(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield the findings on solver.precision: small motions in a wide domain, small strains of a stiff body."""
+    if facts.scene.solver.precision == "f64":
+        return
+    end = facts.scene.time.end
+    for body in facts.bodies:
+        # Positions are relative to the origin of the domain, so that the farthest of a body is rounded most.
+        farthest = float(np.max(body.body.shape.form.bounds()[1] - facts.scene.domain.origin))
+        speed = facts.bounds.speed if facts.deformed else highest_speed(body.body)
+        way = (speed + facts.bounds.gravity * end) * end
+        if way > 0 and HALF_ULP * farthest > LOST_MOTION * way:
+            what = (
+                f'Body "{body.name}" moves {way:.2g} m at most in the run, and its positions, up to {farthest:.3g} m '
+                f"from the corner of the domain, are rounded by {HALF_ULP * farthest:.2g} m in single precision."
+            )
+            fix = 'Set solver.precision = "f64".'
+            yield Finding("warning", "rounding-positions", what, fix, HALF_ULP * farthest / way, body.name)
+    for body in facts.bodies:
+        density = body.body.material.density
+        weight = density * facts.bounds.gravity * body.height
+        typical = weight if weight > 0 else density * facts.bounds.speed**2
+        noise = HALF_ULP * body.stiffness
+        if typical > 0 and noise > STRESS_NOISE * typical:
+            what = (
+                f'Body "{body.name}" is so stiff that rounding its strain in single precision makes {noise:.2g} Pa, '
+                f"{100 * noise / typical:.2g} % of the {typical:.2g} Pa of its {'weight' if weight > 0 else 'motion'}."
+            )
+            fix = 'Set solver.precision = "f64", or take a softer material.'
+            yield Finding("warning", "rounding-strains", what, fix, noise / typical, body.name)

@@ -1,38 +1,27 @@
 """`mpmcli bench`."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mpmcli.cli.limit_types import Duration
-from mpmcli.cli.options import json_option
+from mpmcli.cli.options import COUNT, json_option, thread_counts, time_option
 from mpmcli.cli.streams import print_json, print_text
 from mpmcli.errors import InputError
 
 if TYPE_CHECKING:
     from mpmcli.bench.cases import BenchCase
+    from mpmcli.bench.side import BenchOptions
 
 # What --quick still takes.
 QUICK_PARTICLES = 10_000
 # Length of a block, s: of most tables, of --dataset, and of --device; and the wall time of --scaling, s.
 SECONDS, DATASET_SECONDS, DEVICE_SECONDS, BUDGET = 2.0, 20.0, 0.05, 1200.0
+# What a table makes: its record for JSON, and what writes that as text.
+Outcome = tuple[dict, Callable[[dict], str]]
 # What has a table of its own.
 TABLES = ("materials", "features", "dataset", "scaling", "profile", "device")
-
-
-class ThreadCounts(click.ParamType):
-    """Numbers of threads with commas between them, such as `1,2`."""
-
-    name = "numbers"
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
-        if isinstance(value, tuple):
-            return value
-        parts = [part.strip() for part in str(value).split(",")]
-        if not all(part.isascii() and part.isdecimal() and 0 < int(part) < 10**6 for part in parts):
-            self.fail(f"{value} is no number of threads; give 2, or 1,2 for each of both", param, ctx)
-        return tuple(dict.fromkeys(int(part) for part in parts))
 
 
 @dataclass(frozen=True)
@@ -63,6 +52,15 @@ class Choice:
             raise InputError(f"--{self.table} takes one number of threads: give --threads {self.threads[0]}.")
         return self.threads[0] if self.threads else default
 
+    def options(
+        self, threads: tuple[int, ...], seconds: float = SECONDS, blocks: int | None = None, **others: Any
+    ) -> "BenchOptions":
+        """Return the options of a table, with its defaults where none were given."""
+        from mpmcli.bench.side import BLOCKS, BenchOptions
+
+        times = {"seconds": self.seconds or seconds, "blocks": self.blocks or blocks or BLOCKS}
+        return BenchOptions(self.threads or threads, progress=_progress, **times, **others)
+
     def chosen(self, known: "tuple[BenchCase, ...]") -> "list[BenchCase]":
         """Return the cases that were asked for."""
         self.check_names([case.name for case in known])
@@ -90,7 +88,10 @@ class Choice:
     "--peers", is_flag=True, help="Every example of the taichi package that computes a fluid; with --scaling too."
 )
 @click.option(
-    "--threads", type=ThreadCounts(), help="CPU threads, all of them by default; 1,2 measures with one and with two."
+    "--threads",
+    type=thread_counts,
+    metavar="NUMBERS",
+    help="CPU threads, all of them by default; 1,2 measures with one and with two.",
 )
 @click.option(
     "--arch", type=click.Choice(["cpu", "cuda", "vulkan", "metal"]), help="Device of the comparison, or of --device."
@@ -98,15 +99,11 @@ class Choice:
 @click.option(
     "--seconds", type=click.FloatRange(min=0.01), help="Length of a block, by default 2; --dataset 20, --features 0.5."
 )
-@click.option(
-    "--blocks", type=click.IntRange(min=1), help="Blocks of each side, by default 5; --dataset 2, --features 15."
-)
-@click.option(
-    "--budget", type=Duration(), help="Time for --scaling, such as 20m, the default: larger sizes are left out."
-)
+@click.option("--blocks", type=COUNT, help="Blocks of each side, by default 5; --dataset 2, --features 15.")
+@time_option("--budget", "Time for --scaling, such as 20m, the default: larger sizes are left out.")
 @click.option("--largest", type=click.FloatRange(min=1e4), help="Most particles of --scaling, such as 1e6.")
 @json_option
-def command(as_json: bool, **options: Any) -> int:
+def bench_command(as_json: bool, **options: Any) -> int:
     """Compare speed with the MPM examples that the taichi package ships.
 
     All sides run the same fluid block: equal particles, grid, step and precision, in turn (A B A B), and medians are
@@ -144,11 +141,11 @@ def command(as_json: bool, **options: Any) -> int:
         choice.refuse("arch", why=f"--{choice.table} runs on the CPU:")
     if choice.table not in (None, "scaling"):
         choice.refuse("peers", why=f"--{choice.table} has no peers:")
-    report = _RUN[choice.table](choice)
+    record, table = _RUN[choice.table](choice)
     if as_json:
-        print_json(report.as_dict())
+        print_json(record)
     else:
-        print_text(report.table())
+        print_text(table(record))
     return 0
 
 
@@ -158,103 +155,81 @@ def _progress(line: str) -> None:
 
 def _yardstick() -> bool:
     """Return whether the yardstick can be measured; say so where it cannot."""
-    from mpmcli.bench.yardstick import ABSENT, is_here
+    from mpmcli.bench.peers import ABSENT, is_here
 
     if not is_here():
         _progress(f"note: {ABSENT}")
     return is_here()
 
 
-def _comparison(choice: Choice) -> Any:
+def _comparison(choice: Choice) -> Outcome:
     import os
 
     from mpmcli.bench.cases import CASES
-    from mpmcli.bench.compare import BLOCKS, run_bench
+    from mpmcli.bench.compare import bench_table, run_bench
 
     cases = [case for case in choice.chosen(CASES) if not choice.quick or case.particles <= QUICK_PARTICLES]
     arch = choice.arch or "cpu"
-    return run_bench(
-        cases,
-        choice.threads or (os.cpu_count() or 1,),
-        choice.seconds or SECONDS,
-        _progress,
-        blocks=choice.blocks or BLOCKS,
-        arch=arch,
-        yardstick=arch == "cpu" and _yardstick(),
-        peers=choice.peers,
-    )
+    yardstick = arch == "cpu" and _yardstick()
+    threads = choice.threads or (os.cpu_count() or 1,)
+    options = choice.options(threads, arch=arch, yardstick=yardstick, peers=choice.peers)
+    return run_bench(cases, options), bench_table
 
 
-def _materials(choice: Choice) -> Any:
-    from mpmcli.bench.compare import BLOCKS
-    from mpmcli.bench.costs import run_costs
-    from mpmcli.bench.materials import MATERIAL_CASES
+def _materials(choice: Choice) -> Outcome:
+    from mpmcli.bench.materials import MATERIAL_CASES, cost_table, run_costs
 
     if choice.quick:
         raise InputError("--quick is about the comparison; with --materials, --case takes one size.")
-    cases, seconds, blocks = choice.chosen(MATERIAL_CASES), choice.seconds or SECONDS, choice.blocks or BLOCKS
-    return run_costs(cases, choice.one_count(1), seconds, _progress, blocks=blocks)
+    return run_costs(choice.chosen(MATERIAL_CASES), choice.options((choice.one_count(1),))), cost_table
 
 
-def _features(choice: Choice) -> Any:
-    from mpmcli.bench.feature_costs import BLOCK, ROUNDS, run_features
-    from mpmcli.bench.features import FEATURE_CASES
+def _features(choice: Choice) -> Outcome:
+    from mpmcli.bench.features import BLOCK, FEATURE_CASES, ROUNDS, feature_table, run_features
 
     if choice.quick:
         raise InputError("--features has one table: leave out --quick; --case takes one size.")
-    cases, rounds = choice.chosen(FEATURE_CASES), choice.blocks or ROUNDS
-    return run_features(cases, choice.threads or (1, 2), choice.seconds or BLOCK, _progress, rounds=rounds)
+    return run_features(choice.chosen(FEATURE_CASES), choice.options((1, 2), BLOCK, ROUNDS)), feature_table
 
 
-def _dataset(choice: Choice) -> Any:
-    from mpmcli.bench.throughput import ROUNDS, run_throughput
+def _dataset(choice: Choice) -> Outcome:
+    from mpmcli.bench.throughput import ROUNDS, run_throughput, throughput_table
     from mpmcli.cores import available_cores
 
-    workers, seconds = choice.one_count(available_cores()), choice.seconds or DATASET_SECONDS
-    return run_throughput(workers, seconds, _progress, rounds=choice.blocks or ROUNDS)
+    options = choice.options((choice.one_count(available_cores()),), DATASET_SECONDS, ROUNDS)
+    return run_throughput(options), throughput_table
 
 
-def _scaling(choice: Choice) -> Any:
-    from mpmcli.bench.scaling import BLOCKS, COUNTS, run_scaling
+def _scaling(choice: Choice) -> Outcome:
+    from mpmcli.bench.compare import COUNTS, SCALING_BLOCKS, run_scaling, scaling_table
 
     choice.refuse("quick", why="--scaling takes --largest:")
     choice.check_names(["2d", "3d"])
-    return run_scaling(
+    record = run_scaling(
         tuple(int(name[0]) for name in sorted(set(choice.names)) or ("2d", "3d")),
-        choice.threads or (1, 2),
-        choice.seconds or SECONDS,
-        _progress,
+        choice.options((1, 2), blocks=SCALING_BLOCKS, yardstick=_yardstick(), peers=choice.peers),
         budget=choice.budget or BUDGET,
         counts=[count for count in COUNTS if count <= (choice.largest or COUNTS[-1])],
-        blocks=choice.blocks or BLOCKS,
-        yardstick=_yardstick(),
-        peer=choice.peers,
     )
+    return record, scaling_table
 
 
-def _profile(choice: Choice) -> Any:
-    from mpmcli.bench.compare import BLOCKS
+def _profile(choice: Choice) -> Outcome:
     from mpmcli.bench.materials import MATERIAL_CASES
-    from mpmcli.bench.profile import run_profile
+    from mpmcli.bench.profile import profile_table, run_profile
 
     choice.refuse("quick", why="--profile takes --case:")
-    return run_profile(
-        choice.chosen(MATERIAL_CASES),
-        choice.one_count(1),
-        choice.seconds or SECONDS,
-        _progress,
-        blocks=choice.blocks or BLOCKS,
-        yardstick=_yardstick(),
-    )
+    cases, threads = choice.chosen(MATERIAL_CASES), (choice.one_count(1),)
+    return run_profile(cases, choice.options(threads, yardstick=_yardstick())), profile_table
 
 
-def _device(choice: Choice) -> Any:
-    from mpmcli.bench.device import DeviceReport, measure_device
-    from mpmcli.solver.backend import start_backend
+def _device(choice: Choice) -> Outcome:
+    from mpmcli.bench.device import device_record, device_table, measure_device
+    from mpmcli.solver.machine.backend import start_backend
 
     choice.refuse("case", "quick", "blocks", why="--device has one table:")
     backend = start_backend(choice.arch or "auto", choice.one_count(0) or None)
-    return DeviceReport(measure_device(backend, choice.seconds or DEVICE_SECONDS))
+    return device_record(measure_device(backend, choice.seconds or DEVICE_SECONDS)), device_table
 
 
 _RUN = {

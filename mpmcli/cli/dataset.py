@@ -1,31 +1,115 @@
-"""`mpmcli dataset`."""
+"""`mpmcli sweep`, `mpmcli dataset` and `mpmcli export`."""
 
+import math
+import time
 from pathlib import Path
+from typing import Any
 
 import click
 
-from mpmcli.cli.options import json_option, quiet_option
-from mpmcli.cli.streams import print_json, print_note, print_text
+from mpmcli.cli import options
+from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
+from mpmcli.cli.options import COUNT, PATH, json_option, quiet_option
+from mpmcli.cli.streams import print_answer, print_json, print_note, print_text
+from mpmcli.errors import InputError
+
+# Time in which the workers of a sweep end, and this process, s.
+RESERVE = 5.0
+
+
+@click.command("sweep")
+@click.argument("sweep", type=PATH)
+@options.output_option("Where the dataset goes; datasets/<name of the sweep> by default.", "DATASET", "directory")
+@click.option("--count", type=COUNT, help="Number of trajectories, in place of that of the file.")
+@click.option("--workers", type=COUNT, help="Processes on this machine; one on each core by default.")
+@click.option("--scheduler", metavar="ADDRESS", default="", help="Use the workers of a running Dask scheduler.")
+@click.option(
+    "--shard",
+    "part",
+    type=options.part,
+    metavar="I/N",
+    default="1/1",
+    help="Compute the i-th of n parts; mpmcli dataset merge joins them.",
+)
+@click.option("--resume", is_flag=True, help="Go on with the dataset in the directory.")
+@click.option("--dry-run", is_flag=True, help="List the draws, check each scene, and forecast time and disk space.")
+@options.arch_option("Where each worker computes")
+@options.time_option(
+    "--max-time", "End the sweep before this wall time, to go on with --resume: 2h, 90m, 45s, 1h30m or 1:30:00."
+)
+@options.plugin_option
+@quiet_option
+@json_option
+def sweep_command(
+    sweep: Path, count: int | None, dry_run: bool, max_time: float | None, quiet: bool, as_json: bool, **given: Any
+) -> int:
+    """Compute the trajectories of SWEEP, a TOML file, and store them as a dataset for learners.
+
+    An interrupted or killed sweep goes on with --resume. Trajectories that are not stable are computed again with
+    half the step, up to twice, and then left out; the exit code is 1 if there are any.
+    """
+    from mpmcli.cli.progress import ProgressBar
+    from mpmcli.dataset.report import status_of
+    from mpmcli.dataset.sweep_file import load_sweep
+    from mpmcli.dataset.sweep_run import SweepSettings, SweepState, discard_beginning, rehearse, run_sweep
+    from mpmcli.materials.registry import load_plugins
+    from mpmcli.plain_text import duration_text
+
+    end = math.inf if max_time is None else time.monotonic() + max_time - RESERVE
+    loaded = load_sweep(sweep, laws=load_plugins(given["plugins"]), count=count)
+    directory = given["directory"] = given["directory"] or Path("datasets") / sweep.stem
+    settings = SweepSettings(**given)
+    if dry_run:
+        rehearsal = rehearse(loaded, settings)
+        print_answer(rehearsal, as_json)
+        return 0 if rehearsal.passes else 1
+    made = [path for path in (directory, *directory.parents) if not path.exists()][::-1]
+    with ProgressBar(loaded.count, "trajectories", quiet=quiet) as bar, interrupts_wait():
+
+        def show(state: SweepState) -> None:
+            left = (state.expected - state.done) / state.per_hour * 3600
+            bar.show(
+                state.done,
+                f"{state.done - state.accepted} left out, {state.per_hour:,.0f} per hour",
+                f", {duration_text(left)} left",
+            )
+
+        state = run_sweep(loaded, settings, show, lambda: interrupt_came() or time.monotonic() > end)
+    if interrupt_came() and not state.done and not settings.resume:
+        discard_beginning(directory, made)
+        raise KeyboardInterrupt
+    stopped = state.status == "interrupted" and not interrupt_came()
+    if stopped:
+        state.status = "stopped"
+        click.echo("error: the sweep stopped before its --max-time; --resume goes on with it", err=True)
+    status = status_of(directory)
+    if as_json:
+        print_json({**state.as_dict(), "dataset": status.as_dict()})
+    elif not quiet:
+        rate = f", {state.per_hour:,.0f} per hour" if state.done > state.kept else ""
+        print_text(f"{state.status}: {state.done} of {state.expected} trajectories{rate}\n{status.text()}")
+    if state.status == "interrupted":
+        return interrupted_code()
+    return 0 if state.accepted == state.done and not stopped else 1
 
 
 @click.group("dataset")
-def command() -> None:
+def dataset_command() -> None:
     """Look after datasets that `mpmcli sweep` has made."""
 
 
-@command.command("status")
-@click.argument("dataset", type=click.Path(path_type=Path))
+@dataset_command.command("status")
+@click.argument("dataset", type=PATH)
 @json_option
 def status(dataset: Path, as_json: bool) -> None:
     """Count the trajectories of DATASET by verdict and split, and say why some were left out."""
     from mpmcli.dataset.report import status_of
 
-    found = status_of(dataset)
-    print_json(found.as_dict()) if as_json else print_text(found.text())
+    print_answer(status_of(dataset), as_json)
 
 
-@command.command("verify")
-@click.argument("dataset", type=click.Path(path_type=Path))
+@dataset_command.command("verify")
+@click.argument("dataset", type=PATH)
 @quiet_option
 @json_option
 def verify(dataset: Path, quiet: bool, as_json: bool) -> int:
@@ -33,23 +117,22 @@ def verify(dataset: Path, quiet: bool, as_json: bool) -> int:
 
     The exit code is 1 if anything differs or is missing.
     """
-    from mpmcli.cli.progress_bar import ProgressBar
-    from mpmcli.dataset.export_directory import is_export, verify_export
+    from mpmcli.cli.progress import ProgressBar
+    from mpmcli.dataset.export import is_export, verify_export
     from mpmcli.dataset.report import status_of, verify
 
     if is_export(dataset):
-        found = verify_export(dataset)
-        print_json(found.as_dict()) if as_json else print_text(found.text())
-        return 1 if found.faults else 0
-    total = len({row.file for row in status_of(dataset).rows if row.file})
-    with ProgressBar(total, "files", quiet=quiet) as bar:
-        found = verify(dataset, lambda done, total: bar.show(done))
-    print_json(found.as_dict()) if as_json else print_text(found.text())
-    return 1 if found.faults else 0
+        verification = verify_export(dataset)
+    else:
+        total = len({row.file for row in status_of(dataset).rows if row.file})
+        with ProgressBar(total, "files", quiet=quiet) as bar:
+            verification = verify(dataset, lambda done, total: bar.show(done))
+    print_answer(verification, as_json)
+    return 1 if verification.faults else 0
 
 
-@command.command("card")
-@click.argument("dataset", type=click.Path(path_type=Path))
+@dataset_command.command("card")
+@click.argument("dataset", type=PATH)
 @click.option("--montage", metavar="CxR", default="4x4", show_default=True, help="Trajectories of the picture.")
 def card(dataset: Path, montage: str) -> None:
     """Write README.md of DATASET again, with a picture of some trajectories, montage.png, where one can be drawn.
@@ -59,7 +142,6 @@ def card(dataset: Path, montage: str) -> None:
     from mpmcli.dataset.card import write_card
     from mpmcli.dataset.montage import write_montage
     from mpmcli.dataset.report import status_of
-    from mpmcli.errors import InputError
 
     status_of(dataset)
     try:
@@ -69,13 +151,71 @@ def card(dataset: Path, montage: str) -> None:
     print_text(str(write_card(dataset)))
 
 
-@command.command("merge")
-@click.argument("parts", type=click.Path(path_type=Path), nargs=-1, required=True)
-@click.option("-o", "--output", type=click.Path(path_type=Path), metavar="DATASET", required=True)
+@dataset_command.command("merge")
+@click.argument("parts", type=PATH, nargs=-1, required=True)
+@click.option("-o", "--output", type=PATH, metavar="DATASET", required=True)
 @json_option
 def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
     """Join PARTS, made by `mpmcli sweep --shard`, into one dataset. The parts stay as they are."""
     from mpmcli.dataset.merge import merge
 
-    found = merge(parts, output)
-    print_json(found.as_dict()) if as_json else print_text(found.text())
+    print_answer(merge(parts, output), as_json)
+
+
+@click.command("export")
+@click.argument("dataset", type=PATH)
+@click.option(
+    "--to",
+    "form",
+    type=click.Choice(["lagrangebench", "gns", "npz", "vtkhdf"]),
+    required=True,
+    help="For the learners LagrangeBench or GNS, for numpy, or for ParaView and every command that reads results.",
+)
+@click.option("-o", "--output", "directory", type=PATH, required=True, metavar="DIR", help="Where it goes.")
+@click.option("--trajectory", type=click.IntRange(min=0), metavar="N", help="Only the trajectory with this number.")
+@click.option("--stride", type=COUNT, default=1, show_default=True, metavar="K", help="Keep every K-th frame.")
+@click.option(
+    "--max-particles",
+    type=COUNT,
+    metavar="M",
+    help="Keep at most M particles of each trajectory, the same ones in all frames: of each body its share, at random.",
+)
+@options.choice_option(
+    "--walls",
+    ["none", "colliders", "all"],
+    "none",
+    "Add particles on the surfaces of colliders; all: on the walls of the domain as well.",
+)
+@click.option(
+    "--wall-spacing",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="M",
+    help="Distance between particles on walls, m; that of the others at the start by default.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace an earlier export in the output directory.")
+@quiet_option
+@json_option
+def export_command(dataset: Path, quiet: bool, as_json: bool, **given: Any) -> None:
+    """Write DATASET, a directory of trajectories or the result of one run, in the format of a learner or a viewer.
+
+    Beside the data lies metadata.json with bounds, spacings, and the statistics of displacements that learners
+    normalise with. The directory appears when it is complete.
+    """
+    from mpmcli.cli.progress import ProgressBar
+    from mpmcli.dataset.dataset import open_dataset
+    from mpmcli.dataset.export import ExportSettings, export
+
+    opened, settings = open_dataset(dataset), ExportSettings(**given)
+    total = len(opened) if settings.trajectory is None else 1
+    with ProgressBar(total, "trajectories", quiet=quiet) as bar, interrupts_wait():
+
+        def watch(done: int) -> None:
+            if interrupt_came():
+                raise KeyboardInterrupt
+            bar.show(done)
+
+        summary = export(opened, settings, watch)
+    if not quiet:
+        for note in summary.notes:
+            print_note(f"note: {note}")
+    print_answer(summary, as_json, quiet=quiet)

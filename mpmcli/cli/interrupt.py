@@ -37,10 +37,7 @@ def catch_interrupts() -> None:
 
 
 def interrupt_came() -> str:
-    """Return the name of the first of the signals that came, "" where none did.
-
-    Modules written in C may lose a KeyboardInterrupt, or make another error of it, while they are imported.
-    """
+    """Return the name of the signal that came first, or ""; modules in C may lose a KeyboardInterrupt."""
     return signal.Signals(_came).name if _came else ""
 
 

@@ -1,4 +1,4 @@
-"""`mpmcli materials`."""
+"""`mpmcli materials` and `mpmcli schema`."""
 
 import inspect
 import sys
@@ -10,6 +10,7 @@ import click
 
 from mpmcli.cli.options import json_option, plugin_option
 from mpmcli.cli.streams import print_json, print_text
+from mpmcli.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -22,18 +23,17 @@ WIDTH = 140
 @click.argument("name", required=False)
 @plugin_option
 @json_option
-def command(name: str | None, plugins: tuple[Path, ...], as_json: bool) -> None:
+def materials_command(name: str | None, plugins: tuple[Path, ...], as_json: bool) -> None:
     """List the laws and presets of materials, or show the one called NAME.
 
     Parameters are listed with units, ranges and defaults, presets with their sources, and knobs with the
     values that they set.
     """
-    from mpmcli.errors import InputError
     from mpmcli.materials.registry import laws, load_plugins
     from mpmcli.scene.catalogue import law_facts, preset_facts
     from mpmcli.scene.expand import available_presets
     from mpmcli.scene.presets import PRESETS
-    from mpmcli.scene.sentences import listed, nearest, quoted
+    from mpmcli.scene.problem import listed, nearest, quoted
 
     models = load_plugins(plugins)
     known, presets = laws(), available_presets(models)
@@ -55,6 +55,19 @@ def command(name: str | None, plugins: tuple[Path, ...], as_json: bool) -> None:
         print_json(facts)
     else:
         _print(facts, in_full=name is not None)
+
+
+@click.command("schema")
+@plugin_option
+def schema_command(plugins: tuple[Path, ...]) -> None:
+    """Print the JSON Schema of scenes on stdout.
+
+    Editors with TOML support complete and check a scene that begins with `#:schema ./scene.schema.json`.
+    """
+    from mpmcli.materials.registry import load_plugins
+    from mpmcli.scene import json_schema
+
+    print_json(json_schema(load_plugins(plugins)))
 
 
 def _summary(law: type) -> str:
@@ -112,13 +125,12 @@ def _knob_text(knob: dict[str, Any]) -> str:
 
 
 def _plain(value: object) -> str:
-    from mpmcli.scene.sentences import written
+    from mpmcli.scene.problem import written
 
     return f"{value:g}" if isinstance(value, float) else written(value)
 
 
 def _say_table(console: "Console", head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table whose last column wraps."""
     from rich.table import Table
     from rich.text import Text
 

@@ -4,34 +4,34 @@ import errno
 import importlib
 import sys
 import traceback
-from contextlib import suppress
 from typing import Any, NoReturn
 
 import click
 
 from mpmcli import __version__
 from mpmcli.cli.interrupt import catch_interrupts, interrupt_came, interrupted_code
-from mpmcli.cli.streams import flush_streams, print_note
+from mpmcli.cli.streams import flush_streams, print_error
 from mpmcli.cli.supervisor import may_supervise, supervise
 from mpmcli.errors import MpmcliError
 
-# Name of each command, the module that holds it, and its line in the help: so that help loads no module.
+# Name of each command, the module that holds it as NAME_command, and its line in the help, which so loads no module.
 COMMANDS = {
-    "simulate": "Run a scene and store its particles.",
-    "check": "Say which step is safe and why, or whether a result stayed stable.",
-    "sweep": "Compute a dataset of many varied runs.",
-    "dataset": "Count, verify and merge datasets.",
-    "info": "Say what a result or a scene holds, and whether it has changed.",
-    "repair": "Make a readable file of a broken run.",
-    "render": "Draw frames of a result: pictures, films, montages.",
-    "plot": "Draw a result's ledger: energies, momentum, steps, volumes, reach.",
-    "export": "Write a dataset or a result for learners, numpy or ParaView.",
-    "materials": "List laws, presets, their parameters and knobs.",
-    "schema": "Print the JSON Schema of scenes, for editors.",
-    "validate": "Measure speed against error on problems with known answers.",
-    "bench": "Compare speed with the MPM examples that Taichi ships.",
-    "doctor": "Say whether everything that mpmcli needs works here.",
-    "completion": "Print the script that completes commands in a shell.",
+    "simulate": ("simulate", "Run a scene and store its particles."),
+    "check": ("inspection", "Say which step is safe and why, or whether a result stayed stable."),
+    "warm": ("simulate", "Compile the kernels of scenes ahead."),
+    "sweep": ("dataset", "Compute a dataset of many varied runs."),
+    "dataset": ("dataset", "Count, verify and merge datasets."),
+    "info": ("inspection", "Say what a result or a scene holds, and whether it has changed."),
+    "repair": ("inspection", "Make a readable file of a broken run."),
+    "render": ("pictures", "Draw frames of a result: pictures, films, montages."),
+    "plot": ("pictures", "Draw a result's ledger: energies, momentum, steps, volumes, reach."),
+    "export": ("dataset", "Write a dataset or a result for learners, numpy or ParaView."),
+    "materials": ("materials", "List laws, presets, their parameters and knobs."),
+    "schema": ("materials", "Print the JSON Schema of scenes, for editors."),
+    "validate": ("validate", "Measure speed against error on problems with known answers."),
+    "bench": ("bench", "Compare speed with the MPM examples that Taichi ships."),
+    "doctor": ("inspection", "Say whether everything that mpmcli needs works here."),
+    "completion": ("program", "Print the script that completes commands in a shell."),
 }
 
 # Faults of the disk, which any file may meet.
@@ -47,7 +47,8 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        return importlib.import_module(f"mpmcli.cli.{cmd_name}").command
+        module = importlib.import_module(f"mpmcli.cli.{COMMANDS[cmd_name][0]}")
+        return getattr(module, f"{cmd_name}_command")
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
@@ -60,7 +61,7 @@ class LazyGroup(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
 
 @click.group(cls=LazyGroup, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"]})
@@ -77,6 +78,20 @@ def program(context: click.Context, debug: bool) -> None:
     if context.invoked_subcommand is None:
         click.echo(context.get_help(), err=True)
         context.exit(2)
+
+
+@click.command("completion")
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def completion_command(shell: str) -> None:
+    """Print the script that completes mpmcli in SHELL.
+
+    For bash: `mpmcli completion bash >> ~/.bashrc`.
+    """
+    from click.shell_completion import get_completion_class
+
+    script = get_completion_class(shell)
+    assert script is not None
+    click.echo(script(program, {}, "mpmcli", "_MPMCLI_COMPLETE").source())
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
@@ -97,41 +112,35 @@ def run(arguments: list[str]) -> int:
         result = program.main(arguments, prog_name="mpmcli", standalone_mode=False)
         return result if isinstance(result, int) else 0
     except click.ClickException as error:
-        _print_error(f"error: {_usage_sentence(error)}")
+        print_error(f"error: {_usage_sentence(error)}")
         return 2
     except (click.Abort, KeyboardInterrupt):
-        _print_error("interrupted")
+        print_error("interrupted")
         return interrupted_code()
     except MpmcliError as error:
         if debug:
             traceback.print_exc()
-        _print_error(f"error: {error}")
+        print_error(f"error: {error}")
         return error.exit_code
     except (BrokenPipeError, SystemExit):
         # The reader of stdout or stderr has closed it, as in `mpmcli materials | head -1`. click and rich exit then.
         return 0
     except Exception as error:
         if interrupt_came():
-            _print_error("interrupted")
+            print_error("interrupted")
             return interrupted_code()
         if debug:
             traceback.print_exc()
         if isinstance(error, OSError) and error.errno in DISK_FAULTS:
             place = f"{error.filename} could not be written" if error.filename else "a file could not be written"
-            _print_error(f"error: {place} ({error.strerror}); what was written before it is kept.")
+            print_error(f"error: {place} ({error.strerror}); what was written before it is kept.")
             return 1
         kind = type(error).__name__
         # On a bare machine a library of the system may be missing, which a package of ours loads.
         of_system = isinstance(error, ImportError) and not (error.name or "").startswith("mpmcli")
         whose = "mpmcli doctor says what is missing" if of_system else "a fault of mpmcli"
-        _print_error(f"error: {kind}: {error} ({whose}; --debug shows where)")
+        print_error(f"error: {kind}: {error} ({whose}; --debug shows where)")
         return 1
-
-
-def _print_error(line: str) -> None:
-    """Print a line on stderr, where somebody still reads it."""
-    with suppress(OSError, ValueError):
-        print_note(line)
 
 
 def _usage_sentence(error: click.ClickException) -> str:

@@ -1,44 +1,29 @@
-"""`mpmcli simulate`."""
+"""`mpmcli simulate` and `mpmcli warm`."""
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
+from mpmcli.cli import options
 from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
-from mpmcli.cli.limit_types import Duration, Size
-from mpmcli.cli.options import json_option, plugin_option, quiet_option, set_option
-from mpmcli.cli.streams import print_json, print_text
+from mpmcli.cli.options import COUNT, PATH, json_option, quiet_option
+from mpmcli.cli.streams import print_answer, print_json, print_text
 from mpmcli.cli.supervisor import announce
+from mpmcli.errors import InputError
 
 
 @click.command("simulate")
-@click.argument("scene", type=click.Path(path_type=Path))
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="Where the result goes; results/<name of the scene> by default.",
-)
-@set_option
-@plugin_option
-@click.option(
-    "--arch",
-    type=click.Choice(["auto", "cpu", "cuda", "vulkan", "metal"]),
-    default="auto",
-    show_default=True,
-    help="Where to compute; auto takes CUDA or Metal where they are, and else the CPU.",
-)
-@click.option("--threads", type=click.IntRange(min=1), help="CPU threads; by default one for each 2,500 particles.")
+@click.argument("scene", type=PATH)
+@options.output_option("Where the result goes; results/<name of the scene> by default.", name="directory")
+@options.set_option
+@options.plugin_option
+@options.arch_option("Where to compute")
+@click.option("--threads", type=COUNT, help="CPU threads; by default one for each 2,500 particles.")
 @click.option("--precision", type=click.Choice(["f32", "f64"]), help="Replaces solver.precision of the scene.")
-@click.option(
-    "--format",
-    "form",
-    type=click.Choice(["vtkhdf", "vtk"]),
-    default="vtkhdf",
-    show_default=True,
-    help="One temporal VTKHDF file, or a .vtu series with a .pvd.",
+@options.choice_option(
+    "--format form", ["vtkhdf", "vtk"], "vtkhdf", "One temporal VTKHDF file, or a .vtu series with a .pvd."
 )
 @click.option("--compress", is_flag=True, help="Compress the stored file with gzip.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier result in the output directory.")
@@ -53,69 +38,70 @@ from mpmcli.cli.supervisor import announce
 @click.option(
     "--force", is_flag=True, help="Run although `mpmcli check` finds errors, and take time.step above the stable step."
 )
-@click.option(
-    "--max-time",
-    type=Duration(),
-    help="End the run, with the result packed, before this wall time: 2h, 90m, 45s, 1h30m or 1:30:00.",
+@options.time_option(
+    "--max-time", "End the run, with the result packed, before this wall time: 2h, 90m, 45s, 1h30m or 1:30:00."
 )
 @click.option(
     "--max-memory",
-    type=Size(),
+    type=options.size,
+    metavar="SIZE",
     help="End the run before it takes more memory of this machine: 8GB, 500MB or 8GiB.",
 )
 @quiet_option
 @json_option
-def command(
-    scene: Path,
-    output: Path | None,
-    overrides: tuple[str, ...],
-    plugins: tuple[Path, ...],
-    arch: str,
-    threads: int | None,
-    precision: str | None,
-    form: str,
-    compress: bool,
-    overwrite: bool,
-    resume: bool,
-    checkpoint_every: float | None,
-    force: bool,
-    max_time: float | None,
-    max_memory: int | None,
-    quiet: bool,
-    as_json: bool,
-) -> int:
+def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: bool, **run: Any) -> int:
     """Run SCENE, a TOML file, and store its particles for ParaView, h5py and learners."""
-    from mpmcli.cli.simulate_progress import SimulateProgress
-    from mpmcli.errors import InputError
+    from mpmcli.cli.progress import SimulateProgress
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
     from mpmcli.simulation.limits import Limits
     from mpmcli.simulation.simulate import RunSettings, simulate
 
-    if resume and overwrite:
+    if run["resume"] and run["overwrite"]:
         raise InputError("--resume keeps an earlier result, and --overwrite removes it: give one of them.")
+    overrides = run.pop("overrides")
     overrides += (f'solver.precision="{precision}"',) if precision else ()
-    overrides += ("output.compress=true",) if compress else ()
-    loaded = load_scene(scene, overrides, laws=load_plugins(plugins))
-    settings = RunSettings(
-        directory=output or Path("results") / scene.stem,
-        arch=arch,
-        threads=threads,
-        form=form,
-        overwrite=overwrite,
-        resume=resume,
-        checkpoint_every=checkpoint_every,
-        force=force,
-        limits=Limits(max_time, max_memory),
-        command=["mpmcli", *sys.argv[1:]],
-    )
+    overrides += ("output.compress=true",) if run.pop("compress") else ()
+    loaded = load_scene(scene, overrides, laws=load_plugins(run.pop("plugins")))
+    limits = Limits(run.pop("max_time"), run.pop("max_memory"))
+    run["directory"] = run["directory"] or Path("results") / scene.stem
+    settings = RunSettings(**run, limits=limits, command=["mpmcli", *sys.argv[1:]])
     announce(settings.directory)
     progress = SimulateProgress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
     with progress, interrupts_wait():
         summary = simulate(loaded, settings, progress.start, progress.advance, interrupt_came)
     progress.close(summary)
-    if as_json:
-        print_json(summary.as_dict())
-    elif not quiet:
-        print_text(summary.text())
+    print_answer(summary, as_json, quiet=quiet)
     return {"finished": 0, "interrupted": interrupted_code()}.get(summary.status, 1)
+
+
+@click.command("warm")
+@click.argument("scenes", type=PATH, nargs=-1, required=True)
+@options.arch_option("Where they will be computed")
+@click.option("--threads", type=COUNT, help="CPU threads; by default as many as `mpmcli simulate` takes.")
+@click.option("--jobs", type=COUNT, help="Processes at once; one for each core by default.")
+@json_option
+def warm_command(scenes: tuple[Path, ...], arch: str, threads: int | None, jobs: int | None, as_json: bool) -> int:
+    """Compile the kernels of SCENES, TOML files, so that runs of them on this machine start at once.
+
+    For an installation, for jobs of a CI that keep the folder of compiled kernels, and for the nodes of a cluster. The
+    exit code is 1 if a scene could not be compiled.
+    """
+    from mpmcli.cores import available_cores
+    from mpmcli.materials.registry import parameter_models
+    from mpmcli.scene import load_scene
+    from mpmcli.simulation.engine import backend_for
+    from mpmcli.simulation.warm import warm
+
+    for path in scenes:
+        backend_for(load_scene(path, laws=parameter_models()).scene, arch, threads)
+    found = []
+    for one in warm(scenes, jobs or available_cores(), arch, threads, stop=interrupt_came):
+        found.append(one)
+        if not as_json:
+            done = "was there" if one.stored else "compiled"
+            print_text(f"{one.scene}: {one.fault or f'{done}, {one.seconds:.1f} s'}")
+    if as_json:
+        known = {str(one.scene): {"stored": one.stored, "seconds": one.seconds, "fault": one.fault} for one in found}
+        print_json({"ok": not any(one.fault for one in found), "scenes": known})
+    return 1 if any(one.fault for one in found) else 0

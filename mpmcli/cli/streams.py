@@ -3,7 +3,8 @@
 import json
 import os
 import sys
-from typing import IO
+from contextlib import suppress
+from typing import IO, Any
 
 import click
 
@@ -12,21 +13,24 @@ from mpmcli.plain_json import finite_json
 from mpmcli.plain_text import escaped
 
 
-def print_json(content: object) -> None:
-    """Print one JSON document on stdout; numbers that are not finite become null.
+def print_answer(answer: Any, as_json: bool, *, quiet: bool = False) -> None:
+    """Print what has `as_dict` and `text` on stdout, as JSON or as text; no text if quiet."""
+    if as_json:
+        print_json(answer.as_dict())
+    elif not quiet:
+        print_text(answer.text())
 
-    Raises:
-        RunError: stdout is closed, or cannot be written to, as on a full disk.
-    """
-    print_text(json.dumps(finite_json(content), indent=2, ensure_ascii=not _has_unicode(), allow_nan=False))
+
+def print_json(content: object) -> None:
+    """Print one JSON document on stdout; numbers that are not finite become null. Raises as `print_text` does."""
+    # JSON can escape the characters that stdout does not encode.
+    encoding = (getattr(sys.stdout, "encoding", None) or "").lower().replace("-", "")
+    to_ascii = encoding not in ("utf8", "utf16", "utf32")
+    print_text(json.dumps(finite_json(content), indent=2, ensure_ascii=to_ascii, allow_nan=False))
 
 
 def print_text(text: str) -> None:
-    """Print an answer on stdout, with a newline and control characters escaped; a closed pipe is no error.
-
-    Raises:
-        RunError: stdout is closed, or cannot be written to, as on a full disk.
-    """
+    """Print a text, control characters escaped; a closed pipe is no error, RunError a closed stdout or a full disk."""
     try:
         click.echo(escaped(text))
         # click writes nothing, and raises nothing, where there is no stdout.
@@ -45,6 +49,12 @@ def print_note(text: str) -> None:
     click.echo(escaped(text), err=True)
 
 
+def print_error(text: str) -> None:
+    """Print an error on stderr, where somebody still reads it."""
+    with suppress(OSError, ValueError, AttributeError):
+        print_note(text)
+
+
 def flush_streams() -> None:
     """Flush stdout and stderr, and discard what cannot be written.
 
@@ -57,17 +67,10 @@ def flush_streams() -> None:
             _discard(stream)
 
 
-def _has_unicode() -> bool:
-    """Return whether stdout encodes every character; JSON can escape those that it does not."""
-    return (getattr(sys.stdout, "encoding", None) or "").lower().replace("-", "") in ("utf8", "utf16", "utf32")
-
-
 def _discard(stream: IO[str] | None) -> None:
     """Send what is buffered, and all that follows, to the null device."""
-    try:
+    with suppress(OSError, AttributeError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
         os.close(null)
         stream.flush()
-    except (OSError, AttributeError, ValueError):
-        pass

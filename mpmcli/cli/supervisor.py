@@ -6,6 +6,7 @@ take long run in a child process. What a user sees is one process: exit codes, s
 """
 
 import ctypes
+import importlib
 import json
 import os
 import signal
@@ -16,6 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from mpmcli.cli.interrupt import INTERRUPTED, TERMINATED
+from mpmcli.cli.streams import flush_streams, print_error
 
 # Commands that may take long.
 LONG = ("simulate", "sweep", "render", "validate", "export", "dataset", "plot")
@@ -38,11 +40,7 @@ def may_supervise(arguments: Sequence[str]) -> bool:
 
 
 def supervise(work: Callable[[], int]) -> int:
-    """Do work in a child process; return its exit code, or that of an interrupt where it had to be ended.
-
-    A child that was killed by a signal takes this process with it, by the same signal; one that crashed makes exit
-    code 1, with a sentence. The signals are blocked when this returns, as the process is about to end.
-    """
+    """Do work in a child process and return its exit code; a signal that kills the child kills this process too."""
     # Ignored ones, as in `mpmcli ... &` or under nohup, stay ignored.
     requests = {
         getattr(signal, name) for name in REQUESTS if signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN
@@ -57,7 +55,7 @@ def supervise(work: Callable[[], int]) -> int:
         _begin_child(us, tells)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         code = work()
-        _flush()
+        flush_streams()
         # As after `sys.exit`; the caller must not go on in two processes.
         sys.exit(code)
     os.close(tells)
@@ -102,7 +100,8 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
             came = signal.sigtimedwait(watched, max(0.0, pause if ready else min(pause, SOON)))
         if came is None and not ready:
             # What is needed then takes a while to load.
-            _load()
+            for name in ("psutil", "mpmcli.output.directory"):
+                importlib.import_module(name)
             ready = True
             continue
         if came is None:
@@ -129,21 +128,12 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
                 return _code(status)
 
 
-def _load() -> None:
-    import psutil
-
-    import mpmcli.output.abandoned
-
-    assert psutil and mpmcli.output.abandoned
-
-
 def _interrupted(first: signal.Signals) -> int:
-    _say("interrupted")
+    print_error("interrupted")
     return INTERRUPTED if first == signal.SIGINT else TERMINATED
 
 
 def _kill_tree(child: int) -> None:
-    """Kill a child and all processes that it has started."""
     import psutil
 
     with suppress(psutil.Error):
@@ -173,9 +163,11 @@ def _code(status: int) -> int:
     except ValueError:
         name = f"signal {number}"
     if number == signal.SIGKILL:
-        _say("error: the process was killed (SIGKILL), perhaps for want of memory; what it had reported is kept.")
+        print_error(
+            "error: the process was killed (SIGKILL), perhaps for want of memory; what it had reported is kept."
+        )
         os.kill(os.getpid(), signal.SIGKILL)
-    _say(f"error: the process crashed ({name}); what it had reported is kept.")
+    print_error(f"error: the process crashed ({name}); what it had reported is kept.")
     return 1
 
 
@@ -189,19 +181,8 @@ def _close_result(child: int, told: int, first: signal.Signals) -> None:
     if not lines:
         return
     from mpmcli.errors import MpmcliError
-    from mpmcli.output.abandoned import close_abandoned
+    from mpmcli.output.directory import close_abandoned
 
     facts = json.loads(lines[-1])
     with suppress(MpmcliError, OSError):
         close_abandoned(Path(facts["directory"]), [Path(path) for path in facts["made"]], child, first.name)
-
-
-def _say(line: str) -> None:
-    with suppress(OSError, ValueError, AttributeError):
-        print(line, file=sys.stderr, flush=True)
-
-
-def _flush() -> None:
-    from mpmcli.cli.streams import flush_streams
-
-    flush_streams()

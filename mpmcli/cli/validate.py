@@ -2,40 +2,29 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
-from mpmcli.cli.options import json_option, quiet_option
+from mpmcli.cli.options import COUNT, choice_option, json_option, output_option, quiet_option
 from mpmcli.cli.streams import print_json, print_text
+from mpmcli.errors import InputError
 
 if TYPE_CHECKING:
     from mpmcli.validation.case import Case, Level
 
-LEVELS = ("coarse", "default", "fine")
-
 
 @click.command("validate")
 @click.argument("names", nargs=-1, metavar="[CASE]...")
-@click.option(
-    "--levels",
-    "level",
-    type=click.Choice(LEVELS),
-    default="default",
-    show_default=True,
-    help="Resolutions, and what is varied: coarse takes minutes, default up to an hour, fine more.",
+@choice_option(
+    "--levels level",
+    ["coarse", "default", "fine"],
+    "default",
+    "Resolutions, and what is varied: coarse takes minutes, default up to an hour, fine more.",
 )
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="Where report.json, report.md, report.html, figures and every run go; without it nothing is written.",
-)
-@click.option(
-    "--workers", type=click.IntRange(min=1), help="Runs at a time, one thread each; as many as cores by default."
-)
+@output_option("Where report.json, report.md, report.html, figures and every run go; without it nothing is written.")
+@click.option("--workers", type=COUNT, help="Runs at a time, one thread each; as many as cores by default.")
 @click.option(
     "--timeout", type=click.FloatRange(min=1.0), default=1800.0, show_default=True, help="Seconds that a run may take."
 )
@@ -43,24 +32,11 @@ LEVELS = ("coarse", "default", "fine")
 @click.option("--overwrite", is_flag=True, help="Replace the report and all runs in the output directory.")
 @click.option("--list", "listing", is_flag=True, help="List the cases and run nothing.")
 @click.option("--write-scene", is_flag=True, help="Print the scene of a case as TOML and run nothing.")
-@click.option(
-    "--resolution", type=click.IntRange(min=1), metavar="N", help="Of --write-scene; the coarsest by default."
-)
+@click.option("--resolution", type=COUNT, metavar="N", help="Of --write-scene; the coarsest by default.")
 @quiet_option
 @json_option
-def command(
-    names: tuple[str, ...],
-    level: "Level",
-    output: Path | None,
-    workers: int | None,
-    timeout: float,
-    resume: bool,
-    overwrite: bool,
-    listing: bool,
-    write_scene: bool,
-    resolution: int | None,
-    quiet: bool,
-    as_json: bool,
+def validate_command(
+    names: tuple[str, ...], level: "Level", output: Path | None, quiet: bool, as_json: bool, **asked: Any
 ) -> int:
     """Measure speed against error on problems with known answers.
 
@@ -69,123 +45,41 @@ def command(
 
     Exit code 1 where a case is out of tolerance.
     """
-    from mpmcli.errors import InputError
-
-    if resolution is not None and not write_scene:
+    resume, overwrite, resolution = asked["resume"], asked["overwrite"], asked["resolution"]
+    if resolution is not None and not asked["write_scene"]:
         raise InputError("--resolution is for --write-scene; --levels chooses the resolutions of a report.")
     if (resume or overwrite) and output is None:
         raise InputError("--resume and --overwrite are about an earlier report: name its directory with -o.")
     if resume and overwrite:
         raise InputError("--resume keeps what is there and --overwrite removes it; give one of them.")
-    if listing and write_scene:
+    if asked["listing"] and asked["write_scene"]:
         raise InputError("--list lists the cases and --write-scene prints the scene of one; give one of them.")
     cases = _chosen(names)
-    if listing:
-        return _list(cases, level, as_json)
-    if write_scene:
-        return _write_scene(cases, names, level, resolution)
-    return _run(cases, level, output, workers, timeout, resume, overwrite, quiet, as_json)
-
-
-def _chosen(names: Sequence[str]) -> list["Case"]:
-    """Return the cases of some names, in the order of `all_cases`."""
-    from mpmcli.errors import InputError
-    from mpmcli.scene.sentences import listed, nearest
-    from mpmcli.validation.cases import all_cases
-
-    known = all_cases()
-    found = set()
-    for name in names:
-        meant = [name] if name in known else [case for case in known if case.startswith(f"{name}_")]
-        if not meant:
-            guess = nearest(name, [*known, *dict.fromkeys(case.partition("_")[0] for case in known)])
-            hint = f'did you mean "{guess}"?' if guess else f"there are {listed(list(known), 'and')}."
-            raise InputError(f'there is no case "{name}"; {hint}')
-        found.update(meant)
-    return [case for name, case in known.items() if not names or name in found]
-
-
-def _list(cases: Sequence["Case"], level: "Level", as_json: bool) -> int:
-    from mpmcli.plain_text import text_table
-    from mpmcli.validation.matrix import runs_of
-
-    facts = [
-        {
-            "case": case.name,
-            "title": case.title,
-            "group": case.group,
-            "source": case.source,
-            "resolution": case.resolution,
-            "resolutions": sorted(case.levels[level]),
-            "runs": len(runs_of(case, level)),
-        }
-        for case in cases
-    ]
-    if as_json:
-        print_json(facts)
+    if asked["listing"]:
+        _list(cases, level, as_json)
         return 0
-    head = ("case", "problem", f"n at level {level}", "runs", "n counts")
-    rows = [
-        (f["case"], f["title"], ", ".join(map(str, f["resolutions"])), str(f["runs"]), f["resolution"]) for f in facts
-    ]
-    print_text(text_table(head, rows, left={0, 1, 2, 4}))
-    return 0
-
-
-def _write_scene(cases: Sequence["Case"], names: Sequence[str], level: "Level", resolution: int | None) -> int:
-    from mpmcli.errors import InputError
-    from mpmcli.scene import scene_to_toml
-    from mpmcli.validation.carry_out import scene_of
-    from mpmcli.validation.setting import Setting
-
-    if not names:
-        raise InputError("--write-scene prints the scene of one case; name it.")
-    case = cases[0]
-    if len(cases) > 1:
-        others = ", ".join(other.name for other in cases[1:])
-        click.echo(f"this is the scene of {case.name}; others are those of {others}", err=True)
-    print_text(scene_to_toml(scene_of(case, resolution or min(case.levels[level]), Setting())).rstrip("\n"))
-    return 0
-
-
-def _run(
-    cases: Sequence["Case"],
-    level: "Level",
-    output: Path | None,
-    workers: int | None,
-    timeout: float,
-    resume: bool,
-    overwrite: bool,
-    quiet: bool,
-    as_json: bool,
-) -> int:
-    from mpmcli.cli.validate_progress import ValidateProgress
+    if asked["write_scene"]:
+        _write_scene(cases, names, level, resolution)
+        return 0
+    from mpmcli.cli.progress import ValidateProgress
     from mpmcli.cores import available_cores
     from mpmcli.validation.journal import Journal
-    from mpmcli.validation.matrix import matrix
-    from mpmcli.validation.report_files import write_report
+    from mpmcli.validation.report_page import write_report
+    from mpmcli.validation.runs import matrix
     from mpmcli.validation.study import study
 
-    workers = workers or available_cores()
+    workers = asked["workers"] or available_cores()
     journal = None if output is None else Journal(output, resume=resume, overwrite=overwrite)
     progress = ValidateProgress(cases, len(matrix(cases, level)), workers, quiet=quiet)
+    followed = {"on_run": progress.advance, "resumed": progress.resumed, "stop": interrupt_came}
     try:
         with progress, interrupts_wait():
-            report = study(
-                cases,
-                level,
-                workers,
-                journal=journal,
-                timeout=timeout,
-                on_run=progress.advance,
-                resumed=progress.resumed,
-                stop=interrupt_came,
-            )
+            report = study(cases, level, workers, journal=journal, timeout=asked["timeout"], **followed)
     except KeyboardInterrupt:
-        if output is not None:
-            click.echo(f"interrupted; the runs that are done are kept: --resume -o {output} goes on", err=True)
-            return interrupted_code()
-        raise
+        if output is None:
+            raise
+        click.echo(f"interrupted; the runs that are done are kept: --resume -o {output} goes on", err=True)
+        return interrupted_code()
     if output is not None:
         write_report(report, output)
     if as_json:
@@ -195,3 +89,56 @@ def _run(
         if output is not None:
             print_text(f"report: {output / 'report.html'}")
     return 0 if report.passed else 1
+
+
+def _chosen(names: Sequence[str]) -> list["Case"]:
+    from mpmcli.scene.problem import listed, nearest
+    from mpmcli.validation.cases import all_cases
+
+    known = all_cases()
+    chosen = set()
+    for name in names:
+        meant = [name] if name in known else [case for case in known if case.startswith(f"{name}_")]
+        if not meant:
+            guess = nearest(name, [*known, *dict.fromkeys(case.partition("_")[0] for case in known)])
+            hint = f'did you mean "{guess}"?' if guess else f"there are {listed(list(known), 'and')}."
+            raise InputError(f'there is no case "{name}"; {hint}')
+        chosen.update(meant)
+    return [case for name, case in known.items() if not names or name in chosen]
+
+
+def _list(cases: Sequence["Case"], level: "Level", as_json: bool) -> None:
+    from mpmcli.plain_text import text_table
+    from mpmcli.validation.runs import runs_of
+
+    facts = [
+        {
+            "case": case.name,
+            **{name: getattr(case, name) for name in ("title", "group", "source", "resolution")},
+            "resolutions": sorted(case.levels[level]),
+            "runs": len(runs_of(case, level)),
+        }
+        for case in cases
+    ]
+    if as_json:
+        print_json(facts)
+        return
+    head = ("case", "problem", f"n at level {level}", "runs", "n counts")
+    rows = [
+        (f["case"], f["title"], ", ".join(map(str, f["resolutions"])), str(f["runs"]), f["resolution"]) for f in facts
+    ]
+    print_text(text_table(head, rows, left={0, 1, 2, 4}))
+
+
+def _write_scene(cases: Sequence["Case"], names: Sequence[str], level: "Level", resolution: int | None) -> None:
+    from mpmcli.scene import scene_to_toml
+    from mpmcli.validation.carry_out import scene_of
+    from mpmcli.validation.case import Setting
+
+    if not names:
+        raise InputError("--write-scene prints the scene of one case; name it.")
+    case = cases[0]
+    if len(cases) > 1:
+        others = ", ".join(other.name for other in cases[1:])
+        click.echo(f"this is the scene of {case.name}; others are those of {others}", err=True)
+    print_text(scene_to_toml(scene_of(case, resolution or min(case.levels[level]), Setting())).rstrip("\n"))

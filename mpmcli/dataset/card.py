@@ -1,25 +1,30 @@
 """The card of a dataset, README.md in its directory: what varies, what was kept, how to load it."""
 
 import json
+import math
 import tomllib
+from array import array
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
-from mpmcli.dataset.drawn_values import DrawnComponent, values_of
-from mpmcli.dataset.manifest import VERDICTS, Manifest, Row
-from mpmcli.dataset.paths import BASE, SWEEP
+from mpmcli.dataset.folder import VERDICTS, Manifest, Row
 from mpmcli.dataset.report import MOST_NAMED
-from mpmcli.dataset.shard import LABELS, LEDGER, SPLITS, TABLES, group_name, open_shard
+from mpmcli.dataset.shard import BASE, LABELS, LEDGER, SPLITS, SWEEP, TABLES, group_name, open_shard
 from mpmcli.errors import RunError
 from mpmcli.output.durable import write_text
 from mpmcli.plain_text import counted, one_line, size_text
 
 CARD, MONTAGE = "README.md", "montage.png"
+# Of a histogram; where values repeat and there are few, each is counted by itself.
+BINS = 10
+MOST_COUNTED = 6
+LEVELS = "▁▂▃▄▅▆▇█"
+EMPTY = "·"
 
 
 def write_card(directory: Path) -> Path:
@@ -27,10 +32,6 @@ def write_card(directory: Path) -> Path:
 
     Its bytes depend on the sweep and on the trajectories alone: not on times, machines, interrupts or parts. A
     picture montage.png that lies in the directory is shown.
-
-    Raises:
-        InputError: the directory holds no dataset, or a shard is missing or damaged.
-        RunError: the disk refuses.
     """
     manifest = Manifest(directory)
     facts, rows = manifest.facts(), manifest.rows()
@@ -38,16 +39,16 @@ def write_card(directory: Path) -> Path:
     sweep = tomllib.loads(sweep_text)
     base = tomllib.loads((directory / BASE).read_text(encoding="utf-8"))
     included = [row for row in rows if row.accepted]
-    found = _Found.of(directory, included)
+    heads = _Heads(directory, included)
     sections = [
         f"# {one_line(base.get('title') or 'Trajectories of particles')}",
         first_paragraph(sweep_text),
         "![Some of the trajectories](montage.png)" if (directory / MONTAGE).is_file() else "",
-        _contents(found, included),
+        _contents(heads, included) if included else "No trajectory is included.",
         _counts(facts["count"], rows),
         _left_out([row for row in rows if not row.accepted]),
         _drawn(sweep, included),
-        _loading(included[0], found) if included else "",
+        _loading(included[0], heads.dimension) if included else "",
         f"Drawn with seed {facts['seed']}; computed with mpmcli {facts['version']}. `sweep.toml` and `base.toml` are "
         "the sweep and its base scene.",
     ]
@@ -70,54 +71,38 @@ def first_paragraph(text: str) -> str:
     return "\n".join(lines)
 
 
-@dataclass
-class _Found:
-    """What the trajectories in the shards have in common, and what they have not.
+class _Heads:
+    """What the heads of all included trajectories have in common, and what they have not: lengths in m, times in s."""
 
-    Attributes:
-        dimension: 2 or 3.
-        lower, upper: corners of the box around all domains, m.
-        spacings: of the grids, m; intervals: shortest and longest time between frames, s; durations: s.
-        arrays: name and shape of what moves; laws: of the materials.
-        bytes: of the shards.
-    """
-
-    dimension: int = 0
-    lower: np.ndarray | None = None
-    upper: np.ndarray | None = None
-    spacings: set[float] = field(default_factory=set)
-    intervals: set[float] = field(default_factory=set)
-    durations: set[float] = field(default_factory=set)
-    arrays: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    laws: set[str] = field(default_factory=set)
-    bytes: int = 0
-
-    @classmethod
-    def of(cls, directory: Path, included: Sequence[Row]) -> "_Found":
-        """Read the heads of all trajectories, one at a time."""
-        found = cls()
+    def __init__(self, directory: Path, included: Sequence[Row]) -> None:
+        self.dimension = self.bytes = 0
+        self.lowers, self.uppers = [], []
+        # Of the intervals between frames the shortest and the longest.
+        self.spacings, self.intervals, self.durations, self.laws = set(), set(), set(), set()
+        # What moves: the shape of a particle's value by name.
+        self.arrays: dict[str, tuple[int, ...]] = {}
         for name in sorted({row.file for row in included}):
-            found.bytes += (directory / name).stat().st_size
+            self.bytes += (directory / name).stat().st_size
             with open_shard(directory / name) as shard:
                 for group in shard.values():
-                    found._add(group)
-        return found
+                    self._add(group)
 
-    def _add(self, group: Any) -> None:
-        header = json.loads(group.attrs["header"])
-        lower = np.array(header["origin"])
-        upper = lower + header["size"]
+    def _add(self, group: h5py.Group) -> None:
+        header, times = json.loads(group.attrs["header"]), group["time"][:]
         self.dimension = header["dimension"]
-        self.lower = lower if self.lower is None else np.minimum(self.lower, lower)
-        self.upper = upper if self.upper is None else np.maximum(self.upper, upper)
+        self.lowers.append(np.array(header["origin"]))
+        self.uppers.append(self.lowers[-1] + header["size"])
         self.spacings.add(header["spacing"])
         self.laws |= set(header["materials"])
-        times = group["time"][:]
         if len(times) > 1:
-            self.intervals |= {float(f"{apart:.6g}") for apart in (np.diff(times).min(), np.diff(times).max())}
-        self.durations.add(float(f"{times[-1]:.6g}"))
+            self.intervals |= {_rounded(apart) for apart in (np.diff(times).min(), np.diff(times).max())}
+        self.durations.add(_rounded(times[-1]))
         moving = [name for name in group if name not in (*LABELS, *TABLES, LEDGER)]
         self.arrays |= {name: group[name].shape[2:] for name in moving}
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
 
 
 def _range(values: Collection[float], unit: str = "") -> str:
@@ -126,29 +111,26 @@ def _range(values: Collection[float], unit: str = "") -> str:
     return f"{told} {unit}".rstrip()
 
 
-def _contents(found: _Found, included: Sequence[Row]) -> str:
-    if not included:
-        return "No trajectory is included."
-    lower, upper = ([float(f"{x:.6g}") for x in corner.tolist()] for corner in (found.lower, found.upper))
-    names = [f"`{name}` ({', '.join(['T', 'N', *map(str, shape)])})" for name, shape in found.arrays.items()]
+def _contents(heads: _Heads, included: Sequence[Row]) -> str:
+    lower, upper = np.min(heads.lowers, axis=0).tolist(), np.max(heads.uppers, axis=0).tolist()
+    names = [f"`{name}` ({', '.join(['T', 'N', *map(str, shape)])})" for name, shape in heads.arrays.items()]
     lines = [
-        f"{counted(len(included), 'trajectory')} in {found.dimension}D, {size_text(found.bytes)}; T frames of the same "
+        f"{counted(len(included), 'trajectory')} in {heads.dimension}D, {size_text(heads.bytes)}; T frames of the same "
         "N particles, in SI units:",
         "",
         f"* particles N: {_range([row.particles for row in included])}",
         f"* frames T: {_range([row.frames for row in included])}, with the initial one",
-        f"* end: {_range(found.durations, 's')}",
-        f"* domain: {lower} to {upper} m, cells of {_range(found.spacings, 'm')}",
-        f"* laws: {', '.join(sorted(found.laws))}",
+        f"* end: {_range(heads.durations, 's')}",
+        f"* domain: {[*map(_rounded, lower)]} to {[*map(_rounded, upper)]} m, cells of {_range(heads.spacings, 'm')}",
+        f"* laws: {', '.join(sorted(heads.laws))}",
         f"* arrays: {', '.join(names)}",
     ]
-    if found.intervals:
-        lines.insert(4, f"* interval between frames: {_range(found.intervals, 's')}")
+    if heads.intervals:
+        lines.insert(4, f"* interval between frames: {_range(heads.intervals, 's')}")
     return "\n".join(lines)
 
 
 def _counts(expected: int, rows: Sequence[Row]) -> str:
-    """Return a table of the trajectories by split and verdict."""
     verdicts = [verdict for verdict in VERDICTS if any(row.verdict == verdict for row in rows)]
     table = [("split", "computed", "included", *verdicts)]
     for split in (*SPLITS, "all"):
@@ -194,14 +176,8 @@ def _drawn(sweep: Mapping[str, Any], included: Sequence[Row]) -> str:
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
-    """Write rows below their head as a table of Markdown."""
     lines = [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in rows]
     return "\n".join([lines[0], f"|{' --- |' * len(rows[0])}", *lines[1:]])
-
-
-def _loading(first: Row, found: _Found) -> str:
-    """Return code that loads the first trajectory from the directory of the dataset, and from exports beside it."""
-    return _LOADING.format(file=first.file, group=group_name(first.number), split=first.split, d=found.dimension)
 
 
 _LOADING = """\
@@ -250,3 +226,104 @@ import numpy as np
 arrays = np.load("../npz/{group}.npz")
 position, velocity, times = arrays["position"], arrays["velocity"], arrays["time"]
 ```"""
+
+
+def _loading(first: Row, d: int) -> str:
+    return _LOADING.format(file=first.file, group=group_name(first.number), split=first.split, d=d)
+
+
+class DrawnComponent:
+    """Values over all trajectories of one component of a key, such as "domain.gravity.1", drawn from `source`."""
+
+    def __init__(self, label: str, source: str) -> None:
+        self.label, self.source = label, source
+        self._numbers = array("d")
+        self._texts: Counter[str] = Counter()
+
+    def add(self, value: Any) -> None:
+        """Count a value: a finite number, or anything else that JSON holds."""
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            self._numbers.append(value)
+        else:
+            self._texts[value if isinstance(value, str) else json.dumps(value)] += 1
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """Label, source, minimum, mean, maximum and distribution, as text; "" where there is none."""
+        ends = ("", "", "")
+        if self._numbers and not self._texts:
+            # The exact sum does not depend on the order.
+            mean = math.fsum(self._numbers) / len(self._numbers)
+            ends = (number_text(min(self._numbers)), number_text(mean), number_text(max(self._numbers)))
+        return (self.label, self.source, *ends, self._distribution())
+
+    def _distribution(self) -> str:
+        # Sorted as numbers; a key that draws texts has few of them.
+        counts = Counter(map(number_text, sorted(self._numbers))) + self._texts
+        repeated = len(counts) < max(len(self._numbers), 2)
+        if (len(counts) <= MOST_COUNTED and repeated) or self._texts:
+            told = [f"{value}: {count}" for value, count in list(counts.items())[:MOST_COUNTED]]
+            return ", ".join([*told, "..."] if len(counts) > MOST_COUNTED else told)
+        return f"`{histogram(self._numbers)}`"
+
+
+def histogram(values: Sequence[float]) -> str:
+    """Return bars of equal bins from the smallest to the largest value, which differ, as high as their counts."""
+    low, high = min(values), max(values)
+    counts = [0] * BINS
+    for value in values:
+        counts[min(BINS - 1, int(BINS * ((value - low) / (high - low))))] += 1
+    most = max(counts)
+    return "".join(LEVELS[-(-count * len(LEVELS) // most) - 1] if count else EMPTY for count in counts)
+
+
+def number_text(value: float) -> str:
+    """Write a number with four digits."""
+    return f"{value:.4g}"
+
+
+def values_of(sweep: Mapping[str, Any], drawn: Mapping[str, Any]) -> Iterator[tuple[str, str, Any]]:
+    """Yield label, source and value of each drawn component, in the order of the `sweep` file's TOML."""
+    for key, table in sweep.get("vary", {}).items():
+        if key in drawn:
+            yield from _components(key, table, drawn[key])
+    places = sweep.get("place", [])
+    for place in [places] if isinstance(places, dict) else places:
+        key = f"place.{place['body']}" if "body" in place else f"place.colliders.{place['collider']}"
+        bodies = drawn.get(key, [])
+        if key in drawn:
+            yield f"{key}.count", _source(place["count"]), len(bodies)
+        for body in bodies:
+            low, high = body.get("min"), body.get("max")
+            if low and "size" in place:
+                size = [b - a for a, b in zip(low, high, strict=True)]
+                yield from _components(f"{key}.size", place["size"], size)
+            if "radius" in body and "radius" in place:
+                yield f"{key}.radius", _source(place["radius"]), body["radius"]
+            center = body.get("center") or [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+            region = {"within": [place["region"]["min"], place["region"]["max"]]}
+            yield from _components(f"{key}.center", region, center)
+            if "velocity" in body:
+                yield from _components(f"{key}.velocity", place["velocity"], body["velocity"])
+
+
+def _components(key: str, table: Any, value: Any) -> Iterator[tuple[str, str, Any]]:
+    if not isinstance(value, list):
+        yield key, _source(table), value
+        return
+    for index, one in enumerate(value):
+        yield f"{key}.{index}", _source(table, index), one
+
+
+def _source(table: Any, component: int | None = None) -> str:
+    """Write a distribution as the sweep file does; of one with bounds for each component, those of one."""
+    if not isinstance(table, dict):
+        return json.dumps(table)
+
+    def written(name: str, given: Any) -> str:
+        bounds = name not in ("choice", "grid") and component is not None
+        if bounds and all(isinstance(one, list) for one in given):
+            given = [one[component] for one in given]
+        return f"{name} {json.dumps(given)}"
+
+    return ", ".join(written(name, given) for name, given in table.items())

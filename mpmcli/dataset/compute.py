@@ -1,50 +1,62 @@
-"""What a worker of a sweep does: draws trajectories, runs them, and stores each in a file of its own."""
+"""What workers of a sweep do: draw, run and store trajectories; and the Dask cluster that sends them tasks."""
 
 import hashlib
 import json
+import os
+import queue
+import signal
 import threading
 import time
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
+from multiprocessing import resource_tracker
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import h5py
 import numpy as np
 
-from mpmcli.check.finding import passes
 from mpmcli.check.scene_check import check_scene
 from mpmcli.dataset.draw import Draw, draw
-from mpmcli.dataset.manifest import Row
-from mpmcli.dataset.paths import PENDING, QUARANTINE, file_name
-from mpmcli.dataset.shard import TrajectoryData, checksum_of, stored_bytes, write_trajectory
+from mpmcli.dataset.folder import Row
+from mpmcli.dataset.shard import LABELS, MOVING, PENDING, QUARANTINE, TrajectoryData, file_name, write_single
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.materials.registry import load_plugins
-from mpmcli.output.durable import sealed
-from mpmcli.output.file_checksum import append_checksum
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.engine import Arch
 from mpmcli.simulation.recording import Recording
 from mpmcli.simulation.runner import Runner
 
+if TYPE_CHECKING:
+    from distributed import LocalCluster
+
 # Runs of a trajectory with half the step of the one before, after the first.
 RETRIES = 2
 # Trajectories that a worker draws before its first run, to know how many particles it needs room for.
 LOOK_AHEAD = 32
+# Tasks under way for each worker: one to compute, and one that waits for it.
+AHEAD = 2
+# Attempts to start a cluster.
+STARTS = 3
+# Seconds between looks at `stop`.
+PATIENCE = 0.2
+_SETTINGS = {
+    # Workers that a task may lose before it counts as failed.
+    "distributed.scheduler.allowed-failures": 5,
+    # A step of a large scene holds the interpreter for longer than Dask expects.
+    "distributed.admin.tick.limit": "1h",
+    "distributed.comm.timeouts.connect": "30s",
+    # Samples of every thread, a hundred a second, which nobody sees.
+    "distributed.worker.profile.enabled": False,
+}
 
 
 @dataclass(frozen=True)
 class Task:
-    """Trajectories for a worker.
-
-    Attributes:
-        directory: of the dataset.
-        numbers: of the trajectories.
-        arch, threads: backend of each worker.
-        plugins: files with further laws.
-    """
+    """Trajectories of the dataset in a directory, for a worker with this backend and further laws from files."""
 
     directory: Path
     sweep: Sweep
@@ -55,21 +67,14 @@ class Task:
 
 
 def compute(task: Task) -> list[Row]:
-    """Compute trajectories, and return their rows for the manifest.
+    """Compute trajectories, and return their rows for the manifest; a RunError says that a file could not be written.
 
     Taichi belongs to the thread that started it, and Dask's threads come and go.
-
-    Raises:
-        RunError: a file could not be written.
     """
     return _thread().submit(_compute, task).result()
 
 
-@cache
-def _thread() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1)
-
-
+_thread = cache(partial(ThreadPoolExecutor, 1))
 _kept = threading.local()
 
 
@@ -111,7 +116,8 @@ def _compute(task: Task) -> list[Row]:
             drawn = draw(task.sweep, number)
             row = replace(row, draws=json.dumps(drawn.values, sort_keys=True))
             loaded = drawn.scene(_kept.laws)
-            _require_sound(loaded)
+            if fault := scene_fault(loaded):
+                raise InputError(fault)
         except Exception as error:
             rows[number] = _failed(row, error)
         else:
@@ -149,64 +155,44 @@ def _compute(task: Task) -> list[Row]:
 
 
 def _failed(row: Row, error: Exception) -> Row:
-    """Return the row of a trajectory that has none, for want of a scene or by a fault.
-
-    One trajectory must not end thousands. What a fault has left on the device is dropped.
-    """
+    """Return the row of a trajectory that has failed, without ending others; after a fault the device is emptied."""
     if isinstance(error, InputError):
         return replace(row, reason=str(error))
     _kept.known = None
     return replace(row, reason=f"{type(error).__name__}: {error} (a fault of mpmcli).")
 
 
-def _require_sound(loaded: LoadedScene) -> None:
-    findings = check_scene(loaded).findings
-    if not passes(findings):
-        raise InputError(next(finding.what for finding in findings if finding.severity == "error"))
+def scene_fault(loaded: LoadedScene) -> str:
+    """Return the first error that a check finds in a scene, "" where there is none."""
+    return next((finding.what for finding in check_scene(loaded).findings if finding.severity == "error"), "")
 
 
 def _with_step(scene: Scene, factor: float) -> Scene:
-    """Return a scene whose steps are shorter by a factor."""
     if factor == 1:
         return scene
     step = scene.time.step if scene.time.step == "auto" else factor * scene.time.step
-    time_settings = scene.time.model_copy(update={"safety": factor * scene.time.safety, "step": step})
-    return scene.model_copy(update={"time": time_settings})
+    shorter = scene.time.model_copy(update={"safety": factor * scene.time.safety, "step": step})
+    return scene.model_copy(update={"time": shorter})
 
 
 def _stored(task: Task, row: Row, drawn: Draw, scene: Scene, run: Recording, retries: int, accepted: bool) -> Row:
     """Write the frames of a run, if there are any, and return its row."""
     backend = run.header.backend
-    file, found = "", ""
+    file = checksum = ""
     if run.frames:
         folder = PENDING if accepted else QUARANTINE
         path = task.directory / folder / file_name(row.number)
         path.parent.mkdir(parents=True, exist_ok=True)
-        data = trajectory_data(drawn, run)
         try:
-            with sealed(path, stored_bytes(data)) as temporary:
-                with h5py.File(temporary, "w") as opened:
-                    write_trajectory(opened, data, compress=scene.output.compress)
-                append_checksum(temporary)
+            checksum = write_single(path, trajectory_data(drawn, run), compress=scene.output.compress)
         except (OSError, RuntimeError) as error:
             reason = getattr(error, "strerror", None) or error
             raise RunError(f"trajectory {row.number} could not be written to {path} ({reason}).") from error
-        file, found = f"{folder}/{path.name}", checksum_of(data)
-    return replace(
-        row,
-        scene=hashlib.sha256(scene_to_toml(scene).encode()).hexdigest(),
-        verdict=run.verdict,
-        reason=run.reason,
-        accepted=int(accepted),
-        retries=retries,
-        steps=run.steps,
-        frames=len(run.frames),
-        particles=run.particles,
-        arch=backend["arch"],
-        precision=backend["precision"],
-        file=file,
-        checksum=found,
-    )
+        file = f"{folder}/{path.name}"
+    facts = {name: getattr(run, name) for name in ("verdict", "reason", "steps", "particles")}
+    facts |= {"arch": backend["arch"], "precision": backend["precision"], "file": file, "checksum": checksum}
+    digest = hashlib.sha256(scene_to_toml(scene).encode()).hexdigest()
+    return replace(row, scene=digest, accepted=int(accepted), retries=retries, frames=len(run.frames), **facts)
 
 
 def trajectory_data(drawn: Draw, run: Recording) -> TrajectoryData:
@@ -217,13 +203,135 @@ def trajectory_data(drawn: Draw, run: Recording) -> TrajectoryData:
         split=drawn.split,
         draws=drawn.values,
         header=run.header.stored,
-        position=np.stack([frame.position for frame in frames]),
-        velocity=np.stack([frame.velocity for frame in frames]),
-        body=first.body,
-        material=first.material,
-        time=np.array([frame.time for frame in frames]),
-        step=np.array([frame.step for frame in frames]),
+        **{name: np.stack([getattr(frame, name) for frame in frames]) for name in MOVING},
+        **{name: getattr(first, name) for name in LABELS},
+        **{name: np.array([getattr(frame, name) for frame in frames]) for name in ("time", "step")},
         frame=np.array([frame.index for frame in frames]),
         ledger=run.ledger,
         fields={name: np.stack([frame.fields[name] for frame in frames]) for name in first.fields},
     )
+
+
+class Workers:
+    """Workers that compute tasks, as `local_workers` and `joined_workers` give them."""
+
+    def __init__(self, client: object) -> None:
+        self._client = client
+        self.count = len(client.scheduler_info(n_workers=-1)["workers"])
+
+    def outcomes(self, tasks: Iterable[Task], stop: Callable[[], bool]) -> Iterator[tuple[Task, list[Row] | None]]:
+        """Yield tasks with rows as they end, None where no worker survived; RunError: a write failed, or no cluster."""
+        from distributed import Future
+        from distributed.scheduler import KilledWorker
+
+        ended: queue.Queue[tuple[Task, Future]] = queue.Queue()
+        waiting = iter(tasks)
+        under_way = 0
+
+        def send() -> bool:
+            task = next(waiting, None)
+            if task is None:
+                return False
+            future = self._client.submit(compute, task, pure=False, retries=0)
+            future.add_done_callback(lambda done, task=task: ended.put((task, done)))
+            return True
+
+        while under_way < AHEAD * self.count and send():
+            under_way += 1
+        while under_way:
+            if stop():
+                raise KeyboardInterrupt
+            try:
+                task, future = ended.get(timeout=PATIENCE)
+            except queue.Empty:
+                continue
+            if not send():
+                under_way -= 1
+            if future.status == "cancelled":
+                raise RunError("the cluster has ended; the trajectories that are done are kept, and --resume goes on.")
+            error = future.exception()
+            if error is None:
+                yield task, future.result()
+            elif not isinstance(error, KilledWorker):
+                raise error
+            elif len(task.numbers) > 1:
+                # One of them takes its worker with it; which one, the next tries tell.
+                yield from self.outcomes([replace(task, numbers=(number,)) for number in task.numbers], stop)
+            else:
+                yield task, None
+
+
+@contextmanager
+def local_workers(count: int) -> Iterator[Workers]:
+    """Start workers on this machine, one process each, that end with the block."""
+    import dask
+    from distributed import Client
+
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set(_SETTINGS))
+        cluster = stack.enter_context(_local_cluster(count))
+        workers = Workers(stack.enter_context(Client(cluster)))
+        try:
+            yield workers
+        except BaseException:
+            # A worker hears of nothing while a kernel runs; what it writes is whole or absent.
+            for nanny in cluster.workers.values():
+                nanny.auto_restart = False
+                with suppress(OSError, AttributeError, TypeError):
+                    os.kill(nanny.pid, signal.SIGKILL)
+            raise
+
+
+def _local_cluster(count: int) -> "LocalCluster":
+    """Start a cluster; again, where a worker was killed before it had started, which Dask does not forgive."""
+    from distributed import LocalCluster
+
+    for left in reversed(range(STARTS)):
+        try:
+            with _interrupts_blocked():
+                return LocalCluster(
+                    n_workers=count,
+                    threads_per_worker=1,
+                    processes=True,
+                    memory_limit=None,
+                    # The status pages that Dask serves: for this machine only, on a free port.
+                    dashboard_address="127.0.0.1:0",
+                    silence_logs="CRITICAL",
+                )
+        except (RuntimeError, OSError) as error:
+            if not left:
+                raise RunError(f"the workers do not start ({error}); --resume goes on with what is done.") from error
+    raise AssertionError
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT for all that is started here: Ctrl-C reaches all processes, and this one ends the workers."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    # The first process starts this, which unblocks the signal.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def joined_workers(address: str) -> Iterator[Workers]:
+    """Use the workers of a running scheduler; they see the dataset at the same path."""
+    import dask
+    from distributed import Client
+
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set(_SETTINGS))
+        try:
+            client = stack.enter_context(Client(address, timeout=10))
+        except (OSError, ValueError) as error:
+            raise InputError(f"--scheduler {address}: no scheduler answers there; give tcp://HOST:PORT.") from error
+        workers = Workers(client)
+        if workers.count == 0:
+            raise InputError(f"--scheduler {address}: this scheduler has no worker; start dask worker {address}.")
+        yield workers

@@ -8,9 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli.dataset.paths import SHARDS, SWEEP
-from mpmcli.dataset.shard import LABELS, MOVING, SPLITS, moving_names, open_shard, particles_of, shard_splits
-from mpmcli.dataset.stored_trajectory import StoredGroup
+from mpmcli.dataset.shard import (
+    LABELS,
+    MOVING,
+    SHARDS,
+    SPLITS,
+    SWEEP,
+    TABLES,
+    StoredGroup,
+    moving_names,
+    open_shard,
+    particles_of,
+    shard_splits,
+)
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -30,14 +40,12 @@ class Trajectory(ABC):
     """T frames of the same N particles. No file stays open, so it can be copied to other processes.
 
     Attributes:
-        number: in the dataset.
-        split: "train", "valid" or "test".
+        number: in the dataset; split: "train", "valid" or "test".
         draws: what was drawn for it, by the key of the scene.
         header: facts about the run.
         times: (T,) float64, s.
         steps, frames: (T,) int64, time steps since the start, and number of each frame in its run.
-        particle_count: N.
-        field_names: names of the further arrays.
+        particle_count: N; field_names: names of the further arrays.
     """
 
     number: int
@@ -81,11 +89,7 @@ class Trajectory(ABC):
         return self.read("material")
 
     def field(self, name: str) -> np.ndarray:
-        """Read a field, (T, N) or (T, N, ...).
-
-        Raises:
-            InputError: as `read`.
-        """
+        """Read a field, (T, N) or (T, N, ...); errors are those of `read`."""
         return self.read(name)
 
     def read(self, name: str, frames: slice = ALL, particles: Particles = ALL) -> np.ndarray:
@@ -126,8 +130,6 @@ class Trajectory(ABC):
 
 
 class _StoredTrajectory(Trajectory):
-    """A trajectory in a shard."""
-
     def __init__(self, shard: Path, number: int) -> None:
         self._shard = shard
         with open_shard(shard) as file:
@@ -135,7 +137,7 @@ class _StoredTrajectory(Trajectory):
             self.number, self.split = number, str(stored.attribute("split"))
             self.draws = stored.attribute("draws")
             self.header = RunHeader.read(stored.attribute("header"))
-            self.times, self.steps, self.frames = stored.tables()
+            self.times, self.steps, self.frames = (stored.table(name) for name in TABLES)
             self.field_names = tuple(name for name in moving_names(stored.group) if name not in MOVING)
             self.particle_count = particles_of(stored.group, self.header.dimension, self.field_names)
 
@@ -151,8 +153,6 @@ class _StoredTrajectory(Trajectory):
 
 
 class _ResultTrajectory(Trajectory):
-    """The result of a single run."""
-
     def __init__(self, result: Result) -> None:
         if result.header.drops:
             raise InputError(
@@ -196,11 +196,7 @@ class _ResultTrajectory(Trajectory):
 
 
 def _require_no_gap(result: Result) -> None:
-    """Refuse the segments of a run of which some are missing, and would be read as if time had jumped.
-
-    Raises:
-        InputError: so.
-    """
+    """Refuse the segments of a run of which some are missing, and would be read as if time had jumped."""
     if result.kind != "segments":
         return
     told = (result.record or {}).get("frames_written")
@@ -236,11 +232,7 @@ class Dataset:
         return (self[number] for number in self.numbers)
 
     def __getitem__(self, number: int) -> Trajectory:
-        """Return a trajectory; its arrays are read later.
-
-        Raises:
-            InputError: there is none with this number, or its shard is missing or damaged.
-        """
+        """Return a trajectory, whose arrays are read later; InputError: there is none, or its shard is damaged."""
         if number not in self._known:
             first, last = self.numbers[0], self.numbers[-1]
             held = f"{len(self)}, from {first} to {last}" if len(self) > 1 else f"number {first} only"
@@ -274,21 +266,20 @@ def open_dataset(path: Path | str) -> Dataset:
     path = Path(path)
     if not path.exists():
         raise InputError(f"{path} does not exist: give the directory of a dataset, or a result.")
-    if path.is_dir() and not is_dataset(path):
+    if not is_dataset(path):
         if (path / SWEEP).exists():
             raise InputError(f"{path} is an empty dataset: it holds no trajectory yet.")
-        if not any((path / name).exists() for name in (PACKED, SEGMENTS, SERIES, RECORD)) and path.name != SEGMENTS:
+        results = (path / name for name in (PACKED, SEGMENTS, SERIES, RECORD))
+        if path.is_dir() and path.name != SEGMENTS and not any(result.exists() for result in results):
             raise InputError(f"{path} is not a dataset: it has no directory {SHARDS}, and it is no result either.")
-    if not is_dataset(path):
         return Dataset(path, {0: SPLITS[0]}, open_result(path))
     splits: dict[int, str] = {}
     places: dict[int, Path] = {}
     for shard in sorted((path / SHARDS).glob("*.h5")):
         found = shard_splits(shard)
         if twice := places.keys() & found.keys():
-            raise InputError(
-                f"trajectory {min(twice)} lies in {places[min(twice)]} and in {shard}: remove one of them."
-            )
+            both = f"{places[min(twice)]} and in {shard}"
+            raise InputError(f"trajectory {min(twice)} lies in {both}: remove one of them.")
         splits |= found
         places |= dict.fromkeys(found, shard)
     if not splits:

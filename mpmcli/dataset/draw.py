@@ -1,42 +1,286 @@
-"""One trajectory of a sweep: its values, and the scene with them."""
+"""One trajectory of a sweep: its values, its bodies and colliders placed at random, and the scene with them."""
 
 import copy
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path as File
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from mpmcli.dataset.placed_bodies import place_bodies
-from mpmcli.dataset.sweep import Sweep
-from mpmcli.dataset.trajectory_values import TrajectoryValues
-from mpmcli.dataset.unit_numbers import generator
+import numpy as np
+from pydantic import ValidationError
+
+from mpmcli.dataset.sweep import Placement, Sweep, TrajectoryValues, generator
 from mpmcli.errors import InputError
 from mpmcli.scene import LoadedScene, parse_scene
+from mpmcli.scene.colliders import Collider, Plane
+from mpmcli.scene.entry import definitions
 from mpmcli.scene.expand import Laws
-from mpmcli.scene.overrides import key_parts, set_value
-from mpmcli.scene.problem import Path
+from mpmcli.scene.problem import Path as KeyPath
+from mpmcli.scene.quantity import dimension_of
+from mpmcli.scene.shapes import Ball, BodyShape, Form
+from mpmcli.scene.toml_file import key_parts, set_value
 
+# Signed distance of points (n, d), (n,), m.
+Distance = Callable[[np.ndarray], np.ndarray]
+# Candidates that are drawn for one body before the placement starts anew, and how often it does.
+TRIES = 256
+STARTS = 20
+# How often sizes and radii are drawn before a trajectory is given up.
+ROUNDS = 10
 # Seeds of bodies that are sampled at random are below this, so that every format holds them exactly.
 SEEDS = 2**53
-_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclass(frozen=True, eq=False)
+class RoundedBox:
+    """All points no farther than `radius`, m, from a box of half edge lengths `half`, (d,), m; so also a ball."""
+
+    center: np.ndarray
+    half: np.ndarray
+    radius: float
+
+
+@dataclass(frozen=True, eq=False)
+class Wanted:
+    """A body that needs a place in its region, from `lower` to `upper`, (d,), m; it fits in.
+
+    `half` and `radius` are those of a RoundedBox; `volume` in m^3 (m^2 in 2D), as large bodies are placed first;
+    `min_distance` to other bodies in m.
+    """
+
+    half: np.ndarray
+    radius: float
+    volume: float
+    lower: np.ndarray
+    upper: np.ndarray
+    min_distance: float
+    generator: np.random.Generator
+
+
+class NoPlace(Exception):  # noqa: N818
+    """No arrangement was found; in that which came farthest, `placed` bodies had a place, and body `index` had none."""
+
+    def __init__(self, index: int, placed: int) -> None:
+        super().__init__(index, placed)
+        self.index, self.placed = index, placed
+
+
+def room_before(centers: np.ndarray, half: np.ndarray, radius: float, wall: Distance) -> np.ndarray:
+    """Return how far a rounded box at each of m centres (m, d) is from a wall, (m,), m: exact for convex room."""
+    corners = _corners(-half, half)
+    return np.min([wall(centers + corner) for corner in np.unique(corners, axis=0)], axis=0) - radius
+
+
+def _corners(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Return the corners of a box, (2^d, d)."""
+    d = len(lower)
+    return np.array([[upper[a] if k >> a & 1 else lower[a] for a in range(d)] for k in range(2**d)])
+
+
+def _box(lower: np.ndarray, upper: np.ndarray) -> RoundedBox:
+    return RoundedBox((lower + upper) / 2, (upper - lower) / 2, 0.0)
+
+
+def rounded_box(form: Form) -> RoundedBox:
+    """Return a box or a ball itself, and of any other shape its bounding box."""
+    if isinstance(form, Ball):
+        center = np.array(form.center)
+        return RoundedBox(center, np.zeros(len(center)), form.radius)
+    return _box(*form.bounds())
+
+
+def find_places(
+    wanted: Sequence[Wanted], obstacles: Sequence[RoundedBox], walls: Sequence[Distance] = ()
+) -> list[np.ndarray]:
+    """Return the centre of every body, (d,), m, by rejection, the largest first; NoPlace after STARTS starts.
+
+    Each takes the first of TRIES candidates, uniform in its region, that keeps its distance from `obstacles`, from
+    bodies before it, and from `walls`, signed distances that are positive where there is room.
+    """
+    order = sorted(range(len(wanted)), key=lambda i: -wanted[i].volume)
+    farthest = NoPlace(0, -1)
+    for _ in range(STARTS):
+        centers: dict[int, np.ndarray] = {}
+        for i in order:
+            least = wanted[i].min_distance
+            others = [*obstacles, *(RoundedBox(c, wanted[k].half, wanted[k].radius) for k, c in centers.items())]
+            apart = [least] * len(obstacles) + [max(least, wanted[k].min_distance) for k in centers]
+            center = _free_center(wanted[i], others, np.array(apart), walls)
+            if center is None:
+                if len(centers) > farthest.placed:
+                    farthest = NoPlace(i, len(centers))
+                break
+            centers[i] = center
+        else:
+            return [centers[i] for i in range(len(wanted))]
+    raise farthest
+
+
+def _free_center(
+    body: Wanted, others: Sequence[RoundedBox], apart: np.ndarray, walls: Sequence[Distance]
+) -> np.ndarray | None:
+    """Return the first free one of TRIES candidates, (d,), or None; `apart` is the distance to each of `others`, m."""
+    reach = body.half + body.radius
+    slack = np.maximum(0.0, body.upper - body.lower - 2 * reach)
+    centers = body.lower + reach + body.generator.random((TRIES, len(body.lower))) * slack
+    free = np.ones(TRIES, dtype=bool)
+    if others:
+        distance = distances(centers, body.half, body.radius, others)
+        # Bodies that overlap have the distance 0, too.
+        free = np.all((distance >= apart) & (distance > 0), axis=1)
+    for wall in walls:
+        room = room_before(centers, body.half, body.radius, wall)
+        free &= (room >= body.min_distance) & (room > 0)
+    return centers[np.argmax(free)] if free.any() else None
+
+
+def distances(centers: np.ndarray, half: np.ndarray, radius: float, others: Sequence[RoundedBox]) -> np.ndarray:
+    """Return the distances of a rounded box at centres (m, d) to n others, (m, n), m; 0 where they overlap."""
+    other_centers = np.array([other.center for other in others])
+    other_halves = np.array([other.half for other in others])
+    other_radii = np.array([other.radius for other in others])
+    beyond = np.abs(centers[:, None] - other_centers) - (half + other_halves)
+    return np.maximum(0.0, np.linalg.norm(np.maximum(0.0, beyond), axis=2) - (radius + other_radii))
+
+
+class PlacementError(InputError):
+    """The bodies of a placement have no place; `source` is the sweep file, `placement` the index of the placement."""
+
+    def __init__(self, source: str, placement: int, sentence: str) -> None:
+        super().__init__(source, placement, sentence)
+        self.source, self.placement, self.sentence = source, placement, sentence
+
+    def __str__(self) -> str:
+        return f"{self.source}: {self.sentence}"
+
+
+def place_bodies(values: TrajectoryValues, data: dict[str, Any]) -> list[list[dict[str, Any]]]:
+    """Return for each placement its bodies: name, corners or centre and radius, and velocity where it is drawn.
+
+    Where bodies find no places, all sizes are drawn anew, up to ROUNDS times, and then PlacementError is raised. `data`
+    is the parsed TOML of the scene with its templates.
+    """
+    placements = values.sweep.placements
+    templates = {
+        place.key: next(entry for entry in data[place.list] if entry["name"] == place.template) for place in placements
+    }
+    obstacles, walls = _obstacles(data, {(p.list, p.template) for p in placements}, values.sweep.base.parent)
+    farthest: tuple[int, int, list[Wanted]] | None = None
+    # Index of the placement and number of each body.
+    chosen: list[tuple[int, int]] = []
+    for index, place in enumerate(placements):
+        key = f"{place.key}.count"
+        chosen += [(index, k) for k in range(1, values.value(key, key, place.count) + 1)]
+    random = [values.generator(f"{placements[index].key}.{k}.position") for index, k in chosen]
+    for round_number in range(ROUNDS):
+        wanted = []
+        for (index, k), numbers in zip(chosen, random, strict=True):
+            place = placements[index]
+            shape = templates[place.key]["shape"]
+            name = "radius" if "ball" in shape else "size"
+            distribution = getattr(place, name)
+            # What is drawn, else that of the template.
+            extent = template_extent(shape)
+            if distribution is not None:
+                stream = f"{place.key}.{k}.{name}" + (f".{round_number}" if round_number else "")
+                extent = values.value(f"{place.key}.{name}", stream, distribution)
+            wanted.append(_wanted(place, extent, numbers))
+        try:
+            centers = find_places(wanted, obstacles, walls)
+            break
+        except NoPlace as found:
+            if farthest is None or found.placed > farthest[1]:
+                farthest = (chosen[found.index][0], found.placed, wanted)
+    else:
+        assert farthest is not None
+        index, placed, wanted = farthest
+        there = [body for body, (of, _) in zip(wanted, chosen, strict=True) if of == index]
+        sentence = _crowded(placements[index], there, placed, len(wanted))
+        raise PlacementError(str(values.sweep.path), index, f"trajectory {values.number}: {sentence}")
+    result: list[list[dict[str, Any]]] = [[] for _ in placements]
+    for (index, k), want, center in zip(chosen, wanted, centers, strict=True):
+        place = placements[index]
+        body = {"name": f"{place.template}_{k}", **_shape_values(want, center)}
+        if place.velocity is not None:
+            key = place.key
+            body["velocity"] = copy.deepcopy(values.value(f"{key}.velocity", f"{key}.{k}.velocity", place.velocity))
+        result[index].append(body)
+    return result
+
+
+def template_extent(shape: dict[str, Any]) -> Any:
+    """Return the radius of a ball, or the edge lengths of a box, m, from its table."""
+    if "ball" in shape:
+        return shape["ball"]["radius"]
+    return [high - low for low, high in zip(shape["box"]["min"], shape["box"]["max"], strict=True)]
+
+
+def _wanted(place: Placement, extent: Any, generator: np.random.Generator) -> Wanted:
+    lower, upper = np.array(place.region.min), np.array(place.region.max)
+    d, is_box = len(lower), isinstance(extent, list)
+    half, radius = (np.array(extent, float) / 2, 0.0) if is_box else (np.zeros(d), float(extent))
+    volume = math.prod((2 * half).tolist()) if is_box else [math.pi, 4 / 3 * math.pi][d - 2] * radius**d
+    return Wanted(half, radius, volume, lower, upper, place.min_distance, generator)
+
+
+def _shape_values(want: Wanted, center: np.ndarray) -> dict[str, Any]:
+    if want.radius:
+        return {"center": center.tolist(), "radius": want.radius}
+    # Round-off may carry a face out of the region.
+    lower, upper = (np.clip(center + side * want.half, want.lower, want.upper) for side in (-1, 1))
+    return {"min": lower.tolist(), "max": upper.tolist()}
+
+
+def _obstacles(
+    data: dict[str, Any], templates: set[tuple[str, str]], directory: Path
+) -> tuple[list[RoundedBox], list[Distance]]:
+    """Return bodies and colliders that stay, and distances of walls; the scene's validation tells of faulty ones."""
+    dimension = dimension_of(data)
+    constants, _ = definitions(data.get("constants"), dimension)
+    context = {"dimension": dimension, "constants": constants, "directory": directory}
+    boxes: list[RoundedBox] = []
+    walls: list[Distance] = []
+    for body in data["bodies"]:
+        if ("bodies", body["name"]) not in templates:
+            with suppress(ValidationError, KeyError):
+                boxes.append(rounded_box(BodyShape.model_validate(body["shape"], context=context).form))
+    for table in data.get("colliders", []):
+        if ("colliders", table["name"]) not in templates:
+            with suppress(ValidationError):
+                collider = Collider.model_validate(table, context=context)
+                if isinstance(collider.form, Ball) and collider.side == "outside":
+                    center = collider.motion.placed(np.array([collider.form.center]), 0.0)[0]
+                    boxes.append(RoundedBox(center, np.zeros(len(center)), collider.form.radius))
+                elif collider.side == "inside" or isinstance(collider.form, Plane):
+                    walls.append(collider.signed_distance)
+                else:
+                    # A box with faces along the axes, about the bounding box at time 0.
+                    placed = collider.motion.placed(_corners(*collider.form.bounds()), 0.0)
+                    boxes.append(_box(placed.min(axis=0), placed.max(axis=0)))
+    return boxes, walls
+
+
+def _crowded(place: Placement, there: list[Wanted], placed: int, total: int) -> str:
+    """Say how far the placement came, and how full the region would be."""
+    fill = sum(body.volume for body in there) / math.prod((there[0].upper - there[0].lower).tolist())
+    measure = "area" if len(place.region.min) == 2 else "volume"
+    return (
+        f"at most {placed} of {total} {place.list} found a place in {ROUNDS * STARTS} starts of {TRIES} tries each; "
+        f'"{place.template}" takes {100 * fill:.3g} percent of the {measure} of its region; '
+        f"place fewer or smaller {place.list}, with a smaller min_distance, or in a larger region"
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """One trajectory of a sweep.
+    """One trajectory of a sweep, of the `split` "train", "valid" or "test".
 
-    Attributes:
-        number: of the trajectory, from 0.
-        split: "train", "valid" or "test".
-        values: what was drawn, plain Python that JSON holds: the value of every key of [vary], and under `place.NAME`
-            a list of the placed bodies, `{name, min, max}` or `{name, center, radius}`, with `velocity` where drawn;
-            under `place.colliders.NAME` one of colliders.
-        data: parsed TOML of the scene with all of it.
-        origins: for each body of the scene, the index of the body of the base scene that it comes from;
-            collider_origins: the same of colliders.
-        source: what to call the scene in errors.
-        directory: that of the base scene.
+    `values` were drawn, as JSON holds them: of each key of [vary], and under `place.NAME` (`place.colliders.NAME`)
+    lists of placed `{name, min, max}` or `{name, center, radius}`, with `velocity` where drawn. `data` is the parsed
+    TOML with all of it; origins are indices of base entries; `source` names the scene in errors.
     """
 
     number: int
@@ -46,67 +290,46 @@ class Draw:
     origins: tuple[int, ...]
     collider_origins: tuple[int, ...]
     source: str
-    directory: File
+    directory: Path
 
     def scene(self, laws: Laws) -> LoadedScene:
-        """Return the complete scene.
-
-        Args:
-            laws: parameter models of the constitutive laws that a material may follow.
-
-        Raises:
-            InputError: the values make no valid scene; one line per fault.
-        """
+        """Return the complete scene; an InputError has one line per fault."""
         loaded = parse_scene(self.data, laws=laws, source=self.source, directory=self.directory)
         if loaded.scene.output.drop_retired:
-            raise InputError(
-                f"{self.source}: output.drop_retired: a trajectory of a dataset has the same particles in all frames; "
-                "leave it out"
-            )
+            said = "a trajectory of a dataset has the same particles in all frames; leave it out"
+            raise InputError(f"{self.source}: output.drop_retired: {said}")
         return loaded
 
 
-def draw(sweep: Sweep, number: int, given: Mapping[str, Any] = _NOTHING) -> Draw:
-    """Draw one trajectory; the same sweep and number always give the same.
+def draw(sweep: Sweep, number: int, given: Mapping[str, Any] = MappingProxyType({})) -> Draw:
+    """Draw one trajectory, always the same; PlacementError: bodies have no place; ValueError: there is no such one.
 
-    Values drawn at random depend on the seed, the number and their own key alone. Continuous ones of a Sobol
-    sequence or a Latin hypercube also depend on which keys are continuous, and those of a hypercube on the count.
-    Bodies that are sampled at random get a seed of their own, from the seed, the number and their name, unless [vary]
-    has it. A force on a body that is replaced acts on each of those in its place.
-
-    Args:
-        sweep: from `sweep_file.load_sweep`.
-        number: of the trajectory, from 0 to `sweep.count` - 1.
-        given: values in place of drawn ones, by the keys of `sweep.distributions`.
-
-    Raises:
-        ValueError: there is no such trajectory.
-        PlacementError: the bodies have no place in their regions.
+    Random values depend on the seed, the number and their own key alone; Sobol and Latin ones also on which keys are
+    continuous, Latin ones on the count. Bodies sampled at random get seeds of their own unless [vary] has them. A force
+    on a replaced body acts on each in its place. `given` values replace drawn ones.
     """
     if not 0 <= number < sweep.count:
         raise ValueError(f"The sweep has trajectories 0 to {sweep.count - 1}; there is no trajectory {number}.")
     drawn = TrajectoryValues(sweep, number, given)
     data = copy.deepcopy(sweep.base_data)
     values: dict[str, Any] = {}
-    varied: set[Path] = set()
+    varied: set[KeyPath] = set()
     for key, distribution in sweep.vary.items():
         values[key] = copy.deepcopy(drawn.value(key, key, distribution))
         varied.add(set_value(data, key_parts(key), copy.deepcopy(values[key])))
     origins, collider_origins = (tuple(range(len(data.get(name, [])))) for name in ("bodies", "colliders"))
     if sweep.placements:
-        placed = place_bodies(drawn, data)
-        values |= {place.key: bodies for place, bodies in zip(sweep.placements, placed, strict=True)}
-        new = list(zip(sweep.placements, placed, strict=True))
+        placed = list(zip(sweep.placements, place_bodies(drawn, data), strict=True))
+        values |= {place.key: bodies for place, bodies in placed}
         origins, collider_origins = (
-            _put_in_place(data, name, {p.template: made for p, made in new if p.list == name})
+            _put_in_place(data, name, {place.template: bodies for place, bodies in placed if place.list == name})
             for name in ("bodies", "colliders")
         )
     for body, origin in zip(data["bodies"], origins, strict=True):
         if body.get("sampling") in ("jittered", "poisson") and ("bodies", origin, "seed") not in varied:
             body["seed"] = int(generator(sweep.seed, number, f"bodies.{body['name']}.seed").integers(SEEDS))
-    source = f"{sweep.path}: trajectory {number}"
-    directory = sweep.base.parent
-    return Draw(number, sweep.split_of(number), values, data, origins, collider_origins, source, directory)
+    source, split = f"{sweep.path}: trajectory {number}", sweep.split_of(number)
+    return Draw(number, split, values, data, origins, collider_origins, source, sweep.base.parent)
 
 
 def _put_in_place(data: dict[str, Any], name: str, placed: dict[str, list[dict[str, Any]]]) -> tuple[int, ...]:
@@ -114,7 +337,12 @@ def _put_in_place(data: dict[str, Any], name: str, placed: dict[str, list[dict[s
     entries, origins = [], []
     for index, entry in enumerate(data.get(name, [])):
         for new in placed.get(entry["name"], [None]):
-            entries.append(entry if new is None else _entry_from(entry, new))
+            made = copy.deepcopy(entry)
+            if new is not None:
+                keys = copy.deepcopy(new)
+                form = {key: keys.pop(key) for key in ("min", "max", "center", "radius") if key in keys}
+                made |= {**keys, "shape": {"ball" if "radius" in form else "box": form}}
+            entries.append(made)
             origins.append(index)
     if entries or name in data:
         data[name] = entries
@@ -125,9 +353,3 @@ def _put_in_place(data: dict[str, Any], name: str, placed: dict[str, list[dict[s
             for new in next((bodies for name, bodies in placed.items() if force.get("body") == name), [None])
         ]
     return tuple(origins)
-
-
-def _entry_from(template: dict[str, Any], placed: dict[str, Any]) -> dict[str, Any]:
-    placed = copy.deepcopy(placed)
-    form = {key: placed.pop(key) for key in ("min", "max", "center", "radius") if key in placed}
-    return {**copy.deepcopy(template), **placed, "shape": {"ball" if "radius" in form else "box": form}}

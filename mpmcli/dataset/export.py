@@ -1,44 +1,39 @@
-"""Export of a dataset to what learners, numpy and ParaView read."""
+"""Export of a dataset to what learners, numpy and ParaView read: a directory that appears as a whole or not."""
 
+import itertools
 import json
-from collections.abc import Callable, Sequence
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-from mpmcli.dataset import export_gns, export_lagrangebench, export_npz, export_vtkhdf
 from mpmcli.dataset.dataset import Dataset
-from mpmcli.dataset.export_directory import METADATA, check_export_directory, new_directory, seal_export
-from mpmcli.dataset.facts import common_facts
+from mpmcli.dataset.formats import FORMATS
+from mpmcli.dataset.metadata import EXPORTED_BY, FORMAT_KEY, common_facts
 from mpmcli.dataset.shard import SPLITS
-from mpmcli.dataset.thinned import SEED, ThinnedTrajectory
-from mpmcli.dataset.walls import Walls
+from mpmcli.dataset.thinned import SEED, ThinnedTrajectory, Walls
 from mpmcli.errors import InputError, RunError
-from mpmcli.output.durable import require_free_space
+from mpmcli.output import check_directory
+from mpmcli.output.checksums import SUMS, path_digest, sums_faults, sums_text
+from mpmcli.output.durable import TEMPORARY_SUFFIX, require_free_space, sync_directory, sync_file
+from mpmcli.output.verify import Verification
 from mpmcli.plain_json import finite_json
 from mpmcli.plain_text import counted, size_text
 
-# Each module has check, size and write.
-FORMATS: dict[str, ModuleType] = {
-    "lagrangebench": export_lagrangebench,
-    "gns": export_gns,
-    "npz": export_npz,
-    "vtkhdf": export_vtkhdf,
-}
+METADATA = "metadata.json"
+_OURS = re.compile(r"metadata\.json|checksums\.sha256|(train|valid|test)\.(h5|npz)|\d{6,}\.(npz|vtkhdf)")
 
 
 @dataclass(frozen=True)
 class ExportSettings:
     """What is exported, and where to.
 
-    Attributes:
-        form: a key of FORMATS.
-        directory: made, or replaced if it is empty or, with `overwrite`, an earlier export.
-        trajectory: number of the one to export, all if None.
-        stride: every how many frames one is taken.
-        max_particles: of each trajectory, None for all.
-        walls: which have particles; wall_spacing: between these, m, None for that of the particles.
+    `form` is a key of FORMATS; an earlier export is replaced with `overwrite` alone; None exports every trajectory, or
+    all particles. `wall_spacing` is between particles on walls, m, None for that of the others.
     """
 
     form: str
@@ -53,14 +48,7 @@ class ExportSettings:
 
 @dataclass(frozen=True)
 class ExportSummary:
-    """What was written.
-
-    Attributes:
-        trajectories: how many, by split.
-        frames, particles: most of a trajectory.
-        bytes: of all files.
-        notes: what the user should know of it.
-    """
+    """What was written: trajectories by split, most frames and particles of one, bytes of all files, and notes."""
 
     directory: str
     form: str
@@ -91,75 +79,123 @@ def export(
 ) -> ExportSummary:
     """Write a directory with a dataset in another format, and metadata.json; all of it, or nothing.
 
-    Args:
-        watch: called with the number of trajectories written, after each one.
-
-    Raises:
-        InputError: the directory is in use, there is no such trajectory, or the format cannot hold the dataset; nothing
-            was written.
-        RunError: the disk is full or refuses; nothing was left.
+    `watch` is told the trajectories written. InputError, nothing written: the directory is in use, there is no such
+    trajectory, or the format cannot hold it. RunError, nothing left: the disk is full or refuses.
     """
-    directory, form = Path(settings.directory), FORMATS[settings.form]
+    directory = Path(settings.directory)
     check_export_directory(directory, settings.overwrite)
     numbers: Sequence[int] = dataset.numbers if settings.trajectory is None else [settings.trajectory]
-    chosen = [
-        ThinnedTrajectory(
-            dataset[number], settings.stride, settings.max_particles, settings.walls, settings.wall_spacing
-        )
-        for number in numbers
-    ]
+    options = (settings.stride, settings.max_particles, settings.walls, settings.wall_spacing)
+    chosen = [ThinnedTrajectory(dataset[number], *options) for number in numbers]
     for each in chosen:
         if each.particle_count == 0 or each.frame_count == 0:
             raise InputError(f"trajectory {each.source.number} of {dataset.path} is empty: there is nothing to export.")
     metadata = common_facts(chosen, settings.stride)
     if any(each.particle_count < each.source.particle_count for each in chosen):
         metadata["particle_seed"] = SEED
-    form.check(chosen)
+    form = FORMATS[settings.form](chosen)
+    form.check()
     for each in chosen:
-        _require_sound_walls(each)
+        walls = each.walls
+        lost = set(walls.header.collider_names) - {collider.name for collider in walls.colliders}
+        if lost and walls.walls != "none":
+            number = each.source.number
+            raise InputError(f'the collider "{min(lost)}" of trajectory {number} cannot be read: leave --walls out.')
     there = next(parent for parent in directory.resolve().parents if parent.exists())
     what, kept = f"the export to {directory}", "nothing was written"
-    require_free_space(there, form.size(chosen), what, kept, several=True)
+    require_free_space(there, form.size(), what, kept, several=True)
     if settings.walls != "none":
         metadata["wall_spacing"] = max(each.walls.spacing for each in chosen)
-    done = 0
-
-    def tick() -> None:
-        nonlocal done
-        done += 1
-        watch(done)
-
+    count = itertools.count(1)
     try:
         with new_directory(directory, settings.overwrite) as temporary:
-            more, notes = form.write(temporary, chosen, tick)
+            more, notes = form.write(temporary, lambda: watch(next(count)))
             text = json.dumps(finite_json(metadata | more), indent=2, allow_nan=False) + "\n"
             (temporary / METADATA).write_text(text, encoding="utf-8", newline="\n")
-            seal_export(temporary)
+            sums = {path.name: [path_digest(path)] for path in temporary.iterdir()}
+            (temporary / SUMS).write_text(sums_text(sums), encoding="ascii", newline="\n")
             files = {path.name: path.stat().st_size for path in sorted(temporary.iterdir())}
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise RunError(f"{directory} could not be written ({reason}); nothing of it was left.") from error
-    return ExportSummary(
-        directory=str(directory),
-        form=settings.form,
-        files=list(files),
-        trajectories={split: metadata[f"num_trajs_{split}"] for split in SPLITS},
-        frames=max(each.frame_count for each in chosen),
-        particles=metadata["num_particles_max"],
-        bytes=sum(files.values()),
-        notes=notes,
-    )
+    splits = {split: metadata[f"num_trajs_{split}"] for split in SPLITS}
+    frames, particles = max(each.frame_count for each in chosen), metadata["num_particles_max"]
+    total = sum(files.values())
+    return ExportSummary(str(directory), settings.form, list(files), splits, frames, particles, total, notes)
 
 
-def _require_sound_walls(trajectory: ThinnedTrajectory) -> None:
-    """Refuse walls that are not known, and more particles on them than fit into memory.
-
-    Raises:
-        InputError: so.
-    """
-    walls, number = trajectory.walls, trajectory.source.number
-    if walls.walls == "none":
+def check_export_directory(directory: Path, overwrite: bool) -> None:
+    """Refuse a directory that holds anything, or, with `overwrite`, anything but an earlier export."""
+    check_directory(directory, overwrite)
+    if directory.resolve() == Path.cwd():
+        raise InputError(f"{directory} is the present directory, which an export would replace: give another with -o.")
+    if not directory.is_dir():
         return
-    lost = set(walls.header.collider_names) - {collider.name for collider in walls.colliders}
-    if lost:
-        raise InputError(f'the collider "{min(lost)}" of trajectory {number} cannot be read: leave --walls out.')
+    names = [path.name for path in directory.iterdir()]
+    foreign = sorted(name for name in names if not _OURS.fullmatch(name))
+    if names and (foreign or EXPORTED_BY not in _metadata(directory)):
+        what = f"it holds {foreign[0]}" if foreign else f"it has no {METADATA} of mpmcli export"
+        raise InputError(f"{directory} is not an earlier export, as {what}: give another directory with -o.")
+
+
+@contextmanager
+def new_directory(directory: Path, overwrite: bool) -> Iterator[Path]:
+    """Give an empty directory to write to; on leaving, put it at `directory`; if the block raises, leave nothing."""
+    check_export_directory(directory, overwrite)
+    target = directory.resolve()
+    missing = [parent for parent in target.parents if not parent.exists()]
+    temporary, former = (
+        target.with_name(f"{target.name}.{os.getpid()}{end}") for end in (TEMPORARY_SUFFIX, f".old{TEMPORARY_SUFFIX}")
+    )
+    try:
+        try:
+            temporary.mkdir(parents=True)
+        except OSError as error:
+            reason = error.strerror or error
+            raise InputError(f"{directory} cannot be made ({reason}): give another place with -o.") from error
+        yield temporary
+        for path in temporary.iterdir():
+            sync_file(path)
+        if target.exists():
+            # Something may have been put into it meanwhile.
+            check_export_directory(directory, overwrite)
+            os.rename(target, former)
+        try:
+            os.rename(temporary, target)
+        except OSError:
+            if former.exists():
+                os.rename(former, target)
+            raise
+        sync_directory(target.parent)
+        shutil.rmtree(former, ignore_errors=True)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        for parent in missing:
+            with suppress(OSError):
+                parent.rmdir()
+        raise
+
+
+def is_export(path: Path) -> bool:
+    """Return whether a directory holds an export, whole or not."""
+    return path.is_dir() and (EXPORTED_BY in _metadata(path) or ((path / SUMS).exists() and (path / METADATA).exists()))
+
+
+def verify_export(directory: Path) -> Verification:
+    """Compare the files of an export with its checksums."""
+    found = Verification(directory)
+    metadata = _metadata(directory)
+    if not (directory / SUMS).exists() and EXPORTED_BY in metadata and FORMAT_KEY not in metadata:
+        found.files = sum(1 for path in directory.iterdir() if _OURS.fullmatch(path.name))
+        found.unchecked.append(str(directory))
+        return found
+    found.files, found.faults = sums_faults(directory)
+    return found
+
+
+def _metadata(directory: Path) -> dict[str, Any]:
+    try:
+        metadata = json.loads((directory / METADATA).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return metadata if isinstance(metadata, dict) else {}

@@ -1,34 +1,162 @@
-"""The directory of a dataset: where its trajectories lie, and how those of a shard become one file."""
+"""The directory of a dataset: its manifest, a SQLite file with a row for each trajectory, and its shards."""
 
+import json
+import re
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import astuple, dataclass, fields, replace
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any, get_args
 
 import h5py
 
-from mpmcli.dataset.manifest import Row
-from mpmcli.dataset.paths import PENDING, SHARDS, file_name
-from mpmcli.dataset.shard import CHECKSUMS, FORMAT, VERSION, add_checksums, checksum, group_name
+from mpmcli import __version__
+from mpmcli.check.finding import Verdict
+from mpmcli.dataset.shard import PENDING, SHARDS, checksum, file_name, group_name, join_trajectories
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.directory import check_directory
 from mpmcli.output.durable import require_free_space, sealed
-from mpmcli.output.file_checksum import append_checksum
 from mpmcli.output.lock import LOCK
+from mpmcli.plain_text import one_line
 
+MANIFEST = "manifest.sqlite"
+FORMAT = 1
 # Bytes of a shard, about: large enough for a file system and for copies over a network, small enough to lose.
 SHARD_BYTES = 256e6
+VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
+_PLACE = re.compile(r"(shards|pending|quarantine)/\w+\.h5")
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is known of a trajectory.
+
+    Attributes:
+        draws: what was drawn, JSON; scene: SHA-256 of the complete scene.
+        verdict: one of VERDICTS; reason: why it is not "stable", "" where it is.
+        accepted: 1 where the dataset includes it.
+        retries: runs with half the step of the one before; steps, frames, particles: counts of the last run.
+        seconds: wall time of all runs.
+        arch, precision, version, taichi: backend, and versions of mpmcli and Taichi.
+        file: where the frames are, relative to the dataset, "" where none were kept; checksum: `shard.checksum`.
+    """
+
+    number: int
+    split: str
+    draws: str
+    scene: str
+    verdict: str
+    reason: str
+    accepted: int
+    retries: int
+    steps: int
+    frames: int
+    particles: int
+    seconds: float
+    arch: str
+    precision: str
+    version: str
+    taichi: str
+    file: str
+    checksum: str
+
+    @classmethod
+    def failed(cls, number: int, split: str, reason: str = "") -> "Row":
+        """Return the row of a trajectory of which nothing is known but that it failed."""
+        values: dict[str, Any] = {f.name: f.type() for f in fields(cls)}
+        values |= {"number": number, "split": split, "draws": "{}", "verdict": "failed", "reason": reason}
+        return cls(**{**values, "version": __version__, "taichi": version("taichi")})
+
+
+_COLUMNS = ", ".join(f.name for f in fields(Row))
+_TYPES = {int: "INTEGER", float: "REAL", str: "TEXT"}
+
+
+class Manifest:
+    """Rows of a dataset and facts about its sweep; each call opens and closes the file, and only one process writes."""
+
+    def __init__(self, directory: Path) -> None:
+        self.path = directory / MANIFEST
+
+    def create(self, facts: Mapping[str, Any]) -> None:
+        """Make the file, with facts that JSON can hold."""
+        columns = ", ".join(f"{f.name} {_TYPES[f.type]} NOT NULL" for f in fields(Row))
+        # Under its name there is never half a manifest.
+        with sealed(self.path) as temporary, self._open("create", temporary) as connection:
+            connection.execute("CREATE TABLE sweep (name TEXT PRIMARY KEY, value TEXT NOT NULL)")
+            connection.execute(f"CREATE TABLE trajectories ({columns}, PRIMARY KEY (number))")
+            told = {"format": FORMAT, **facts}
+            values = [(name, json.dumps(value, sort_keys=True)) for name, value in told.items()]
+            connection.executemany("INSERT INTO sweep VALUES (?, ?)", values)
+
+    def facts(self) -> dict[str, Any]:
+        """Return the facts about the sweep."""
+        with self._reading() as connection:
+            facts = {name: json.loads(value) for name, value in connection.execute("SELECT name, value FROM sweep")}
+        if facts.get("format") != FORMAT:
+            raise InputError(f"{self.path} has format {facts.get('format')}; this version of mpmcli reads {FORMAT}.")
+        wrong = [name for name, sound in _SOUND.items() if not sound(facts.get(name))]
+        if wrong:
+            raise InputError(f"{self.path} is damaged: what it says of {wrong[0]} cannot be; copy it again.")
+        return facts
+
+    def rows(self) -> list[Row]:
+        """Return all rows, by number."""
+        with self._reading() as connection:
+            rows = [Row(*row) for row in connection.execute(f"SELECT {_COLUMNS} FROM trajectories ORDER BY number")]
+        for row in rows:
+            if wrong := [f.name for f in fields(Row) if type(getattr(row, f.name)) is not f.type]:
+                raise InputError(f"{self.path} is damaged: the {wrong[0]} of trajectory {row.number} cannot be read.")
+            # Paths are data: none leads out of the dataset.
+            if row.file and not _PLACE.fullmatch(row.file):
+                raise InputError(f"{self.path} places trajectory {row.number} in {one_line(row.file)}: it is damaged.")
+        return rows
+
+    def put(self, rows: Iterable[Row]) -> None:
+        """Add rows, or replace those of the same numbers, all at once and durably."""
+        insert = f"INSERT OR REPLACE INTO trajectories ({_COLUMNS}) VALUES ({', '.join('?' * len(fields(Row)))})"
+        with self._open("write", self.path) as connection:
+            connection.executemany(insert, map(astuple, rows))
+
+    @contextmanager
+    def _open(self, verb: str, path: Path) -> Iterator[sqlite3.Connection]:
+        try:
+            with closing(sqlite3.connect(path)) as connection:
+                connection.execute("PRAGMA synchronous = FULL")
+                with connection:
+                    yield connection
+        except sqlite3.Error as error:
+            raise RunError(f"mpmcli could not {verb} {path} ({error}); rows written before are kept.") from error
+
+    @contextmanager
+    def _reading(self) -> Iterator[sqlite3.Connection]:
+        if not self.path.is_file():
+            raise InputError(f"{self.path.parent} is no dataset: it has no {MANIFEST}.")
+        try:
+            # Not mode=ro, which could not roll back what a killed writer left.
+            with closing(sqlite3.connect(f"file:{self.path}?mode=rw", uri=True)) as connection:
+                yield connection
+        except (sqlite3.Error, TypeError, ValueError, RecursionError, MemoryError) as error:
+            raise InputError(f"{self.path} cannot be read ({error}); copy it again, or run the sweep again.") from error
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and 0 < value <= 10**9
+
+
+def _is_part(value: object) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(map(_is_count, value)) and value[0] <= value[1]
+
+
+# What the facts of a sweep must be.
+_SOUND = {"key": lambda value: isinstance(value, str), "count": _is_count, "per_shard": _is_count, "part": _is_part}
 
 
 def require_empty(directory: Path, *, locked: bool = False) -> None:
-    """Refuse a directory that holds something, is being written or cannot be.
-
-    Args:
-        locked: whether this process has the lock of the directory.
-
-    Raises:
-        InputError: it does; nothing was made.
-    """
+    """Refuse a directory that holds something, is being written or cannot be; `locked` says that this process does."""
     if directory.is_dir() and any(path.name != LOCK for path in directory.iterdir()):
         raise InputError(f"{directory} exists and is not empty: give another directory with -o.")
     check_directory(directory, overwrite=False, locked=locked)
@@ -37,10 +165,8 @@ def require_empty(directory: Path, *, locked: bool = False) -> None:
 class Folder:
     """Places of the trajectories in a dataset.
 
-    Attributes:
-        path: of the dataset.
-        count: trajectories of the sweep; per_shard: of which a shard has so many, the last one fewer.
-        part: (i, n): this directory has every n-th shard, from the i-th on, counted from 1.
+    Each of its shards has `per_shard` of `count` trajectories, the last one fewer. With `part` (i, n) this directory
+    has every n-th shard, from the i-th on, counted from 1.
     """
 
     def __init__(self, path: Path, count: int, per_shard: int, part: tuple[int, int]) -> None:
@@ -52,13 +178,18 @@ class Folder:
         first, parts = self.part
         return range(first - 1, -(-self.count // self.per_shard), parts)
 
+    @property
+    def expected(self) -> int:
+        """Number of trajectories of this part."""
+        return sum(len(self.numbers(shard)) for shard in self.shards)
+
+    def all_numbers(self) -> Iterator[int]:
+        """Yield the numbers of the trajectories of this part."""
+        return (number for shard in self.shards for number in self.numbers(shard))
+
     def numbers(self, shard: int) -> range:
         """Return the numbers of the trajectories of a shard."""
         return range(shard * self.per_shard, min((shard + 1) * self.per_shard, self.count))
-
-    def shard_of(self, number: int) -> int:
-        """Return the number of the shard that a trajectory belongs to."""
-        return number // self.per_shard
 
     def shard_file(self, shard: int) -> str:
         """Return the path of a shard in the dataset."""
@@ -69,37 +200,23 @@ class Folder:
         return row.verdict != "failed" and (not row.file or (self.path / row.file).is_file())
 
     def seal(self, shard: int, rows: Mapping[int, Row]) -> list[Row]:
-        """Join the accepted trajectories of a shard in one file, durably, and return the rows that it changes.
-
-        Args:
-            rows: of all its trajectories, by number.
-
-        Raises:
-            RunError: the disk refuses, or a trajectory does not read back; the files of the trajectories are kept.
-        """
+        """Join accepted trajectories of a shard durably, return changed rows; RunError: the single files are kept."""
         accepted = [rows[n] for n in self.numbers(shard) if rows[n].accepted]
         target = self.path / self.shard_file(shard)
         if not accepted:
             return []
-        sources = [self.path / row.file for row in accepted]
-        size = sum(source.stat().st_size for source in sources)
+        files = {row.number: self.path / row.file for row in accepted}
+        size = sum(file.stat().st_size for file in files.values())
         kept = f"its trajectories are kept in {self.path / PENDING}"
         target.parent.mkdir(exist_ok=True)
         require_free_space(target.parent, size, f"shard {shard}", kept)
         try:
             with sealed(target, size) as temporary:
-                with h5py.File(temporary, "w") as joined:
-                    joined.attrs["format"], joined.attrs["version"] = FORMAT, VERSION
-                    for row, path in zip(accepted, sources, strict=True):
-                        with h5py.File(path, "r") as source:
-                            source.copy(group_name(row.number), joined)
-                            if CHECKSUMS not in joined[group_name(row.number)]:
-                                # An older version has computed it.
-                                add_checksums(joined[group_name(row.number)])
-                append_checksum(temporary)
-                damaged = _differing(temporary, accepted)
-                if damaged is not None:
-                    raise RunError(f"{target} does not hold trajectory {damaged} as it was computed; {kept}.")
+                join_trajectories(files, temporary)
+                with h5py.File(temporary, "r") as joined:
+                    damaged = [r.number for r in accepted if checksum(joined[group_name(r.number)]) != r.checksum]
+                if damaged:
+                    raise RunError(f"{target} does not hold trajectory {damaged[0]} as it was computed; {kept}.")
         except (OSError, RuntimeError, KeyError) as error:
             reason = getattr(error, "strerror", None) or error
             raise RunError(f"{target} could not be written ({reason}); {kept}.") from error
@@ -113,9 +230,3 @@ class Folder:
     def close(self) -> None:
         """Remove what unfinished work has left."""
         shutil.rmtree(self.path / PENDING, ignore_errors=True)
-
-
-def _differing(path: Path, rows: Sequence[Row]) -> int | None:
-    """Return the first trajectory whose checksum is not that of its row."""
-    with h5py.File(path, "r") as file:
-        return next((row.number for row in rows if checksum(file[group_name(row.number)]) != row.checksum), None)

@@ -6,29 +6,23 @@ from pathlib import Path
 from typing import Any
 
 from mpmcli.dataset.card import write_card
-from mpmcli.dataset.folder import require_empty
-from mpmcli.dataset.manifest import Manifest
-from mpmcli.dataset.paths import BASE, QUARANTINE, SHARDS, SWEEP
+from mpmcli.dataset.folder import Manifest, require_empty
 from mpmcli.dataset.report import Status, status_of, verify
+from mpmcli.dataset.shard import BASE, QUARANTINE, SHARDS, SWEEP
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.durable import require_free_space, sealed, write_text
 from mpmcli.output.lock import take_lock
 
 
 def merge(parts: Sequence[Path], target: Path) -> Status:
-    """Copy the parts of one sweep into one dataset, which equals that of a sweep in one part.
-
-    Raises:
-        InputError: a part is missing, not complete, damaged, or of another sweep; nothing was written.
-        RunError: the disk refuses.
-    """
+    """Copy complete parts of one sweep into a dataset as of one part; InputError, nothing written: a part is wrong."""
     require_empty(target)
     facts = [Manifest(part).facts() for part in parts]
-    for part, own in zip(parts, facts, strict=True):
-        if {**own, "part": None} != {**facts[0], "part": None}:
+    for part, its in zip(parts, facts, strict=True):
+        if {**its, "part": None} != {**facts[0], "part": None}:
             raise InputError(f"{part} is of another sweep than {parts[0]}, or of another version of mpmcli.")
     count = facts[0]["part"][1]
-    there = sorted(own["part"][0] for own in facts)
+    there = sorted(its["part"][0] for its in facts)
     # A part beyond the last shard is empty, and nobody can compute it.
     shards = -(-facts[0]["count"] // facts[0]["per_shard"])
     needed = list(range(1, min(count, shards) + 1))
@@ -48,7 +42,7 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
 
 
 def _join(parts: Sequence[Path], target: Path, files: Sequence[Path], facts: Mapping[str, Any]) -> None:
-    """Copy files of the parts, and write what belongs to the whole; see `merge`."""
+    """Copy files of the parts, and write what belongs to the whole."""
     size = sum(file.stat().st_size for file in files)
     require_free_space(target, size, "the merged dataset", "the parts are kept", several=True)
     try:

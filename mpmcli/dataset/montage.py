@@ -9,32 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli.dataset.card import MONTAGE
+from mpmcli.dataset.card import MONTAGE, number_text
 from mpmcli.dataset.dataset import Dataset, Trajectory, open_dataset
-from mpmcli.dataset.drawn_values import number_text
 from mpmcli.errors import InputError
-from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.header import BodyHeader, RunHeader
-from mpmcli.output.layout import POSITION, STANDARD, FrameLayout
+from mpmcli.output.layout import POSITION, STANDARD, FrameIndex, FrameLayout
 from mpmcli.output.result import Result
-from mpmcli.render.appearance import appearance_of
 from mpmcli.render.frame_choice import evenly_spaced
-from mpmcli.render.render_plan import RenderPlan
-from mpmcli.render.request import Request, plan_render
+from mpmcli.render.render_scene import appearance_of
+from mpmcli.render.request import RenderPlan, Request, plan_render
 from mpmcli.render.settings import parse_grid
 from mpmcli.scene.colliders import Collider
 
 
 def plan_montage(path: Path, request: Request) -> RenderPlan:
-    """Plan a montage of a dataset: evenly spaced trajectories, each at one frame, under its number and drawn values.
+    """Plan a montage of evenly spaced trajectories, each at one frame; InputError: the request is not possible.
 
-    Args:
-        path: the directory of the dataset.
-        request: its `frames` is N, "first" or "last" for every trajectory, None for the middle one of each; its
-            `output` is montage.png in the dataset where none is given.
-
-    Raises:
-        InputError: the request is not possible.
+    `frames` of the request is N, "first" or "last" for all, None for the middle one of each.
     """
     if request.montage is None or request.movie is not None or request.save_surface is not None:
         raise InputError(
@@ -47,37 +38,19 @@ def plan_montage(path: Path, request: Request) -> RenderPlan:
     cells = TrajectoryCells(dataset, numbers, request.frames)
     # No empty cells, but for those of the last row.
     columns = min(columns, len(numbers))
-    request = replace(
-        request,
-        frames=None,
-        montage=f"{columns}x{-(-len(numbers) // columns)}",
-        output=request.output or path / MONTAGE,
-    )
-    return plan_render(cells, request, cells.captions)
+    grid, output = f"{columns}x{-(-len(numbers) // columns)}", request.output or path / MONTAGE
+    return plan_render(cells, replace(request, frames=None, montage=grid, output=output), cells.captions)
 
 
 def write_montage(path: Path, grid: str = "4x4") -> Path:
-    """Draw the montage of a dataset, montage.png in its directory, and return its path.
-
-    Raises:
-        InputError: nothing draws on this machine, or a file of this name is there that mpmcli did not make.
-        RunError: the disk is full.
-    """
+    """Draw montage.png of a dataset, return its path; InputError: nothing draws here, or a foreign file is there."""
     return plan_montage(path, Request(montage=grid)).carry_out().pictures[0]
 
 
 class TrajectoryCells(Result):
     """One frame of each of some trajectories, as the frames of one run that has the bodies of all of them.
 
-    So they share one camera, one scale and one explanation of colours. The domain is the box around all domains, and
-    materials that look alike are one; fields are those that all trajectories have.
-
-    Args:
-        numbers: of the trajectories, one or more.
-        frame: as of `plan_montage`.
-
-    Attributes:
-        captions: the number of each trajectory, and what it has drawn.
+    They share camera, scale and colours. The domain is the box around all; fields are those that all have.
     """
 
     kind = "packed"
@@ -150,7 +123,6 @@ class _Body(BodyHeader):
 
 
 def _all_bodies(headers: Sequence[RunHeader]) -> tuple[BodyHeader, ...]:
-    """Return the bodies of all runs, in the order of the runs."""
     alike: dict[str, Any] = {}
     bodies = []
     for header in headers:
@@ -165,10 +137,9 @@ def _all_bodies(headers: Sequence[RunHeader]) -> tuple[BodyHeader, ...]:
 
 def _common_layout(trajectories: Sequence[Trajectory]) -> FrameLayout:
     layouts = [each.layout() for each in trajectories]
-    common = [name for name in layouts[0].arrays if all(name in each.arrays for each in layouts)]
-    names = [*(name for name in (POSITION, *STANDARD) if name in common)]
-    names += [name for name in common if name not in names]
-    return FrameLayout(layouts[0].dimension, {name: layouts[0].arrays[name] for name in names})
+    names = dict.fromkeys((POSITION, *STANDARD, *layouts[0].arrays))
+    common = [name for name in names if all(name in each.arrays for each in layouts)]
+    return FrameLayout(layouts[0].dimension, {name: layouts[0].arrays[name] for name in common})
 
 
 def _position(frame: str | None, trajectory: Trajectory) -> int:

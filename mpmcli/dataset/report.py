@@ -8,14 +8,11 @@ from pathlib import Path
 
 import h5py
 
-from mpmcli.dataset.folder import Folder
-from mpmcli.dataset.manifest import VERDICTS, Manifest, Row
-from mpmcli.dataset.paths import SHARDS
-from mpmcli.dataset.shard import checksum, group_name, open_shard
-from mpmcli.dataset.stored_trajectory import StoredGroup
+from mpmcli.dataset.folder import VERDICTS, Folder, Manifest, Row
+from mpmcli.dataset.shard import SHARDS, StoredGroup, checksum, group_name, open_shard
 from mpmcli.errors import InputError
-from mpmcli.output.file_checksum import checksum_is_right
-from mpmcli.output.hdf5_items import held
+from mpmcli.output.checksums import checksum_is_right
+from mpmcli.output.guarded_read import held
 from mpmcli.plain_text import counted, one_line
 
 # Trajectories that a text names.
@@ -24,12 +21,7 @@ MOST_NAMED = 10
 
 @dataclass(frozen=True)
 class Status:
-    """Counts of a dataset.
-
-    Attributes:
-        path: of the dataset; part: (i, n) of the sweep.
-        expected: trajectories of the part; rows: those that have been tried.
-    """
+    """Counts of a dataset with `part` (i, n) of a sweep: trajectories `expected` in it, and `rows` of those tried."""
 
     path: Path
     part: tuple[int, int]
@@ -45,6 +37,7 @@ class Status:
         """Return the counts, and the reason of each trajectory that is not included."""
         verdicts = Counter(row.verdict for row in self.rows)
         splits = Counter(row.split for row in self.rows if row.accepted)
+        told = ("number", "verdict", "reason", "file")
         return {
             "path": str(self.path),
             "part": list(self.part),
@@ -56,11 +49,7 @@ class Status:
             "splits": dict(sorted(splits.items())),
             "steps": sum(row.steps for row in self.rows),
             "seconds": sum(row.seconds for row in self.rows),
-            "excluded": [
-                {"number": row.number, "verdict": row.verdict, "reason": row.reason, "file": row.file}
-                for row in self.rows
-                if not row.accepted
-            ],
+            "excluded": [{name: getattr(row, name) for name in told} for row in self.rows if not row.accepted],
         }
 
     def text(self) -> str:
@@ -80,24 +69,16 @@ class Status:
 
 
 def status_of(path: Path) -> Status:
-    """Read the counts of a dataset.
-
-    Raises:
-        InputError: it is none, or its manifest cannot be read.
-    """
+    """Read the counts of a dataset; an InputError says that it is none, or that its manifest cannot be read."""
     manifest = Manifest(path)
     facts, rows = manifest.facts(), manifest.rows()
     folder = Folder(path, facts["count"], facts["per_shard"], tuple(facts["part"]))
-    return Status(path, folder.part, sum(len(folder.numbers(shard)) for shard in folder.shards), tuple(rows))
+    return Status(path, folder.part, folder.expected, tuple(rows))
 
 
 @dataclass(frozen=True)
 class Verification:
-    """Outcome of a comparison of a dataset with its manifest.
-
-    Attributes:
-        path: of the dataset; trajectories: compared; faults: one sentence each.
-    """
+    """Outcome of a comparison of a dataset with its manifest: how many trajectories, and a sentence for each fault."""
 
     path: Path
     trajectories: int
@@ -105,12 +86,8 @@ class Verification:
 
     def as_dict(self) -> dict:
         """Return it as JSON can hold it."""
-        return {
-            "path": str(self.path),
-            "ok": not self.faults,
-            "trajectories": self.trajectories,
-            "faults": list(self.faults),
-        }
+        read = {"trajectories": self.trajectories, "faults": list(self.faults)}
+        return {"path": str(self.path), "ok": not self.faults, **read}
 
     def text(self) -> str:
         """Return the outcome, and a line for each fault."""
@@ -119,14 +96,7 @@ class Verification:
 
 
 def verify(path: Path, on_file: Callable[[int, int], None] = lambda done, total: None) -> Verification:
-    """Read every trajectory of a dataset, and compare checksums and counts with the manifest.
-
-    Args:
-        on_file: called after each file with the number of files read, and of all.
-
-    Raises:
-        InputError: it is no dataset, or its manifest cannot be read.
-    """
+    """Compare a dataset with its manifest; `on_file` is told files read, and their number, after each."""
     status = status_of(path)
     faults = []
     missing = status.expected - len(status.rows)
@@ -138,10 +108,8 @@ def verify(path: Path, on_file: Callable[[int, int], None] = lambda done, total:
             by_file.setdefault(row.file, []).append(row)
         elif row.accepted:
             faults.append(f"trajectory {row.number} is included, but has no file.")
-    known = {path / name for name in by_file}
-    faults += [
-        f"{found} is in no row of the manifest." for found in sorted((path / SHARDS).glob("*.h5")) if found not in known
-    ]
+    others = set((path / SHARDS).glob("*.h5")) - {path / name for name in by_file}
+    faults += [f"{other} is in no row of the manifest." for other in sorted(others)]
     for done, (name, rows) in enumerate(sorted(by_file.items()), 1):
         faults += _faults_of(path / name, rows)
         on_file(done, len(by_file))
@@ -156,10 +124,8 @@ def _faults_of(file: Path, rows: list[Row]) -> list[str]:
             others = sorted(opened.keys() - names.keys())
             faults += [f"{file} holds {one_line(name)}, which the manifest does not place there." for name in others]
             for name, row in names.items():
-                if opened.get(name, getlink=True) is None:
-                    faults.append(f"{file} lacks trajectory {row.number}.")
-                else:
-                    faults += _trajectory_faults(opened, row)
+                there = opened.get(name, getlink=True) is not None
+                faults += _trajectory_faults(opened, row) if there else [f"{file} lacks trajectory {row.number}."]
             checked = opened.attrs["version"] > 1
         if checked and not faults and not checksum_is_right(file):
             faults.append(f"{file} has changed between its data: the checksum at its end differs.")
@@ -170,17 +136,18 @@ def _faults_of(file: Path, rows: list[Row]) -> list[str]:
 
 def _trajectory_faults(file: h5py.File, row: Row) -> list[str]:
     """Compare a trajectory with its row, and with its own checksums, where its version has any."""
+    it = f"trajectory {row.number} in {file.filename}"
     try:
         stored = StoredGroup(file, row.number)
         if checksum(stored.group) != row.checksum:
-            return [f"trajectory {row.number} in {file.filename} has changed: its checksum differs."]
+            return [f"{it} has changed: its checksum differs."]
         if held(stored.group, "position").shape[:2] != (row.frames, row.particles):
-            return [f"trajectory {row.number} in {file.filename} has other counts than its row."]
+            return [f"{it} has other counts than its row."]
         if stored.attribute("split") != row.split or stored.attribute("draws") != json.loads(row.draws):
-            return [f"trajectory {row.number} in {file.filename} has other draws or another split than its row."]
+            return [f"{it} has other draws or another split than its row."]
         stored.require_all()
     except (OSError, RuntimeError, ValueError, KeyError, TypeError):
-        return [f"trajectory {row.number} in {file.filename} is damaged: it cannot be read."]
+        return [f"{it} is damaged: it cannot be read."]
     except InputError as error:
         return [str(error)]
     return []

@@ -8,7 +8,7 @@
 /000007/ledger/mass   and every other column of the ledger, T rows
 /000007/checksums     of each frame and of all else, see `output/checksums.py`; not in version 1
 
-The last bytes of the file are a checksum of all before (`output/file_checksum.py`).
+The last bytes of the file are a checksum of all before (`output/checksums.py`).
 """
 
 import json
@@ -25,24 +25,20 @@ import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output import checksums
 from mpmcli.output.checksums import NAME as CHECKSUMS
-from mpmcli.output.checksums import (
-    attribute_checksum,
-    frame_checksums,
-    kind_checksum,
-    store_checksums,
-    table_checksum,
-)
-from mpmcli.output.damage import DAMAGE
-from mpmcli.output.guarded_read import read_whole, require_stored
-from mpmcli.output.hdf5_heaps import require_sound_heaps
-from mpmcli.output.hdf5_items import held, items
-from mpmcli.output.ledger_table import ledger_columns
+from mpmcli.output.checksums import Checksums, append_checksum, attribute_checksum, store_checksums, table_checksum
+from mpmcli.output.durable import sealed
+from mpmcli.output.guarded_read import DAMAGE, held, items, read_whole, require_sound_heaps, require_stored
+from mpmcli.output.ledger_table import ledger_columns, read_ledger
 
 FORMAT, VERSION = "mpmcli-dataset", 2
 SPLITS = ("train", "valid", "test")
 MOVING, LABELS, TABLES = ("position", "velocity"), ("body", "material"), ("time", "step", "frame")
 LEDGER = "ledger"
+# The files of a dataset, and its directories.
+SWEEP, BASE = "sweep.toml", "base.toml"
+SHARDS, PENDING, QUARANTINE = "shards", "pending", "quarantine"
 # Of HDF5 for a data set and for a group, at most.
 TABLE_BYTES, GROUP_BYTES = 1024, 16 * 1024
 # Of a compressed chunk: as much as HDF5 caches of a dataset.
@@ -54,15 +50,11 @@ class TrajectoryData:
     """One trajectory of T frames with N particles each.
 
     Attributes:
-        number: in the dataset, from 0.
-        split: "train", "valid" or "test".
-        draws: what was drawn for it, by the key of the scene; JSON can hold it.
-        header: `RunHeader.stored`.
+        number: in the dataset, from 0; split: "train", "valid" or "test".
+        draws: what was drawn, by the key of the scene; header: `RunHeader.stored`. JSON can hold both.
         position, velocity: (T, N, d) float32 or float64, m and m/s.
         body, material: (N,), indices into the bodies and laws of the header.
-        time: (T,), s.
-        step, frame: (T,), time steps since the start, and number of the frame.
-        ledger: T rows.
+        time: (T,), s; step, frame: (T,), time steps since the start, and number of the frame; ledger: T rows.
         fields: further arrays of `output.fields`, (T, N) or (T, N, ...), by name.
     """
 
@@ -95,45 +87,47 @@ def group_name(number: int) -> str:
     return f"{number:06d}"
 
 
+def file_name(number: int) -> str:
+    """Return the name of the file of a single trajectory, before it is in a shard or in quarantine."""
+    return f"{group_name(number)}.h5"
+
+
 def write_trajectory(file: h5py.File, data: TrajectoryData, *, compress: bool = False) -> None:
-    """Add a trajectory to a shard that is open for writing.
-
-    The bytes of the file depend on the trajectories and their order alone, not on when or where it is written.
-
-    Args:
-        compress: gzip-1 with shuffle, for what moves.
-
-    Raises:
-        ValueError: the split or the name of a field is not possible, shapes contradict each other, or the shard
-            holds the trajectory already.
-    """
+    """Add a trajectory to an open shard, its bytes by content alone; ValueError: it contradicts itself, or is there."""
     if fault := _fault(data):
         raise ValueError(f"trajectory {data.number}: {fault}")
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     # Fields keep their order.
     group = file.create_group(group_name(data.number), track_order=True)
-    attributes, arrays = _attributes(data), data.arrays
+    attributes, arrays, names = _attributes(data), data.arrays, [*MOVING, *data.fields]
     group.attrs.update(attributes)
-    for name, array in arrays.items():
-        moves = name in (*MOVING, *data.fields)
-        options = _storage(array) if compress and moves and array.size else {}
-        group.create_dataset(name, data=array, track_times=False, **options)
-    names = [*MOVING, *data.fields]
     known = {f"@{name}": attribute_checksum(value) for name, value in attributes.items()}
     for name, array in arrays.items():
-        known[name] = kind_checksum(array.dtype, array.shape) if name in names else table_checksum(array)
+        moves = name in names
+        options = _storage(array) if compress and moves and array.size else {}
+        group.create_dataset(name, data=array, track_times=False, **options)
+        known[name] = checksums.kind_checksum(array.dtype, array.shape) if moves else table_checksum(array)
     store_checksums(group, "", names, _table([arrays[name] for name in names]), known)
 
 
-def add_checksums(group: h5py.Group) -> None:
-    """Write the checksums of a trajectory that an older version has written."""
-    names = moving_names(group)
-    store_checksums(group, "", names, _table([held(group, name)[...] for name in names]))
+def join_trajectories(files: Mapping[int, Path], path: Path) -> None:
+    """Write a shard with trajectories by number, each from a file of its own."""
+    with h5py.File(path, "w") as joined:
+        joined.attrs["format"], joined.attrs["version"] = FORMAT, VERSION
+        for number, file in files.items():
+            with h5py.File(file, "r") as source:
+                source.copy(group_name(number), joined)
+                group = joined[group_name(number)]
+                if CHECKSUMS not in group:
+                    # An older version has computed it.
+                    names = moving_names(group)
+                    store_checksums(group, "", names, _table([held(group, name)[...] for name in names]))
+    append_checksum(path)
 
 
 def _table(arrays: Sequence[np.ndarray]) -> np.ndarray:
     """Return the checksums of arrays of T frames, (T, A) uint32."""
-    columns = [frame_checksums(array) for array in arrays]
+    columns = [checksums.frame_checksums(array) for array in arrays]
     return np.array(columns, np.uint32).reshape(len(arrays), len(arrays[0])).T
 
 
@@ -147,14 +141,15 @@ def _attributes(data: TrajectoryData) -> dict[str, int | str]:
     return {"number": data.number, "split": data.split, "draws": draws, "header": header}
 
 
-def stored_bytes(data: TrajectoryData) -> int:
-    """Return the bytes of a shard that holds this trajectory alone, without compression, rounded up."""
+def write_single(path: Path, data: TrajectoryData, *, compress: bool) -> str:
+    """Write a shard with this trajectory alone in one durable step, and return the checksum of the trajectory."""
     attributes = sum(len(str(value)) for value in _attributes(data).values())
-    return sum(array.nbytes + TABLE_BYTES for array in data.arrays.values()) + attributes + GROUP_BYTES
-
-
-def checksum_of(data: TrajectoryData) -> str:
-    """Return the checksum that the group of a trajectory will have."""
+    # Without compression, rounded up.
+    size = sum(array.nbytes + TABLE_BYTES for array in data.arrays.values()) + attributes + GROUP_BYTES
+    with sealed(path, size) as temporary:
+        with h5py.File(temporary, "w") as file:
+            write_trajectory(file, data, compress=compress)
+        append_checksum(temporary)
     return _checksum(_attributes(data), sorted(data.arrays.items()))
 
 
@@ -176,11 +171,7 @@ def _checksum(attributes: Mapping[str, Any], arrays: Iterable[tuple[str, np.ndar
 
 @contextmanager
 def open_shard(path: Path) -> Iterator[h5py.File]:
-    """Open a sealed shard for reading.
-
-    Raises:
-        InputError: it is missing, no shard, of a newer mpmcli, or damaged; also where what is read from it is.
-    """
+    """Open a sealed shard for reading; an InputError says that it, or what is read from it, is missing or damaged."""
     if not path.exists():
         raise InputError(f"{path} is missing: the dataset is not complete.")
     try:
@@ -194,37 +185,28 @@ def open_shard(path: Path) -> Iterator[h5py.File]:
             if file.attrs["version"] > VERSION:
                 raise InputError(f"{path} was written by a newer version of mpmcli; update mpmcli to read it.")
             yield file
+    except InputError:
+        raise
     except DAMAGE as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path} is damaged: what it should hold cannot be read.") from error
 
 
 def shard_splits(path: Path) -> dict[int, str]:
-    """Return the split of each trajectory in a shard, by number.
-
-    Raises:
-        InputError: as `open_shard`.
-    """
+    """Return the split of each trajectory in a shard, by number; errors are those of `open_shard`."""
     with open_shard(path) as file:
         splits = {}
         for name in file:
-            group = held(file, name)
-            number = int(group.attrs["number"])
-            if group_name(number) != name:
+            attributes = held(file, name).attrs
+            splits[int(attributes["number"])] = str(attributes["split"])
+            if group_name(int(attributes["number"])) != name:
                 raise ValueError("a trajectory has the name of another")
-            splits[number] = str(group.attrs["split"])
         if not set(splits.values()) <= set(SPLITS):
             raise ValueError("a split has another name")
         return splits
 
 
 def particles_of(group: h5py.Group, d: int, names: Sequence[str]) -> int:
-    """Return N, the number of particles of a trajectory in d dimensions with fields of these names.
-
-    Raises:
-        KeyError, ValueError: its arrays are not of T frames and N particles, or of other types.
-    """
+    """Return N of a trajectory in d dimensions; KeyError or ValueError: arrays are not of T frames and N particles."""
     shapes = {name: require_stored(group, name).shape for name in (*MOVING, *LABELS, *TABLES, *names)}
     frames, particles, axes = shapes["position"]
     right = {name: (particles,) for name in LABELS} | {name: (frames,) for name in TABLES}
@@ -237,7 +219,6 @@ def particles_of(group: h5py.Group, d: int, names: Sequence[str]) -> int:
 
 
 def _fault(data: TrajectoryData) -> str:
-    """Return what is wrong with a trajectory, "" where nothing is."""
     if data.split not in SPLITS:
         return f'its split is "{data.split}", and not one of {", ".join(SPLITS)}'
     if data.position.ndim != 3 or data.velocity.shape != data.position.shape:
@@ -261,3 +242,48 @@ def _storage(array: np.ndarray) -> dict[str, Any]:
     frames = min(array.shape[0], max(1, CHUNK_BYTES // (row * particles)))
     chunks = (frames, particles, *array.shape[2:])
     return {"chunks": chunks, "compression": "gzip", "compression_opts": 1, "shuffle": True}
+
+
+class StoredGroup:
+    """A trajectory's group, compared with checksums as it is read; KeyError: there is none; InputError: it changed."""
+
+    def __init__(self, file: h5py.File, number: int) -> None:
+        self.group: h5py.Group = held(file, group_name(number))
+        # Version 1 has none.
+        new = file.attrs["version"] > 1
+        self._checksums: Checksums | None = checksums.load_checksums(self.group, "") if new else None
+
+    def attribute(self, name: str) -> Any:
+        """Read an attribute."""
+        found = self.group.attrs[name]
+        if self._checksums is not None:
+            self._checksums.require(f"@{name}", attribute_checksum(found))
+        return json.loads(found) if name in ("draws", "header") else found
+
+    def table(self, path: str, kinds: str = "iuf") -> np.ndarray:
+        """Read all of an array without frames, which has one of these kinds of numpy types."""
+        found = read_whole(self.group, path, kinds)
+        if self._checksums is not None:
+            self._checksums.require(path, table_checksum(found))
+        return found
+
+    def frames(self, name: str, chosen: slice) -> np.ndarray:
+        """Read some frames of an array."""
+        data = require_stored(self.group, name)
+        found = data[chosen]
+        if self._checksums is not None:
+            for t, rows in zip(range(len(data))[chosen], found, strict=True):
+                self._checksums.require_frame(t, name, rows, t)
+        return found
+
+    def require_all(self) -> None:
+        """Compare the checksums of all that the group holds."""
+        if self._checksums is None:
+            return
+        for name in self._checksums.arrays:
+            self.frames(name, slice(None))
+        self._checksums.require_items(checksums.item_checksums(self.group, self._checksums.arrays, CHECKSUMS))
+
+    def ledger(self) -> list[LedgerRow]:
+        """Read the ledger."""
+        return read_ledger(held(self.group, LEDGER), lambda name, kinds: self.table(f"{LEDGER}/{name}", kinds))

@@ -1,24 +1,278 @@
-"""What a sweep file says, read and complete."""
+"""What a sweep file says, read and complete: its tables, its distributions, and what a trajectory draws."""
 
-import hashlib
 import json
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from statistics import NormalDist
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, PlainValidator, model_validator
 
-from mpmcli.dataset.distributions import Distribution, read_distribution
-from mpmcli.dataset.unit_numbers import Method, generator
-from mpmcli.scene.quantity import AXES, Integer, NotNegative, Number, Table, flaw, list_of_axes
+from mpmcli.scene.problem import listed, nearest, quoted, written
+from mpmcli.scene.quantity import AXES, LARGEST, Integer, NotNegative, Number, Table, flaw, list_of_axes
 
+# A normal distribution that says no bounds ends at so many standard deviations.
+USUAL_DEVIATIONS = 3.0
+Method = Literal["random", "sobol", "latin"]
+Accepted = Literal["stable", "suspect"]
+_KINDS = ["uniform", "loguniform", "normal", "integers", "choice", "grid"]
 # 2^64 / golden ratio, made odd.
 GOLDEN = 0x9E3779B97F4A7C15
 ROUND_OFF = 1e-9
 
-Accepted = Literal["stable", "suspect"]
+
+@dataclass(frozen=True)
+class Distribution:
+    """What one key of a sweep is drawn from.
+
+    Attributes:
+        continuous: whether the value depends continuously on u; such values are drawn by the sweep's method.
+        components: number of u that a value needs.
+    """
+
+    continuous: ClassVar[bool] = False
+    components: ClassVar[int] = 0
+
+    def value(self, u: Sequence[float]) -> Any:
+        """Return the value at u, `components` numbers in [0, 1); plain Python, as TOML holds it."""
+        raise NotImplementedError
+
+    def extremes(self) -> list[Any]:
+        """Return the values at both ends; all values where they have no order."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Constant(Distribution):
+    """One value."""
+
+    constant: Any
+
+    def value(self, u: Sequence[float]) -> Any:
+        return self.constant
+
+    def extremes(self) -> list[Any]:
+        return [self.constant]
+
+
+@dataclass(frozen=True)
+class Choice(Distribution):
+    """One of some values, each as likely."""
+
+    components = 1
+    values: tuple[Any, ...]
+
+    def value(self, u: Sequence[float]) -> Any:
+        return self.values[int(len(self.values) * u[0])]
+
+    def extremes(self) -> list[Any]:
+        return list(self.values)
+
+
+@dataclass(frozen=True)
+class Grid(Distribution):
+    """Values in turn: trajectories run through the combinations of all grids of a sweep."""
+
+    values: tuple[Any, ...]
+
+    def extremes(self) -> list[Any]:
+        return list(self.values)
+
+
+@dataclass(frozen=True)
+class Numbers(Distribution):
+    """A number, or a vector of independent ones; the last two `parameters` of each are smallest and largest value."""
+
+    continuous = True
+    parameters: tuple[tuple[float, ...], ...]
+    vector: bool
+
+    @property
+    def components(self) -> int:
+        return len(self.parameters)
+
+    def value(self, u: Sequence[float]) -> Any:
+        drawn = [min(max(self.quantile(x, *one), one[-2]), one[-1]) for x, one in zip(u, self.parameters, strict=True)]
+        return drawn if self.vector else drawn[0]
+
+    def extremes(self) -> list[Any]:
+        """Return the value with every component at its lower end, and that with every one at its upper end."""
+        ends = [[one[end] for one in self.parameters] for end in (-2, -1)]
+        return ends if self.vector else [end[0] for end in ends]
+
+    @staticmethod
+    def quantile(u: float, *parameters: float) -> float:
+        """Return where the cumulative distribution of one component is u."""
+        raise NotImplementedError
+
+
+class Uniform(Numbers):
+    """As likely everywhere between two bounds."""
+
+    @staticmethod
+    def quantile(u: float, low: float, high: float) -> float:
+        return low + u * (high - low)
+
+
+class LogUniform(Numbers):
+    """The logarithm is uniform between the logarithms of two bounds: lo (hi / lo)^u."""
+
+    @staticmethod
+    def quantile(u: float, low: float, high: float) -> float:
+        return low * math.exp(u * (math.log(high) - math.log(low)))
+
+
+class Integers(Numbers):
+    """Whole numbers, both bounds included, each as likely; below 2^53, so that no rounding skips one."""
+
+    continuous = False
+
+    @staticmethod
+    def quantile(u: float, low: float, high: float) -> float:
+        return low + math.floor(u * (high - low + 1))
+
+
+class Normal(Numbers):
+    """Normal, cut off at two bounds: the density between them is that of the whole one, scaled."""
+
+    @staticmethod
+    def quantile(u: float, mean: float, deviation: float, low: float, high: float) -> float:
+        """mean + std Phi^-1(Phi(a) + u (Phi(b) - Phi(a))), with a and b the bounds in standard deviations."""
+        a, b = (low - mean) / deviation, (high - mean) / deviation
+        # In the upper tail Phi rounds to 1, so that both tails are computed in the lower one.
+        sign = 1.0 if a + b <= 0 else -1.0
+        from_a, from_b = cumulative_normal(sign * a), cumulative_normal(sign * b)
+        p = min(max(from_a + u * (from_b - from_a), math.ulp(0.0)), 1.0 - math.ulp(0.5))
+        return mean + sign * deviation * NormalDist().inv_cdf(p)
+
+
+def cumulative_normal(z: float) -> float:
+    """Return Phi(z) = erfc(-z / sqrt 2) / 2, exact in the lower tail."""
+    return math.erfc(-z / math.sqrt(2)) / 2
+
+
+def read_distribution(value: object) -> Distribution:
+    """Return the distribution that a value of a sweep file means.
+
+    `uniform = [lo, hi]`, `loguniform = [lo, hi]`, `integers = [lo, hi]` with both bounds, `normal = [mean, std]`
+    with `within = [min, max]` (default: three standard deviations either side), `choice = [values]`, `grid =
+    [values]`; what is no table is a constant. Where both bounds are lists of equal length, the value is a list
+    with independent components. A flaw is raised for pydantic to report.
+    """
+    if not isinstance(value, dict):
+        return Constant(value)
+    kind = _kind(value)
+    given = value[kind]
+    if kind in ("choice", "grid"):
+        if not isinstance(given, list) or not given:
+            raise flaw(f"must be a list with at least one value; found {written(given)}", kind)
+        return (Choice if kind == "choice" else Grid)(tuple(given))
+    first, second = _two(given, kind)
+    vector = isinstance(given[0], list)
+    if kind == "normal":
+        return Normal(_bounded(first, second, value, vector), vector)
+    for low, high in zip(first, second, strict=True):
+        if not low <= high:
+            raise flaw(f"must be [lower, upper]; found {written(low)} above {written(high)}", kind)
+        if kind == "loguniform" and low <= 0:
+            raise flaw(f"needs bounds greater than 0; found {written(low)}", kind)
+        if kind == "integers" and not (isinstance(low, int) and isinstance(high, int)):
+            raise flaw(f"needs whole numbers; found {written(given)}", kind)
+    numbers = {"uniform": Uniform, "loguniform": LogUniform, "integers": Integers}[kind]
+    cast = int if kind == "integers" else float
+    return numbers(tuple((cast(low), cast(high)) for low, high in zip(first, second, strict=True)), vector)
+
+
+def _kind(table: dict[str, Any]) -> str:
+    if any(isinstance(inner, dict) for inner in table.values()):
+        raise flaw('must be a distribution or a value; a key with dots stands in quotes, "domain.gravity"')
+    found = [kind for kind in _KINDS if kind in table]
+    if len(found) > 1:
+        raise flaw(f"is one distribution, and {listed(quoted(found), 'and')} are {len(found)}; keep one of them")
+    for key in table:
+        known = ["within"] if found == ["normal"] else [] if found else _KINDS
+        if key not in (*found, *known):
+            guess = nearest(key, known)
+            takes = f"{found[0]} takes no other key" if found else f"the distributions are {listed(_KINDS, 'and')}"
+            hint = f'did you mean "{guess}"?' if guess else takes
+            raise flaw(f"unknown key; {hint}", key)
+    if not found:
+        raise flaw(f"must be a distribution, {listed(_KINDS)}, or a value; found an empty table")
+    return found[0]
+
+
+def _two(given: object, key: str) -> tuple[list[Any], list[Any]]:
+    if isinstance(given, list) and len(given) == 2:
+        first, second = (one if isinstance(one, list) else [one] for one in given)
+        alike = isinstance(given[0], list) == isinstance(given[1], list) and len(first) == len(second) > 0
+        if alike and all(is_number(one) for one in first + second):
+            return first, second
+    raise flaw(f"must be two numbers, or two lists of numbers of the same length; found {written(given)}", key)
+
+
+def is_number(value: object) -> bool:
+    """Say whether a value is a finite number that can be computed with."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+
+
+def _bounded(
+    mean: list[float], deviation: list[float], table: dict[str, Any], vector: bool
+) -> tuple[tuple[float, ...], ...]:
+    """Return (mean, deviation, lower bound, upper bound) of each component of a normal distribution."""
+    if not all(std > 0 for std in deviation):
+        right = "is [mean, standard deviation], and a deviation is greater than 0"
+        raise flaw(f"{right}; found {written(deviation)}", "normal")
+    low = [m - USUAL_DEVIATIONS * std for m, std in zip(mean, deviation, strict=True)]
+    high = [m + USUAL_DEVIATIONS * std for m, std in zip(mean, deviation, strict=True)]
+    if "within" in table:
+        low, high = _two(table["within"], "within")
+        if isinstance(table["within"][0], list) != vector or len(low) != len(mean):
+            raise flaw("must be two bounds of the same kind as mean and standard deviation", "within")
+    for m, std, lo, hi in zip(mean, deviation, low, high, strict=True):
+        near = min(abs(lo - m), abs(hi - m)) if (lo - m) * (hi - m) > 0 else 0.0
+        if not lo < hi or cumulative_normal(-near / std) == 0:
+            raise flaw(f"must be [min, max] around values that occur; found [{lo:g}, {hi:g}]", "within")
+    return tuple(tuple(map(float, one)) for one in zip(mean, deviation, low, high, strict=True))
+
+
+def generator(seed: int, number: int, key: str) -> np.random.Generator:
+    """Return the random numbers of one key of one trajectory; no other key and no other trajectory shares them.
+
+    Philox (J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11), seeded by the sweep's seed,
+    the trajectory's number, and the first 128 bits of the SHA-256 of the key.
+    """
+    words = np.frombuffer(sha256(key.encode()).digest()[:16], "<u4").tolist()
+    return np.random.Generator(np.random.Philox(np.random.SeedSequence(seed, spawn_key=(number, *words))))
+
+
+def joint_point(method: Method, seed: int, number: int, dimension: int, count: int) -> list[float]:
+    """Return the point of a trajectory in the unit cube that all continuous components of a sweep share.
+
+    It is point `number` of the scrambled Sobol sequence (A. B. Owen 1998), which does not depend on the count, or row
+    `number` of a Latin hypercube of `count` points. The seed is that of the scrambling, or of the hypercube.
+    """
+    if method == "latin":
+        return _latin_hypercube(seed, dimension, count)[number].tolist()
+    from scipy.stats import qmc
+
+    sequence = qmc.Sobol(dimension, scramble=True, rng=seed)
+    if number:  # SciPy cannot go forward by nothing.
+        sequence.fast_forward(number)
+    return sequence.random(1)[0].tolist()
+
+
+@lru_cache(maxsize=2)
+def _latin_hypercube(seed: int, dimension: int, count: int) -> np.ndarray:
+    from scipy.stats import qmc
+
+    return qmc.LatinHypercube(dimension, rng=seed).random(count)
+
+
 Drawn = Annotated[Distribution, PlainValidator(read_distribution)]
 
 
@@ -121,15 +375,11 @@ class Sweep:
     """A sweep file and its base scene, checked; see `sweep_file.load_sweep`.
 
     Attributes:
-        path, text, data: the sweep file, its text, and its parsed TOML.
-        base, base_text, base_data: the same of the base scene.
-        count: number of trajectories.
-        seed: of everything that is drawn.
-        method: how the continuous distributions of `vary` are drawn.
-        accept: the worst verdict of a trajectory that belongs to the dataset.
+        path, text, data: the sweep file, its text, and its parsed TOML; base, base_text, base_data: the same of the
+            base scene.
+        count, seed, method, accept, split: as in the file, or the count given in its place.
         vary: distributions by key of the base scene, in the order of the file.
         placements: bodies and colliders placed at random.
-        split: fractions of the trajectories by their purpose.
     """
 
     path: Path
@@ -153,17 +403,10 @@ class Sweep:
         The order of keys in [vary] and of [[place]] counts, as grids and Sobol components follow it.
         """
         vary, place = self.data.get("vary", {}), self.data.get("place", [])
-        content = {
-            "base": self.base_data,
-            "count": self.count,
-            "seed": self.seed,
-            "method": self.method,
-            "accept": self.accept,
-            "vary": list(vary.items()),
-            "place": [place] if isinstance(place, dict) else place,
-            "split": self.split.model_dump(),
-        }
-        return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
+        content = {name: getattr(self, name) for name in ("count", "seed", "method", "accept")}
+        content |= {"base": self.base_data, "vary": list(vary.items()), "split": self.split.model_dump()}
+        content["place"] = [place] if isinstance(place, dict) else place
+        return sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
     @cached_property
     def distributions(self) -> dict[str, Distribution]:
@@ -187,3 +430,37 @@ class Sweep:
             if share > 0 and place < total:
                 break
         return last
+
+
+class TrajectoryValues:
+    """Values of one trajectory; those `given` by the keys of `sweep.distributions` are not drawn."""
+
+    def __init__(self, sweep: Sweep, number: int, given: Mapping[str, Any]) -> None:
+        self.sweep, self.number = sweep, number
+        self.given = {**_grid_values(sweep, number), **given}
+        joint = {} if sweep.method == "random" else {k: d for k, d in sweep.vary.items() if d.continuous}
+        size = sum(distribution.components for distribution in joint.values())
+        numbers = iter(joint_point(sweep.method, sweep.seed, number, size, sweep.count) if size else [])
+        self.joint = {key: [next(numbers) for _ in range(one.components)] for key, one in joint.items()}
+
+    def value(self, key: str, stream: str, distribution: Distribution) -> Any:
+        """Return the value of a key of `sweep.distributions`, drawn with the random numbers of a stream."""
+        if key in self.given:
+            return self.given[key]
+        if key in self.joint:
+            return distribution.value(self.joint[key])
+        return distribution.value(self.generator(stream).random(distribution.components).tolist())
+
+    def generator(self, stream: str) -> np.random.Generator:
+        """Return the random numbers of a stream of this trajectory."""
+        return generator(self.sweep.seed, self.number, stream)
+
+
+def _grid_values(sweep: Sweep, number: int) -> dict[str, Any]:
+    """Return the value of every grid; the last one changes from each trajectory to the next."""
+    values = {}
+    for key, grid in reversed(sweep.distributions.items()):
+        if isinstance(grid, Grid):
+            number, index = divmod(number, len(grid.values))
+            values[key] = grid.values[index]
+    return values

@@ -1,64 +1,57 @@
 """From a sweep file to a checked sweep, or to one error that names everything wrong with it."""
 
+import copy
+import re
+from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path as File
 from typing import Any
 
 from pydantic import ValidationError
 
-from mpmcli.dataset.sweep import Sweep, SweepTable
-from mpmcli.dataset.sweep_check import sweep_problems
+from mpmcli.dataset.draw import PlacementError, draw, template_extent
+from mpmcli.dataset.sweep import ROUND_OFF, Placement, Sweep, SweepTable, is_number
 from mpmcli.errors import InputError
 from mpmcli.scene import parse_scene
-from mpmcli.scene.expand import Laws
 from mpmcli.scene.geometry_file import absence
-from mpmcli.scene.load import read_toml, report
-from mpmcli.scene.locate import key_lines, line_of
-from mpmcli.scene.problem import Path, Problem
-from mpmcli.scene.quantity import dimension_of
-from mpmcli.scene.sentences import problems_of, written
+from mpmcli.scene.load import read_toml, report, scene_problems
+from mpmcli.scene.material import Laws
+from mpmcli.scene.problem import Path, Problem, listed, nearest, path_text, problems_of, quoted, written
+from mpmcli.scene.quantity import AXES, NUMBER_WORDS, dimension_of
+from mpmcli.scene.shapes import COMBINED
+from mpmcli.scene.toml_file import key_parts, set_value
+
+MOST_BODIES = 1000
+# The key of a placement by the list that its template is in.
+KINDS = {"bodies": "body", "colliders": "collider"}
 
 
 def load_sweep(path: str | PathLike[str], *, laws: Laws, count: int | None = None) -> Sweep:
     """Read a sweep and its base scene from TOML files, and try the scenes that they make.
 
-    The base scene is sought in the directory of the sweep, then in the working directory. Trajectory 0 must be a
-    valid scene, also with every distribution at either of its ends and with every value of a choice or grid, one
-    key at a time.
-
-    Args:
-        path: the sweep file.
-        laws: parameter models of the constitutive laws that a material may follow.
-        count: number of trajectories; default: that of the file.
-
-    Raises:
-        InputError: one line per fault: `FILE:LINE: KEY: what is wrong and what would be right`; the faults of a base
-            scene that is itself no valid scene are told as `mpmcli.scene.load_scene` tells them.
+    The base is sought beside the sweep, then in the working directory. Trajectory 0 must be valid, also with each
+    distribution at its ends, one key at a time. `count` replaces that of the file. InputError has one line per fault:
+    `FILE:LINE: KEY: what is wrong and what would be right`.
     """
     text, data = read_toml(path, "sweep")
     read = data if count is None else {**data, "count": count}
     base = _base_file(File(path), text, data)
     base_text, base_data = read_toml(base)
-    table, problems = _validate(read, dimension_of(base_data))
-    if table is None:
-        raise InputError(report(problems, str(path), text))
+    place = read.get("place")
+    tables = {**read, "place": [place]} if isinstance(place, dict) else read
+    try:
+        table = SweepTable.model_validate(tables, context={"dimension": dimension_of(base_data)})
+    except ValidationError as error:
+        problems = [_as_written(p, read) for p in problems_of(error, tables, SweepTable)]
+        raise InputError(report(problems, str(path), text)) from None
     parse_scene(base_data, laws=laws, source=str(base), text=base_text, directory=base.parent)
-    sweep = Sweep(
-        path=File(path),
-        text=text,
-        data=data,
-        base=base,
-        base_text=base_text,
-        base_data=base_data,
-        count=table.count,
-        seed=table.seed,
-        method=table.method,
-        accept=table.accept,
-        vary=table.vary,
-        placements=table.place,
-        split=table.split,
-    )
-    if problems := sweep_problems(sweep, laws):
+    same = {name: getattr(table, name) for name in ("count", "seed", "method", "accept", "vary", "split")}
+    sweep = Sweep(File(path), text, data, base, base_text, base_data, placements=table.place, **same)
+    problems = list(_misplaced(sweep))
+    if not problems:
+        set_by, problems = _owners(sweep)
+        problems = problems or _faulty_scenes(sweep, laws, set_by)
+    if problems:
         raise InputError(report([_as_written(p, data) for p in problems], str(path), text))
     return sweep
 
@@ -66,31 +59,164 @@ def load_sweep(path: str | PathLike[str], *, laws: Laws, count: int | None = Non
 def _base_file(path: File, text: str, data: dict[str, Any]) -> File:
     """Return the file of the base scene; relative to the sweep, or to the working directory."""
     name = data.get("base")
-    line = line_of(("base",), key_lines(text))
-    place = f"{path}: base" if line is None else f"{path}:{line}: base"
     if name is None:
-        raise InputError(f'{place}: missing key: the base scene, such as base = "scene.toml"')
-    if not isinstance(name, str):
-        raise InputError(f"{place}: must be text in quotes; found {written(name)}")
-    beside = path.parent / name
-    found = next((file for file in (beside, File(name)) if not absence(file)), None)
-    if found is None:
-        raise InputError(f"{place}: there is no such file: neither {beside} nor {File.cwd() / name} is one")
-    return found
-
-
-def _validate(data: dict[str, Any], dimension: int | None) -> tuple[SweepTable | None, list[Problem]]:
-    place = data.get("place")
-    listed = {**data, "place": [place]} if isinstance(place, dict) else data
-    try:
-        return SweepTable.model_validate(listed, context={"dimension": dimension}), []
-    except ValidationError as error:
-        return None, [_as_written(p, data) for p in problems_of(error, listed, SweepTable)]
+        fault = 'missing key: the base scene, such as base = "scene.toml"'
+    elif not isinstance(name, str):
+        fault = f"must be text in quotes; found {written(name)}"
+    else:
+        beside = path.parent / name
+        for file in (beside, File(name)):
+            if not absence(file):
+                return file
+        fault = f"there is no such file: neither {beside} nor {File.cwd() / name} is one"
+    raise InputError(report([Problem(("base",), fault)], str(path), text))
 
 
 def _as_written(problem: Problem, data: dict[str, Any]) -> Problem:
     """Take the index out of the path to a placement where the file has one [place] table instead of a list."""
-    path: Path = problem.path
-    if path[:1] == ("place",) and isinstance(data["place"], dict):
-        path = ("place", *path[2:])
-    return Problem(path, problem.sentence)
+    if problem.path[:1] == ("place",) and isinstance(data["place"], dict):
+        return Problem(("place", *problem.path[2:]), problem.sentence)
+    return problem
+
+
+def _misplaced(sweep: Sweep) -> Iterator[Problem]:
+    domain = sweep.base_data["domain"]
+    for index, place in enumerate(sweep.placements):
+        path = ("place", index)
+        kind, name = KINDS[place.list], place.template
+        there = {entry["name"]: entry for entry in sweep.base_data.get(place.list, [])}
+        names = [other.template for other in sweep.placements if other.list == place.list]
+        if name not in there:
+            guess = nearest(name, list(there))
+            known = f"the {place.list} are {listed(quoted(list(there)), 'and')}" if there else "it has none"
+            hint = f'did you mean "{guess}"?' if guess else known
+            yield Problem((*path, kind), f'no {kind} of the base scene has the name "{name}"; {hint}')
+        elif place.key in [other.key for other in sweep.placements[:index]]:
+            yield Problem((*path, kind), f'"{name}" is placed already; a template is for one placement')
+        else:
+            taken = [n for n in there if n not in names and re.fullmatch(rf"{re.escape(name)}_\d+", n)]
+            if taken:
+                said = f'makes {place.list} of names such as "{taken[0]}", which the base scene has; rename one of them'
+                yield Problem((*path, kind), said)
+            yield from _misshapen(place, path, there[name]["shape"])
+        size = domain["size"]
+        for k, (axis, low, high) in enumerate(zip(AXES, place.region.min, place.region.max, strict=False)):
+            start = domain.get("origin", [0.0] * len(size))[k]
+            end = start + size[k]
+            if low < start - ROUND_OFF * size[k] or high > end + ROUND_OFF * size[k]:
+                found = f"{axis} = {low:g} to {high:g} of {start:g} to {end:g} m"
+                yield Problem((*path, "region"), f"must lie in the domain; found {found}")
+
+
+def _misshapen(place: Placement, path: Path, shape: dict[str, Any]) -> Iterator[Problem]:
+    """Find extents that do not fit the shape of the template, and counts that are none."""
+    form = next((name for name in shape if name not in COMBINED), "shape without a form")
+    if form not in ("box", "ball") or set(shape) & set(COMBINED):
+        found = f"{form} with others" if set(shape) & set(COMBINED) else form
+        yield Problem((*path, KINDS[place.list]), f'must be a box or a ball; "{place.template}" is a {found}')
+        return
+    foreign, own = ("radius", "size") if form == "box" else ("size", "radius")
+    if getattr(place, foreign) is not None:
+        yield Problem((*path, foreign), f'"{place.template}" is a {form}, which has no {foreign}; give {own}')
+    least = 1 if place.list == "bodies" else 0
+    counts = [count for count in place.count.extremes() if not _is_count(count, least)]
+    if counts:
+        right = f"must be whole numbers from {least} to {MOST_BODIES}, such as {{ integers = [1, 3] }}"
+        yield Problem((*path, "count"), f"{right}; found {written(counts[0])}")
+    room = [high - low for low, high in zip(place.region.min, place.region.max, strict=True)]
+    drawn = getattr(place, own)
+    for extent in [template_extent(shape)] if drawn is None else drawn.extremes():
+        if form == "box" and not _is_size(extent, len(room)):
+            right = f"must be {NUMBER_WORDS[len(room)]} numbers greater than 0"
+            yield Problem((*path, own), f"{right}; found {written(extent)}")
+        elif form == "ball" and not (is_number(extent) and extent > 0):
+            yield Problem((*path, own), f"must be a number greater than 0; found {written(extent)}")
+        else:
+            size = extent if form == "box" else [2 * extent] * len(room)
+            if any(x > r * (1 + ROUND_OFF) for x, r in zip(size, room, strict=True)):
+                sides, found = (" x ".join(f"{x:.6g}" for x in lengths) for lengths in (room, size))
+                yield Problem((*path, own), f"must fit into the region, {sides} m; found {found} m")
+
+
+def _is_count(value: object, least: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= MOST_BODIES
+
+
+def _is_size(value: object, dimension: int) -> bool:
+    return isinstance(value, list) and len(value) == dimension and all(is_number(x) and x > 0 for x in value)
+
+
+def _owners(sweep: Sweep) -> tuple[dict[Path, Path], list[Problem]]:
+    """Return by path of the base scene where the sweep file sets it, and what is wrong with keys of [vary]."""
+    names = {name: [entry["name"] for entry in sweep.base_data.get(name, [])] for name in KINDS}
+    problems: list[Problem] = []
+    set_by: dict[Path, Path] = {}
+    for k, place in enumerate(sweep.placements):
+        index = names[place.list].index(place.template)
+        set_by[(place.list, index, "shape")] = ("place", k)
+        if place.velocity is not None:
+            set_by[(place.list, index, "velocity")] = ("place", k, "velocity")
+    data = copy.deepcopy(sweep.base_data)
+    for key, distribution in sweep.vary.items():
+        at = ("vary", key)
+        try:
+            path = set_value(data, key_parts(key), distribution.extremes()[0])
+        except InputError as fault:
+            problems.append(Problem(at, str(fault)))
+            continue
+        if path[0] in (*KINDS, "forces") and (len(path) < 3 or path[2] == "name"):
+            said = "vary what a body, a collider or a force holds, such as bodies.NAME.velocity, and not its name"
+            problems.append(Problem(at, said))
+            continue
+        for other, owner in set_by.items():
+            shared = min(len(path), len(other))
+            if path[:shared] == other[:shared]:
+                same = path_text(owner) if owner[0] == "vary" else f'the placement of "{names[path[0]][path[1]]}"'
+                problems.append(Problem(at, f"sets what {same} sets as well; leave one of them out"))
+                break
+        else:
+            set_by[path] = at
+    return set_by, problems
+
+
+def _faulty_scenes(sweep: Sweep, laws: Laws, set_by: dict[Path, Path]) -> list[Problem]:
+    """Find problems of trajectory 0, also at the ends of each distribution, where bodies may find no place."""
+    try:
+        usual = _scene_problems(sweep, laws, set_by, {})
+    except PlacementError as error:
+        return [Problem(("place", error.placement), error.sentence)]
+    found = [p if p.path else Problem((), f"trajectory 0: {p.sentence}") for p in usual]
+    places = {key: ("vary", key) for key in sweep.vary}
+    for k, place in enumerate(sweep.placements):
+        places |= {key: ("place", k, key.rpartition(".")[2]) for key in place.distributions}
+    for key, distribution in sweep.distributions.items():
+        for value in distribution.extremes():
+            try:
+                variant = _scene_problems(sweep, laws, set_by, {key: value})
+            except PlacementError:
+                continue
+            for problem in variant:
+                if problem.path != places[key] and problem not in usual:
+                    where = f"{path_text(problem.path)}: " if problem.path else ""
+                    problem = Problem(places[key], f"with {written(value)}: {where}{problem.sentence}")
+                if problem not in usual and problem not in found:
+                    found.append(problem)
+    return found
+
+
+def _scene_problems(sweep: Sweep, laws: Laws, set_by: dict[Path, Path], given: dict[str, Any]) -> list[Problem]:
+    """Return problems of trajectory 0, with `given` values, at the paths of the sweep file in `set_by`, or at none."""
+    drawn = draw(sweep, 0, given)
+    found: list[Problem] = []
+    for problem in scene_problems(drawn.data, laws, drawn.directory):
+        path = problem.path
+        for name, origins in (("bodies", drawn.origins), ("colliders", drawn.collider_origins)):
+            if path[:1] == (name,) and len(path) > 1:
+                path = (name, origins[int(path[1])], *path[2:])
+        owner = next((owner for base, owner in set_by.items() if path[: len(base)] == base), None)
+        sentence = problem.sentence if owner else f"{path_text(problem.path)}: {problem.sentence}"
+        new = Problem(owner or (), sentence)
+        # The bodies of one placement have the faults of their template each.
+        if new not in found:
+            found.append(new)
+    return found

@@ -1,23 +1,221 @@
-"""Runs a sweep: sends what is missing to workers, keeps the manifest, and seals shards."""
+"""Runs a sweep, in a directory that is made or resumed: sends what is missing to workers; or rehearses it."""
 
+import math
+import shutil
 import time
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, nullcontext
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from mpmcli import __version__
+from mpmcli.check.facts import SceneFacts
+from mpmcli.check.forecast import expected_steps, layout_of
 from mpmcli.cores import available_cores
 from mpmcli.dataset.card import write_card
-from mpmcli.dataset.cluster import Workers, joined_workers, local_workers
-from mpmcli.dataset.compute import Task
-from mpmcli.dataset.folder import Folder
-from mpmcli.dataset.manifest import Manifest, Row
+from mpmcli.dataset.compute import LOOK_AHEAD, Task, Workers, joined_workers, local_workers, scene_fault
+from mpmcli.dataset.draw import draw
+from mpmcli.dataset.folder import MANIFEST, SHARD_BYTES, VERDICTS, Folder, Manifest, Row, require_empty
+from mpmcli.dataset.shard import BASE, LABELS, SWEEP
 from mpmcli.dataset.sweep import Sweep
-from mpmcli.dataset.sweep_folder import taken_folder
-from mpmcli.dataset.sweep_state import SweepSettings, SweepState
+from mpmcli.errors import InputError
+from mpmcli.materials.registry import load_plugins
+from mpmcli.output.durable import SPACE_MARGIN, TEMPORARY_SUFFIX, write_text
+from mpmcli.output.lock import LOCK, refuse_locked, take_lock
+from mpmcli.plain_text import counted, duration_text, size_text, text_table
+from mpmcli.scene import Scene, estimate_particles
+from mpmcli.simulation.engine import Arch
+from mpmcli.simulation.runner import Runner
 
+# Trajectories whose sizes give the size of all.
+SAMPLE = 16
+# Bytes of a trajectory beside its arrays: headers of HDF5 and the scene; times and ledger of a frame.
+HEADER_BYTES, FRAME_BYTES = 11_000, 200
 # Most trajectories of a task, and tasks per worker below which they become shorter.
 TASK, GPU_TASK, ROUNDS = 8, 128, 8
 # Why a trajectory has failed that no worker survived.
 LOST = "every worker that computed it was killed, perhaps for want of memory."
+# Seconds of the run that measures the time of a particle-step.
+PROBE_SECONDS = 1.0
+# Rows of the table of a rehearsal, and faults below it.
+MOST_ROWS, MOST_FAULTS = 20, 10
+
+
+@dataclass(frozen=True)
+class SweepSettings:
+    """Settings of a sweep that are not part of its file.
+
+    `workers` are processes here, None for one on each core, or those of a Dask `scheduler` at an address; `part` (i, n)
+    is every n-th shard from the i-th on; arch and threads are of each worker.
+    """
+
+    directory: Path
+    workers: int | None = None
+    scheduler: str = ""
+    part: tuple[int, int] = (1, 1)
+    resume: bool = False
+    arch: Arch = "auto"
+    threads: int | None = 1
+    plugins: tuple[Path, ...] = ()
+
+
+@dataclass
+class SweepState:
+    """How far a sweep is.
+
+    Of `expected` trajectories, `kept` were done by an earlier command; counts, seconds and `particle_steps` are of this
+    one. It is `settled` (done, seconds) when each worker has ended a task; until then kernels compile. The status is
+    "running", "finished" or "interrupted".
+    """
+
+    directory: Path
+    expected: int
+    kept: int = 0
+    verdicts: Counter[str] = field(default_factory=Counter)
+    accepted: int = 0
+    particle_steps: float = 0.0
+    seconds: float = 0.0
+    start_seconds: float = 0.0
+    settled: tuple[int, float] | None = None
+    status: str = "running"
+
+    @property
+    def done(self) -> int:
+        """Trajectories that have a verdict."""
+        return self.verdicts.total()
+
+    @property
+    def per_hour(self) -> float:
+        """Trajectories per hour of this command, since it has settled where it has."""
+        done, seconds = self.settled if self.settled is not None and self.done > self.settled[0] else (self.kept, 0.0)
+        return 3600 * (self.done - done) / (self.seconds - seconds) if self.seconds > seconds else 0.0
+
+    def count(self, row: Row) -> None:
+        """Count a row."""
+        self.verdicts[row.verdict] += 1
+        self.accepted += row.accepted
+
+    def as_dict(self) -> dict:
+        """Return it as JSON can hold it."""
+        return {
+            "status": self.status,
+            "directory": str(self.directory),
+            "trajectories": self.expected,
+            **{name: getattr(self, name) for name in ("done", "kept", "accepted")},
+            "verdicts": {verdict: self.verdicts[verdict] for verdict in VERDICTS},
+            **{name: getattr(self, name) for name in ("per_hour", "seconds", "start_seconds", "particle_steps")},
+        }
+
+
+@contextmanager
+def taken_folder(sweep: Sweep, settings: SweepSettings) -> Iterator[tuple[Folder, Manifest]]:
+    """Make or open a dataset's directory, and keep other sweeps out: one process writes manifest and shards."""
+    directory = settings.directory
+    if directory.is_dir():
+        refuse_locked(directory)
+        if settings.resume:
+            with take_lock(directory):
+                yield open_folder(sweep, settings)
+            return
+    with ExitStack() as held:
+        yield open_folder(sweep, settings, lambda: held.enter_context(take_lock(directory)))
+
+
+def open_folder(
+    sweep: Sweep, settings: SweepSettings, take: Callable[[], object] = lambda: None
+) -> tuple[Folder, Manifest]:
+    """Make or resume a dataset's directory; `take` is called before the first file; InputError: it does not suit."""
+    directory = settings.directory
+    manifest = Manifest(directory)
+    if settings.resume and (directory / MANIFEST).exists():
+        facts = manifest.facts()
+        i, n = facts["part"]
+        if facts["key"] != sweep.key:
+            raise InputError(
+                f"{directory} holds the dataset of another sweep, or of another count: give another directory with "
+                f"-o, or the sweep of {directory / SWEEP}."
+            )
+        if (i, n) != settings.part:
+            raise InputError(f"{directory} holds part {i}/{n} of the sweep; resume it with --shard {i}/{n}.")
+        return Folder(directory, sweep.count, facts["per_shard"], settings.part), manifest
+    if (directory / MANIFEST).exists():
+        raise InputError(f"{directory} holds a dataset: --resume goes on with it, and -o gives another directory.")
+    if not (settings.resume and _is_beginning(directory)):
+        require_empty(directory)
+    size = _bytes_of_trajectories(sweep, settings)
+    per_shard = _per_shard(size)
+    folder = Folder(directory, sweep.count, per_shard, settings.part)
+    if not folder.expected:
+        i, n = settings.part
+        shards = math.ceil(sweep.count / per_shard)
+        raise InputError(f"--shard {i}/{n} is empty: {sweep.count} trajectories fill {counted(shards, 'shard')}.")
+    # While a shard is sealed, its trajectories lie there twice.
+    needed = size * folder.expected + SHARD_BYTES + SPACE_MARGIN
+    free = shutil.disk_usage(next(p for p in (directory, *directory.resolve().parents) if p.exists())).free
+    if needed > free:
+        raise InputError(
+            f"the disk of {directory} has {size_text(free)} left, but the dataset needs about {size_text(needed)}: "
+            "give another place with -o, or a smaller --count."
+        )
+    directory.mkdir(parents=True, exist_ok=True)
+    take()
+    if not settings.resume:
+        # Another sweep may have come and gone meanwhile.
+        require_empty(directory, locked=True)
+    write_text(directory / SWEEP, sweep.text)
+    write_text(directory / BASE, sweep.base_text)
+    facts = {"key": sweep.key, "count": sweep.count, "seed": sweep.seed, "accept": sweep.accept}
+    manifest.create({**facts, "per_shard": per_shard, "part": list(settings.part), "version": __version__})
+    return folder, manifest
+
+
+def discard_beginning(directory: Path, made: Sequence[Path]) -> None:
+    """Remove a dataset in which no trajectory has been done, and the directories `made` for it, outermost first."""
+    if not (directory / MANIFEST).exists() or Manifest(directory).rows():
+        return
+    with take_lock(directory):
+        Folder(directory, 0, 1, (1, 1)).close()
+        for name in (SWEEP, BASE, MANIFEST):
+            (directory / name).unlink(missing_ok=True)
+    for path in reversed(made):
+        with suppress(OSError):
+            path.rmdir()
+
+
+def _is_beginning(directory: Path) -> bool:
+    """Return whether a sweep was killed here before it had a manifest."""
+    names = [path.name.removesuffix(TEMPORARY_SUFFIX) for path in directory.iterdir()] if directory.is_dir() else [""]
+    return {name.removesuffix("-journal") for name in names} <= {SWEEP, BASE, MANIFEST, LOCK}
+
+
+def trajectory_bytes(scene: Scene, particles: int) -> int:
+    """Return the bytes of a trajectory without compression."""
+    arrays = [array for name, array in layout_of(scene).arrays.items() if name not in ("id", *LABELS)]
+    each = sum(np.dtype(array.dtype).itemsize * math.prod(array.shape) for array in arrays)
+    return (scene.time.frames + 1) * (particles * each + FRAME_BYTES) + HEADER_BYTES
+
+
+def _per_shard(size: float) -> int:
+    return max(1, math.floor(SHARD_BYTES / size))
+
+
+def _bytes_of_trajectories(sweep: Sweep, settings: SweepSettings) -> float:
+    """Return the mean bytes of a trajectory without compression, from the first ones that can be drawn."""
+    laws = load_plugins(settings.plugins)
+    sizes, fault = [], None
+    for number in range(min(SAMPLE, sweep.count)):
+        try:
+            scene = draw(sweep, number).scene(laws).scene
+            sizes.append(trajectory_bytes(scene, estimate_particles(scene)))
+        except InputError as error:
+            fault = error
+    if not sizes:
+        raise fault
+    return sum(sizes) / len(sizes)
 
 
 def run_sweep(
@@ -26,89 +224,75 @@ def run_sweep(
     on_progress: Callable[[SweepState], None] = lambda state: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> SweepState:
-    """Compute the trajectories of a sweep that are not there yet.
+    """Compute the missing trajectories of a sweep; the files do not depend on workers, their order, or interrupts.
 
-    The files of the dataset do not depend on workers, on their order, or on interrupts between.
-
-    Args:
-        on_progress: called with the state after each task.
-        stop: called often; True ends the sweep, which --resume continues.
-
-    Raises:
-        InputError: the directory, the settings or the disk do not suit; nothing was written.
-        RunError: a file could not be written; what was done is kept.
+    `on_progress` is called after each task; `stop` often, and True ends the sweep. InputError, nothing written:
+    directory, settings or disk do not suit. RunError: a file could not be written; what was done is kept.
     """
     began = time.perf_counter()
     with ExitStack() as stack:
         # Nothing is written where there is no scheduler.
         joined = stack.enter_context(joined_workers(settings.scheduler)) if settings.scheduler else None
-        folder, manifest = stack.enter_context(taken_folder(sweep, settings))
-        return _run(sweep, settings, folder, manifest, joined, began, on_progress, stop)
+        run = _Run(sweep, settings, *stack.enter_context(taken_folder(sweep, settings)))
+        run.seal_complete(run.folder.shards)
+        try:
+            run.compute_missing(joined, began, on_progress, stop)
+            if settings.part == (1, 1):
+                write_card(settings.directory)
+            run.folder.close()
+            run.state.status = "finished"
+        except KeyboardInterrupt:
+            run.state.status = "interrupted"
+        return run.state
 
 
-def _run(
-    sweep: Sweep,
-    settings: SweepSettings,
-    folder: Folder,
-    manifest: Manifest,
-    joined: Workers | None,
-    began: float,
-    on_progress: Callable[[SweepState], None],
-    stop: Callable[[], bool],
-) -> SweepState:
-    rows = {row.number: row for row in manifest.rows() if folder.is_kept(row)}
-    state = SweepState(settings.directory, sum(len(folder.numbers(shard)) for shard in folder.shards), len(rows))
-    for row in rows.values():
-        state.count(row)
-    numbers = [n for shard in folder.shards for n in folder.numbers(shard) if n not in rows]
-    keeper = _Keeper(folder, manifest, rows)
-    keeper.seal_complete(folder.shards)
-    try:
-        if numbers:
-            count = min(settings.workers or available_cores(), len(numbers))
-            with nullcontext(joined) if joined else local_workers(count) as workers:
-                state.start_seconds = time.perf_counter() - began
-                since = time.perf_counter()
-                outcomes = workers.outcomes(_tasks(sweep, settings, numbers, workers.count), stop)
-                for ended, (task, found) in enumerate(outcomes, 1):
-                    new = [Row.failed(n, sweep.split_of(n), LOST) for n in task.numbers] if found is None else found
-                    keeper.take(new)
-                    for row in new:
-                        state.count(row)
-                        state.particle_steps += row.particles * row.steps
-                    state.seconds = time.perf_counter() - since
-                    if ended == workers.count:
-                        state.settled = state.done, state.seconds
-                    on_progress(state)
-        if settings.part == (1, 1):
-            write_card(settings.directory)
-        folder.close()
-        state.status = "finished"
-    except KeyboardInterrupt:
-        state.status = "interrupted"
-    return state
-
-
-class _Keeper:
+class _Run:
     """Enters rows into the manifest, and seals each shard when its last row has come."""
 
-    def __init__(self, folder: Folder, manifest: Manifest, rows: dict[int, Row]) -> None:
-        self._folder, self._manifest, self._rows = folder, manifest, rows
+    def __init__(self, sweep: Sweep, settings: SweepSettings, folder: Folder, manifest: Manifest) -> None:
+        self.sweep, self.settings, self.folder, self.manifest = sweep, settings, folder, manifest
+        self.rows = {row.number: row for row in manifest.rows() if folder.is_kept(row)}
+        self.state = SweepState(settings.directory, folder.expected, len(self.rows))
+        for row in self.rows.values():
+            self.state.count(row)
 
-    def take(self, new: Sequence[Row]) -> None:
-        self._manifest.put(new)
-        self._rows.update((row.number, row) for row in new)
-        self.seal_complete(sorted({self._folder.shard_of(row.number) for row in new}))
+    def compute_missing(
+        self, joined: Workers | None, began: float, on_progress: Callable[[SweepState], None], stop: Callable[[], bool]
+    ) -> None:
+        state, missing = self.state, [n for n in self.folder.all_numbers() if n not in self.rows]
+        if not missing:
+            return
+        count = min(self.settings.workers or available_cores(), len(missing))
+        with nullcontext(joined) if joined else local_workers(count) as workers:
+            since = time.perf_counter()
+            state.start_seconds = since - began
+            outcomes = workers.outcomes(_tasks(self.sweep, self.settings, missing, workers.count), stop)
+            for ended, (task, found) in enumerate(outcomes, 1):
+                self.take(found or [Row.failed(n, self.sweep.split_of(n), LOST) for n in task.numbers])
+                state.seconds = time.perf_counter() - since
+                if ended == workers.count:
+                    state.settled = state.done, state.seconds
+                on_progress(state)
+
+    def take(self, rows: Sequence[Row]) -> None:
+        self._put(rows)
+        self.seal_complete(sorted({row.number // self.folder.per_shard for row in rows}))
+        for row in rows:
+            self.state.count(row)
+            self.state.particle_steps += row.particles * row.steps
 
     def seal_complete(self, shards: Sequence[int]) -> None:
         for shard in shards:
-            own = [self._rows.get(number) for number in self._folder.numbers(shard)]
-            if None in own or all(row.file == self._folder.shard_file(shard) for row in own if row.accepted):
+            rows = [self.rows.get(number) for number in self.folder.numbers(shard)]
+            if None in rows or all(row.file == self.folder.shard_file(shard) for row in rows if row.accepted):
                 continue
-            changed = self._folder.seal(shard, self._rows)
-            self._manifest.put(changed)
-            self._rows.update((row.number, row) for row in changed)
-            self._folder.clear(changed)
+            changed = self.folder.seal(shard, self.rows)
+            self._put(changed)
+            self.folder.clear(changed)
+
+    def _put(self, rows: Sequence[Row]) -> None:
+        self.manifest.put(rows)
+        self.rows.update((row.number, row) for row in rows)
 
 
 def _tasks(sweep: Sweep, settings: SweepSettings, numbers: Sequence[int], workers: int) -> list[Task]:
@@ -122,3 +306,124 @@ def _tasks(sweep: Sweep, settings: SweepSettings, numbers: Sequence[int], worker
         Task(directory, sweep, tuple(numbers[i : i + size]), settings.arch, settings.threads, plugins)
         for i in range(0, len(numbers), size)
     ]
+
+
+@dataclass(frozen=True)
+class Rehearsed:
+    """One trajectory: values by key, expected counts, bytes without compression, and why it cannot be computed."""
+
+    number: int
+    split: str
+    values: dict[str, Any]
+    particles: int
+    steps: int
+    bytes: int
+    fault: str
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """Trajectories of a part, and the particle-steps per second of one of the `workers`, 0 where none is computed."""
+
+    trajectories: tuple[Rehearsed, ...]
+    rate: float
+    workers: int
+
+    @property
+    def passes(self) -> bool:
+        """Whether every trajectory can be computed."""
+        return not any(one.fault for one in self.trajectories)
+
+    @property
+    def bytes(self) -> int:
+        """Bytes of the dataset without compression."""
+        return sum(one.bytes for one in self.trajectories)
+
+    @property
+    def seconds(self) -> float | None:
+        """Expected wall time, None where it is not known."""
+        work = sum(one.particles * one.steps for one in self.trajectories)
+        return work / self.rate / self.workers if self.rate else None
+
+    def as_dict(self) -> dict:
+        """Return it as JSON can hold it."""
+        whole = {"ok": self.passes, "trajectories": [vars(one) for one in self.trajectories], "bytes": self.bytes}
+        return {**whole, "seconds": self.seconds, "workers": self.workers, "particle_steps_per_s": self.rate}
+
+    def text(self) -> str:
+        """Return it as text: the first draws, what cannot be computed, and the forecast."""
+        shown = self.trajectories[:MOST_ROWS]
+        keys = list(dict.fromkeys(key for one in shown for key in one.values))
+        rows = []
+        for one in shown:
+            values = (_short(one.values.get(key)) for key in keys)
+            rows.append((str(one.number), one.split, *values, f"{one.particles:,}", f"{one.steps:,}"))
+        names = [key.removeprefix("bodies.") for key in keys]
+        lines = [text_table(("number", "split", *names, "particles", "steps"), rows, {1})]
+        if len(self.trajectories) > MOST_ROWS:
+            lines.append(f"and {len(self.trajectories) - MOST_ROWS} more; --json lists all")
+        faults = [one for one in self.trajectories if one.fault]
+        lines += [f"error: trajectory {one.number}: {one.fault}" for one in faults[:MOST_FAULTS]]
+        if len(faults) > MOST_FAULTS:
+            lines.append(f"error: {len(faults) - MOST_FAULTS} more cannot be computed; --json tells why")
+        time_text = "" if self.seconds is None else f", about {duration_text(self.seconds)}"
+        total = counted(len(self.trajectories), "trajectory")
+        lines.append(f"{total}: {size_text(self.bytes)}{time_text} with {counted(self.workers, 'worker')}")
+        return "\n".join(lines)
+
+
+def rehearse(sweep: Sweep, settings: SweepSettings, stop: Callable[[], bool] = lambda: False) -> Rehearsal:
+    """Draw and check the trajectories of a part, and time the first sound one; InputError: none can be drawn."""
+    laws = load_plugins(settings.plugins)
+    per_shard = _per_shard(_bytes_of_trajectories(sweep, settings))
+    folder = Folder(settings.directory, sweep.count, per_shard, settings.part)
+    found, sound, first = [], None, []
+    for number in folder.all_numbers():
+        if stop():
+            raise KeyboardInterrupt
+        values, fault, counts = {}, "", (0, 0, 0)
+        try:
+            drawn = draw(sweep, number)
+            values = drawn.values
+            loaded = drawn.scene(laws)
+            fault, particles = scene_fault(loaded), estimate_particles(loaded.scene)
+            steps = expected_steps(SceneFacts(loaded.scene))
+            counts = particles, steps, trajectory_bytes(loaded.scene, particles)
+            if not fault:
+                sound = sound or loaded.scene
+                first += [loaded.scene] if number < LOOK_AHEAD else []
+        except InputError as error:
+            fault = str(error)
+        found.append(Rehearsed(number, sweep.split_of(number), values, *counts, fault))
+    rate = 0.0 if sound is None else _rate(sound, first, settings)
+    return Rehearsal(tuple(found), rate, settings.workers or available_cores())
+
+
+def _rate(scene: Scene, first: Sequence[Scene], settings: SweepSettings) -> float:
+    """Return particle-steps per second of a worker, compiled with room for the `first` scenes, as a sweep's are."""
+    runner = Runner(settings.arch, settings.threads)
+    with suppress(InputError):
+        runner.expect(first)
+    interval = scene.time.end / scene.time.frames
+    # The first run compiles the kernels.
+    frames, seconds, steps = 1, 0.0, 0
+    runner.run(_cut(scene, interval, frames))
+    while seconds < PROBE_SECONDS and frames <= scene.time.frames:
+        began = time.perf_counter()
+        recording = runner.run(_cut(scene, interval, frames))
+        seconds, steps = time.perf_counter() - began, recording.steps
+        frames *= 2
+    return recording.particles * steps / seconds
+
+
+def _cut(scene: Scene, interval: float, frames: int) -> Scene:
+    return scene.model_copy(update={"time": scene.time.model_copy(update={"end": frames * interval, "frames": frames})})
+
+
+def _short(value: Any) -> str:
+    """Write a drawn value with few digits; of placed bodies their number."""
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return str(len(value))
+    if isinstance(value, list):
+        return ", ".join(map(_short, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

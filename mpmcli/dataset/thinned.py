@@ -1,31 +1,107 @@
-"""A trajectory as an export takes it: every K-th frame, and at most M particles."""
+"""A trajectory as an export takes it: every K-th frame, at most M particles, and particles on walls."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
 from mpmcli.dataset.dataset import ALL, Particles, Trajectory
-from mpmcli.dataset.walls import WallParticles, Walls
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
+from mpmcli.scene.colliders import Collider, Motion
+from mpmcli.scene.primitives import Box
+from mpmcli.scene.surface import collider_surface, form_surface, surface_points
 
+# Of colliders, or of the domain as well.
+Walls = Literal["none", "colliders", "all"]
+WALLS: tuple[Walls, ...] = ("none", "colliders", "all")
+# The number in place of that of a collider, of the walls of the domain.
+DOMAIN = -1
+# Distance in spacings to which a point is on a surface.
+ON_SURFACE = 0.01
 # Of the random choice of particles, together with the number of the trajectory.
 SEED = 0
 BLOCK_BYTES = 64 * 2**20
 
 
+@dataclass(frozen=True, eq=False)
+class WallParticles:
+    """Particles on some of the walls of a run; neighbours are `spacing` apart, m."""
+
+    header: RunHeader
+    colliders: tuple[Collider, ...]
+    walls: Walls
+    spacing: float
+
+    @cached_property
+    def _parts(self) -> list[tuple[int, np.ndarray, Motion | None]]:
+        """Number, points (n, d) and motion of each wall; None for one that rests, whose points lie where they are."""
+        found: list[tuple[int, np.ndarray, Motion | None]] = []
+        header = self.header
+        if self.walls == "none" or header.origin is None:
+            return found
+        names = header.collider_names
+        for collider in self.colliders:
+            motion = collider.motion
+            points = surface_points(collider_surface(collider, header.origin, header.upper), self.spacing)
+            points = points if motion.moves else motion.placed(points, 0.0)
+            found.append((names.index(collider.name), points, motion if motion.moves else None))
+        if self.walls == "all":
+            box = form_surface(Box.model_construct(min=tuple(header.origin), max=tuple(header.upper)))
+            points = surface_points(box, self.spacing)
+            # Periodic faces are no walls.
+            on_face = np.isclose(points, header.origin) | np.isclose(points, header.upper)
+            found.append((DOMAIN, points[(on_face & ~header.periodic).any(axis=1)], None))
+        return [
+            (number, self._seen(number, points) if motion is None else points, motion)
+            for number, points, motion in found
+        ]
+
+    def _seen(self, number: int, points: np.ndarray) -> np.ndarray:
+        """Leave out points (n, d) of a wall at rest that lie inside of another collider at rest."""
+        seen = np.ones(len(points), bool)
+        for other in self.colliders:
+            if not other.motion.moves and self.header.collider_names.index(other.name) != number:
+                seen &= other.signed_distance(points) >= -ON_SURFACE * self.spacing
+        return points[seen]
+
+    @cached_property
+    def _sizes(self) -> np.ndarray:
+        return np.array([len(points) for _, points, _ in self._parts], int)
+
+    @property
+    def count(self) -> int:
+        """Number of particles."""
+        return int(self._sizes.sum())
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """The collider of each particle by its number in the scene, (W,) int32; -1 of the domain."""
+        return np.repeat(np.array([number for number, _, _ in self._parts], np.int32), self._sizes)
+
+    @property
+    def moving(self) -> np.ndarray:
+        """Whether each particle moves, (W,) bool."""
+        return np.repeat(np.array([motion is not None for _, _, motion in self._parts], bool), self._sizes)
+
+    def positions(self, times: Sequence[float]) -> np.ndarray:
+        """Return where they are at some times, s: (T, W, d) float64, m."""
+        found = np.empty((len(times), self.count, self.header.dimension))
+        first = 0
+        for _, points, motion in self._parts:
+            for k, time in enumerate(times):
+                found[k, first : first + len(points)] = points if motion is None else motion.placed(points, time)
+            first += len(points)
+        return found
+
+
 class ThinnedTrajectory:
-    """Every `stride`-th frame from the first on, and at most `most` particles of a trajectory, all of them if None.
+    """Every `stride`-th frame, and at most `most` particles, of a `source`; those on `walls` do not count.
 
-    The particles are the same ones in all frames, and the same ones in every export: of each body its share,
-    drawn at random. The ledger stays that of all particles.
-
-    Attributes:
-        source: the whole trajectory.
-        particle_count: after thinning.
-        walls: particles on walls, which are not among these.
+    They are the same in all frames and exports: of each body its share at random. The ledger is of all particles.
     """
 
     def __init__(
@@ -36,12 +112,7 @@ class ThinnedTrajectory:
         walls: Walls = "none",
         wall_spacing: float | None = None,
     ) -> None:
-        """Thin a trajectory; nothing is read.
-
-        Args:
-            walls: which have particles.
-            wall_spacing: between these, m; that of the particles at the start if None.
-        """
+        """Thin a trajectory; nothing is read. `wall_spacing` is that of the particles at the start if None."""
         self.source = source
         self._stride, self._most = stride, most
         self.times, self.steps, self.frames = (table[::stride] for table in (source.times, source.steps, source.frames))
@@ -68,10 +139,7 @@ class ThinnedTrajectory:
 
     @property
     def spacing(self) -> float | None:
-        """Distance between neighbours at the start, m: the largest of all bodies; None where it is not known.
-
-        Thinned particles are further apart, as those of a coarser lattice.
-        """
+        """Largest distance of neighbours at the start, m, as of a coarser lattice where thinned; None: not known."""
         header = self.source.header
         if header.spacing is None or not header.bodies:
             return None
@@ -121,11 +189,7 @@ class ThinnedTrajectory:
 
 
 def joined_row(rows: Sequence[LedgerRow], before: float) -> LedgerRow:
-    """Return the row of the last of consecutive frames, as if those before it had not been stored.
-
-    Args:
-        before: time of the frame before the first, s.
-    """
+    """Return the row of the last of consecutive frames, as if those before it had not been stored; `before` in s."""
     if len(rows) == 1:
         return rows[0]
     spans = np.diff([before, *(row.time for row in rows)])
@@ -147,16 +211,7 @@ def joined_row(rows: Sequence[LedgerRow], before: float) -> LedgerRow:
 
 
 def chosen_particles(body: np.ndarray, most: int, number: int) -> np.ndarray:
-    """Choose particles at random, of each body its share; the same arguments always give the same ones.
-
-    Args:
-        body: (N,) labels.
-        most: how many, 1 to N.
-        number: of the trajectory; others draw other particles.
-
-    Returns:
-        (most,) int64, ascending.
-    """
+    """Choose `most` of N labels at random, of each body its share, always the same: ascending indices, (most,)."""
     # In order of random keys, the k-th of n particles of a body stands at (k + 1/2) / n of the way. The first ones of
     # all bodies by that place are as many of each as its share, to less than one.
     keys = np.random.default_rng([SEED, number]).random(len(body))

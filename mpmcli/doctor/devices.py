@@ -4,11 +4,13 @@ import ctypes
 import sys
 from dataclasses import dataclass
 
-from mpmcli.solver.device_memory import CUDA_LIBRARIES
+from mpmcli.solver.machine.device_memory import CUDA_LIBRARIES
 
 NAME_LENGTH = 256
 # VkPhysicalDeviceProperties: offsets of deviceType and deviceName, an upper bound of its size, and the type of a CPU.
 VULKAN_TYPE, VULKAN_NAME, VULKAN_SIZE, VULKAN_CPU = 16, 20, 4096, 4
+# Words of 8 bytes of VkInstanceCreateInfo.
+INSTANCE_INFO_WORDS = 8
 VULKAN_LIBRARIES = {"linux": "libvulkan.so.1", "win32": "vulkan-1.dll", "darwin": "libvulkan.1.dylib"}
 
 
@@ -39,31 +41,17 @@ def _cuda(driver: ctypes.CDLL) -> list[Device]:
     devices = []
     for number in range(count.value):
         handle = ctypes.c_int()
-        if not driver.cuDeviceGet(ctypes.byref(handle), number) and not driver.cuDeviceGetName(
-            name, NAME_LENGTH, handle
-        ):
-            devices.append(Device(name.value.decode(errors="replace")))
+        if driver.cuDeviceGet(ctypes.byref(handle), number) or driver.cuDeviceGetName(name, NAME_LENGTH, handle):
+            continue
+        devices.append(Device(name.value.decode(errors="replace")))
     return devices
-
-
-class _InstanceInfo(ctypes.Structure):
-    """VkInstanceCreateInfo; sType is 1, all other members may be zero."""
-
-    _fields_ = (
-        ("sType", ctypes.c_int),
-        ("pNext", ctypes.c_void_p),
-        ("flags", ctypes.c_uint32),
-        ("pApplicationInfo", ctypes.c_void_p),
-        ("enabledLayerCount", ctypes.c_uint32),
-        ("ppEnabledLayerNames", ctypes.c_void_p),
-        ("enabledExtensionCount", ctypes.c_uint32),
-        ("ppEnabledExtensionNames", ctypes.c_void_p),
-    )
 
 
 def _vulkan(loader: ctypes.CDLL) -> list[Device]:
     instance, count = ctypes.c_void_p(), ctypes.c_uint32()
-    if loader.vkCreateInstance(ctypes.byref(_InstanceInfo(sType=1)), None, ctypes.byref(instance)):
+    # VkInstanceCreateInfo: sType is 1, and all other members may be zero.
+    info = (ctypes.c_uint64 * INSTANCE_INFO_WORDS)(1)
+    if loader.vkCreateInstance(ctypes.byref(info), None, ctypes.byref(instance)):
         return []
     loader.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), None)
     handles = (ctypes.c_void_p * count.value)()

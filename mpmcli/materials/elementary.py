@@ -6,7 +6,7 @@ A call of the C library keeps a loop over particles from it. Reduction and coeff
 
 import math
 
-import taichi as ti
+from mpmcli.quick_taichi import ti
 
 # By precision, single and double. ln 2 in two parts, the first with zeros at its end; the coefficients of log and exp.
 LN2 = (6.9313812256e-01, 9.0580006145e-06), (6.93147180369123816490e-01, 1.90821492927058770002e-10)

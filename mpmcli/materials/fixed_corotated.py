@@ -4,13 +4,11 @@ import math
 from typing import Literal
 
 import numpy as np
-import taichi as ti
 
 from mpmcli.materials.elasticity import ElasticParameters
 from mpmcli.materials.law import Law, Mode, StateBound, principal
-from mpmcli.materials.polar import polar_rotation, rounding
-from mpmcli.materials.principal import from_principal, principal_stretches
-from mpmcli.materials.tensors import volume_strain
+from mpmcli.materials.tensors import from_principal, polar_rotation, principal_stretches, rounding, volume_strain
+from mpmcli.quick_taichi import ti
 
 # Places in the vector of constants.
 MU, LAMBDA = range(2)

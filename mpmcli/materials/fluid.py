@@ -2,22 +2,35 @@
 
 import math
 from dataclasses import replace
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-import taichi as ti
 from pydantic import Field
 
 from mpmcli.materials.elementary import exp_minus_1, log
 from mpmcli.materials.law import CARRIED, Law, Mode, StateBound
-from mpmcli.materials.volume_relaxation import opened_volume, relaxed_volume
-from mpmcli.scene.knobs import Knob
-from mpmcli.scene.material import MaterialParameters, SceneBounds
+from mpmcli.quick_taichi import ti
+from mpmcli.scene.material import Knob, MaterialParameters, SceneBounds
 from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
 
 # Places in the vector of constants.
 BULK_MODULUS, EXPONENT, VISCOSITY, SECOND_VISCOSITY, LARGEST_J, SOUND_SPEED = range(6)
 
+# A particle is relaxed where every node of its stencil is filled beyond this fraction: not at a free surface, where the
+# kernel sees air. The grid sees J up to its inverse.
+FULL = 0.2
+# It opens only where the nodes beside the stencil are filled beyond this fraction of the mean over the stencil.
+BESIDE = 0.4
+# Difference of the volume ratio that is left alone where there is pressure. The density of particles varies by as much
+# from point to point where they are not on a lattice; relaxed, that noise would make pressure.
+DEAD_BAND = 0.02
+# Largest lack of volume that makes pressure: particles that lie in one place are no reason for a blow.
+LARGEST_LACK = 0.1
+# Difference that is left alone without pressure, and opening that is forgotten when it ends. A column that is let go
+# opens by a tenth of it at its turning points; closing that without pressure would lengthen its period.
+SLACK = 0.005
+# J up to which deformation opens; beyond it only the grid says how far.
+OPENED = 2.0
 # Speed that "auto" assumes if nothing in the scene moves or falls, m/s.
 QUIET_SPEED = 1.0
 # The pressure of a nonlinear equation of state is constant below this J, so that J^-g stays within single precision for
@@ -30,27 +43,25 @@ RELAXATION = 0.00175
 ITERATIONS_MAX = 100
 
 
+def compressibility_of(modulus: str) -> Any:
+    """Return the type of the parameter that settles a modulus which may be "auto"."""
+    meaning = "0 lets the density vary by 10 %, 1 by 0.01 %, in steps 30 times as many"
+    return Annotated[
+        float,
+        Field(gt=0, le=0.1, description=f'Density variation that {modulus} = "auto" allows, a fraction.'),
+        Knob("stiffness", 0.1, 1e-4, meaning, excludes=(modulus,)),
+    ]
+
+
 class WeaklyCompressibleParameters(MaterialParameters):
     """Parameters of a fluid whose bulk modulus may be "auto"."""
 
-    bulk_modulus: Annotated[
-        Positive | Literal["auto"],
-        Field(
-            description='Bulk modulus K = density c^2, Pa; "auto" picks the softest that keeps the density '
-            "variation under `compressibility` at the highest speed the scene can reach."
-        ),
-    ] = "auto"
-    compressibility: Annotated[
-        float,
-        Field(gt=0, le=0.1, description='Density variation that bulk_modulus = "auto" allows, a fraction.'),
-        Knob(
-            "stiffness",
-            0.1,
-            1e-4,
-            "0 lets the density vary by 10 %, 1 by 0.01 %, in steps 30 times as many",
-            excludes=("bulk_modulus",),
-        ),
-    ] = 0.01
+    bulk_modulus: Positive | Literal["auto"] = Field(
+        "auto",
+        description='Bulk modulus K = density c^2, Pa; "auto" picks the softest that keeps the density '
+        "variation under `compressibility` at the highest speed the scene can reach.",
+    )
+    compressibility: compressibility_of("bulk_modulus") = 0.01
 
 
 class FluidParameters(WeaklyCompressibleParameters):
@@ -59,37 +70,29 @@ class FluidParameters(WeaklyCompressibleParameters):
     hydrostatic = True
 
     law: Literal["fluid"] = "fluid"
-    exponent: Annotated[
-        float,
-        Field(
-            ge=1,
-            le=15,
-            description="Exponent g of the equation of state p = K/g (J^-g - 1): 1 is linear in the density, "
-            "7 the Tait equation of water.",
-        ),
-    ] = 1.0
+    exponent: float = Field(
+        1.0,
+        ge=1,
+        le=15,
+        description="Exponent g of the equation of state p = K/g (J^-g - 1): 1 is linear in the density, "
+        "7 the Tait equation of water.",
+    )
     viscosity: Annotated[
-        NotNegative,
-        Field(description="Shear (dynamic) viscosity, Pa s; water 1e-3."),
-        Knob("thickness", 1e-3, 1e2, "0 is water, 0.4 olive oil, 0.8 honey, 1 cold treacle"),
-    ] = 0.0
-    bulk_viscosity: Annotated[
-        NotNegative, Field(description="Bulk viscosity, Pa s: resists changes of volume, and damps sound.")
-    ] = 0.0
-    tension_cutoff: Annotated[
-        Flag,
-        Field(
-            description="Whether the fluid takes no tension: below the density at rest its pressure is 0. "
-            "False holds droplets together by suction."
-        ),
-    ] = True
-    volume_correction: Annotated[
-        Flag,
-        Field(
-            description="Whether fluid without tension follows the density that the grid sees, and must close up again "
-            "before it bears pressure. Otherwise it gains volume in splashes and loses it when it is stirred."
-        ),
-    ] = True
+        NotNegative, Knob("thickness", 1e-3, 1e2, "0 is water, 0.4 olive oil, 0.8 honey, 1 cold treacle")
+    ] = Field(0.0, description="Shear (dynamic) viscosity, Pa s; water 1e-3.")
+    bulk_viscosity: NotNegative = Field(
+        0.0, description="Bulk viscosity, Pa s: resists changes of volume, and damps sound."
+    )
+    tension_cutoff: Flag = Field(
+        True,
+        description="Whether the fluid takes no tension: below the density at rest its pressure is 0. "
+        "False holds droplets together by suction.",
+    )
+    volume_correction: Flag = Field(
+        True,
+        description="Whether fluid without tension follows the density that the grid sees, and must close up again "
+        "before it bears pressure. Otherwise it gains volume in splashes and loses it when it is stirred.",
+    )
 
     @property
     def relaxes(self) -> bool:
@@ -134,6 +137,37 @@ def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBound
         f"a hard impact at that speed reaches {100 * np.sqrt(compressibility):.3g} %"
     )
     return modulus, note
+
+
+@ti.func
+def relaxed_volume(J: float, seen: float, crossings: float, rate: float, opens: float):
+    """Return the volume ratio J after relaxation where the grid sees `seen`, and how much of its change makes pressure.
+
+    Above 1, where there is no pressure, J follows at once (docs/theory.md, 5.11); below, by the share `rate` while
+    sound crosses a cell. Where `opens` is 0 the volume may not grow.
+    """
+    free = J
+    if J >= 1.0:
+        free = ti.max(J + opens * ti.max(seen - J - SLACK, 0.0) + ti.min(seen - J + SLACK, 0.0), 1.0)
+    gap = ti.max(seen, ti.min(free, 1.0) - LARGEST_LACK) - free
+    # The density at rest is no room to open into: particles at even spacing may bear pressure.
+    room = ti.max(ti.min(gap, seen - 1.0) - DEAD_BAND, 0.0)
+    change = opens * room + ti.min(gap + DEAD_BAND, 0.0)
+    change *= rate * crossings / (1.0 + rate * crossings)
+    return free + change, ti.abs(change)
+
+
+@ti.func
+def opened_volume(J_minus_1: float, growth: float):
+    """Return J - 1 after J grew by the factor 1 + growth, for material that remembers how far it opened."""
+    opened = J_minus_1 + (growth + growth * J_minus_1)
+    # Comparisons, which NaN does not meet: a lost particle stays not finite.
+    if opened > OPENED - 1.0 and opened > J_minus_1:
+        opened = ti.max(J_minus_1, OPENED - 1.0)
+    # Closing after so little begins at J = 1.
+    if growth < 0.0 and J_minus_1 > 0.0 and J_minus_1 < SLACK:
+        opened = growth
+    return opened
 
 
 @ti.data_oriented

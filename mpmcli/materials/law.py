@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
-import taichi as ti
 
+from mpmcli.quick_taichi import ti
 from mpmcli.scene.material import Internal, MaterialParameters, SceneBounds
-from mpmcli.scene.solver_settings import NEARLY_INCOMPRESSIBLE
+from mpmcli.scene.schema import NEARLY_INCOMPRESSIBLE
 
 # In bulk the pressure itself adds stiffness, because particles carry it with them: pressure waves see the sum of the
 # tangent modulus and the pressure (docs/theory.md, 6.6). For a fluid of p = K (1/J - 1) that is K at any J. At J = 0.5
@@ -68,9 +68,7 @@ def principal(deformation: np.ndarray, dimension: int) -> np.ndarray:
 def carried_stiffness(tangent: float, pressure: float) -> float:
     """Return the stiffness that a wave in compressed bulk sees, Pa: tangent modulus and pressure (docs/theory.md, 6.6).
 
-    Args:
-        tangent: of a plane wave, d tau / d strain along its direction, Pa.
-        pressure: the largest -tau_i, Pa.
+    The tangent modulus is that of a plane wave, d tau / d strain along its direction; the pressure the largest -tau_i.
     """
     return tangent + CARRIED * max(pressure, 0.0)
 
@@ -259,11 +257,10 @@ class Law(ABC):
         time: float,
         constants: ti.template(),
     ):
-        """Return (deformation, internal, change), moved towards what the grid sees.
+        """Return (deformation, internal, change), moved towards what the grid sees; momentum and mass stay.
 
-        The change is that of the logarithm of the volume, without sign, as far as it changes the stiffness.
-
-        Only laws with `relaxes` have it. It changes no momentum and no mass.
+        The change is that of the logarithm of the volume, without sign, as far as it changes the stiffness. Only laws
+        with `relaxes` have it.
 
         Args:
             deformation, internal, constants: as of `respond`.

@@ -4,12 +4,12 @@ import math
 from typing import Literal
 
 import numpy as np
-import taichi as ti
 
 from mpmcli.materials.elasticity import ElasticParameters
 from mpmcli.materials.elementary import log
 from mpmcli.materials.law import SMALLEST, Law, Mode, StateBound, carried_stiffness, least_stretch, principal
 from mpmcli.materials.tensors import log_ratio, volume_strain
+from mpmcli.quick_taichi import ti
 
 # Places in the vector of constants.
 MU, LAMBDA = range(2)

@@ -30,11 +30,7 @@ def parameter_models() -> tuple[type[MaterialParameters], ...]:
 
 
 def load_plugins(paths: Sequence[Path]) -> tuple[type[MaterialParameters], ...]:
-    """Replace all loaded plugins by these, and return the parameter models of all laws.
-
-    Raises:
-        InputError: as for `load_plugin`.
-    """
+    """Replace all loaded plugins by these, as `load_plugin` does, and return the parameter models of all laws."""
     _plugins.clear()
     for path in paths:
         load_plugin(path)

@@ -5,11 +5,9 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-import taichi as ti
 from pydantic import Field, ValidationInfo, field_validator
 
-from mpmcli.materials.elementary import log
-from mpmcli.materials.hencky import (
+from mpmcli.materials.elasticity import (
     MODULUS_PER_STRENGTH,
     STRETCH_MIN,
     Compressibility,
@@ -20,9 +18,10 @@ from mpmcli.materials.hencky import (
     soft_youngs_modulus,
     stretch_tensor,
 )
-from mpmcli.materials.principal import from_principal, principal_stretches
-from mpmcli.scene.knobs import Knob
-from mpmcli.scene.material import Internal, SceneBounds
+from mpmcli.materials.elementary import log
+from mpmcli.materials.tensors import from_principal, principal_stretches
+from mpmcli.quick_taichi import ti
+from mpmcli.scene.material import Internal, Knob, SceneBounds
 from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, flaw, scene_dimension
 
 # Places in the vector of constants.
@@ -49,23 +48,18 @@ class SandParameters(HenckyParameters):
     compressibility: Compressibility = 0.002
     friction_angle: Annotated[
         float,
-        Field(
-            gt=0,
-            lt=90,
-            description="Friction angle that acts in plane strain, degrees; glass beads 22, dry sand 30 to 40.",
-        ),
         Knob("grip", 20.0, 45.0, "0 is smooth beads, 0.4 loose sand, 0.6 packed sand, 1 crushed rock", scale="linear"),
-    ]
-    cohesion: Annotated[
-        NotNegative, Field(description="Shear strength that is left without pressure, Pa; dry sand 0, damp sand 1e3.")
-    ] = 0.0
-    volume_correction: Annotated[
-        Flag,
-        Field(
-            description="Whether sand that has come apart follows the density that the grid sees, and must close up "
-            "again before it bears pressure. False makes it gain volume each time it is stirred."
-        ),
-    ] = True
+    ] = Field(
+        gt=0, lt=90, description="Friction angle that acts in plane strain, degrees; glass beads 22, dry sand 30 to 40."
+    )
+    cohesion: NotNegative = Field(
+        0.0, description="Shear strength that is left without pressure, Pa; dry sand 0, damp sand 1e3."
+    )
+    volume_correction: Flag = Field(
+        True,
+        description="Whether sand that has come apart follows the density that the grid sees, and must close up "
+        "again before it bears pressure. False makes it gain volume each time it is stirred.",
+    )
 
     internal: ClassVar[tuple[Internal, ...]] = (
         Internal(

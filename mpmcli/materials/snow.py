@@ -5,17 +5,15 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-import taichi as ti
 from pydantic import Field
 
 from mpmcli.materials.elasticity import ElasticParameters, PoissonsRatio
 from mpmcli.materials.elementary import exp
 from mpmcli.materials.fixed_corotated import corotated_energy, corotated_stiffness
 from mpmcli.materials.law import Law, Mode, StateBound
-from mpmcli.materials.polar import rounding
-from mpmcli.materials.principal import from_principal, principal_stretches
-from mpmcli.scene.knobs import Knob
-from mpmcli.scene.material import Internal, SceneBounds
+from mpmcli.materials.tensors import from_principal, principal_stretches, rounding
+from mpmcli.quick_taichi import ti
+from mpmcli.scene.material import Internal, Knob, SceneBounds
 from mpmcli.scene.quantity import Positive
 
 # Places in the vector of constants.
@@ -30,30 +28,24 @@ class SnowParameters(ElasticParameters):
 
     law: Literal["snow"] = "snow"
     youngs_modulus: Annotated[
-        Positive,
-        Field(description="Young's modulus E before hardening, Pa."),
-        Knob("stiffness", 1e4, 1e6, "0 is fresh powder, 0.6 snow that packs well, 1 old firm snow"),
-    ] = 1.4e5
+        Positive, Knob("stiffness", 1e4, 1e6, "0 is fresh powder, 0.6 snow that packs well, 1 old firm snow")
+    ] = Field(1.4e5, description="Young's modulus E before hardening, Pa.")
     poissons_ratio: PoissonsRatio = 0.2
-    critical_compression: Annotated[
-        float,
-        Field(gt=0, lt=1, description="Elastic compression at which snow begins to pack; smaller is more powdery."),
-    ] = 0.025
-    critical_stretch: Annotated[
-        float,
-        Field(gt=0, le=1, description="Elastic extension at which snow begins to break; larger is chunkier."),
-    ] = 0.0075
+    critical_compression: float = Field(
+        0.025, gt=0, lt=1, description="Elastic compression at which snow begins to pack; smaller is more powdery."
+    )
+    critical_stretch: float = Field(
+        0.0075, gt=0, le=1, description="Elastic extension at which snow begins to break; larger is chunkier."
+    )
     hardening: Annotated[
         float,
-        Field(
-            ge=0, le=100, description="Hardening xi: packed snow is exp(xi (1 - J_P)) times as stiff, J_P its volume."
-        ),
         Knob("hardness", 0.0, 20.0, "0 is slush that packs without hardening, 0.5 snow, 1 icy snow", scale="linear"),
-    ] = 10.0
-    hardening_limit: Annotated[
-        float,
-        Field(ge=1, le=1e6, description="Packing stiffens by this factor at most, and breaking softens by no more."),
-    ] = 100.0
+    ] = Field(
+        10.0, ge=0, le=100, description="Hardening xi: packed snow is exp(xi (1 - J_P)) times as stiff, J_P its volume."
+    )
+    hardening_limit: float = Field(
+        100.0, ge=1, le=1e6, description="Packing stiffens by this factor at most, and breaking softens by no more."
+    )
 
     internal: ClassVar[tuple[Internal, ...]] = (
         Internal("plastic_volume_ratio", 1.0, "Permanent volume ratio J_P: below 1 packed, above 1 broken."),

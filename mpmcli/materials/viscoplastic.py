@@ -3,15 +3,14 @@
 import math
 from typing import Annotated, Literal, Self
 
-import taichi as ti
 from pydantic import Field
 
 from mpmcli.materials.elementary import exp, log
 from mpmcli.materials.fluid import WeaklyCompressibleParameters, soft_bulk_modulus, volume_energy
 from mpmcli.materials.law import CARRIED, Law, Mode, StateBound
-from mpmcli.materials.polar import rounding
-from mpmcli.scene.knobs import Knob
-from mpmcli.scene.material import SceneBounds
+from mpmcli.materials.tensors import rounding
+from mpmcli.quick_taichi import ti
+from mpmcli.scene.material import Knob, SceneBounds
 from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
 
 # Places in the vector of constants.
@@ -31,35 +30,24 @@ class ViscoplasticParameters(WeaklyCompressibleParameters):
 
     law: Literal["viscoplastic"] = "viscoplastic"
     yield_stress: Annotated[
-        NotNegative,
-        Field(description="Shear stress below which the material does not flow, Pa; mud 10 to 1000."),
-        Knob("strength", 1.0, 1e5, "0 is thin slurry, 0.3 ketchup, 0.4 mud, 0.6 lava, 1 stiff clay"),
-    ]
+        NotNegative, Knob("strength", 1.0, 1e5, "0 is thin slurry, 0.3 ketchup, 0.4 mud, 0.6 lava, 1 stiff clay")
+    ] = Field(description="Shear stress below which the material does not flow, Pa; mud 10 to 1000.")
     consistency: Annotated[
-        Positive,
-        Field(description="Stress above yield at a shear rate of 1/s, Pa s^n; for n = 1 the plastic viscosity, Pa s."),
-        Knob("thickness", 0.1, 1e5, "0 is paint, 0.3 mud, 0.6 runny lava, 1 lava that is about to set"),
-    ]
-    flow_index: Annotated[
-        float,
-        Field(
-            ge=0.1, le=2, description="Exponent n of the shear rate: 1 Bingham, below 1 thinning, above 1 thickening."
-        ),
-    ] = 1.0
-    shear_modulus: Annotated[
-        Positive | Literal["auto"],
-        Field(
-            description='Elastic shear modulus below yield, Pa; "auto" takes the larger of a quarter of the bulk '
-            "modulus, which leaves the time step alone, and 20 yield stresses, which keep elastic strain under 5 %."
-        ),
-    ] = "auto"
-    tension_cutoff: Annotated[
-        Flag,
-        Field(
-            description="Whether the material takes no tension: below the density at rest its pressure is 0, "
-            "and it forgets its shear stress as it opens. Pastes hang together, and swell where they cannot."
-        ),
-    ] = False
+        Positive, Knob("thickness", 0.1, 1e5, "0 is paint, 0.3 mud, 0.6 runny lava, 1 lava that is about to set")
+    ] = Field(description="Stress above yield at a shear rate of 1/s, Pa s^n; for n = 1 the plastic viscosity, Pa s.")
+    flow_index: float = Field(
+        1.0, ge=0.1, le=2, description="Exponent n of the shear rate: 1 Bingham, below 1 thinning, above 1 thickening."
+    )
+    shear_modulus: Positive | Literal["auto"] = Field(
+        "auto",
+        description='Elastic shear modulus below yield, Pa; "auto" takes the larger of a quarter of the bulk '
+        "modulus, which leaves the time step alone, and 20 yield stresses, which keep elastic strain under 5 %.",
+    )
+    tension_cutoff: Flag = Field(
+        False,
+        description="Whether the material takes no tension: below the density at rest its pressure is 0, "
+        "and it forgets its shear stress as it opens. Pastes hang together, and swell where they cannot.",
+    )
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
         """Replace "auto" by the bulk modulus of the fluid, and by a shear modulus of small strain at yield."""

@@ -5,10 +5,9 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-import taichi as ti
 from pydantic import Field
 
-from mpmcli.materials.hencky import (
+from mpmcli.materials.elasticity import (
     MODULUS_PER_STRENGTH,
     STRETCH_MIN,
     HenckyLaw,
@@ -17,9 +16,9 @@ from mpmcli.materials.hencky import (
     soft_youngs_modulus,
     stretch_tensor,
 )
-from mpmcli.materials.principal import from_principal, principal_stretches
-from mpmcli.scene.knobs import Knob
-from mpmcli.scene.material import Internal, SceneBounds
+from mpmcli.materials.tensors import from_principal, principal_stretches
+from mpmcli.quick_taichi import ti
+from mpmcli.scene.material import Internal, Knob, SceneBounds
 from mpmcli.scene.quantity import LARGEST, NotNegative, Positive
 
 # Places in the vector of constants.
@@ -32,16 +31,11 @@ class VonMisesParameters(HenckyParameters):
     law: Literal["von_mises"] = "von_mises"
     yield_stress: Annotated[
         Positive,
-        Field(
-            description="Stress at which a bar that is pulled begins to flow, Pa; clay 1e4 to 1e5, metal 1e7 to 1e9."
-        ),
         Knob("strength", 1e3, 1e9, "0 is soft putty, 0.3 clay, 0.75 soft aluminium, 0.9 mild steel, 1 tool steel"),
-    ]
+    ] = Field(description="Stress at which a bar that is pulled begins to flow, Pa; clay 1e4 to 1e5, metal 1e7 to 1e9.")
     hardening_modulus: Annotated[
-        NotNegative,
-        Field(description="Growth of the yield stress per plastic strain, Pa; 0 is perfectly plastic."),
-        Knob("hardness", 1e3, 1e9, "0 goes on as soft as it begins, 1 hardens like steel"),
-    ] = 0.0
+        NotNegative, Knob("hardness", 1e3, 1e9, "0 goes on as soft as it begins, 1 hardens like steel")
+    ] = Field(0.0, description="Growth of the yield stress per plastic strain, Pa; 0 is perfectly plastic.")
 
     internal: ClassVar[tuple[Internal, ...]] = (
         Internal("plastic_strain", 0.0, "Equivalent plastic strain, dimensionless."),
@@ -79,12 +73,7 @@ class VonMises(HenckyLaw):
     coherent = True
 
     def constants(self, parameters: VonMisesParameters) -> tuple[float, ...]:
-        return (
-            parameters.shear_modulus,
-            parameters.lame_lambda,
-            parameters.yield_stress,
-            parameters.hardening_modulus,
-        )
+        return (parameters.shear_modulus, parameters.lame_lambda, parameters.yield_stress, parameters.hardening_modulus)
 
     def total_volume_ratio(self, J: np.ndarray, internal: Mapping[str, np.ndarray]) -> np.ndarray:
         return J * np.exp(internal["elastic_strain_zz"]) if self.dimension == 2 else J

@@ -1,7 +1,4 @@
-"""Frames on disk: the stores that write them, the results that read them, the record of a run.
-
-Neither vtk nor meshio is imported until a series is written or read.
-"""
+"""Frames on disk: the stores that write them, the results that read them, the record of a run."""
 
 from mpmcli.output.directory import check_directory, prepare_directory
 from mpmcli.output.result import Result, open_result

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from mpmcli import __version__
-from mpmcli.output.durable import TEMPORARY_SUFFIX, require_free_space, sealed, sync_directory
+from mpmcli.output.durable import numbered_files, remove_numbered, require_free_space, sealed, sync_directory
+from mpmcli.output.guarded_read import DAMAGE
 
 CHECKPOINTS = "checkpoints"
 CHECKPOINT_NAME = re.compile(r"step_\d{9,}\.npz")
@@ -27,31 +28,12 @@ FACTS = "facts"
 # Facts about the backend.
 BACKEND = {"arch", "precision"}
 # What a damaged archive raises.
-DAMAGE = (
-    OSError,
-    RuntimeError,
-    ValueError,
-    KeyError,
-    TypeError,
-    EOFError,
-    AttributeError,
-    RecursionError,
-    struct.error,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+ARCHIVE_DAMAGE = (*DAMAGE, EOFError, struct.error, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A state of a run at rest.
-
-    Attributes:
-        frame: number of the first frame that it had not stored; step: steps taken; time: s.
-        backend: "arch" and "precision"; forced: whether time.step was taken as it was.
-        numbers: of the state, as JSON can hold them; arrays: by name, asked for one at a time and once.
-        version: of mpmcli that wrote it.
-    """
+    """A run at rest: `frame` is the first not stored, `forced` time.step as it was, `arrays` are taken one by one."""
 
     frame: int
     step: int
@@ -64,14 +46,7 @@ class Checkpoint:
 
 
 def write_checkpoint(directory: Path, checkpoint: Checkpoint, size: int) -> Path:
-    """Seal a checkpoint of the run in `directory`, and remove those before the last one.
-
-    Args:
-        size: bytes of its arrays.
-
-    Raises:
-        RunError, OSError: the disk cannot hold it; earlier ones are kept.
-    """
+    """Seal a checkpoint, whose arrays have `size` bytes, and remove older ones; RunError or OSError: no room."""
     folder = directory / CHECKPOINTS
     facts = {name: value for name, value in vars(checkpoint).items() if name != "arrays"}
     text = np.frombuffer(json.dumps({"format": FORMAT, **facts}).encode("utf-8"), np.uint8)
@@ -93,22 +68,13 @@ def write_checkpoint(directory: Path, checkpoint: Checkpoint, size: int) -> Path
 def read_checkpoints(directory: Path) -> Iterator[Checkpoint]:
     """Yield the sound checkpoints of a directory that this version can read, the newest first."""
     for path in _paths(directory):
-        with suppress(*DAMAGE):
+        with suppress(*ARCHIVE_DAMAGE):
             yield _read(path)
 
 
-def remove_checkpoints(directory: Path, *, but: int = 0) -> None:
-    """Remove all checkpoints except for the newest `but`, and their folder where it becomes empty."""
-    folder = directory / CHECKPOINTS
-    if not folder.is_dir():
-        return
-    for path in _paths(directory)[but:]:
-        path.unlink(missing_ok=True)
-    for path in folder.glob(f"*{TEMPORARY_SUFFIX}"):
-        if CHECKPOINT_NAME.fullmatch(path.name.removesuffix(TEMPORARY_SUFFIX)):
-            path.unlink(missing_ok=True)
-    with suppress(OSError):
-        folder.rmdir()
+def remove_checkpoints(directory: Path) -> None:
+    """Remove all checkpoints, and their folder unless something else lies in it."""
+    remove_numbered(directory / CHECKPOINTS, CHECKPOINT_NAME)
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
@@ -118,10 +84,7 @@ def _add(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
 
 
 def _paths(directory: Path) -> list[Path]:
-    """Return the files of checkpoints, the newest first."""
-    folder = directory / CHECKPOINTS
-    found = [path for path in folder.iterdir() if CHECKPOINT_NAME.fullmatch(path.name)] if folder.is_dir() else []
-    return sorted(found, key=lambda path: int(path.stem.split("_")[1]), reverse=True)
+    return numbered_files(directory / CHECKPOINTS, CHECKPOINT_NAME)[::-1]
 
 
 def _read(path: Path) -> Checkpoint:

@@ -1,23 +1,36 @@
-"""Checksums inside an HDF5 file: of each array in each frame, and of each table and attribute.
+"""Checksums of what was written: of the parts of an HDF5 file, of a whole one, and of the files of a directory.
 
-A group has a data set `checksums`, (T, A) uint32: the CRC-32 of the rows of frame t in array a. Its attribute `list`,
-JSON, names the A arrays, and gives the CRC-32 of every other data set and attribute; its attribute `checksum` is the
-CRC-32 of that text and of the table.
+A group of an HDF5 file has a data set `checksums`, (T, A) uint32: the CRC-32 of the rows of frame t in array a. Its
+attribute `list`, JSON, names the A arrays, and gives the CRC-32 of every other data set and attribute; its attribute
+`checksum` is the CRC-32 of that text and of the table. The last bytes of the file, which no reader of HDF5 reads, are a
+CRC-32 of all bytes before them but those of the A arrays, so that large files are read once.
+
+A directory has a file checksums.sha256, as `sha256sum -c` reads it.
 """
 
 import json
+import re
 import zlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from hashlib import file_digest, sha256
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
 
-from mpmcli.output.hdf5_items import DamageError, held, items
+from mpmcli.output.durable import write_text
+from mpmcli.output.guarded_read import DamageError, held, items
 
 NAME = "checksums"
 _LIST, _OWN = "list", "checksum"
+_FILE_END = "\nmpmcli crc32 {:08x}\n"
+_BLOCK = 2**22
+SUMS = "checksums.sha256"
+# Names of our own files are plain.
+_SUMS_LINE = re.compile(r"([0-9a-f]{64})  (\w[\w.-]*)\n")
+Gap = tuple[int, int]
 
 
 def checksum(array: np.ndarray, before: int = 0) -> int:
@@ -27,8 +40,37 @@ def checksum(array: np.ndarray, before: int = 0) -> int:
 
 def frame_checksums(array: np.ndarray) -> list[int]:
     """Return the CRC-32 of each entry of an array along its first axis."""
-    rows = np.ascontiguousarray(array).reshape(len(array), -1).view(np.uint8)
-    return [zlib.crc32(row) for row in rows]
+    return [checksum(row) for row in array]
+
+
+def kind_checksum(dtype: np.dtype, shape: tuple[int, ...]) -> int:
+    """Return the checksum of the type and the shape of a data set."""
+    return zlib.crc32(f"{dtype.str} {shape}\n".encode())
+
+
+def table_checksum(array: np.ndarray) -> int:
+    """Return the checksum of the type, the shape and the content of a data set that was read."""
+    return checksum(array, kind_checksum(array.dtype, array.shape))
+
+
+def attribute_checksum(value: Any) -> int:
+    """Return the checksum of an attribute as h5py gives it."""
+    if isinstance(value, str):
+        return zlib.crc32(value.encode("utf-8", "surrogateescape"))
+    return table_checksum(np.asarray(value))
+
+
+def item_checksums(root: h5py.Group, arrays: Collection[str], own: str) -> dict[str, int]:
+    """Return the checksums of all below a group but those at `own`; of `arrays`, which have frames, type and shape."""
+    sums = {}
+    for path, item in items(root):
+        if path == own:
+            continue
+        for name in item.attrs:
+            sums[f"{path}@{name}"] = attribute_checksum(item.attrs[name])
+        if isinstance(item, h5py.Dataset):
+            sums[path] = kind_checksum(item.dtype, item.shape) if path in arrays else table_checksum(item[...])
+    return sums
 
 
 def damaged(path: str, what: str) -> DamageError:
@@ -37,11 +79,7 @@ def damaged(path: str, what: str) -> DamageError:
 
 
 class FrameChecksums:
-    """Checksums of arrays with frames, whose rows are given a part after another.
-
-    Attributes:
-        table: (T, A) uint32, those of what was given so far.
-    """
+    """The checksums of arrays with frames, whose rows are given a part after another: a table, (T, A) uint32."""
 
     def __init__(self, names: Collection[str], counts: Sequence[int]) -> None:
         """Begin with the first row of A arrays; `counts` of rows of each of the T frames."""
@@ -57,22 +95,15 @@ class FrameChecksums:
         while len(rows):
             while self._ends[k] == row:
                 k += 1
-            own = rows[: self._ends[k] - row]
-            self.table[k, column] = checksum(own, int(self.table[k, column]))
-            row, rows = row + len(own), rows[len(own) :]
+            of_frame = rows[: self._ends[k] - row]
+            self.table[k, column] = checksum(of_frame, int(self.table[k, column]))
+            row, rows = row + len(of_frame), rows[len(of_frame) :]
         self._places[name] = k, row
 
 
 @dataclass(frozen=True)
 class Checksums:
-    """Checksums of the frames and of the other items of a group.
-
-    Attributes:
-        file: path of the file.
-        arrays: A paths from the group.
-        table: (T, A) uint32.
-        items: CRC-32 by path, "path" of a data set and "path@name" of an attribute.
-    """
+    """Checksums of A arrays with frames, (T, A) uint32, and of other items by "path" or "path@attribute" in a file."""
 
     file: str
     arrays: tuple[str, ...]
@@ -80,37 +111,22 @@ class Checksums:
     items: dict[str, int]
 
     def require(self, key: str, found: int) -> None:
-        """Compare the checksum of an item.
-
-        Raises:
-            DamageError: it differs, or the item is not known.
-        """
+        """Compare the checksum of an item, which must be known."""
         if self.items.get(key) != found:
-            raise damaged(self.file, item_name(key))
+            raise damaged(self.file, _item_name(key))
 
     def require_items(self, found: Mapping[str, int]) -> None:
-        """Compare the checksums of all items (`item_checksums`).
-
-        Raises:
-            DamageError: one differs, is missing, or is not known.
-        """
+        """Compare the checksums of all items (`item_checksums`): none may be missing or unknown."""
         for error in self.differences(found):
             raise error
 
     def differences(self, found: Mapping[str, int]) -> list[DamageError]:
         """Return an error for each item (`item_checksums`) that differs, is missing, or is not known."""
         keys = sorted(found.keys() | self.items.keys())
-        return [damaged(self.file, item_name(key)) for key in keys if found.get(key) != self.items.get(key)]
+        return [damaged(self.file, _item_name(key)) for key in keys if found.get(key) != self.items.get(key)]
 
     def require_frame(self, t: int, path: str, rows: np.ndarray, number: int) -> None:
-        """Compare the checksum of the rows of a frame.
-
-        Args:
-            t: place of the frame in the file; number: of the frame in its run.
-
-        Raises:
-            DamageError: it differs.
-        """
+        """Compare the checksum of the rows of the t-th frame of the file, which has a `number` in its run."""
         if path not in self.arrays or t >= len(self.table) or checksum(rows) != self.table[t, self.arrays.index(path)]:
             raise damaged(self.file, f"the data set {path} of frame {number}")
 
@@ -118,35 +134,26 @@ class Checksums:
 def store_checksums(
     root: h5py.Group, place: str, arrays: Sequence[str], table: np.ndarray, known: Mapping[str, int] | None = None
 ) -> None:
-    """Write the checksums of all below a group.
+    """Write the checksums of all below a group at `place` in it, once all of it has been written.
 
-    Args:
-        root: the group; all of it has been written.
-        place: path from it of the group that gets the data set.
-        arrays: paths of the arrays with frames; table: (T, A) uint32.
-        known: what `item_checksums` would find, None to read all items again.
+    `arrays` have the frames' checksums (T, A) uint32; `known` are `item_checksums`, None to read all items again.
     """
     path = f"{place}/{NAME}" if place else NAME
-    found = item_checksums(root, arrays, path) if known is None else known
-    text = json.dumps({"arrays": list(arrays), "items": found}, sort_keys=True)
+    sums = item_checksums(root, arrays, path) if known is None else known
+    text = json.dumps({"arrays": list(arrays), "items": sums}, sort_keys=True)
     table = np.asarray(table, "<u4")
     data = root.create_dataset(path, data=table, track_times=False)
     data.attrs[_LIST] = text
-    data.attrs[_OWN] = np.uint32(_own(text, table))
+    data.attrs[_OWN] = np.uint32(checksum(table, zlib.crc32(text.encode("utf-8"))))
 
 
 def load_checksums(root: h5py.Group, place: str) -> Checksums:
-    """Read the checksums that `store_checksums` wrote.
-
-    Raises:
-        DamageError: they are missing or have changed.
-    """
-    path = f"{place}/{NAME}" if place else NAME
+    """Read the checksums that `store_checksums` wrote; DamageError where they are missing or have changed."""
     file = root.file.filename
     try:
-        data = held(root, path)
+        data = held(root, f"{place}/{NAME}" if place else NAME)
         table, text = data[...], str(data.attrs[_LIST])
-        if int(data.attrs[_OWN]) != _own(text, table):
+        if int(data.attrs[_OWN]) != checksum(table, zlib.crc32(text.encode("utf-8"))):
             raise damaged(file, "the list of its checksums")
         told = json.loads(text)
         return Checksums(file, tuple(told["arrays"]), table, told["items"])
@@ -154,50 +161,7 @@ def load_checksums(root: h5py.Group, place: str) -> Checksums:
         raise DamageError(f"{file} is damaged: its checksums cannot be read.") from error
 
 
-def item_checksums(root: h5py.Group, arrays: Collection[str], own: str) -> dict[str, int]:
-    """Return the checksums of all items below a group; of an array with frames only that of its type and shape.
-
-    Args:
-        arrays: paths of those; own: path of the checksums, which are left out.
-
-    Raises:
-        InputError: an item leads out of the file.
-    """
-    found = {}
-    for path, item in items(root):
-        if path == own:
-            continue
-        for name in item.attrs:
-            found[f"{path}@{name}"] = attribute_checksum(item.attrs[name])
-        if isinstance(item, h5py.Dataset):
-            found[path] = dataset_checksum(item, bare=path in arrays)
-    return found
-
-
-def dataset_checksum(data: h5py.Dataset, *, bare: bool = False) -> int:
-    """Return the checksum of the type, the shape and, unless `bare`, the content of a data set."""
-    return kind_checksum(data.dtype, data.shape) if bare else table_checksum(data[...])
-
-
-def kind_checksum(dtype: np.dtype, shape: tuple[int, ...]) -> int:
-    """Return the checksum of the type and the shape of a data set."""
-    return zlib.crc32(f"{dtype.str} {shape}\n".encode())
-
-
-def table_checksum(array: np.ndarray) -> int:
-    """Return the checksum of the type, the shape and the content of a data set that was read."""
-    own = kind_checksum(array.dtype, array.shape)
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8), own)
-
-
-def attribute_checksum(value: Any) -> int:
-    """Return the checksum of an attribute as h5py gives it."""
-    if isinstance(value, str):
-        return zlib.crc32(value.encode("utf-8", "surrogateescape"))
-    return table_checksum(np.asarray(value))
-
-
-def item_name(key: str) -> str:
+def _item_name(key: str) -> str:
     """Return what a key of `Checksums.items` means, in words."""
     path, at, name = key.rpartition("@")
     if not at:
@@ -205,5 +169,99 @@ def item_name(key: str) -> str:
     return f"the attribute {name} of {path}" if path else f"the attribute {name}"
 
 
-def _own(text: str, table: np.ndarray) -> int:
-    return zlib.crc32(np.ascontiguousarray(table).view(np.uint8).reshape(-1), zlib.crc32(text.encode("utf-8")))
+def gaps_of(arrays: Sequence[h5py.Dataset]) -> list[Gap]:
+    """Return offset and length of the contiguous arrays in their file; compressed ones have none."""
+    places = [(data.id.get_offset(), data.id.get_storage_size()) for data in arrays if data.chunks is None]
+    return sorted((offset, length) for offset, length in places if offset is not None and length)
+
+
+def append_checksum(path: Path, gaps: Sequence[Gap] = ()) -> None:
+    """Append the checksum to a closed file, of all its bytes but those in `gaps`, ascending."""
+    with path.open("r+b") as file:
+        size = file.seek(0, 2)
+        end = _file_end(file, size, gaps)
+        file.seek(size)
+        file.write(end)
+
+
+def checksum_is_right(path: Path, gaps: Sequence[Gap] = ()) -> bool:
+    """Return whether the last bytes of a file are the checksum of those before."""
+    with path.open("rb") as file:
+        size = file.seek(0, 2) - len(_FILE_END.format(0))
+        if size < 0:
+            return False
+        file.seek(size)
+        return file.read() == _file_end(file, size, gaps)
+
+
+def _file_end(file: BinaryIO, size: int, gaps: Sequence[Gap]) -> bytes:
+    """Return what ends a file that has `size` bytes before."""
+    total = 0
+    for first, end in _between(gaps, size):
+        file.seek(first)
+        while first < end and (block := file.read(min(_BLOCK, end - first))):
+            total = zlib.crc32(block, total)
+            first += len(block)
+    return _FILE_END.format(total).encode("ascii")
+
+
+def _between(gaps: Sequence[Gap], size: int) -> Iterator[tuple[int, int]]:
+    first = 0
+    for offset, length in gaps:
+        yield first, min(offset, size)
+        first = offset + length
+    yield first, size
+
+
+def text_digest(text: str) -> str:
+    """Return the SHA-256 of a text in UTF-8, hexadecimal."""
+    return sha256(text.encode("utf-8")).hexdigest()
+
+
+def path_digest(path: Path) -> str:
+    """Return the SHA-256 of a file, hexadecimal."""
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
+
+
+def sums_text(sums: Mapping[str, Sequence[str]]) -> str:
+    """Return the text of checksums.sha256: digests by the names of files; one that is about to be replaced has two."""
+    return "".join(f"{digest}  {name}\n" for name in sorted(sums) for digest in sums[name])
+
+
+def write_sums(directory: Path, sums: Mapping[str, Sequence[str]]) -> None:
+    """Replace checksums.sha256 of a directory in one durable step."""
+    write_text(directory / SUMS, sums_text(sums))
+
+
+def read_sums(directory: Path) -> dict[str, list[str]]:
+    """Read checksums.sha256 of a directory, digests by names of files; DamageError where it is missing or damaged."""
+    path = directory / SUMS
+    try:
+        lines = path.read_bytes().decode("ascii").splitlines(keepends=True)
+    except (OSError, ValueError) as error:
+        raise DamageError(f"{path} is missing or damaged: the files beside it have no checksums.") from error
+    sums: dict[str, list[str]] = {}
+    for line in lines:
+        match = _SUMS_LINE.fullmatch(line)
+        if match is None:
+            raise DamageError(f"{path} is damaged: a line of it is not a checksum and the name of a file.")
+        sums.setdefault(match[2], []).append(match[1])
+    return sums
+
+
+def sums_faults(directory: Path) -> tuple[int, list[str]]:
+    """Return the number of files that checksums.sha256 lists, and a sentence for each that is missing or changed."""
+    try:
+        sums = read_sums(directory)
+    except DamageError as error:
+        return 0, [str(error)]
+    faults = []
+    for name, digests in sums.items():
+        path = directory / name
+        try:
+            if path_digest(path) not in digests:
+                faults.append(f"{path} has changed since it was written: its checksum differs.")
+        except OSError as error:
+            faults.append(f"{path} cannot be read ({error.strerror or error}).")
+    return len(sums), faults

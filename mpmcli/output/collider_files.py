@@ -6,8 +6,8 @@ cells, and those of colliders at rest one set of points.
 
 import json
 import re
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,19 +17,13 @@ import h5py
 import numpy as np
 
 from mpmcli.errors import InputError, RunError
-from mpmcli.output.checksums import load_checksums, store_checksums, table_checksum
-from mpmcli.output.damage import DAMAGE
+from mpmcli.output.checksums import append_checksum, load_checksums, store_checksums, table_checksum
 from mpmcli.output.durable import require_free_space, sealed, write_text
-from mpmcli.output.file_checksum import append_checksum
-from mpmcli.output.guarded_read import read_whole
-from mpmcli.output.hdf5_heaps import require_sound_heaps
-from mpmcli.output.hdf5_items import held
-from mpmcli.output.stored_colliders import triangles_of
+from mpmcli.output.guarded_read import DAMAGE, held, read_whole, require_sound_heaps
 from mpmcli.output.vtkhdf import FORMAT, LIBVER
-from mpmcli.scene.collider_surface import collider_surface
 from mpmcli.scene.colliders import Collider
-from mpmcli.scene.surface import Surface, joined
-from mpmcli.scene.triangles import Surface as Triangles
+from mpmcli.scene.surface import Surface, collider_surface, form_surface, joined
+from mpmcli.scene.triangles import ClosedSurface
 
 RESTING, MOVING = "colliders.vtkhdf", "colliders_moving.vtkhdf"
 SERIES = "colliders.pvd"
@@ -41,18 +35,18 @@ CELLS = ("Vertices", "Lines", "Polygons", "Strips")
 
 
 @dataclass(frozen=True, eq=False)
-class Things:
-    """Some colliders of a run as one surface.
-
-    Attributes:
-        colliders: k of them.
-        surfaces: of each, where its shape stands.
-        numbers: of each, in the scene.
-    """
+class ColliderGroup:
+    """The colliders of a run that move, or those that do not: their surfaces where they stand, and their numbers."""
 
     colliders: tuple[Collider, ...]
     surfaces: tuple[Surface, ...]
     numbers: tuple[int, ...]
+    moves: bool
+
+    @property
+    def name(self) -> str:
+        """Of the VTKHDF file."""
+        return MOVING if self.moves else RESTING
 
     @property
     def whole(self) -> Surface:
@@ -62,7 +56,7 @@ class Things:
     @cached_property
     def meshes(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         """Vertices and triangles of those that are read from files, which may be gone later, by number."""
-        pairs = zip(self.numbers, map(triangles_of, self.colliders), strict=True)
+        pairs = zip(self.numbers, map(_triangles, self.colliders), strict=True)
         return {number: triangles for number, triangles in pairs if triangles is not None}
 
     @property
@@ -80,65 +74,50 @@ class Things:
 def write_collider_files(
     directory: Path, header: Mapping[str, Any], times: Sequence[float], colliders: Sequence[Collider]
 ) -> None:
-    """Write the colliders of a run, if it has any, at the times of its frames, s.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
-    for name, moves in ((RESTING, False), (MOVING, True)):
-        things = _things(header, colliders, moving=moves)
-        if things is None:
-            continue
-        frames = len(times) if moves else 1
-        size = 24 * sum(len(s.points) for s in things.surfaces) * frames + 32 * len(things.labels) + 2**16
-        size += 200 * len(times) + sum(vertices.nbytes + cells.nbytes for vertices, cells in things.meshes.values())
-        _written(directory, name, size, lambda path, things=things: _write_vtkhdf(path, things, times))
+    """Write the colliders of a run, if it has any, at the times of its frames, s; RunError where the disk refuses."""
+    for group in _groups(header, colliders):
+        frames = len(times) if group.moves else 1
+        size = 24 * sum(len(s.points) for s in group.surfaces) * frames + 32 * len(group.labels) + 2**16
+        size += 200 * len(times) + sum(vertices.nbytes + cells.nbytes for vertices, cells in group.meshes.values())
+        with _written(directory, group.name, size) as path:
+            _write_vtkhdf(path, group, times)
 
 
 def write_collider_series(
     directory: Path, header: Mapping[str, Any], times: Sequence[float], colliders: Sequence[Collider]
 ) -> list[str]:
-    """Write the colliders of a run, if it has any, as .vtu files and the .pvd that lists them.
-
-    Returns:
-        Names of the files.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """Write the colliders of a run as .vtu files and a .pvd, and return their names; RunError: the disk refuses."""
     entries: list[tuple[float, int, str]] = []
-    for part, moves in enumerate((False, True)):
-        things = _things(header, colliders, moving=moves)
-        if things is None:
-            continue
-        size = 64 * (3 * sum(len(s.points) for s in things.surfaces) + 3 * len(things.labels)) + 2**12
+    for group in _groups(header, colliders):
+        size = 64 * (3 * sum(len(s.points) for s in group.surfaces) + 3 * len(group.labels)) + 2**12
         for k, time in enumerate(times):
-            name = MOVING_PIECE.format(k) if moves else RESTING_PIECE
-            entries.append((time, part, name))
-            if moves or k == 0:
-                _written(directory, name, size, lambda path, things=things, time=time: _write_vtu(path, things, time))
+            name = MOVING_PIECE.format(k) if group.moves else RESTING_PIECE
+            entries.append((time, int(group.moves), name))
+            if group.moves or k == 0:
+                with _written(directory, name, size) as path:
+                    _write_vtu(path, group, time)
     if entries:
-        lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "<Collection>"]
-        lines += [f'<DataSet timestep="{t!r}" group="" part="{p}" file="{name}"/>' for t, p, name in sorted(entries)]
-        write_text(directory / SERIES, "\n".join([*lines, "</Collection>", "</VTKFile>", ""]))
+        write_text(directory / SERIES, pvd_text(sorted(entries)))
     return sorted({name for _, _, name in entries} | ({SERIES} if entries else set()))
+
+
+def pvd_text(entries: Sequence[tuple[float, int, str]]) -> str:
+    """Return the text of a .pvd file, which lists files by time, s, and part."""
+    lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "<Collection>"]
+    lines += [f'<DataSet timestep="{t!r}" group="" part="{p}" file="{name}"/>' for t, p, name in entries]
+    return "\n".join([*lines, "</Collection>", "</VTKFile>", ""])
 
 
 def expected_files(header: Mapping[str, Any], colliders: Sequence[Collider]) -> list[str]:
     """Return the names of the files that `write_collider_files` makes."""
-    return [name for name, moves in ((RESTING, False), (MOVING, True)) if _things(header, colliders, moving=moves)]
+    return [group.name for group in _groups(header, colliders)]
 
 
-def read_stored_surfaces(directory: Path) -> dict[int, Triangles]:
-    """Return the surfaces of colliders that were read from files, by number, as a packed result keeps them.
-
-    Raises:
-        InputError: one has changed since it was written, or lies in another file.
-    """
+def read_stored_surfaces(directory: Path) -> dict[int, ClosedSurface]:
+    """Return the surfaces of colliders read from files, by number; InputError: one has changed, or is elsewhere."""
     found = {}
     for name in (RESTING, MOVING):
-        faults = tuple(kind for kind in DAMAGE if kind is not InputError)
-        with suppress(*faults):
+        with suppress(*(kind for kind in DAMAGE if kind is not InputError)):
             require_sound_heaps(directory / name)
             with h5py.File(directory / name, "r", locking=False) as file:
                 checksums = load_checksums(file, "mpmcli") if held(file, "mpmcli").attrs.get("format", 1) > 1 else None
@@ -152,39 +131,47 @@ def read_stored_surfaces(directory: Path) -> dict[int, Triangles]:
     return found
 
 
-def _surface(vertices: np.ndarray, triangles: np.ndarray) -> Triangles:
-    """Return a surface of vertices (n, 3) and triangles (m, 3).
+def _triangles(collider: Collider) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return vertices and triangles of a collider whose shape is read from files, None of any other."""
+    if not collider.shape.files:
+        return None
+    surface = form_surface(collider.form)
+    return surface.points, surface.cells
 
-    Raises:
-        ValueError: it is none.
-    """
+
+def _surface(vertices: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
+    """Return a surface of vertices (n, 3) and triangles (m, 3); ValueError where it is none."""
     shapes = vertices.shape == (len(vertices), 3) and triangles.shape == (len(triangles), 3)
     if not (shapes and triangles.size and np.isfinite(vertices).all()):
         raise ValueError("it is no surface")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise ValueError("a triangle has no vertex")
-    return Triangles(vertices.astype(np.float64), triangles.astype(np.int64))
+    return ClosedSurface(vertices.astype(np.float64), triangles.astype(np.int64))
 
 
-def _things(header: Mapping[str, Any], colliders: Sequence[Collider], *, moving: bool) -> Things | None:
-    """Return the colliders that move, or those that do not; None where there are none."""
-    found = []
-    for number, collider in enumerate(colliders):
-        if collider.motion.moves == moving:
-            lower = np.array(header["origin"], float)
-            surface = collider_surface(collider, lower, lower + np.array(header["size"], float))
-            if len(surface.cells):
-                found.append((collider, surface, number))
-    return Things(*zip(*found, strict=True)) if found else None
+def _groups(header: Mapping[str, Any], colliders: Sequence[Collider]) -> Iterator[ColliderGroup]:
+    """Yield the colliders at rest, then those that move; a group without any is left out."""
+    for moving in (False, True):
+        members = []
+        for number, collider in enumerate(colliders):
+            if collider.motion.moves == moving:
+                lower = np.array(header["origin"], float)
+                surface = collider_surface(collider, lower, lower + np.array(header["size"], float))
+                if len(surface.cells):
+                    members.append((collider, surface, number))
+        if members:
+            yield ColliderGroup(*zip(*members, strict=True), moves=moving)
 
 
-def _written(directory: Path, name: str, size: int, write: Any) -> None:
+@contextmanager
+def _written(directory: Path, name: str, size: int) -> Iterator[Path]:
+    """Give a temporary path to write a file of `size` bytes; RunError where the disk is full or refuses."""
     path = directory / name
     kept = "the frames of the run are kept"
     try:
         require_free_space(directory, size, f"writing {name}", kept)
         with sealed(path, size) as temporary:
-            write(temporary)
+            yield temporary
     except (OSError, RuntimeError) as error:
         if isinstance(error, RunError):
             raise
@@ -192,49 +179,48 @@ def _written(directory: Path, name: str, size: int, write: Any) -> None:
         raise RunError(f"{path} could not be written ({reason}); {kept}.") from error
 
 
-def _write_vtkhdf(path: Path, things: Things, times: Sequence[float]) -> None:
-    whole, labels = things.whole, things.labels
+def _write_vtkhdf(path: Path, group: ColliderGroup, times: Sequence[float]) -> None:
+    whole, labels = group.whole, group.labels
     count, cells, corners = len(whole.points), len(whole.cells), whole.cells.shape[1]
-    moving = any(collider.motion.moves for collider in things.colliders)
     with h5py.File(path, "w", libver=LIBVER, locking="best-effort") as file:
         root = file.create_group("VTKHDF")
         root.attrs["Version"] = [2, 0]
         root.attrs["Type"] = np.bytes_("PolyData")
-        sets = len(times) if moving else 1
+        sets = len(times) if group.moves else 1
         points = root.create_dataset("Points", (sets * count, 3), "f8")
         for k in range(sets):
-            points[k * count : (k + 1) * count] = things.points(times[k])
+            points[k * count : (k + 1) * count] = group.points(times[k])
         root["NumberOfPoints"] = np.array([count])
         for kind in CELLS:
             ours = kind == ("Lines" if corners == 2 else "Polygons")
-            group = root.create_group(kind)
-            group["NumberOfCells"] = np.array([cells * ours])
-            group["NumberOfConnectivityIds"] = np.array([cells * corners * ours])
-            group["Connectivity"] = whole.cells.ravel() if ours else np.empty(0, np.int64)
-            group["Offsets"] = np.arange(0, cells * corners * ours + 1, corners)
+            cell_group = root.create_group(kind)
+            cell_group["NumberOfCells"] = np.array([cells * ours])
+            cell_group["NumberOfConnectivityIds"] = np.array([cells * corners * ours])
+            cell_group["Connectivity"] = whole.cells.ravel() if ours else np.empty(0, np.int64)
+            cell_group["Offsets"] = np.arange(0, cells * corners * ours + 1, corners)
         root["CellData/collider"] = labels
         steps, zeros = root.create_group("Steps"), np.zeros(len(times), np.int64)
         steps["PartOffsets"] = zeros
         steps["NumberOfParts"] = zeros + 1
-        steps["PointOffsets"] = count * np.arange(len(times)) if moving else zeros
+        steps["PointOffsets"] = count * np.arange(len(times)) if group.moves else zeros
         steps["CellOffsets"] = steps["ConnectivityIdOffsets"] = np.zeros((len(times), 4), np.int64)
         steps["CellDataOffsets/collider"] = zeros
         steps["Values"] = np.asarray(times, float)
         steps.attrs["NSteps"] = len(times)
-        names = {number: c.name for number, c in zip(things.numbers, things.colliders, strict=True)}
-        group = file.create_group("mpmcli")
-        group.attrs["colliders"], group.attrs["format"] = json.dumps(names), FORMAT
-        for number, (vertices, triangles) in things.meshes.items():
-            group = file.create_group(f"mpmcli/surfaces/{number}")
-            group["vertices"], group["triangles"] = vertices, triangles
+        names = {number: c.name for number, c in zip(group.numbers, group.colliders, strict=True)}
+        facts = file.create_group("mpmcli")
+        facts.attrs["colliders"], facts.attrs["format"] = json.dumps(names), FORMAT
+        for number, (vertices, triangles) in group.meshes.items():
+            mesh = file.create_group(f"mpmcli/surfaces/{number}")
+            mesh["vertices"], mesh["triangles"] = vertices, triangles
         store_checksums(file, "mpmcli", [], np.empty((0, 0), np.uint32))
     append_checksum(path)
 
 
-def _write_vtu(path: Path, things: Things, time: float) -> None:
+def _write_vtu(path: Path, group: ColliderGroup, time: float) -> None:
     from meshio import Mesh, vtu
 
-    whole = things.whole
+    whole = group.whole
     kind = "line" if whole.cells.shape[1] == 2 else "triangle"
-    mesh = Mesh(things.points(time), [(kind, whole.cells)], cell_data={"collider": [things.labels]})
+    mesh = Mesh(group.points(time), [(kind, whole.cells)], cell_data={"collider": [group.labels]})
     vtu.write(path, mesh, compression=None, header_type="UInt64")

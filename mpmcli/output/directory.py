@@ -1,5 +1,6 @@
-"""The output directory: made, refused, or cleared of an earlier result, and of nothing else."""
+"""The output directory: made, refused, cleared of an earlier result and of nothing else, or closed after a crash."""
 
+import json
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
@@ -8,13 +9,13 @@ from pathlib import Path
 
 from mpmcli.errors import InputError
 from mpmcli.output.checkpoints import remove_checkpoints
+from mpmcli.output.checksums import SUMS
 from mpmcli.output.collider_files import COLLIDER_FILES, MOVING_FRAME
-from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory
-from mpmcli.output.lock import LOCK, DirectoryLock, refuse_locked, take_lock
+from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory, temporary_of, write_text
+from mpmcli.output.lock import LOCK, DirectoryLock, refuse_locked, refused, take_lock, time_now
 from mpmcli.output.run_record import RECORD, read_record
 from mpmcli.output.segments import DAMAGED, PACKED, REPAIRED, remove_segments, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_FRAME, SERIES_HEADER, SERIES_LEDGER
-from mpmcli.output.sums_file import SUMS
 
 SCENE = "scene.toml"
 NAMES = (PACKED, DAMAGED, REPAIRED, SCENE, SERIES, SERIES_HEADER, SERIES_LEDGER, RECORD, SUMS, *COLLIDER_FILES)
@@ -22,13 +23,7 @@ NAMES = (PACKED, DAMAGED, REPAIRED, SCENE, SERIES, SERIES_HEADER, SERIES_LEDGER,
 
 @dataclass(frozen=True)
 class TakenDirectory:
-    """A directory that is this process's to write.
-
-    Attributes:
-        path: of the directory.
-        lock: held until `release`.
-        made: the directories that were made for it, outermost first.
-    """
+    """A directory that this process may write until `release`; of those `made` for it the outermost comes first."""
 
     path: Path
     lock: DirectoryLock
@@ -47,11 +42,7 @@ class TakenDirectory:
         self.lock.release()
 
     def clear(self) -> None:
-        """Remove an earlier result.
-
-        Raises:
-            InputError: it cannot be removed.
-        """
+        """Remove an earlier result; InputError where it cannot be removed."""
         _remove_result(self.path)
 
     def undo(self) -> None:
@@ -65,12 +56,8 @@ class TakenDirectory:
 def take_directory(directory: Path, overwrite: bool, *, resume: bool = False) -> TakenDirectory:
     """Make sure that `directory` exists, is writable, holds no earlier result and is written by nobody else.
 
-    With `overwrite` the files that mpmcli writes are removed: the packed file, segments, series,
-    checkpoints, scene.toml and run.json. Anything else in the directory stays. With `resume` all of it stays.
-
-    Raises:
-        InputError: something is in the way, another process writes the directory, or it cannot be written. Nothing was
-            made or removed then.
+    With `overwrite` the files that mpmcli writes are removed, and nothing else; with `resume` all stay. InputError, and
+    nothing changed: something is in the way, another process writes it, or it cannot be written.
     """
     directory = Path(directory)
     check_directory(directory, overwrite, resume=resume)
@@ -91,40 +78,21 @@ def take_directory(directory: Path, overwrite: bool, *, resume: bool = False) ->
 
 
 def prepare_directory(directory: Path, overwrite: bool) -> Path:
-    """Do what `take_directory` does, and leave the directory to others at once.
-
-    Returns:
-        The directory.
-
-    Raises:
-        InputError: as `take_directory`.
-    """
+    """Do what `take_directory` does, leave the directory to others at once, and return it."""
     taken = take_directory(directory, overwrite)
     taken.release()
     return taken.path
 
 
 def check_directory(directory: Path, overwrite: bool, *, resume: bool = False, locked: bool = False) -> None:
-    """Refuse a directory that holds something, unless a run is resumed there, is being written, or cannot be.
-
-    Nothing is made or removed. Cheap, so that a long preparation need not come first; `take_directory` has the last
-    word.
-
-    Args:
-        resume: whether what it holds goes on.
-        locked: whether this process has the lock of the directory.
-
-    Raises:
-        InputError: as `take_directory`.
-    """
+    """Refuse a directory as `take_directory` does, and change nothing; `locked`: this process has its lock."""
     directory = Path(directory)
     try:
         directory.stat()
     except (FileNotFoundError, NotADirectoryError):
         pass
     except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"{directory} cannot be made ({reason}): give another place with -o.") from error
+        raise refused(directory, "made", error) from error
     if directory.is_dir():
         _refuse_unwritable(directory)
         if not locked:
@@ -160,13 +128,11 @@ def _make(directory: Path) -> list[Path]:
         _unmake(made)
         if isinstance(error, InputError):
             raise
-        reason = error.strerror or error
-        raise InputError(f"{directory} cannot be made ({reason}): give another place with -o.") from error
+        raise refused(directory, "made", error) from error
     return made
 
 
 def _unmake(made: Sequence[Path]) -> None:
-    """Remove directories, given outermost first, that are empty."""
     for path in reversed(made):
         with suppress(OSError):
             path.rmdir()
@@ -178,8 +144,7 @@ def _refuse_unwritable(directory: Path) -> None:
         with tempfile.TemporaryFile(dir=directory):
             pass
     except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"{directory} cannot be written ({reason}): give another place with -o.") from error
+        raise refused(directory, "written", error) from error
 
 
 def _remove_result(directory: Path) -> None:
@@ -187,7 +152,7 @@ def _remove_result(directory: Path) -> None:
     for path in ours:
         if path.is_dir():
             raise InputError(f"{path} is a directory where mpmcli writes a file: give another place with -o.")
-    if (directory / SCENE).exists() and not _holds_result(directory):
+    if (directory / SCENE).exists() and not (has_frames(directory) or read_record(directory) is not None):
         # With `-o .` it may well be the scene that is about to be run.
         raise InputError(f"{directory / SCENE} was not written by mpmcli: give another directory with -o.")
     try:
@@ -197,20 +162,41 @@ def _remove_result(directory: Path) -> None:
         for path in sorted(ours, key=lambda path: path.name == RECORD):
             path.unlink(missing_ok=True)
     except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"The earlier result in {directory} cannot be removed ({reason}).") from error
+        raise InputError(f"The earlier result in {directory} cannot be removed ({error.strerror or error}).") from error
 
 
 def _is_ours(name: str) -> bool:
-    frame = SERIES_FRAME.fullmatch(name) or MOVING_FRAME.fullmatch(name)
-    return name in NAMES or frame is not None
-
-
-def _holds_result(directory: Path) -> bool:
-    return has_frames(directory) or read_record(directory) is not None
+    return name in NAMES or bool(SERIES_FRAME.fullmatch(name) or MOVING_FRAME.fullmatch(name))
 
 
 def has_frames(directory: Path) -> bool:
     """Return whether a directory holds a frame of a run."""
     files = (PACKED, SERIES_HEADER)
     return any((directory / name).exists() for name in files) or bool(sealed_segments(directory))
+
+
+def close_abandoned(directory: Path, made: Sequence[Path], pid: int, signal: str) -> None:
+    """Close the result of a process `pid` that a signal ended by force: run.json says "interrupted".
+
+    Without a frame, what the run has made is removed, with the directories `made` for it, outermost first. A result of
+    another process is left as it is.
+    """
+    if not directory.is_dir():
+        return
+    taken = TakenDirectory(directory, take_lock(directory), tuple(made))
+    try:
+        record = read_record(directory)
+        process = (record or {}).get("process")
+        ours = isinstance(process, dict) and process.get("pid") == pid and record["status"] == "running"
+        if not has_frames(directory) and (ours or (record is None and made)):
+            taken.undo()
+        elif ours:
+            # The packed file that it wrote beside the segments.
+            with suppress(OSError):
+                temporary_of(directory / PACKED).unlink(missing_ok=True)
+            message = f"the run was interrupted ({signal}) and ended by force; its frames were left unpacked"
+            failure = {"message": message, "signal": signal}
+            closed = {**record, "status": "interrupted", "ended": time_now(), "failure": failure}
+            write_text(directory / RECORD, json.dumps(closed, indent=2, ensure_ascii=False) + "\n")
+    finally:
+        taken.release()

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -53,18 +54,7 @@ def sync_directory(directory: Path) -> None:
 
 @contextmanager
 def sealed(path: Path, size: int = 0) -> Iterator[Path]:
-    """Give a temporary path to write and close; on leaving, put it at `path` in one durable step.
-
-    After a crash at any moment `path` holds its old content or the whole new one. If the block
-    raises, the temporary file is removed and `path` is untouched.
-
-    Args:
-        path: the file to make or replace.
-        size: bytes that the system is asked to grant first, 0 for no question.
-
-    Raises:
-        OSError: the system does not grant them: disk full, quota, limit on the size of a file.
-    """
+    """Give a temporary path; on leaving, put it at `path` durably. `size` bytes are asked for first, else OSError."""
     file = Unsealed(path)
     with file.written(size) as temporary:
         yield temporary
@@ -104,11 +94,7 @@ class Unsealed:
 
 
 def ask_for(path: Path, size: int) -> None:
-    """Reserve and release `size` bytes, so that a full disk is found here and not inside HDF5.
-
-    HDF5 that is refused space raises, and then crashes the interpreter at exit. Free space alone does
-    not tell of quotas and limits.
-    """
+    """Reserve and release `size` bytes, since HDF5 that is refused space crashes the interpreter at exit."""
     if not hasattr(os, "posix_fallocate"):
         return
     with open(path, "wb") as file:
@@ -127,6 +113,28 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
+def number_of(path: Path) -> int:
+    """Return the number in a file name such as frame_000007.vtkhdf."""
+    return int(path.stem.split("_")[1])
+
+
+def numbered_files(folder: Path, names: re.Pattern[str]) -> list[Path]:
+    """Return the files of a folder with such names, in the order of their numbers; none where it does not exist."""
+    paths = [path for path in folder.iterdir() if names.fullmatch(path.name)] if folder.is_dir() else []
+    return sorted(paths, key=number_of)
+
+
+def remove_numbered(folder: Path, names: re.Pattern[str]) -> None:
+    """Remove files with such names, unfinished ones too, and the folder unless something else lies in it."""
+    if not folder.is_dir():
+        return
+    for path in folder.iterdir():
+        if names.fullmatch(path.name.removesuffix(TEMPORARY_SUFFIX)):
+            path.unlink(missing_ok=True)
+    with suppress(OSError):
+        folder.rmdir()
+
+
 def is_full(error: BaseException) -> bool:
     """Return whether an error says that the disk is full, or a quota or a limit on the size of a file reached."""
     return isinstance(error, OSError) and error.errno in FULL
@@ -143,18 +151,10 @@ def largest_file() -> int | None:
 def require_free_space(
     directory: Path, size: int, purpose: str, kept: str, *, joined: int = 0, several: bool = False
 ) -> None:
-    """Refuse to start writing what the disk cannot hold.
+    """Refuse with NoRoomError to write `size` bytes, to `several` files maybe, that the disk cannot hold.
 
-    Args:
-        directory: where the file goes; it exists.
-        size: bytes to be written.
-        purpose: what is to be written, the subject of the error's sentence ("frame 7").
-        kept: what stays usable, closing the sentence ("the 7 frames before it are kept").
-        joined: bytes of one more file, of this and of what was written before, that is to follow.
-        several: whether the bytes go to several files.
-
-    Raises:
-        NoRoomError: fewer than `size` + `joined` + `SPACE_MARGIN` bytes are free, or files may not be so large.
+    `purpose` is the subject of the error's sentence ("frame 7"), `kept` its end ("the 7 frames before it are kept");
+    `joined` are bytes of one more file, of this and of what was written before, that is to follow.
     """
     included = "a margin and the packing of all frames up to it" if joined else "a margin"
     free, largest = shutil.disk_usage(directory).free, largest_file()

@@ -7,30 +7,101 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
+from pydantic import ValidationError
 
 from mpmcli import __version__
-from mpmcli.output.header_walls import sticking_axes, words_of
-from mpmcli.output.scene_header import BodyHeader, body_headers, volumes_from_files
-from mpmcli.output.stored_colliders import ColliderFacts
-from mpmcli.output.stored_facts import require_header, require_scene
+from mpmcli.output.stored_facts import require_kinds
 from mpmcli.scene import Scene
-from mpmcli.scene.schema import SolverSettings
+from mpmcli.scene.colliders import Collider, ColliderShape
+from mpmcli.scene.domain import PERIODIC, Walls
+from mpmcli.scene.entry import definitions
+from mpmcli.scene.mesh import Mesh
+from mpmcli.scene.quantity import AXES
+from mpmcli.scene.schema import SolverSettings, usual_particles_per_cell
+from mpmcli.scene.shapes import BodyShape
 from mpmcli.scene.sheets import emitted_volumes
-from mpmcli.scene.wall_rules import PERIODIC
+from mpmcli.scene.triangles import ClosedSurface
 
 # Of a scene that does not say.
 _TRANSFER, _SOLIDS = (SolverSettings.model_fields[name].default for name in ("transfer", "solids"))
 
 
-class LawFacts(Protocol):
-    """What a header keeps of a constitutive law.
+def words_of(walls: Mapping[str, str] | str | None, d: int) -> tuple[tuple[str, str], ...] | None:
+    """Return the words of the faces along each axis, None where they are not known."""
+    if walls is None:
+        return None
+    table = {"default": walls} if isinstance(walls, str) else walls
+    try:
+        return Walls.model_validate(table, context={"dimension": d}).faces(d)
+    except ValidationError:
+        return None
 
-    Attributes:
-        name: the word for it in a scene.
-        deformation: what a particle stores, "J" or "F".
-        coherent: whether the material resists being pulled apart.
-        projects: whether it may yield or flow.
-    """
+
+def sticking_axes(
+    words: tuple[tuple[str, str], ...] | None, friction: Mapping[str, float] | float
+) -> tuple[bool, ...] | None:
+    """Return per axis whether a face normal to it sticks or has friction, None where walls are not known."""
+    if words is None:
+        return None
+    numbers = friction if isinstance(friction, Mapping) else {"default": friction}
+    rough = [numbers.get("default", 0) > 0 or any(numbers.get(f"{a}_{s}", 0) > 0 for s in ("min", "max")) for a in AXES]
+    return tuple("stick" in pair or rubs for pair, rubs in zip(words, rough, strict=False))
+
+
+@dataclass(frozen=True)
+class BodyHeader:
+    """A body of the scene; what is not known is {} or None: `material` is its table, `volume` in m^3 (m^2 in 2D)."""
+
+    name: str
+    material: Mapping[str, Any]
+    volume: float | None
+    particles_per_cell: float
+
+    @property
+    def density(self) -> float | None:
+        """At rest, kg/m^3; None where not known."""
+        return self.material.get("density")
+
+
+def body_headers(
+    names: Sequence[str], tables: Sequence[Mapping[str, Any]], volumes: Sequence[float | None], d: int
+) -> tuple[BodyHeader, ...]:
+    """Return the bodies; of other ones than the scene's the names alone; `volumes` where shapes do not tell them."""
+    tables = tables if len(tables) == len(names) else [{} for _ in names]
+    volumes = volumes if len(volumes) == len(names) else [None] * len(names)
+    return tuple(
+        BodyHeader(
+            name,
+            table.get("material", {}),
+            _volume(table.get("shape", {}), d) if volume is None else volume,
+            table.get("particles_per_cell", usual_particles_per_cell(d)),
+        )
+        for name, table, volume in zip(names, tables, volumes, strict=True)
+    )
+
+
+def _volume(shape: Mapping[str, Any], d: int) -> float | None:
+    try:
+        return BodyShape.model_validate(shape, context={"dimension": d}).form.volume
+    except (ValidationError, StopIteration):
+        return None
+
+
+def _collider(table: Mapping[str, Any], context: dict[str, Any], surface: ClosedSurface | None) -> Collider | None:
+    try:
+        if surface is None:
+            return Collider.model_validate(table, context=context)
+        box = {"box": {name: corner.tolist() for name, corner in zip(("min", "max"), surface.bounds(), strict=True)}}
+        found = Collider.model_validate({**table, "shape": box}, context=context)
+    except ValidationError:
+        return None
+    mesh = Mesh.model_construct(file="", scale=1.0, rotate=None, translate=(0.0,) * len(surface.vertices[0]))
+    mesh._surface = surface
+    return found.model_copy(update={"shape": ColliderShape.model_construct(mesh=mesh)})
+
+
+class LawFacts(Protocol):
+    """What a header keeps of a constitutive law; see `LawHeader`."""
 
     name: str
     deformation: str
@@ -40,17 +111,16 @@ class LawFacts(Protocol):
 
 @dataclass(frozen=True)
 class LawHeader:
-    """A constitutive law of the run; see `LawFacts`."""
+    """A law: its word in a scene, "J" or "F", whether it coheres, and may yield or flow (older files: not known)."""
 
     name: str
     deformation: str
     coherent: bool
-    # Of laws in older files it is not known.
     projects: bool = True
 
 
 @dataclass(frozen=True)
-class RunHeader(ColliderFacts):
+class RunHeader:
     """Facts of a run; those that a file does not hold are None, or empty.
 
     Attributes:
@@ -101,13 +171,9 @@ class RunHeader(ColliderFacts):
 
     @classmethod
     def of(cls, scene: Scene, text: str, laws: Sequence[LawFacts], backend: Mapping[str, Any]) -> "RunHeader":
-        """Return the header of a run that begins.
-
-        Args:
-            text: the scene as TOML, with every default filled in.
-            laws: in the order of `Frame.material`.
-            backend: "arch", "threads" and "precision".
-        """
+        """Return the header of a run that begins; `text` is the complete scene as TOML, laws as in `Frame.material`."""
+        # A shape that is read from a file may be gone later.
+        from_files = any(body.shape.files for body in scene.bodies)
         return cls.read(
             {
                 "version": __version__,
@@ -117,7 +183,7 @@ class RunHeader(ColliderFacts):
                 "origin": list(scene.domain.origin),
                 "size": list(scene.domain.size),
                 "bodies": [body.name for body in scene.sources],
-                **volumes_from_files(scene),
+                **({"volumes": [body.shape.form.volume for body in scene.bodies]} if from_files else {}),
                 "materials": [law.name for law in laws],
                 "laws": [
                     {"deformation": law.deformation, "coherent": law.coherent, "projects": law.projects} for law in laws
@@ -132,14 +198,10 @@ class RunHeader(ColliderFacts):
 
     @classmethod
     def read(cls, stored: Mapping[str, Any]) -> "RunHeader":
-        """Read the header that a file holds; what it does not say itself is taken from the scene's text in it.
-
-        Raises:
-            ValueError: an entry has another type than a run writes.
-        """
-        require_header(stored)
+        """Read a header, and from the scene's text what it lacks; ValueError: an entry has another type than ours."""
+        require_kinds("header", stored)
         scene = _parsed(stored.get("scene", ""))
-        require_scene(scene)
+        require_kinds("scene", scene)
         domain, time, solver = (scene.get(name, {}) for name in ("domain", "time", "solver"))
         d = int(stored.get("dimension", 0)) or len(domain.get("size", (0, 0)))
         origin = _vector(stored.get("origin", domain.get("origin")), d)
@@ -187,6 +249,32 @@ class RunHeader(ColliderFacts):
             backend=stored.get("backend") or {},
         )
 
+    @cached_property
+    def _scene(self) -> Mapping[str, Any]:
+        return _parsed(self.stored.get("scene", ""))
+
+    @property
+    def collider_names(self) -> tuple[str, ...]:
+        """Names of the colliders, in the order of the ledger's columns."""
+        return tuple(str(table.get("name", "")) for table in self._scene.get("colliders", ()))
+
+    @cached_property
+    def colliders(self) -> tuple[Collider, ...]:
+        """The colliders that the scene tells all of; one whose mesh is not found is left out."""
+        return tuple(collider for collider in self.read_colliders({}) if collider is not None)
+
+    @cached_property
+    def moved(self) -> bool:
+        """Whether a collider moves, which does work; also where it is not known."""
+        return any(collider is None or collider.motion.moves for collider in self.read_colliders({}))
+
+    def read_colliders(self, surfaces: Mapping[int, ClosedSurface]) -> tuple[Collider | None, ...]:
+        """Read the colliders, None where that fails; `surfaces`, by number, take the place of those in files."""
+        constants, _ = definitions(self._scene.get("constants"), self.dimension)
+        context = {"dimension": self.dimension, "constants": constants}
+        tables = self._scene.get("colliders", ())
+        return tuple(_collider(table, context, surfaces.get(k)) for k, table in enumerate(tables))
+
     @property
     def body_names(self) -> tuple[str, ...]:
         """Names of the bodies, in the order of their labels in the frames."""
@@ -223,10 +311,7 @@ class RunHeader(ColliderFacts):
         return self.step_error + float(np.finfo(stored).eps) * self.farthest
 
     def way(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return the shortest ways from some places to others, (..., d), m: across a periodic face where that is less.
-
-        That is what a particle moved between two frames, if it is less than half of the domain.
-        """
+        """Return the ways between places, (..., d), m, less than half of the domain along axes that repeat."""
         found = end - start
         for a in np.flatnonzero(self.periodic):
             size = (self.upper - self.origin)[a].astype(found.dtype)

@@ -1,17 +1,19 @@
-"""How the arrays of a Frame lie in a file: names, types, and the padding of 2D to 3D for VTK."""
+"""How frames lie in files: names and types of their arrays, the padding of 2D to 3D for VTK, and the list of frames."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 
 POSITION = "Points"  # VTK's name; every other array keeps its own
 STANDARD = ("id", "body", "material", "velocity")
+# Components of one array for each particle, and particles: more than any law has, and any file holds.
+_MOST_COMPONENTS, _MOST_PARTICLES = 1000, 2**53
 # 2D is plane strain: out of the plane F is the identity, and every other tensor is stored as zero.
-# Of one array, for each particle: more than any law has.
-_MOST_COMPONENTS = 1000
 OUT_OF_PLANE = {"deformation_gradient": 1.0}
 # What both VTK and meshio read back without conversion.
 DTYPES = tuple(np.dtype(code) for code in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"))
@@ -19,14 +21,7 @@ DTYPES = tuple(np.dtype(code) for code in ("f4", "f8", "i1", "i2", "i4", "i8", "
 
 @dataclass(frozen=True)
 class ArrayLayout:
-    """One array over the particles.
-
-    Attributes:
-        name: name in the file.
-        dtype: numpy type name, "float32".
-        shape: per particle as the Frame has it: (), (k,) or (d, d).
-        dimension: d, 2 or 3.
-    """
+    """One array over particles in d dimensions: its name in the file, numpy type, and shape (), (k,) or (d, d)."""
 
     name: str
     dtype: str
@@ -63,15 +58,11 @@ class ArrayLayout:
         if self.is_tensor:
             tensor = array.reshape(n, d, d)
             if d == 2:
-                padded = np.zeros((n, 3, 3), array.dtype)
-                padded[:, :2, :2] = tensor
-                padded[:, 2, 2] = OUT_OF_PLANE.get(self.name, 0.0)
-                tensor = padded
+                tensor = np.pad(tensor, ((0, 0), (0, 1), (0, 1)))
+                tensor[:, 2, 2] = OUT_OF_PLANE.get(self.name, 0.0)
             return np.ascontiguousarray(tensor).reshape(n, 9)
         if self.shape == (d,) and d == 2:
-            padded = np.zeros((n, 3), array.dtype)
-            padded[:, :2] = array
-            return padded
+            return np.ascontiguousarray(np.pad(array, ((0, 0), (0, 1))))
         return np.ascontiguousarray(array)
 
     def unpad(self, stored: np.ndarray) -> np.ndarray:
@@ -86,23 +77,14 @@ class ArrayLayout:
 
 @dataclass(frozen=True)
 class FrameLayout:
-    """All arrays of a frame; the same for every frame of a run.
-
-    Attributes:
-        dimension: d, 2 or 3.
-        arrays: the layouts by name: `Points`, the standard ones, then the scene's output fields.
-    """
+    """All arrays of a frame, the same for every frame of a run: `Points`, the standard ones, then the output fields."""
 
     dimension: int
     arrays: dict[str, ArrayLayout] = field(default_factory=dict)
 
     @classmethod
     def of(cls, frame: Frame) -> "FrameLayout":
-        """Read the layout off a frame.
-
-        Raises:
-            ValueError: an array has a shape, type or name that a file cannot hold.
-        """
+        """Read the layout off a frame; ValueError where an array has a shape, type or name that a file cannot hold."""
         if frame.position.ndim != 2 or frame.position.shape[1] not in (2, 3):
             raise ValueError(f"position must be (n, 2) or (n, 3), not {frame.position.shape}")
         n, d = frame.position.shape
@@ -126,22 +108,14 @@ class FrameLayout:
         return sum(array.bytes_per_particle for array in self.arrays.values())
 
     def stored(self, frame: Frame) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield every array in the form of the file, one at a time.
-
-        Raises:
-            ValueError: the frame has other names, types or shapes than this layout.
-        """
+        """Yield every array in the form of the file, one at a time; ValueError where the layout is another."""
         if FrameLayout.of(frame) != self:
             raise ValueError(f"frame {frame.index} holds other arrays, types or shapes than the first frame")
         for name, array in _named_arrays(frame):
             yield name, self.arrays[name].pad(array)
 
     def stored_together(self, frames: Sequence[Frame]) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield every array of some frames, one frame after the other, in the form of the file.
-
-        Raises:
-            ValueError: as `stored`.
-        """
+        """Yield every array of some frames, one frame after the other, as `stored` does."""
         if len(frames) == 1:
             yield from self.stored(frames[0])
             return
@@ -163,11 +137,7 @@ class FrameLayout:
 
     @classmethod
     def from_dict(cls, plain: dict) -> "FrameLayout":
-        """Undo `to_dict`.
-
-        Raises:
-            KeyError, TypeError, ValueError: it is none.
-        """
+        """Undo `to_dict`; KeyError, TypeError or ValueError where it is none."""
         d = plain["dimension"]
         arrays = {name: ArrayLayout(name, str(t), tuple(s), d) for name, (t, s) in dict(plain["arrays"]).items()}
         known = {dtype.name for dtype in DTYPES}
@@ -200,3 +170,65 @@ def _named_arrays(frame: Frame) -> Iterator[tuple[str, np.ndarray]]:
 
 def _shape_fits(shape: tuple[int, ...], d: int) -> bool:
     return shape in ((), (d, d)) or (len(shape) == 1 and shape[0] > 0)
+
+
+@dataclass(frozen=True)
+class FrameIndex:
+    """Tables of T frames.
+
+    Attributes:
+        layout: the arrays of every frame.
+        header: facts about the run.
+        times: (T,) float64, s.
+        frames, steps: (T,) frame number, and time steps since the start.
+        offsets, counts: (T,) first row and number of rows of each frame in its file.
+        ledger: T rows.
+        checksums: (T, A) uint32, CRC-32 of each array of the layout in each frame; None where the file has none.
+    """
+
+    layout: FrameLayout
+    header: dict[str, Any]
+    times: np.ndarray
+    frames: np.ndarray
+    steps: np.ndarray
+    offsets: np.ndarray
+    counts: np.ndarray
+    ledger: list[LedgerRow]
+    checksums: np.ndarray | None = None
+
+    def first(self, count: int) -> "FrameIndex":
+        """The index of at most `count` frames from the first on."""
+        names = ("times", "frames", "steps", "offsets", "counts", "ledger", "checksums")
+        tables = {name: getattr(self, name) for name in names}
+        return replace(self, **{name: table[:count] for name, table in tables.items() if table is not None})
+
+    def checked(self) -> "FrameIndex":
+        """Return this index, with int64 and float64 tables; ValueError: they contradict each other, or are empty."""
+        tables = self.frames, self.steps, self.offsets, self.counts
+        # A series whose ledger is cut off lists fewer frames than its .pvd.
+        if any(table.ndim != 1 or not 0 < len(table) <= len(self.times) for table in (self.times, *tables)):
+            raise ValueError("the tables of the frames have different lengths")
+        if any(table.min() < 0 or table.max() > _MOST_PARTICLES for table in tables):
+            raise ValueError("a frame has no place in the file")
+        d = self.layout.dimension
+        for row in self.ledger:
+            loads = [len(vector) for load in (row.collider_force, row.collider_torque) for vector in load]
+            angles = 1 if d == 2 else 3
+            if len(row.linear_momentum) != d or len(row.angular_momentum) != angles or {*loads} - {d, angles}:
+                raise ValueError("a vector of the ledger has another number of components")
+        whole = {name: getattr(self, name).astype(np.int64) for name in ("frames", "steps", "offsets", "counts")}
+        return replace(self, times=self.times.astype(np.float64), **whole)
+
+    @staticmethod
+    def joined(indices: Sequence["FrameIndex"]) -> "FrameIndex":
+        """The index that one file with the frames of all these, one after the other, has."""
+        names = ("times", "frames", "steps", "counts")
+        tables = {name: np.concatenate([getattr(index, name) for index in indices]) for name in names}
+        checksums = [index.checksums for index in indices]
+        return replace(
+            indices[0],
+            **tables,
+            offsets=np.cumsum(tables["counts"]) - tables["counts"],
+            ledger=[row for index in indices for row in index.ledger],
+            checksums=None if any(table is None for table in checksums) else np.concatenate(checksums),
+        )

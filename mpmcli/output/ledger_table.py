@@ -20,18 +20,14 @@ LOADS = ("collider_force", "collider_torque")
 COMINGS = ("emitted", "emitted_mass", "retired", "retired_mass", "blocked")
 INTEGERS = ("steps", "emitted", "retired", "blocked")
 TEXT = "limit"
-# Columns that files written before them lack; they are read as nan.
-LATER = ("volume_error", *LOADS)
+# What is read where a file has no such column: those above, and what older files lack.
+MISSING = {"volume_error": math.nan, **dict.fromkeys(LOADS, ()), **dict.fromkeys(COMINGS)}
 # Columns of each frame in the CSV: its number, time steps since the start, particles.
 FRAME_COLUMNS = ("frame", "step", "particles")
 
 
 def ledger_columns(rows: Sequence[LedgerRow]) -> dict[str, np.ndarray]:
-    """Turn T rows into one array per column.
-
-    Returns:
-        (T,) float64, int64 for `steps`, UTF-8 of fixed length for `limit`; momenta (T, components).
-    """
+    """Return columns of T rows; momenta are (T, components), loads (T, colliders, components), `limit` is UTF-8."""
     columns = {}
     for name in _stored(rows):
         values = [getattr(row, name) for row in rows]
@@ -39,8 +35,7 @@ def ledger_columns(rows: Sequence[LedgerRow]) -> dict[str, np.ndarray]:
             continue
         if name == TEXT:
             texts = [text.encode("utf-8") for text in values]
-            length = max(1, *(len(text) for text in texts), 1)
-            columns[name] = np.array(texts, dtype=h5py.string_dtype("utf-8", length))
+            columns[name] = np.array(texts, dtype=h5py.string_dtype("utf-8", max([1, *map(len, texts)])))
         else:
             columns[name] = np.array(values, dtype=np.int64 if name in INTEGERS else np.float64)
     return columns
@@ -53,33 +48,23 @@ def _stored(rows: Sequence[LedgerRow]) -> tuple[str, ...]:
 
 
 def read_ledger(group: h5py.Group, read: Callable[[str, str], np.ndarray] | None = None) -> list[LedgerRow]:
-    """Read the ledger in a group of a file.
-
-    Args:
-        read: (name, kinds of types) -> column, which compares its checksum; `read_whole` by default.
-
-    Raises:
-        KeyError, ValueError: a column is missing, or is none.
-    """
-    found = {}
+    """Read a ledger, each column by `read` (name, kinds of types); KeyError or ValueError where one is none."""
+    columns = {}
     for name in COLUMNS:
         if name in group:
             kinds = "S" if name == TEXT else "iu" if name in INTEGERS else "f"
-            found[name] = read(name, kinds) if read else read_whole(group, name, kinds)
-            if found[name].ndim != 1 + (name in VECTORS) + 2 * (name in LOADS):
-                raise ValueError(f"the column {name} of the ledger is {found[name].shape}")
-    return ledger_rows(found)
+            columns[name] = column = read(name, kinds) if read else read_whole(group, name, kinds)
+            if column.ndim != 1 + (name in VECTORS) + 2 * (name in LOADS):
+                raise ValueError(f"the column {name} of the ledger is {column.shape}")
+    return ledger_rows(columns)
 
 
 def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:
-    """Undo `ledger_columns`; a column of LATER or COMINGS may be absent."""
+    """Undo `ledger_columns`; a column of `MISSING` may be absent."""
     lists = []
     for name in COLUMNS:
-        if name in COMINGS and name not in columns:
-            lists.append([None] * len(columns["time"]))
-            continue
-        if name in LATER and name not in columns:
-            lists.append([() if name in LOADS else math.nan] * len(columns["time"]))
+        if name in MISSING and name not in columns:
+            lists.append([MISSING[name]] * len(columns["time"]))
             continue
         values = np.asarray(columns[name]).tolist()
         if name == TEXT:
@@ -93,12 +78,7 @@ def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:
 
 
 def ledger_csv(rows: Sequence[LedgerRow], frames: Mapping[str, Sequence[int]]) -> str:
-    """Write T rows as CSV with a header line; numbers have the digits that read back exactly.
-
-    Args:
-        rows: the ledger.
-        frames: the first columns, whole numbers by name (`FRAME_COLUMNS`), one per row.
-    """
+    """Write T rows as CSV with a header line, after `FRAME_COLUMNS`; numbers have the digits that read back exactly."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     for i, row in enumerate(rows):
@@ -124,29 +104,21 @@ def parse_ledger_csv(text: str) -> tuple[list[LedgerRow], dict[str, list[int]]]:
     for record in csv.DictReader(io.StringIO(text)):
         for name in FRAME_COLUMNS:
             frames[name].append(int(record[name]))
-        values: dict[str, object] = {}
-        for name in COLUMNS:
-            if name in VECTORS:
-                keys = [key for key in record if key.startswith(f"{name}_")]
-                values[name] = tuple(float(record[key]) for key in keys)
-            elif name == TEXT:
-                values[name] = record[name]
-            elif name in LOADS:
-                values[name] = _vectors(record, name)
-            elif name in LATER and name not in record:
-                values[name] = math.nan
-            elif name in COMINGS and name not in record:
-                values[name] = None
-            else:
-                values[name] = int(record[name]) if name in INTEGERS else float(record[name])
-        rows.append(LedgerRow(**values))
+        rows.append(LedgerRow(**{name: _parsed(name, record) for name in COLUMNS}))
     return rows, frames
 
 
-def _vectors(record: Mapping[str, str], name: str) -> tuple[tuple[float, ...], ...]:
-    """Return the vectors of each collider from their columns, such as collider_force_0_1."""
-    found: dict[int, list[float]] = {}
-    for key, text in record.items():
-        if key.startswith(f"{name}_"):
-            found.setdefault(int(key.rsplit("_", 2)[1]), []).append(float(text))
-    return tuple(tuple(found[k]) for k in sorted(found))
+def _parsed(name: str, record: Mapping[str, str]) -> object:
+    """Return the value of a column; vectors have a column for each number, such as collider_force_0_1."""
+    if name in (*VECTORS, *LOADS):
+        vectors: dict[int, list[float]] = {}
+        for key, entry in record.items():
+            if key.startswith(f"{name}_"):
+                number = int(key.rsplit("_", 2)[1]) if name in LOADS else 0
+                vectors.setdefault(number, []).append(float(entry))
+        in_order = tuple(tuple(vectors[k]) for k in sorted(vectors))
+        return in_order if name in LOADS else tuple(vectors.get(0, ()))
+    if name in MISSING and name not in record:
+        return MISSING[name]
+    entry = record[name]
+    return entry if name == TEXT else int(entry) if name in INTEGERS else float(entry)

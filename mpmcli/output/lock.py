@@ -1,19 +1,24 @@
 """The lock of a directory that is being written: one writer at a time, and a file that names it.
 
-The system holds the lock (flock), and releases it however the process ends; the content of the file tells who has it.
-The file is removed with the lock, so that one that stays behind is of a process that was killed.
+The system holds the lock (flock), and releases it however the process ends; the content of the file tells who has it,
+apart from every other process, also after it has ended. The file is removed with the lock, so that one that stays
+behind is of a process that was killed.
 """
 
 import errno
+import hashlib
 import json
 import os
 import socket
 import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from mpmcli.errors import InputError
-from mpmcli.output.owner import Owner, time_now
 
 try:
     import fcntl
@@ -26,6 +31,116 @@ PATIENCE = 0.5
 PAUSE = 0.02
 # What a file system answers that has no locks.
 NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
+BOOT_ID, MACHINE_ID = Path("/proc/sys/kernel/random/boot_id"), Path("/etc/machine-id")
+# Where boot identifiers are missing, boots count as the same whose times differ by less, s.
+SAME_BOOT = 60.0
+
+Life = Literal["lives", "ended", "elsewhere"]
+
+
+@dataclass(frozen=True)
+class Owner:
+    """A process, as others can recognise it.
+
+    `space` tells namespaces of process numbers apart. It `started` at clock ticks since boot on Linux, which no change
+    of the clock moves, else at seconds since 1970. `host` is a hash of the machine's name and identifier, as run.json
+    is published with its data; `boot` identifies the boot.
+    """
+
+    pid: int
+    started: float
+    host: str
+    boot: str
+    space: str = ""
+
+    @classmethod
+    def here(cls) -> "Owner":
+        """Return this process."""
+        pid = os.getpid()
+        return cls(pid, process_start(pid) or 0.0, _host(), _boot(), _space())
+
+    @classmethod
+    def read(cls, facts: Any) -> "Owner | None":
+        """Return the owner that `as_dict` has told, None where these are not such facts."""
+        try:
+            words = {name: str(facts[name]) for name in ("host", "boot")}
+            return cls(int(facts["pid"]), float(facts["started"]), space=str(facts.get("space", "")), **words)
+        except (TypeError, KeyError, ValueError, AttributeError):
+            return None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as JSON can hold it."""
+        return asdict(self)
+
+    @property
+    def shares_kernel(self) -> bool:
+        """Whether it runs or ran under the running kernel, in which locks of files tell of all processes."""
+        return _same_boot(self.boot, _boot())
+
+    @property
+    def life(self) -> Life:
+        """Whether the process lives; "elsewhere" where that cannot be seen from here."""
+        if self.shares_kernel:
+            if self.space != _space():
+                return "elsewhere"
+            start = process_start(self.pid)
+            return "lives" if start is not None and abs(start - self.started) < 2 else "ended"
+        return "ended" if self.host == _host() else "elsewhere"
+
+
+def process_start(pid: int) -> float | None:
+    """Return when a process began, see `Owner.started`; None where there is no such process, or only its remains."""
+    try:
+        # The second field, the name, may hold anything.
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        return None if fields[0] in "ZX" else float(fields[19])
+    except FileNotFoundError:
+        if Path("/proc/self/stat").exists():
+            return None
+    except (OSError, IndexError, ValueError):
+        pass
+    import psutil
+
+    try:
+        process = psutil.Process(pid)
+        return None if process.status() == psutil.STATUS_ZOMBIE else process.create_time()
+    except psutil.Error:
+        return None
+
+
+def time_now() -> str:
+    """Return the time, UTC, to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+@cache
+def _host() -> str:
+    identifier = ""
+    with suppress(OSError):
+        identifier = MACHINE_ID.read_text(encoding="utf-8").strip()
+    return hashlib.sha256(f"mpmcli {socket.gethostname()} {identifier}".encode()).hexdigest()[:16]
+
+
+@cache
+def _boot() -> str:
+    with suppress(OSError):
+        return BOOT_ID.read_text(encoding="utf-8").strip()
+    import psutil
+
+    return f"{psutil.boot_time():.0f}"
+
+
+def _same_boot(one: str, other: str) -> bool:
+    with suppress(ValueError):
+        return abs(float(one) - float(other)) < SAME_BOOT
+    return one == other
+
+
+@cache
+def _space() -> str:
+    with suppress(OSError):
+        return os.readlink("/proc/self/ns/pid")
+    return ""
 
 
 class DirectoryLock:
@@ -40,9 +155,8 @@ class DirectoryLock:
         if self._descriptor < 0:
             return
         try:
-            self.path.unlink(missing_ok=True)
-        except OSError:
-            pass
+            with suppress(OSError):
+                self.path.unlink(missing_ok=True)
         finally:
             os.close(self._descriptor)
             self._descriptor = -1
@@ -55,14 +169,10 @@ class DirectoryLock:
 
 
 def take_lock(directory: Path) -> DirectoryLock:
-    """Take the lock of a directory, which exists, also from a process that has ended.
+    """Take the lock of a directory, also from a process that has ended; InputError: another has it, or may have it.
 
-    Between the look and the taking nothing can come: the system gives a lock to one process, and only its holder
-    reads, writes and removes the file. Where a file system has no locks, the file alone tells of the owner, and two
-    processes may take it over at the same moment.
-
-    Raises:
-        InputError: another process has it, or one of another machine may have it.
+    Between the look and the taking nothing can come: only the holder of the system's lock reads, writes and removes the
+    file. Where a file system has no locks, two processes may take it over at the same moment.
     """
     path = Path(directory) / LOCK
     until = time.monotonic() + PATIENCE
@@ -70,44 +180,34 @@ def take_lock(directory: Path) -> DirectoryLock:
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o644)
         except OSError as error:
-            raise _cannot(directory, error) from error
+            raise refused(directory, "locked", error) from error
         try:
             got = _lock(descriptor, exclusive=True)
             content = _content(path)
-            if got is False:
-                if time.monotonic() < until:
-                    os.close(descriptor)
-                    descriptor = -1
-                    time.sleep(PAUSE)
-                    continue
+            if got is False and time.monotonic() >= until:
                 raise InputError(_held(directory, content))
-            if not _is_at(descriptor, path):
-                # Its holder has removed it between the two calls.
-                os.close(descriptor)
-                descriptor = -1
-                continue
-            _refuse_foreign(directory, content, locks_work=got is True)
-            try:
-                _write(descriptor)
-            except OSError:
-                # The disk is full.
-                path.unlink(missing_ok=True)
-                raise
+            if got is not False and _is_at(descriptor, path):
+                _refuse_foreign(directory, content, locks_work=got is True)
+                try:
+                    _write(descriptor)
+                except OSError:
+                    # The disk is full.
+                    path.unlink(missing_ok=True)
+                    raise
+                return DirectoryLock(path, descriptor)
         except BaseException as error:
-            if descriptor >= 0:
-                os.close(descriptor)
+            os.close(descriptor)
             if isinstance(error, OSError):
-                raise _cannot(directory, error) from error
+                raise refused(directory, "locked", error) from error
             raise
-        return DirectoryLock(path, descriptor)
+        # Another process has it, or its holder has removed the file between the two calls.
+        os.close(descriptor)
+        if got is False:
+            time.sleep(PAUSE)
 
 
 def refuse_locked(directory: Path) -> None:
-    """Refuse a directory that another process is writing; nothing is taken or changed.
-
-    Raises:
-        InputError: as `take_lock`.
-    """
+    """Refuse a directory that another process is writing, as `take_lock` does; nothing is taken or changed."""
     path = Path(directory) / LOCK
     until = time.monotonic() + PATIENCE
     while lock_is_held(directory):
@@ -146,7 +246,6 @@ def _lock(descriptor: int, *, exclusive: bool) -> bool | None:
 
 
 def _is_at(descriptor: int, path: Path) -> bool:
-    """Return whether the open file is the one of this name."""
     try:
         return os.path.samestat(os.fstat(descriptor), os.stat(path))
     except FileNotFoundError:
@@ -169,11 +268,7 @@ def _write(descriptor: int) -> None:
 
 
 def _refuse_foreign(directory: Path, content: dict[str, Any], *, locks_work: bool) -> None:
-    """Refuse a file whose owner may live although the system gives the lock.
-
-    Raises:
-        InputError: it may.
-    """
+    """Refuse a file whose owner may live although the system gives the lock."""
     owner = Owner.read(content)
     if owner is None or (locks_work and owner.shares_kernel) or owner.life == "ended":
         return
@@ -187,8 +282,9 @@ def _refuse_foreign(directory: Path, content: dict[str, Any], *, locks_work: boo
     )
 
 
-def _cannot(directory: Path, error: OSError) -> InputError:
-    return InputError(f"{directory} cannot be locked ({error.strerror or error}): give another place with -o.")
+def refused(directory: Path, what: str, error: OSError) -> InputError:
+    """Return the error of a directory that cannot be "made", "written" or "locked"."""
+    return InputError(f"{directory} cannot be {what} ({error.strerror or error}): give another place with -o.")
 
 
 def _held(directory: Path, content: dict[str, Any]) -> str:

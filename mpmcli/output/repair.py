@@ -4,36 +4,29 @@ import os
 import shutil
 import tomllib
 from collections.abc import Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from mpmcli.errors import InputError
 from mpmcli.output.collider_files import write_collider_files
-from mpmcli.output.durable import sync_directory, temporary_of, write_text
+from mpmcli.output.directory import SCENE
+from mpmcli.output.durable import number_of, sync_directory, temporary_of, write_text
 from mpmcli.output.header import RunHeader
 from mpmcli.output.lock import take_lock
 from mpmcli.output.pack import pack_segments
 from mpmcli.output.run_record import RECORD, read_record
 from mpmcli.output.segments import DAMAGED, PACKED, REPAIRED, SEGMENTS, remove_segments, sealed_segments
 from mpmcli.output.series import SERIES
-from mpmcli.output.verify import SCENE, FileVerdict, verify_file, verify_result
-from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_index
+from mpmcli.output.verify import FileVerdict, verify_file, verify_result
+from mpmcli.output.vtkhdf import read_index_of
 from mpmcli.plain_text import counted
 
 
 @dataclass
 class Repair:
-    """What a repair has done.
-
-    Attributes:
-        path: of the directory.
-        changed: whether anything was written.
-        frames: that the result holds now.
-        packed: segments that were packed and removed.
-        lost: one sentence for everything that is missing or damaged; notes: what else there is to know.
-    """
+    """What a repair has done: frames that the result holds, segments packed, and sentences on losses and the rest."""
 
     path: Path
     changed: bool = False
@@ -55,12 +48,8 @@ class Repair:
 def repair(directory: Path) -> Repair:
     """Pack the sound frames of a run up to the first one that is damaged or missing.
 
-    Sound segments beyond that one, and what is damaged, stay as they are; a damaged packed file gets another name.
-    A result that is packed and sound is left alone.
-
-    Raises:
-        InputError: there is no result, another process writes it, or no frame of it can be read; nothing was changed.
-        RunError: the disk refuses, or the new file does not read back; nothing was removed.
+    What is damaged or lies beyond stays; a damaged packed file gets another name. InputError: nothing can be read, or
+    another process writes; RunError: the disk refuses; neither has removed anything.
     """
     directory = Path(directory)
     if directory.name == SEGMENTS and directory.is_dir():
@@ -97,7 +86,7 @@ def _pack(segments: Sequence[Path], done: Repair, *, damaged: bool) -> None:
     frames, hole = 0, False
     beyond: list[tuple[int, int]] = []
     for segment in segments:
-        first, verdict = int(segment.stem.split("_")[1]), verify_file(segment)
+        first, verdict = number_of(segment), verify_file(segment)
         (done.notes if verdict.whole else done.lost).extend(verdict.faults)
         if not hole and first > frames:
             hole = True
@@ -142,8 +131,7 @@ def _replace(sources: Sequence[Path], frames: int, done: Repair, *, damaged: boo
     packed, new = done.path / PACKED, done.path / REPAIRED
     # Of a run that was killed.
     temporary_of(packed).unlink(missing_ok=True)
-    with closing(open_vtkhdf(sources[0])) as file:
-        compress = _compresses(read_index(file).header)
+    compress = _compresses(read_index_of(sources[0]).header)
     try:
         pack_segments(sources, new, compress=compress, frames=frames)
         if not verify_file(new).sound:
@@ -159,7 +147,6 @@ def _replace(sources: Sequence[Path], frames: int, done: Repair, *, damaged: boo
 
 
 def _compresses(header: Mapping[str, Any]) -> bool:
-    """Return whether the scene asks for compressed frames."""
     try:
         return bool(tomllib.loads(header.get("scene", "")).get("output", {}).get("compress", False))
     except (tomllib.TOMLDecodeError, AttributeError):
@@ -178,8 +165,7 @@ def _keep(path: Path, name: Path) -> None:
 
 def _complete(directory: Path, done: Repair) -> None:
     """Write the scene and the colliders where they are missing, and say what the record says."""
-    with closing(open_vtkhdf(directory / PACKED)) as file:
-        index = read_index(file)
+    index = read_index_of(directory / PACKED)
     if not (directory / SCENE).exists() and "scene" in index.header:
         write_text(directory / SCENE, index.header["scene"])
         done.changed = True

@@ -1,7 +1,7 @@
 """Reading results: packed file, directory, running or broken directory, VTK series, all alike."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import cached_property
 from pathlib import Path
@@ -14,17 +14,13 @@ from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import checksum, damaged
 from mpmcli.output.collider_files import read_stored_surfaces
-from mpmcli.output.damage import DAMAGE, first_line
-from mpmcli.output.frame_index import FrameIndex
-from mpmcli.output.hdf5_items import DamageError
+from mpmcli.output.guarded_read import DAMAGE, DamageError, first_line
 from mpmcli.output.header import RunHeader
-from mpmcli.output.layout import POSITION, STANDARD
-from mpmcli.output.run_record import read_record
-from mpmcli.output.run_status import run_status
+from mpmcli.output.layout import POSITION, STANDARD, FrameIndex
+from mpmcli.output.run_record import read_record, run_status
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
-from mpmcli.output.series import SERIES, read_vtu
-from mpmcli.output.series_index import read_series
-from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_array, read_index
+from mpmcli.output.series import SERIES, read_series, read_vtu
+from mpmcli.output.vtkhdf import open_vtkhdf, read_array, read_index_of
 from mpmcli.scene.colliders import Collider
 
 Kind = Literal["packed", "segments", "series"]
@@ -85,15 +81,7 @@ class Result(ABC):
         return len(self.times)
 
     def frame(self, k: int, fields: Sequence[str] | None = None) -> Frame:
-        """Read the k-th frame, its arrays as the run gave them: (n, d), types and bits unchanged.
-
-        Args:
-            k: 0 to `frame_count` - 1.
-            fields: names of the fields to read, all when None.
-
-        Raises:
-            InputError: there is no such frame or field, or its file is missing.
-        """
+        """Read the k-th frame with some or all fields, unchanged; InputError: no such frame or field, or no file."""
         if not 0 <= k < self.frame_count:
             raise InputError(f"{self.path} has no frame {k}: it holds frames 0 to {self.frame_count - 1}.")
         names = [POSITION, *STANDARD[1:], *(self.field_names if fields is None else fields)]
@@ -104,8 +92,7 @@ class Result(ABC):
         stored = self._sound(k, names)
         if any(len(array) != self.particle_counts[k] for array in stored.values()):
             raise InputError(f"{self.path} is damaged: frame {k} is cut off.")
-        index = self.index
-        return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
+        return self._frame(k, stored)
 
     def present_frame(self, k: int, fields: Sequence[str] | None = None) -> Frame:
         """Read the k-th frame as `frame` does, of the particles that are there alone, where some come or go."""
@@ -114,19 +101,18 @@ class Result(ABC):
         return self.frame(k, fields).of_present
 
     def numbered_frame(self, k: int) -> tuple[Frame, np.ndarray]:
-        """Read the k-th frame with all its fields, and the particle number that the file gives to each row.
-
-        The numbers are 0, 1, 2, ... unless something has changed the file.
-        """
+        """Read the k-th frame with all fields, and the number of each row: 0, 1, 2, ... unless the file has changed."""
         stored = self._sound(k, [POSITION, *STANDARD, *self.field_names])
-        index = self.index
-        frame = index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
-        return frame, stored["id"]
+        return self._frame(k, stored), stored["id"]
 
     def frames(self, fields: Sequence[str] | None = None) -> Iterator[Frame]:
         """Read all frames, one at a time."""
         for k in range(self.frame_count):
             yield self.frame(k, fields)
+
+    def _frame(self, k: int, stored: Mapping[str, np.ndarray]) -> Frame:
+        index = self.index
+        return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
 
     def _sound(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Read arrays of the k-th frame, which have the types and shapes that the file tells of them."""
@@ -145,7 +131,25 @@ class Result(ABC):
 
 
 class _StoredResult(Result):
-    """Frames in VTKHDF files."""
+    def __init__(self, path: Path, kind: Kind, files: Sequence[Path]) -> None:
+        self.kind = kind
+        indices = [_index_of(file) for file in files]
+        # Of each frame: its file, and its first row there.
+        self._places = [
+            (file, int(offset)) for file, index in zip(files, indices, strict=True) for offset in index.offsets
+        ]
+        super().__init__(path, indices[0] if len(indices) == 1 else FrameIndex.joined(indices))
+
+    def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        file, offset = self._places[k]
+        try:
+            return self._read_arrays(file, k, names, offset)
+        except InputError:
+            packed = self.path / PACKED
+            if file.exists() or not packed.exists():
+                raise
+            # The run has ended since, and its frames were packed: the same ones, and perhaps more.
+            return self._read_arrays(packed, k, names, int(self.index.offsets[k]))
 
     def _read_arrays(self, path: Path, k: int, names: Sequence[str], offset: int) -> dict[str, np.ndarray]:
         """Read arrays of the k-th frame, which begins at row `offset` of a file, and compare their checksums."""
@@ -153,9 +157,9 @@ class _StoredResult(Result):
         try:
             with closing(open_vtkhdf(path)) as file:
                 stored = {name: read_array(file, name, offset, count) for name in names}
+        except InputError:
+            raise
         except DAMAGE as error:
-            if isinstance(error, InputError):
-                raise
             raise DamageError(f"{path} is damaged: a frame that it lists cannot be read.") from error
         if checksums is not None:
             columns = list(self.index.layout.arrays)
@@ -163,39 +167,6 @@ class _StoredResult(Result):
                 if checksum(array) != checksums[k, columns.index(name)]:
                     raise damaged(str(path), f"{name} of frame {self.numbers[k]}")
         return stored
-
-
-class _PackedResult(_StoredResult):
-    kind = "packed"
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, _index_of(path))
-
-    def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
-        return self._read_arrays(self.path, k, names, int(self.index.offsets[k]))
-
-
-class _SegmentsResult(_StoredResult):
-    kind = "segments"
-
-    def __init__(self, path: Path, segments: Sequence[Path]) -> None:
-        indices = [_index_of(segment) for segment in segments]
-        # Of each frame: its file, and its first row there.
-        self._places = [
-            (segment, int(offset)) for segment, index in zip(segments, indices, strict=True) for offset in index.offsets
-        ]
-        super().__init__(path, FrameIndex.joined(indices))
-
-    def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
-        segment, offset = self._places[k]
-        try:
-            return self._read_arrays(segment, k, names, offset)
-        except InputError:
-            packed = self.path / PACKED
-            if segment.exists() or not packed.exists():
-                raise
-            # The run has ended since, and its frames were packed: the same ones, and perhaps more.
-            return self._read_arrays(packed, k, names, int(self.index.offsets[k]))
 
 
 class _SeriesResult(Result):
@@ -238,21 +209,20 @@ def open_result(path: Path) -> Result:
         return _SeriesResult(path)
     if path.suffix == ".vtu":
         raise InputError(f"{path} is one frame of a series: give {path.with_name(SERIES)} instead.")
-    return _PackedResult(path)
+    return _StoredResult(path, "packed", [path])
 
 
 def _open_directory(directory: Path) -> Result:
-    if (directory / PACKED).exists():
-        return _PackedResult(directory / PACKED)
-    segments = sealed_segments(directory)
-    if segments:
+    packed = directory / PACKED
+    if not packed.exists() and (segments := sealed_segments(directory)):
         try:
-            return _SegmentsResult(directory, segments)
+            return _StoredResult(directory, "segments", segments)
         except InputError:
             # The run may have ended, and its frames been packed, while they were listed.
-            if not (directory / PACKED).exists():
+            if not packed.exists():
                 raise
-            return _PackedResult(directory / PACKED)
+    if packed.exists():
+        return _StoredResult(packed, "packed", [packed])
     if (directory / SERIES).exists():
         return _SeriesResult(directory / SERIES)
     record = read_record(directory)
@@ -263,10 +233,9 @@ def _open_directory(directory: Path) -> Result:
 
 
 def _index_of(path: Path) -> FrameIndex:
-    with closing(open_vtkhdf(path)) as file:
-        try:
-            return read_index(file)
-        except DAMAGE as error:
-            if isinstance(error, InputError):
-                raise
-            raise DamageError(f"{path} is damaged: its list of frames cannot be read.") from error
+    try:
+        return read_index_of(path)
+    except InputError:
+        raise
+    except DAMAGE as error:
+        raise DamageError(f"{path} is damaged: its list of frames cannot be read.") from error

@@ -14,12 +14,13 @@ from mpmcli import __version__
 from mpmcli.errors import RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import write_text
-from mpmcli.output.owner import Owner, time_now
+from mpmcli.output.lock import Owner, lock_is_held, time_now
 from mpmcli.output.stored_facts import sound_record
-from mpmcli.scene.tables import too_deep
+from mpmcli.scene.toml_file import too_deep
 
 RECORD = "run.json"
 PROGRAM = "mpmcli"
+DIED, ELSEWHERE = "died", "running on another machine, or died"
 Status = Literal["running", "finished", "unstable", "interrupted", "stopped", "failed"]
 
 
@@ -78,24 +79,14 @@ class RunRecord:
         self.energy["largest"] = max(energy, self.energy.get("largest", energy))
 
     def go_on_from(self, earlier: Mapping[str, Any], rows: Sequence[LedgerRow], step: int) -> None:
-        """Go on with the record of a run that is resumed.
-
-        Args:
-            earlier: content of its run.json; rows: of the frames that are there; step: that it goes on from.
-        """
+        """Go on with an earlier run.json after `rows`, those of the frames that are there, from `step`."""
         for row in rows:
             self.observe(row)
         self.started = str(earlier.get("started", self.started))
         self.resumed = [*earlier.get("resumed", ()), {"at": time_now(), "frames": len(rows), "step": step}]
 
     def close(self, status: Status, message: str = "", **facts: Any) -> None:
-        """Set how the run ended and write.
-
-        Args:
-            status: anything but "running".
-            message: the sentence the user saw, for a run that did not finish.
-            facts: where it failed: step, time, particle, body, position, limit, ...
-        """
+        """Set how the run ended, and the sentence and `facts` (step, time, particle, ...) why, and write."""
         self.status = status
         self.ended = time_now()
         if message or facts:
@@ -103,34 +94,21 @@ class RunRecord:
         self.write()
 
     def write(self) -> None:
-        """Replace run.json by the present state, in one durable step.
-
-        Raises:
-            RunError: the disk is full or refuses.
-        """
-        content = asdict(self)
-        del content["directory"]
-        content["command"] = [Path(word).name if i == 0 else word for i, word in enumerate(self.command)]
-        content = {
-            "program": PROGRAM,
-            "version": __version__,
-            **content,
-            "process": Owner.here().as_dict(),
-            "host": host_facts(),
-        }
+        """Replace run.json by the present state, in one durable step; RunError where the disk is full or refuses."""
+        facts = asdict(self)
+        del facts["directory"]
+        facts["command"] = [Path(word).name if i == 0 else word for i, word in enumerate(self.command)]
+        content = {"program": PROGRAM, "version": __version__, **facts}
+        content |= {"process": Owner.here().as_dict(), "host": host_facts()}
         text = json.dumps(_plain(content), indent=2, ensure_ascii=False)
         try:
             write_text(Path(self.directory) / RECORD, text + "\n")
         except OSError as error:
-            reason = error.strerror or error
-            raise RunError(f"{RECORD} could not be written to {self.directory} ({reason}).") from error
+            raise RunError(f"{RECORD} could not be written to {self.directory} ({error.strerror or error}).") from error
 
 
 def host_facts() -> dict[str, Any]:
-    """What a figure depends on and a name does not: versions, system, processors; no path, no host name.
-
-    Machines are told apart by a hash in "process", see `Owner`.
-    """
+    """What a figure depends on and a name does not: versions, system, processors; "process" tells machines apart."""
     try:
         taichi = version("taichi")
     except PackageNotFoundError:
@@ -166,3 +144,20 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, str | int | bool) else str(value)
+
+
+def run_status(directory: Path, record: dict[str, Any] | None) -> str:
+    """Return the status of a run from its record and the lock of its directory, "unknown" without a record.
+
+    "running" without a lock or living process is "died", or `ELSEWHERE` if that cannot be seen from here.
+    """
+    status = str((record or {}).get("status", "unknown"))
+    if record is None or status != "running":
+        return status
+    if lock_is_held(directory):
+        return status
+    owner = Owner.read(record.get("process"))
+    if owner is None:
+        # Written by a version that kept no such facts.
+        return ELSEWHERE
+    return {"lives": status, "ended": DIED, "elsewhere": ELSEWHERE}[owner.life]

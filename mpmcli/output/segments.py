@@ -3,23 +3,30 @@
 import os
 import re
 from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from mpmcli.errors import RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.collider_files import write_collider_files
-from mpmcli.output.durable import TEMPORARY_SUFFIX, Unsealed, sync_directory, temporary_of
-from mpmcli.output.frame_index import FrameIndex
-from mpmcli.output.layout import FrameLayout
+from mpmcli.output.durable import (
+    Unsealed,
+    ask_for,
+    numbered_files,
+    remove_numbered,
+    require_free_space,
+    sync_directory,
+    sync_file,
+    temporary_of,
+)
+from mpmcli.output.layout import FrameIndex, FrameLayout
 from mpmcli.output.pack import pack_segments
-from mpmcli.output.packed_beside import PackedBeside
 from mpmcli.output.store import ASIDE, MOST_WAITING, Store
-from mpmcli.output.vtkhdf import VtkhdfWriter
-from mpmcli.output.vtkhdf_parts import file_size
-from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_index
+from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, read_index_of
 
 PACKED = "particles.vtkhdf"
 # What `mpmcli repair` calls a damaged one, and the new one before it takes its name.
@@ -35,29 +42,75 @@ def segment_name(index: int) -> str:
 
 def sealed_segments(directory: Path) -> list[Path]:
     """Return the sealed segments of a run that was not packed, in order, without unfinished files."""
-    folder = directory / SEGMENTS
-    if not folder.is_dir():
-        return []
-    found = [path for path in folder.iterdir() if SEGMENT_NAME.fullmatch(path.name)]
-    return sorted(found, key=lambda path: int(path.stem.split("_")[1]))
+    return numbered_files(directory / SEGMENTS, SEGMENT_NAME)
+
+
+class PackedBeside:
+    """The temporary file of a packed result, which gets all frames of a run in order.
+
+    It is given up, its writer is None, where it cannot be written or other frames come; then segments are packed.
+    """
+
+    def __init__(self, target: Path, layout: FrameLayout, frames: int, particles: int) -> None:
+        """Begin the temporary file of `target`, if the disk has room for all frames twice."""
+        self._temporary, self._frames, self._particles = temporary_of(target), frames, particles
+        # Frames whose arrays it has, and those of them whose segments are sealed.
+        self._written = self._sealed = 0
+        self.writer: VtkhdfWriter | None = None
+        counts = [particles] * frames
+        size = file_size(layout, counts)
+        with suppress(OSError, RuntimeError, RunError):
+            require_free_space(target.parent, size, "the packed file", "", joined=size)
+            ask_for(self._temporary, size)
+            self.writer = VtkhdfWriter(self._temporary, layout, counts)
+
+    @property
+    def whole(self) -> bool:
+        """Whether it has all frames."""
+        return self.writer is not None and self._sealed == self._frames
+
+    def expect(self, first: int, counts: Sequence[int]) -> None:
+        """Give it up unless frames with so many particles, from number `first` on, are the next ones."""
+        fit = first == self._written and first + len(counts) <= self._frames
+        if not fit or any(count != self._particles for count in counts):
+            self.give_up()
+        self._written += len(counts)
+
+    def append(self, name: str, stored: np.ndarray) -> None:
+        """Write the rows of an array of all frames that were expected last, as `VtkhdfWriter.append`."""
+        try:
+            if self.writer is not None:
+                self.writer.append(name, stored)
+        except (OSError, RuntimeError, TypeError, ValueError):
+            self.give_up()
+
+    def seal(self, frames: int, *, sync: bool) -> None:
+        """Note that so many more frames are sealed; `sync` what was written, so that little is left for the end."""
+        self._sealed += frames
+        if sync and self.writer is not None:
+            with suppress(OSError):
+                sync_file(self._temporary)
+
+    def give_up(self) -> None:
+        """Close and remove the file."""
+        writer, self.writer = self.writer, None
+        with suppress(OSError, RuntimeError):
+            if writer is not None:
+                writer.close()
+        with suppress(OSError):
+            self._temporary.unlink(missing_ok=True)
 
 
 class SegmentStore(Store):
-    """Frames in `directory`/segments while running, in `directory`/particles.vtkhdf after `finish`.
+    """Frames in `directory`/segments while running, in `directory`/particles.vtkhdf after `finish`; see `Store`.
 
-    Each segment is a complete VTKHDF file that ParaView can open while the run goes on. Segments are
-    not compressed, so that writing does not hold up the run; `compress` (gzip-1 with shuffle) applies to the packed
-    file. The packed file of a large run is written beside the segments (`PackedBeside`).
+    Segments are complete VTKHDF files, not compressed, so that writing does not hold up the run. The packed file of a
+    large run is written beside them, if `frames_expected`, all of as many particles, is given.
     """
 
     def __init__(
         self, directory: Path, header: dict[str, Any], *, frames_expected: int | None = None, **options: Any
     ) -> None:
-        """Begin; see `Store`.
-
-        Args:
-            frames_expected: of the run, if they have the same number of particles.
-        """
         super().__init__(directory, header, **options)
         self.place = self._directory / SEGMENTS
         self._sealed: set[str] = set()
@@ -66,18 +119,7 @@ class SegmentStore(Store):
         self._beside: PackedBeside | None = None
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
-        """Seal the waiting frames, pack all segments, verify the packed file, and remove the segments.
-
-        A single segment becomes the packed file as it is, unless that is compressed. The surfaces of colliders go
-        beside it.
-
-        Returns:
-            The packed file; None when no frame was written.
-
-        Raises:
-            KeyboardInterrupt: `stop` returned True; the segments stay.
-            RunError: the disk cannot hold the packed file or it does not read back; the segments stay.
-        """
+        """Seal, pack and verify all segments, then remove them; they stay where the packed file cannot be written."""
         try:
             self.seal()
             if self._beside is not None and not self._beside.whole:
@@ -115,8 +157,7 @@ class SegmentStore(Store):
             options = {"compress": self._compress, "header": self._header, "known": True, "begun": begun}
             pack_segments(segments, packed, **options, stop=stop)
         if self._colliders:
-            with closing(open_vtkhdf(packed, known=True)) as file:
-                times = read_index(file).times.tolist()
+            times = read_index_of(packed, known=True).times.tolist()
             write_collider_files(self._directory, self._header, times, self._colliders)
         # The result is complete; a segment that somebody holds open may stay beside it.
         with suppress(OSError):
@@ -200,11 +241,4 @@ class SegmentStore(Store):
 
 def remove_segments(directory: Path) -> None:
     """Remove sealed and unfinished segments, and their folder unless something else lies in it."""
-    folder = directory / SEGMENTS
-    if not folder.is_dir():
-        return
-    for path in folder.iterdir():
-        if SEGMENT_NAME.fullmatch(path.name.removesuffix(TEMPORARY_SUFFIX)):
-            path.unlink(missing_ok=True)
-    with suppress(OSError):
-        folder.rmdir()
+    remove_numbered(directory / SEGMENTS, SEGMENT_NAME)

@@ -5,11 +5,12 @@ Every ParaView and VTK reads it, at the price of more and larger files; VTKHDF i
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from time import sleep
 from typing import Any
-from xml.sax.saxutils import quoteattr
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -17,20 +18,23 @@ from mpmcli import __version__
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.collider_files import write_collider_series
+from mpmcli.output.checksums import path_digest, read_sums, text_digest, write_sums
+from mpmcli.output.collider_files import pvd_text, write_collider_series
 from mpmcli.output.durable import sealed, write_text
-from mpmcli.output.frame_index import FrameIndex
-from mpmcli.output.layout import POSITION, FrameLayout
-from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_csv
+from mpmcli.output.guarded_read import DAMAGE, DamageError
+from mpmcli.output.layout import POSITION, FrameIndex, FrameLayout
+from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_csv, parse_ledger_csv
 from mpmcli.output.store import Store
-from mpmcli.output.sums_file import path_digest, read_sums, text_digest, write_sums
-from mpmcli.output.vtkhdf import FORMAT
-from mpmcli.output.vtkhdf_parts import OVERHEAD_BYTES
+from mpmcli.output.vtkhdf import FORMAT, OVERHEAD_BYTES
+from mpmcli.plain_text import one_line
 
 SERIES = "particles.pvd"
 SERIES_HEADER = "particles.json"
 SERIES_LEDGER = "ledger.csv"
 SERIES_FRAME = re.compile(r"particles_\d{6,}\.vtu")
+# While a run goes on, its files may be replaced between two reads.
+TRIES, PAUSE = 4, 0.1
+Digests = dict[str, list[str]]
 
 
 def series_frame_name(index: int) -> str:
@@ -41,9 +45,8 @@ def series_frame_name(index: int) -> str:
 class VtkSeriesStore(Store):
     """The store of `--format vtk`.
 
-    After each frame `directory` holds its .vtu file, ledger.csv and particles.pvd, each replaced in one
-    step, so that ParaView can open the series while the run goes on. particles.json holds the header. `compress` is
-    zlib in the .vtu files.
+    After each frame `directory` holds its .vtu file, ledger.csv and particles.pvd, each replaced in one step, so that
+    ParaView can open the series while the run goes on. particles.json holds the header. `compress` is zlib in the .vtu.
     """
 
     several = True
@@ -61,12 +64,8 @@ class VtkSeriesStore(Store):
         for name, column in zip(FRAME_COLUMNS, (index.frames, index.steps, index.counts), strict=True):
             self._frames[name] = column.tolist()
         self._sums = read_sums(self._directory)
-        # The scene may end later than it did: a reader may find the former header or the new one.
-        before = self._sums[SERIES_HEADER]
-        text = self._header_text(index.layout)
-        self._sums[SERIES_HEADER] = [*before[-1:], text_digest(text)]
-        write_sums(self._directory, self._sums)
-        write_text(self._directory / SERIES_HEADER, text)
+        # The scene may end later than it did.
+        self._replace({SERIES_HEADER: self._header_text(index.layout)})
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
         """Write the colliders, and return the .pvd, complete after every frame; None where no frame was written."""
@@ -106,10 +105,13 @@ class VtkSeriesStore(Store):
             self._times.append(float(frame.time))
             for name, value in zip(FRAME_COLUMNS, (frame.index, frame.step, len(frame.position)), strict=True):
                 self._frames[name].append(int(value))
+        entries = [(time, 0, series_frame_name(k)) for k, time in enumerate(self._times)]
         # The .pvd comes last: what it lists is there.
-        texts = {SERIES_LEDGER: ledger_csv(self._rows, self._frames), SERIES: _pvd_text(self._times)}
+        self._replace({SERIES_LEDGER: ledger_csv(self._rows, self._frames), SERIES: pvd_text(entries)})
+
+    def _replace(self, texts: Mapping[str, str]) -> None:
+        """Replace files; a reader may find the former one or the new one, whenever the run ends."""
         for name, text in texts.items():
-            # A reader may find the former file or the new one, whenever the run ends.
             self._sums[name] = [*self._sums.get(name, [])[-1:], text_digest(text)]
         write_sums(self._directory, self._sums)
         for name, text in texts.items():
@@ -121,14 +123,7 @@ class VtkSeriesStore(Store):
 
 
 def read_vtu(path: Path, digests: Sequence[str] | None = None) -> dict[str, np.ndarray]:
-    """Read the arrays of one frame, in the form of the file.
-
-    Args:
-        digests: SHA-256 that the file may have; None for any.
-
-    Raises:
-        InputError: the file is missing or damaged.
-    """
+    """Read the arrays of one frame, in the form of the file; `digests` are the SHA-256 that it may have, None all."""
     from meshio import vtu
 
     try:
@@ -150,9 +145,49 @@ def _write_vtu(path: Path, arrays: dict[str, np.ndarray], *, compress: bool) -> 
     vtu.write(path, mesh, compression="zlib" if compress else None, header_type="UInt64")
 
 
-def _pvd_text(times: list[float]) -> str:
-    lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "<Collection>"]
-    for k, time in enumerate(times):
-        name = quoteattr(series_frame_name(k))
-        lines.append(f'<DataSet timestep="{time!r}" group="" part="0" file={name}/>')
-    return "\n".join([*lines, "</Collection>", "</VTKFile>", ""])
+def read_series(path: Path) -> tuple[FrameIndex, list[Path], Digests | None]:
+    """Read the .pvd of a series: its index, the file of each frame, and the SHA-256 that each may have, or None.
+
+    InputError: a file is missing, has changed, is of a newer mpmcli, or is no frame.
+    """
+    for _ in range(TRIES - 1):
+        try:
+            return _read(path)
+        except DamageError:
+            sleep(PAUSE)
+    return _read(path)
+
+
+def _read(path: Path) -> tuple[FrameIndex, list[Path], Digests | None]:
+    directory = path.parent
+    try:
+        # The .pvd is read first: the ledger is replaced before it, so it holds at least as many rows.
+        places = [path, directory / SERIES_HEADER, directory / SERIES_LEDGER]
+        listed, header, table = (place.read_bytes().decode("utf-8") for place in places)
+        facts = dict(json.loads(header))
+        if not isinstance(facts["format"], int):
+            raise ValueError("the format is no number")
+        if facts["format"] > FORMAT:
+            raise InputError(f"{path} is of a newer version of mpmcli; update mpmcli to read it.")
+        sums = read_sums(directory) if facts["format"] > 1 else None
+        for place, text in zip(places, (listed, header, table), strict=True):
+            if sums is not None and text_digest(text) not in sums.get(place.name, ()):
+                raise DamageError(f"{place} has changed since it was written: its checksum differs.")
+        entries = list(ElementTree.fromstring(listed).iter("DataSet"))
+        times = np.array([float(entry.attrib["timestep"]) for entry in entries])
+        names = [entry.attrib["file"] for entry in entries]
+        if foreign := [name for name in names if not SERIES_FRAME.fullmatch(name)]:
+            raise InputError(f'{path} names "{one_line(foreign[0])}", and reads no file but the frames beside it.')
+        layout = FrameLayout.from_dict(facts["layout"])
+        rows, columns = parse_ledger_csv(table)
+        frames, steps, counts = (np.array(columns[name][: len(times)]) for name in FRAME_COLUMNS)
+        tables = times, frames, steps, 0 * counts, counts
+        index = FrameIndex(layout, facts["header"], *tables, rows[: len(times)]).checked()
+    except (*DAMAGE, ElementTree.ParseError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{path} is not a series of mpmcli: it needs {SERIES_HEADER}, {SERIES_LEDGER} and its frames "
+            "beside it, as mpmcli wrote them."
+        ) from error
+    return index, [directory / name for name in names], sums

@@ -11,9 +11,8 @@ from mpmcli.errors import InputError, NoRoomError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import is_full, require_free_space
-from mpmcli.output.frame_index import FrameIndex
 from mpmcli.output.header import RunHeader
-from mpmcli.output.layout import FrameLayout
+from mpmcli.output.layout import FrameIndex, FrameLayout
 from mpmcli.scene.colliders import Collider
 
 # Bytes of waiting frames above which they are sealed.
@@ -25,24 +24,13 @@ HOLD = 1.0
 
 
 class Store(ABC):
-    """Writes the frames of one run.
+    """Writes the frames of one run into `directory`, which `prepare_directory` made.
 
-    Frames are sealed in groups, since a durable file costs about 10 ms however small it is. Only sealed frames count as
-    written. Large groups are sealed by a thread while the run goes on, one at a time: they lie in the memory of the
-    system then, and it is the disk that takes its time. Taichi holds Python's lock during a launch, so that a thread
-    could do little more.
-
-    Args:
-        directory: the output directory, made by `prepare_directory`.
-        header: entries of a `RunHeader` that JSON can hold.
-        compress: whether the result is compressed.
-        hold: longest time between the write of a frame and its seal, s, if `seal_due` is called; 0 seals each at once.
-        colliders: of the run, None for those that the header tells.
-
-    Attributes:
-        place: where frames are written.
-        frames_written: number of frames that a crash can no longer harm.
-        bytes_written: their size; seconds: wall time that sealing them took.
+    Frames are sealed in groups, since a durable file costs about 10 ms, within `hold` s of their write if `seal_due` is
+    called. Only sealed ones, which no crash harms, count as `frames_written`, in `seconds` of wall time. Large groups
+    are sealed by a thread, one at a time: they lie in the memory of the system then, and the disk takes its time.
+    Taichi holds Python's lock during a launch, so that a thread could do little more. `colliders` are None for those
+    that the header tells.
     """
 
     # Whether frames that are sealed together have a file each.
@@ -78,14 +66,10 @@ class Store(ABC):
         self._start()
 
     def write(self, frame: Frame, row: LedgerRow) -> None:
-        """Take the next frame; seal the waiting frames if they fill MOST_WAITING bytes or one has waited for `hold`.
+        """Take the next frame, whose arrays must not change; seal when MOST_WAITING bytes or `hold` are reached.
 
-        The arrays of the frame must not change afterwards. One that an earlier process has written is left as it is.
-
-        Raises:
-            RunError: the disk is full or refuses; all frames before this one are kept.
-            InputError: the directory holds an earlier result.
-            ValueError: the frame is out of order or has other arrays than the first one.
+        One that an earlier process has written is left as it is. RunError: the disk refuses, earlier frames are kept;
+        InputError: the directory holds a result; ValueError: the frame is out of order, or has other arrays.
         """
         if frame.index < self._kept:
             return
@@ -109,22 +93,14 @@ class Store(ABC):
         self.seal_due()
 
     def seal_due(self) -> None:
-        """Seal the waiting frames if one has waited for `hold`; cheap otherwise, for calls between slow frames.
-
-        Raises:
-            RunError: as `seal`.
-        """
+        """Seal the waiting frames if one has waited for `hold`; cheap otherwise, for calls between slow frames."""
         if self._sealing is not None and self._sealing.done:
             self._end_seal()
         if self._waiting and time.monotonic() - self._waiting_since >= self._hold:
             self._begin_seal()
 
     def seal(self) -> None:
-        """Write all waiting frames durably.
-
-        Raises:
-            RunError: the disk is full or refuses; all frames before the waiting ones are kept.
-        """
+        """Write all waiting frames durably; RunError: the disk refuses, and the frames before them are kept."""
         self._begin_seal()
         self._end_seal()
 
@@ -152,7 +128,6 @@ class Store(ABC):
             self._end_seal()
 
     def _end_seal(self) -> None:
-        """Wait until the frames that were written are durable."""
         if self._sealing is None:
             return
         sealing = self._sealing
@@ -175,15 +150,7 @@ class Store(ABC):
 
     @abstractmethod
     def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
-        """Complete the result and return the file to open; None where no frame was written.
-
-        Args:
-            stop: called often; True ends it, and what was written stays as it is.
-
-        Raises:
-            KeyboardInterrupt: `stop` returned True.
-            RunError: it could not be completed; what was written stays.
-        """
+        """Complete the result and return the file to open, None without one; `stop` ends it with KeyboardInterrupt."""
 
     def give_up(self) -> None:
         """Forget waiting frames, and remove what is of no use without `finish`; sealed frames stay."""
@@ -213,17 +180,11 @@ class Store(ABC):
 
 
 class _Sealing:
-    """Frames that become durable.
-
-    Attributes:
-        purpose: what they are, in words; frames: their number; size: bytes.
-        seconds: wall time from the beginning of their write until they were durable.
-    """
+    """Frames that become durable, `aside` in a thread or at once; seconds from the beginning of their write."""
 
     def __init__(
         self, seal: Callable[[], None], purpose: str, frames: int, size: int, began: float, *, aside: bool
     ) -> None:
-        """Begin to seal: in a thread where it is done `aside`, else at once; `began` is when their write did."""
         self.purpose, self.frames, self.size, self.seconds = purpose, frames, size, 0.0
         self._seal, self._began = seal, began
         self._error: Exception | None = None

@@ -8,34 +8,35 @@ from pathlib import Path
 import h5py
 
 from mpmcli.errors import InputError
-from mpmcli.output.checksums import NAME, Checksums, checksum, item_checksums, load_checksums
+from mpmcli.output.checksums import (
+    NAME,
+    SUMS,
+    checksum,
+    checksum_is_right,
+    gaps_of,
+    item_checksums,
+    load_checksums,
+    sums_faults,
+)
 from mpmcli.output.collider_files import MOVING, RESTING, expected_files
-from mpmcli.output.file_checksum import checksum_is_right, gaps_of
-from mpmcli.output.frame_index import FrameIndex
-from mpmcli.output.hdf5_items import held
+from mpmcli.output.directory import SCENE
+from mpmcli.output.durable import number_of
+from mpmcli.output.guarded_read import held
+from mpmcli.output.layout import FrameIndex
 from mpmcli.output.result import open_result
 from mpmcli.output.run_record import read_record
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.series import SERIES
-from mpmcli.output.sums_file import SUMS, sums_faults
-from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_array, read_index
+from mpmcli.output.vtkhdf import open_vtkhdf, read_array, read_index
 from mpmcli.plain_text import counted
 
 # What h5py raises on damaged files.
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError, MemoryError)
-SCENE = "scene.toml"
 
 
 @dataclass
 class Verification:
-    """What a comparison of files with their checksums has found.
-
-    Attributes:
-        path: as given.
-        files, frames: how many were read.
-        faults: one sentence each.
-        unchecked: files that an older version has written, which have no checksums; they can be read.
-    """
+    """Files and frames that were read, a sentence for each fault, and `unchecked` files of an older version."""
 
     path: Path
     files: int = 0
@@ -58,14 +59,7 @@ class Verification:
 
 
 def verify_result(path: Path) -> Verification:
-    """Read all of a result, and compare it with its checksums.
-
-    Args:
-        path: what `open_result` takes. Colliders, scene.toml and unpacked segments in its directory are read too.
-
-    Raises:
-        InputError: there is nothing at `path`, or nothing that mpmcli wrote.
-    """
+    """Compare a result and all that lies beside it with its checksums; InputError: there is none of mpmcli."""
     path = Path(path)
     if path.name == SEGMENTS and path.is_dir():
         path = path.parent
@@ -77,16 +71,16 @@ def verify_result(path: Path) -> Verification:
         files = [path / PACKED] if (path / PACKED).exists() else sealed_segments(path)
         if not files:
             open_result(path)
-        counts = [_verify_frames(file, found) for file in files]
+        counts = [_verify_file(file, found) for file in files]
         _verify_count(directory, files, counts, found)
     else:
         if not path.exists():
             raise InputError(f"{path} does not exist: give a {PACKED}, a {SERIES} or their directory.")
-        _verify_frames(path, found)
+        _verify_file(path, found)
     if path.is_dir() or path.name == PACKED:
         for name in (RESTING, MOVING):
             if (directory / name).exists():
-                _verify_colliders(directory / name, found)
+                _verify_file(directory / name, found, frames=False)
         if not found.faults:
             _verify_beside(directory, found)
     return found
@@ -94,14 +88,7 @@ def verify_result(path: Path) -> Verification:
 
 @dataclass
 class FileVerdict:
-    """What a comparison of a file of frames with its checksums has found.
-
-    Attributes:
-        frames: that it lists.
-        prefix: number of frames before the first one that is damaged; 0 where its list of frames is.
-        faults: one sentence each.
-        checked: whether it has checksums.
-    """
+    """What a comparison of a file with its checksums has found; `prefix` frames come before the first damaged one."""
 
     frames: int = 0
     prefix: int = 0
@@ -119,17 +106,19 @@ class FileVerdict:
         return not self.faults
 
 
-def verify_file(path: Path) -> FileVerdict:
-    """Compare all of a VTKHDF file of particles with its checksums."""
+def verify_file(path: Path, *, frames: bool = True) -> FileVerdict:
+    """Compare all of a VTKHDF file with its checksums: of particles, or of colliders, which has no `frames` of ours."""
     found = FileVerdict()
     try:
-        with closing(open_vtkhdf(path)) as file:
-            found.checked = held(file, "mpmcli").attrs["format"] > 1
-            index = read_index(file)
-            found.prefix = found.frames = len(index.times)
+        with closing(open_vtkhdf(path) if frames else h5py.File(path, "r", locking=False)) as file:
+            found.checked = held(file, "mpmcli").attrs.get("format", 1) != 1
+            if frames:
+                index = read_index(file)
+                found.prefix = found.frames = len(index.times)
             if found.checked:
                 checksums = load_checksums(file, "mpmcli")
-                found.faults += map(str, checksums.differences(_items_of(file, checksums)))
+                items = item_checksums(file, checksums.arrays, f"mpmcli/{NAME}")
+                found.faults += map(str, checksums.differences(items))
             for k in range(found.frames):
                 for name in _damaged_arrays(file, index, k):
                     found.faults.append(f"{path} is damaged: {name} of frame {index.frames[k]} has changed.")
@@ -138,14 +127,11 @@ def verify_file(path: Path) -> FileVerdict:
         if found.checked and found.sound and not checksum_is_right(path, gaps):
             found.faults.append(f"{path} is damaged: it has changed between its data sets, or at its end.")
     except HDF5_ERRORS as error:
-        found.faults.append(f"{path} is damaged: it cannot be read ({_first_line(error)}).")
+        said = (str(error).splitlines() or [type(error).__name__])[0].strip("'\"")
+        found.faults.append(f"{path} is damaged: it cannot be read ({said}).")
     except InputError as error:
         found.faults.append(str(error))
     return found
-
-
-def _items_of(file: h5py.File, checksums: Checksums) -> dict[str, int]:
-    return item_checksums(file, checksums.arrays, f"mpmcli/{NAME}")
 
 
 def _damaged_arrays(file: h5py.File, index: FrameIndex, k: int) -> list[str]:
@@ -164,9 +150,9 @@ def _damaged_arrays(file: h5py.File, index: FrameIndex, k: int) -> list[str]:
     return found
 
 
-def _verify_frames(path: Path, found: Verification) -> int:
-    """Verify a file, and return the number of its frames."""
-    verdict = verify_file(path)
+def _verify_file(path: Path, found: Verification, *, frames: bool = True) -> int:
+    """Note what `verify_file` finds, and return the number of frames."""
+    verdict = verify_file(path, frames=frames)
     found.files += 1
     found.frames += verdict.frames
     found.faults += verdict.faults
@@ -183,7 +169,7 @@ def _verify_count(directory: Path, files: Sequence[Path], counts: Sequence[int],
     if files[0].name != PACKED:
         frames = 0
         for file, count in zip(files, counts, strict=True):
-            first = int(file.stem.split("_")[1])
+            first = number_of(file)
             if first != frames:
                 told = f"lacks the frames {frames} to {first - 1}" if first > frames else f"holds frame {first} twice"
                 found.faults.append(f"{directory / SEGMENTS} {told}.")
@@ -214,24 +200,6 @@ def _verify_series(path: Path, found: Verification) -> None:
             found.faults.append(str(error))
 
 
-def _verify_colliders(path: Path, found: Verification) -> None:
-    found.files += 1
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            if held(file, "mpmcli").attrs.get("format", 1) == 1:
-                found.unchecked.append(str(path))
-                return
-            checksums = load_checksums(file, "mpmcli")
-            faults = [str(error) for error in checksums.differences(_items_of(file, checksums))]
-        if not faults and not checksum_is_right(path):
-            faults.append(f"{path} is damaged: it has changed between its data sets, or at its end.")
-    except HDF5_ERRORS as error:
-        faults = [f"{path} is damaged: it cannot be read ({_first_line(error)})."]
-    except InputError as error:
-        faults = [str(error)]
-    found.faults += faults
-
-
 def _verify_beside(directory: Path, found: Verification) -> None:
     """Compare scene.toml, and which colliders have files, with what the frames say of the scene."""
     header, path = open_result(directory).header, directory / SCENE
@@ -243,7 +211,3 @@ def _verify_beside(directory: Path, found: Verification) -> None:
     if (directory / PACKED).exists() and colliders and None not in colliders and directory == found.path:
         missing = [name for name in expected_files(header.stored, colliders) if not (directory / name).exists()]
         found.faults += [f"{directory / name} is missing: the scene has colliders." for name in missing]
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0].strip("'\"")

@@ -10,7 +10,8 @@ point numbers, so that the cells cost 8 bytes per particle once and not for ever
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -18,35 +19,79 @@ import h5py
 import numpy as np
 
 from mpmcli import __version__
+from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import (
     FrameChecksums,
+    append_checksum,
     attribute_checksum,
     checksum,
+    gaps_of,
     kind_checksum,
+    load_checksums,
     store_checksums,
     table_checksum,
 )
-from mpmcli.output.file_checksum import append_checksum, gaps_of
-from mpmcli.output.layout import FrameLayout
-from mpmcli.output.ledger_table import ledger_columns
-from mpmcli.output.vtkhdf_parts import BLOCK_BYTES, CONNECTIVITY, array_path, part_tables
+from mpmcli.output.guarded_read import held, read_rows, read_whole, require_sound_heaps, require_stored
+from mpmcli.output.layout import POSITION, FrameIndex, FrameLayout
+from mpmcli.output.ledger_table import ledger_columns, read_ledger
 
 # A newer upper bound makes files that no VTK can open ("bad version number for layout message").
 LIBVER = ("v110", "v110")
-# 1 has no checksums.
-FORMAT = 2
+# Format 1 has no checksums.
+FORMAT, OLDEST = 2, 1
 CHUNK_BYTES = 2**20
+# Size without the particles: headers, tables of the steps, ledger. Used to reserve disk space.
+OVERHEAD_BYTES = 64 * 1024
+OVERHEAD_BYTES_PER_FRAME = 1024
+# What is copied at once stays in a cache of the processor.
+BLOCK_BYTES = 2**20
+# The numbers of the particles of the largest frame, from 0 on.
+CONNECTIVITY = "Vertices/Connectivity"
+UNUSED_CELLS = ("Lines", "Polygons", "Strips")
+
+
+def array_path(name: str) -> str:
+    """Return the path of an array of frames under /VTKHDF."""
+    return name if name == POSITION else f"PointData/{name}"
+
+
+def file_size(layout: FrameLayout, counts: Sequence[int]) -> int:
+    """Bytes of an uncompressed file with frames of `counts` particles, rounded up."""
+    particles = sum(counts) * layout.bytes_per_particle + 8 * max(counts, default=0)
+    return particles + OVERHEAD_BYTES + OVERHEAD_BYTES_PER_FRAME * len(counts)
+
+
+def part_tables(counts: np.ndarray) -> dict[str, np.ndarray]:
+    """Return all under /VTKHDF but CONNECTIVITY that follows from (T,) particle counts: a part and a cell a frame."""
+    number = len(counts)
+    cells = (counts > 0).astype(np.int64)
+    zeros, cell_offsets = np.zeros(number, np.int64), np.zeros((number, 4), np.int64)
+    cell_offsets[:, 0] = np.cumsum(cells) - cells
+    tables = {
+        "NumberOfPoints": counts,
+        "Vertices/NumberOfCells": cells,
+        "Vertices/NumberOfConnectivityIds": counts,
+        "Vertices/Offsets": np.concatenate([[0, n] if n else [0] for n in counts]).astype(np.int64),
+        "Steps/PartOffsets": np.arange(number, dtype=np.int64),
+        "Steps/NumberOfParts": np.ones(number, np.int64),
+        "Steps/PointOffsets": np.cumsum(counts) - counts,
+        "Steps/CellOffsets": cell_offsets,
+        # Point numbers count from the frame's first particle, so every frame uses the same list.
+        "Steps/ConnectivityIdOffsets": np.zeros((number, 4), np.int64),
+    }
+    for name in UNUSED_CELLS:
+        # The reader opens all four kinds of cells, used or not.
+        tables[f"{name}/NumberOfCells"] = tables[f"{name}/NumberOfConnectivityIds"] = zeros
+        tables[f"{name}/Connectivity"], tables[f"{name}/Offsets"] = zeros[:0], zeros
+    return tables
 
 
 class VtkhdfWriter:
     """Write one file of T frames whose particle counts are known beforehand.
 
-    Arrays are contiguous on disk: no chunk is padded, and a reader may map them. With `compress` they
-    are gzip-1 with shuffle, the one filter that every VTK has, in chunks of about 1 MiB.
-
-    The bytes of a file depend on its content alone, if arrays are written from the first frame to the last, and
-    compressed ones one after the other; not on how many frames are written at once.
+    Arrays are contiguous, or with `compress` gzip-1 with shuffle, the one filter that every VTK has, in chunks of about
+    1 MiB. Bytes depend on content alone, if arrays are written from first frame to last, compressed ones in turn.
     """
 
     def __init__(self, path: Path, layout: FrameLayout, counts: Sequence[int], *, compress: bool = False) -> None:
@@ -128,14 +173,7 @@ class VtkhdfWriter:
         rows: Sequence[LedgerRow],
         header: dict,
     ) -> None:
-        """Write what describes the frames; to be called once, after the last array.
-
-        Args:
-            times: s, one per frame.
-            frames, steps: frame number and time steps since the start, one per frame.
-            rows: the ledger, one row per frame.
-            header: facts about the run that JSON can hold; its "scene", the TOML text, becomes an attribute.
-        """
+        """Write what describes the frames, once, after the last array; the scene of the header becomes an attribute."""
         for name, column in ledger_columns(rows).items():
             self._put(f"ledger/{name}", column)
         self._put("mpmcli/frame", np.asarray(frames, dtype=np.int64))
@@ -189,3 +227,97 @@ class VtkhdfWriter:
             "compression_opts": 1,
             "shuffle": True,
         }
+
+
+def open_vtkhdf(path: Path, *, known: bool = False) -> h5py.File:
+    """Open a sealed file for reading, without a lock; InputError: it is missing, damaged, or not of mpmcli.
+
+    The heaps of one that is `known`, written or opened by this process before, are not searched again.
+    """
+    try:
+        if not known:
+            require_sound_heaps(path)
+        try:
+            file = h5py.File(path, "r", locking=False)
+        except OSError:
+            # This process has the file open with locking; HDF5 requires one setting for all handles.
+            file = h5py.File(path, "r")
+    except OSError as error:
+        reason = "is not an HDF5 file, or a damaged one" if path.exists() else "does not exist"
+        raise InputError(f"{path} {reason}; give a particles.vtkhdf of mpmcli or its directory.") from error
+    try:
+        form = _format(file)
+    except BaseException:
+        file.close()
+        raise
+    if form is not None and OLDEST <= form <= FORMAT:
+        return file
+    file.close()
+    if form is not None and form > FORMAT:
+        raise InputError(f"{path} was written by a newer version of mpmcli; update mpmcli to read it.")
+    raise InputError(f"{path} is an HDF5 file, but mpmcli did not write it: its group /mpmcli is missing.")
+
+
+def _format(file: h5py.File) -> int | None:
+    """Return the format of a file, None where it is not of mpmcli."""
+    try:
+        form = held(file, "mpmcli").attrs["format"]
+        ours = isinstance(form, np.integer) and isinstance(held(file, "VTKHDF"), h5py.Group)
+        return int(form) if ours else None
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError):
+        return None
+
+
+def read_index(file: h5py.File) -> FrameIndex:
+    """Read everything but the particles; errors are those of DAMAGE: DamageError where a checksum differs."""
+    checksums = load_checksums(file, "mpmcli") if _format(file) > 1 else None
+
+    def table(path: str, kinds: str = "iu") -> np.ndarray:
+        found = read_whole(file, path, kinds)
+        if checksums is not None:
+            checksums.require(path, table_checksum(found))
+        return found
+
+    def attribute(name: str) -> str:
+        found = group.attrs[name]
+        if checksums is not None:
+            checksums.require(f"mpmcli@{name}", attribute_checksum(found))
+        return found
+
+    group = held(file, "mpmcli")
+    header = dict(json.loads(attribute("header")))
+    if "scene" in group.attrs:
+        header["scene"] = attribute("scene")
+    layout = FrameLayout.from_dict(json.loads(attribute("layout")))
+    return FrameIndex(
+        layout=layout,
+        header=header,
+        times=table("VTKHDF/Steps/Values", "f"),
+        frames=table("mpmcli/frame"),
+        steps=table("mpmcli/step"),
+        offsets=table("VTKHDF/Steps/PointOffsets"),
+        counts=table("VTKHDF/NumberOfPoints"),
+        ledger=read_ledger(held(file, "ledger"), lambda name, kinds: table(f"ledger/{name}", kinds)),
+        # In the order of the arrays of the layout.
+        checksums=checksums
+        and checksums.table[:, [checksums.arrays.index(f"VTKHDF/{array_path(name)}") for name in layout.arrays]],
+    ).checked()
+
+
+def read_index_of(path: Path, *, known: bool = False) -> FrameIndex:
+    """Return `read_index` of a file that is opened for it as by `open_vtkhdf`."""
+    with closing(open_vtkhdf(path, known=known)) as file:
+        return read_index(file)
+
+
+def read_array(file: h5py.File, name: str, offset: int, count: int) -> np.ndarray:
+    """Read one array of one frame, in the form of the file; its checksum is not compared."""
+    return read_rows(file, f"VTKHDF/{array_path(name)}", offset, count)
+
+
+def read_blocks(file: h5py.File, name: str, offset: int, count: int) -> Iterator[np.ndarray]:
+    """Yield rows of one array as `read_array`, BLOCK_BYTES at a time."""
+    data = require_stored(file, f"VTKHDF/{array_path(name)}")
+    size = max(1, BLOCK_BYTES * len(data) // max(1, data.nbytes))
+    for first in range(offset, offset + count, size):
+        yield data[first : min(first + size, offset + count)]

@@ -14,51 +14,33 @@ from mpmcli.output.result import Result
 from mpmcli.plain_text import one_line
 from mpmcli.render.frame_choice import evenly_spaced
 
-# Frames whose positions are read; more would not be seen in the figure.
-FRAMES_MAX = 200
-# More bodies than this are shown as one.
-BODIES_MAX = 6
-# Frames that a note names.
-NAMED = 5
+FRAMES_MAX = 200  # frames whose positions are read; more would not be seen in the figure
+BODIES_MAX = 6  # more bodies than this are shown as one
+NAMED = 5  # frames that a note names
 
 
 @dataclass(frozen=True)
 class Reach:
-    """How far the particles reach, in some of the frames.
+    """How far the particles reach, in some of the frames."""
 
-    Attributes:
-        times: (F,) s.
-        names: of B bodies, or one name for all of them.
-        lowest, highest: (F, B, d) m, NaN where a body has no particle.
-    """
-
-    times: np.ndarray
-    names: tuple[str, ...]
-    lowest: np.ndarray
+    times: np.ndarray  # (F,) s
+    names: tuple[str, ...]  # of B bodies, or one name for all of them
+    lowest: np.ndarray  # (F, B, d) m, NaN where a body has no particle; `highest` alike
     highest: np.ndarray
 
 
 @dataclass(frozen=True)
 class History:
-    """One run over time.
+    """One run over time."""
 
-    Attributes:
-        title: of the scene.
-        header: facts about the run; particles: in the last frame; kind, status: of the result.
-        columns: (T,) float64 per column of the ledger, momenta (T, components); NaN where it is not finite.
-        limits: T names of the bound on the step, "" at the initial state.
-        reach: see `Reach`.
-        notes: sentences about what the figure does not show.
-    """
-
-    title: str
+    title: str  # of the scene
     header: RunHeader
-    particles: int
-    status: str
-    columns: dict[str, np.ndarray]
-    limits: tuple[str, ...]
+    particles: int  # in the last frame
+    status: str  # of the result
+    columns: dict[str, np.ndarray]  # of the ledger, (T,) float64, momenta (T, components); NaN where it is not finite
+    limits: tuple[str, ...]  # T names of the bound on the step, "" at the initial state
     reach: Reach
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # sentences about what the figure does not show
 
     @property
     def times(self) -> np.ndarray:
@@ -67,11 +49,7 @@ class History:
 
 
 def read_history(result: Result) -> History:
-    """Read what a figure of a result shows.
-
-    Raises:
-        InputError: a frame cannot be read, or the ledger does not belong to the frames.
-    """
+    """Read what a figure of a result shows; InputError where a frame or the ledger is damaged."""
     rows = result.ledger
     if len(rows) != result.frame_count:
         raise InputError(f"{result.path} is damaged: it has {result.frame_count} frames and {len(rows)} ledger rows.")
@@ -112,8 +90,8 @@ def _reach(result: Result, chosen: Sequence[int]) -> Reach:
     bodies = result.header.body_names
     apart = 1 < len(bodies) <= BODIES_MAX
     labels = range(len(bodies)) if apart else [None]
-    found = [[_extent(frame, label) for label in labels] for frame in (result.present_frame(k, ()) for k in chosen)]
-    both = np.array(found).reshape(len(chosen), len(labels), 2, result.dimension)
+    extents = [[_extent(frame, label) for label in labels] for frame in (result.present_frame(k, ()) for k in chosen)]
+    both = np.array(extents).reshape(len(chosen), len(labels), 2, result.dimension)
     names = bodies if apart else (bodies[0] if len(bodies) == 1 else "all bodies",)
     names = tuple(one_line(name) for name in names)
     return Reach(result.times[chosen], names, both[:, :, 0], both[:, :, 1])

@@ -6,32 +6,26 @@ import numpy as np
 
 from mpmcli.plain_text import one_line
 from mpmcli.plot.history import History
-from mpmcli.plot.panels import Panel
-from mpmcli.plot.style import THEMES, ThemeName, drawing, pixels
-from mpmcli.scene.sentences import listed
+from mpmcli.plot.style import THEMES, Theme, ThemeName, drawing, pixels
+from mpmcli.scene.problem import listed
 from mpmcli.stability.limits import COURANT
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+MARKED = 8  # fewer points than this are marked, since a single one makes no line
+FEW_DECADES = 2.5  # fewer decades than this have numbers at 2 and 5 times their powers, too
+NAME_MAX = 16  # characters of a name in a legend
+TITLE_MAX = 64  # characters of the title of a scene
+COLLIDERS_MAX = 6  # more colliders than this are shown as one
 AXES = "xyz"
-# Characters of the title of a scene.
-TITLE_MAX = 64
-# More colliders than this are shown as one.
-COLLIDERS_MAX = 6
 # The order of the colours is that of the legend.
 LIMITS = ("wave", "speed", "force", "viscosity", "deformation", "forced", "maximum")
 
 
 def ledger_picture(history: History, size: tuple[int, int], theme: ThemeName) -> tuple[np.ndarray, list[str]]:
-    """Return the figure of a run as an image, and the titles of its panels.
-
-    Args:
-        size: pixels, wide and high.
-
-    Returns:
-        (h, w, 3) uint8, the same for the same history.
-    """
+    """Return the figure of a run, (h, w, 3) uint8 of a size (width, height) in pixels, and the titles of its panels."""
     with drawing(size, THEMES[theme]) as figure:
         titles = draw_ledger(figure, history, theme)
         return pixels(figure), titles
@@ -46,23 +40,23 @@ def draw_ledger(figure: "Figure", history: History, theme: ThemeName) -> list[st
     places = [cell for row, count in enumerate(counts) for cell in rows[row].subgridspec(1, count)]
     panels = [Panel(figure.add_subplot(place), history.times, THEMES[theme]) for place in places]
     _energy(panels[0], panels[1], history)
-    _momentum(panels[2], history)
-    _angular_momentum(panels[3], history)
-    _step(panels[4], history)
-    _courant(panels[5], history)
-    _volume(panels[6], history)
-    _speed(panels[7], history)
-    for axis, panel in enumerate(panels[8 : 8 + d]):
-        _reach(panel, history, axis)
+    _momenta(panels[2], panels[3], history)
+    _steps(panels[4], panels[5], history)
+    _extremes(panels[6], panels[7], history)
+    for axis in range(d):
+        _reach(panels[8 + axis], history, axis)
     for axis, panel in enumerate(panels[8 + d :]):
         _load(panel, history, axis)
     for panel in panels:
         panel.finish()
     status = f", {history.status}" if history.status else ""
-    said = f"{history.particles:,} particles, {len(history.times)} frames{status}"
-    title = history.title if len(history.title) <= TITLE_MAX else f"{history.title[: TITLE_MAX - 1]}…"
-    figure.suptitle(f"{title}: {said}", x=0.012, ha="left", fontsize=11)
+    facts = f"{history.particles:,} particles, {len(history.times)} frames{status}"
+    figure.suptitle(f"{_shortened(history.title, TITLE_MAX)}: {facts}", x=0.012, ha="left", fontsize=11)
     return [panel.axes.get_title(loc="left") for panel in panels]
+
+
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else f"{text[: length - 1]}…"
 
 
 def _first(values: np.ndarray) -> int:
@@ -70,25 +64,117 @@ def _first(values: np.ndarray) -> int:
     return int(np.isfinite(values).reshape(len(values), -1).all(1).argmax())
 
 
-def _units(history: History) -> tuple[str, str, str]:
-    """Return the units of energy, momentum and angular momentum: in the plane they are per metre of depth."""
-    return ("J/m", "N s/m", "N s") if history.header.dimension == 2 else ("J", "N s", "N m s")
+class Panel:
+    """Axes with the times (T,), s, of the values along x; colours go by number, None is that of the text."""
+
+    def __init__(self, axes: "Axes", times: np.ndarray, theme: Theme) -> None:
+        self.axes, self._times, self._theme = axes, times, theme
+
+    def title(self, title: str, label: str) -> None:
+        """Name what is shown, and its unit."""
+        self.axes.set_title(title)
+        self.axes.set_ylabel(label)
+
+    def line(
+        self, values: np.ndarray, name: str, color: int | None, width: float = 1.4, times: np.ndarray | None = None
+    ) -> None:
+        """Draw values at the times of the frames, or at others; NaN is a gap."""
+        marker = "o" if np.isfinite(values).sum() < MARKED else ""
+        keywords = {"color": self._color(color), "linewidth": width, "label": self._name(name)}
+        self.axes.plot(self._times if times is None else times, values, marker=marker, markersize=3.5, **keywords)
+
+    def steps(self, values: np.ndarray, color: int | None, name: str = "") -> None:
+        """Draw values (T,) that hold from the frame before to each frame."""
+        keywords = {"color": self._color(color), "linewidth": 1.4, "label": self._name(name)}
+        self.axes.step(self._times[1:], values[1:], where="pre", **keywords)
+
+    def band(self, low: np.ndarray, high: np.ndarray, name: str, color: int, times: np.ndarray | None = None) -> None:
+        """Fill between two series, at the times of the frames or at others."""
+        times = self._times if times is None else times
+        self.axes.fill_between(times, low, high, color=self._color(color), alpha=0.28, linewidth=0)
+        self.line(low, name, color, 1.2, times)
+        self.line(high, "", color, 1.2, times)
+
+    def between_frames(
+        self, low: np.ndarray, high: np.ndarray, chosen: np.ndarray, name: str, color: int | None
+    ) -> None:
+        """Fill from low to high in the time before each chosen frame, (T,) bool."""
+        from matplotlib.collections import PolyCollection
+
+        ends = np.flatnonzero(chosen & np.isfinite(low) & np.isfinite(high))
+        ends = ends[ends > 0]
+        left, right, bottom, top = self._times[ends - 1], self._times[ends], low[ends], high[ends]
+        corners = [np.stack(corner, -1) for corner in ((left, bottom), (right, bottom), (right, top), (left, top))]
+        shown = self._color(color)
+        # The edge is seen where the band has no height.
+        boxes = PolyCollection(np.stack(corners, 1), facecolor=shown, edgecolor=shown, linewidth=1.6, label=name)
+        boxes.set_capstyle("butt")
+        self.axes.add_collection(boxes)
+        self.axes.update_datalim(np.concatenate(corners))
+
+    def level(self, value: float, name: str = "", color: int | None = None) -> None:
+        """Draw a dashed line at a value that means something, faint where it has no colour."""
+        shown = self._theme.faint if color is None else self._color(color)
+        keywords = {"linestyle": (0, (4, 2.5)), "linewidth": 1.0, "zorder": 1.5}
+        self.axes.axhline(value, color=shown, label=self._name(name), **keywords)
+
+    def note(self, text: str) -> None:
+        """Write a text in the middle, where nothing is drawn."""
+        place = {"transform": self.axes.transAxes, "ha": "center", "va": "center"}
+        self.axes.text(0.5, 0.5, text, color=self._theme.faint, **place)
+
+    def logarithmic(self, *values: np.ndarray) -> None:
+        """Scale positive values logarithmically, over three quarters of a decade at least."""
+        from matplotlib.ticker import LogLocator
+
+        positive = np.concatenate([series[series > 0] for series in values])
+        if len(positive) == 0:
+            return
+        low, high = np.log10(positive.min()), np.log10(positive.max())
+        room = max(0.08 * (high - low), 0.375 - (high - low) / 2)
+        self.axes.set_yscale("log")
+        self.axes.set_ylim(10 ** (low - room), 10 ** (high + room))
+        if high - low + 2 * room < FEW_DECADES:
+            self.axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+
+    def finish(self) -> None:
+        """Set the limits of the times, the form of the numbers, and the legend."""
+        from matplotlib.ticker import FuncFormatter, NullFormatter
+
+        axes = self.axes
+        first, last = float(self._times[0]), float(self._times[-1])
+        if last > first:
+            axes.set_xlim(first, last)
+        axes.set_xlabel("t, s", labelpad=1.0)
+        plain = FuncFormatter(lambda value, _: f"{value:g}")
+        axes.xaxis.set_major_formatter(plain)
+        axes.yaxis.set_major_formatter(plain)
+        if axes.get_yscale() == "log":
+            axes.yaxis.set_minor_formatter(NullFormatter())
+        handles, names = axes.get_legend_handles_labels()
+        if handles:
+            axes.legend(handles, names, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(handles))
+
+    def _color(self, color: int | None) -> str:
+        return self._theme.ink if color is None else self._theme.series[color % len(self._theme.series)]
+
+    def _name(self, name: str) -> str:
+        # matplotlib leaves out of legends what begins with a line below.
+        return _shortened(name, NAME_MAX).lstrip("_") or "_"
 
 
 def _energy(parts: Panel, change: Panel, history: History) -> None:
-    unit, columns = _units(history)[0], history.columns
+    columns, header = history.columns, history.header
     potential = columns["potential"]
     above = potential - np.nanmin(potential) if np.isfinite(potential).any() else potential
+    series = {"kinetic": columns["kinetic"], "elastic": columns["elastic"], "potential": above}
     total = columns["kinetic"] + columns["elastic"] + above
-    parts.title("Energy", f"{unit}, potential above its lowest")
-    parts.line(total, "total", None, linewidth=2.0)
-    for k, (name, values) in enumerate(
-        (("kinetic", columns["kinetic"]), ("elastic", columns["elastic"]), ("potential", above))
-    ):
+    parts.title("Energy", f"{'J/m' if header.dimension == 2 else 'J'}, potential above its lowest")
+    parts.line(total, "total", None, width=2.0)
+    for k, (name, values) in enumerate(series.items()):
         parts.line(values, name, k)
     largest = float(np.nanmax(total)) if np.isfinite(total).any() else 0.0
-    sources = [("forces", history.header.driven), ("colliders", history.header.moved)]
-    work = " and ".join(name for name, there in sources if there)
+    work = " and ".join([*["forces"] * header.driven, *["colliders"] * header.moved])
     work = f", while {work} do work" if work else ""
     change.title("Change of total energy", f"(E - E₀) / largest E{work}")
     if largest > 0:
@@ -96,68 +182,58 @@ def _energy(parts: Panel, change: Panel, history: History) -> None:
     change.level(0.0)
 
 
-def _momentum(panel: Panel, history: History) -> None:
-    """Draw what gravity does not explain of the momentum: 0 but for rounding until something else acts."""
+def _momenta(linear: Panel, angular: Panel, history: History) -> None:
+    """Draw what gravity does not explain of the momentum, 0 until something else acts, and the angular momentum."""
     header, columns = history.header, history.columns
     momentum = columns["linear_momentum"]
     start = _first(momentum)
     values = momentum - momentum[start]
-    unit = _units(history)[1]
+    # In the plane they are per metre of depth.
+    unit, angular_unit = ("N s/m", "N s") if header.dimension == 2 else ("N s", "N m s")
     if header.gravity is None:
-        panel.title("Momentum (gravity is not constant)", f"P - P₀, {unit}")
+        linear.title("Momentum (gravity is not constant)", f"P - P₀, {unit}")
     else:
         what = listed(["walls", *["colliders"] * bool(header.collider_names), *["forces"] * header.driven], "and")
-        panel.title(f"Impulse of the {what}", f"P - P₀ - M g t, {unit}")
+        linear.title(f"Impulse of the {what}", f"P - P₀ - M g t, {unit}")
         # Velocities are those of the middle of the last step.
         middle = history.times - (columns["step_min"] + columns["step_max"]) / 4
         values = values - columns["mass"][:, None] * header.gravity * (middle - middle[start])[:, None]
     for axis in range(header.dimension):
-        panel.line(values[:, axis], AXES[axis], axis)
-    panel.level(0.0)
+        linear.line(values[:, axis], AXES[axis], axis)
+    linear.level(0.0)
+    moments = columns["angular_momentum"]
+    angular.title("Angular momentum", f"about the domain's corner, {angular_unit}")
+    # In the plane there is one component, about z.
+    for axis, component in zip(range(3)[-moments.shape[1] :], moments.T, strict=True):
+        angular.line(component, AXES[axis], axis)
+    angular.level(0.0)
 
 
-def _angular_momentum(panel: Panel, history: History) -> None:
-    values, unit = history.columns["angular_momentum"], _units(history)[2]
-    panel.title("Angular momentum", f"about the domain's corner, {unit}")
-    if values.shape[1] == 1:
-        panel.line(values[:, 0], "z", 2)
-    else:
-        for axis in range(3):
-            panel.line(values[:, axis], AXES[axis], axis)
-    panel.level(0.0)
-
-
-def _step(panel: Panel, history: History) -> None:
-    panel.title("Time step, by what bounds it", "smallest to largest, s")
-    columns = history.columns
+def _steps(length: Panel, courant: Panel, history: History) -> None:
+    length.title("Time step, by what bounds it", "smallest to largest, s")
+    shortest, longest = history.columns["step_min"], history.columns["step_max"]
     names = [name for name in LIMITS if name in history.limits]
     names += sorted(set(history.limits) - {"", *LIMITS})
     for name in names:
         chosen = np.array([limit == name for limit in history.limits])
         color = LIMITS.index(name) if name in LIMITS else None
-        panel.between_frames(columns["step_min"], columns["step_max"], chosen, name, color)
+        length.between_frames(shortest, longest, chosen, name, color)
     if not names:
-        panel.say("no step yet")
-    panel.logarithmic([columns["step_min"], columns["step_max"]])
+        length.note("no step yet")
+    length.logarithmic(shortest, longest)
+    courant.title("Courant number", "largest displacement in a step, cells")
+    courant.steps(history.columns["courant_max"], 0)
+    courant.level(COURANT, f"limit {COURANT:g}", 1)
+    courant.axes.set_ylim(bottom=0.0)
 
 
-def _courant(panel: Panel, history: History) -> None:
-    panel.title("Courant number", "largest displacement in a step, cells")
-    panel.steps(history.columns["courant_max"], 0)
-    panel.level(COURANT, f"limit {COURANT:g}", 1)
-    panel.from_zero()
-
-
-def _volume(panel: Panel, history: History) -> None:
-    panel.title("Volume ratio J", "smallest to largest")
-    panel.band(history.columns["volume_ratio_min"], history.columns["volume_ratio_max"], "", 2)
-    panel.level(1.0)
-
-
-def _speed(panel: Panel, history: History) -> None:
-    panel.title("Largest speed", "m/s")
-    panel.line(history.columns["speed_max"], "", 0)
-    panel.from_zero()
+def _extremes(volume: Panel, speed: Panel, history: History) -> None:
+    volume.title("Volume ratio J", "smallest to largest")
+    volume.band(history.columns["volume_ratio_min"], history.columns["volume_ratio_max"], "", 2)
+    volume.level(1.0)
+    speed.title("Largest speed", "m/s")
+    speed.line(history.columns["speed_max"], "", 0)
+    speed.axes.set_ylim(bottom=0.0)
 
 
 def _reach(panel: Panel, history: History, axis: int) -> None:
@@ -176,7 +252,7 @@ def _load(panel: Panel, history: History, axis: int) -> None:
     panel.title(f"Force on colliders along {AXES[axis]}", f"mean since the frame before, {unit}")
     forces, names = history.columns["collider_force"], history.header.collider_names
     if forces.ndim != 3:
-        panel.say("not in this ledger")
+        panel.note("not in this ledger")
         return
     if len(names) > COLLIDERS_MAX:
         forces, names = forces.sum(axis=1, keepdims=True), ("all together",)

@@ -9,12 +9,13 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 from mpmcli.cores import available_cores
-from mpmcli.errors import RunError
+from mpmcli.errors import MpmcliError, RunError
 
 # Seconds between two looks at whether to stop.
 PAUSE = 0.05
@@ -31,7 +32,7 @@ THREADS = (
     "RAYON_NUM_THREADS",
     "VTK_SMP_MAX_THREADS",
 )
-CODE = "import sys; sys.path[:] = {path!r}\nfrom mpmcli.processes.pool_process import main; main()"
+CODE = "import sys; sys.path[:] = {path!r}\nfrom mpmcli.processes.pool import serve; serve()"
 
 
 class Job(Protocol):
@@ -56,7 +57,6 @@ def render_frames(
     Ctrl-C at the terminal does not reach them. None is left when this returns or raises; frames that are done stay.
 
     Args:
-        job: see `Job`.
         ks: the frames, begun in this order.
         workers: processes at a time, each with one frame.
         watch: called with each frame as it is done, and what the job returned for it, which can be pickled.
@@ -114,10 +114,7 @@ def _render_beside(
 
 
 class _Worker:
-    """One process, and the thread that reads its answers; `frame` is the one in work.
-
-    An answer of None means that it ended.
-    """
+    """One process with a `frame` in work, and the thread that reads its answers; None means that it ended."""
 
     def __init__(self, threads: int, answers: "queue.SimpleQueue") -> None:
         self.frame = -1
@@ -182,9 +179,10 @@ class _Worker:
                 answer = pickle.load(self.process.stdout)  # type: ignore[arg-type]
             # It ended, perhaps in the middle of an answer.
             except Exception:
-                answers.put((self, None))
-                return
+                answer = None
             answers.put((self, answer))
+            if answer is None:
+                return
 
 
 def _close_all(workers: Sequence[_Worker], *, at_work: bool) -> None:
@@ -200,3 +198,53 @@ def _close_all(workers: Sequence[_Worker], *, at_work: bool) -> None:
         for worker in workers:
             worker.close(0.0)
         raise
+
+
+def serve() -> None:
+    """Render in a process of its own: start the job, then render each frame that is sent, until stdin ends.
+
+    Messages are pickled objects on stdin and stdout, pipes to the process that started it, which it does not outlive.
+    First comes the job; then the number of a frame, again and again, each answered by ("done", what the job returned)
+    or ("failed", exception).
+    """
+    # An unfinished file is removed on the way out.
+    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # What libraries print goes to stderr.
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    questions = sys.stdin.buffer
+    try:
+        render = pickle.load(questions).start()
+    except Exception as error:
+        _answer(answers, "failed", error)
+        return
+    while True:
+        try:
+            k = pickle.load(questions)
+        except EOFError:
+            return
+        try:
+            kind, content = "done", render(k)
+        except Exception as error:
+            kind, content = "failed", error
+        _answer(answers, kind, content)
+
+
+def _answer(answers: IO[bytes], kind: str, content: Any) -> None:
+    """Send an answer; an exception that cannot travel is replaced by one that names it."""
+    if isinstance(content, Exception) and not isinstance(content, MpmcliError):
+        content.add_note("".join(traceback.format_exception(content)))
+    try:
+        whole = pickle.dumps((kind, content))
+        pickle.loads(whole)
+    except Exception as error:
+        said = content if isinstance(content, Exception) else error
+        whole = pickle.dumps(("failed", RuntimeError(f"{type(said).__name__}: {said}")))
+    answers.write(whole)
+    answers.flush()
+
+
+def _leave(*_: object) -> None:
+    # The base class, as no handler of errors must stop it.
+    raise KeyboardInterrupt

@@ -9,7 +9,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import IO
 
@@ -25,7 +25,6 @@ class Question:
     """A command that answers with JSON objects on stdout, one per line.
 
     Attributes:
-        command: program and arguments.
         timeout: time limit, s.
         environment: variables added to those of this process; None removes one.
         leads_a_group: whether it is ended together with the processes that it has started.
@@ -45,7 +44,7 @@ class Reply:
     """The outcome of a process.
 
     Attributes:
-        answer: its JSON objects, merged; empty if there were none.
+        answer: its JSON objects, merged.
         fault: "" if it answered and exited with 0; else the reason, such as "died by SIGSEGV".
         complaint: the end of what it wrote on stderr.
     """
@@ -81,12 +80,8 @@ def ask_as_ended(
 ) -> Iterator[tuple[int, Reply]]:
     """Ask each process, at most `at_once` at a time, and yield (number of the question, reply) as they end.
 
-    Args:
-        questions: each is taken when its process starts.
-        stop: polled while processes are running; True ends all of them.
-
-    Raises:
-        KeyboardInterrupt: `stop` returned True. No process is left running.
+    A question is taken when its process starts. `stop` is polled; where it returns True, KeyboardInterrupt is raised,
+    and no process is left running.
     """
     going: dict[int, _Child] = {}
     waiting = enumerate(questions)
@@ -105,9 +100,8 @@ def ask_as_ended(
                 raise KeyboardInterrupt
             ended = [number for number in going if going[number].has_ended()]
             for number in ended:
-                child = going.pop(number)
-                reply = child.reply()
-                child.close()
+                with closing(going.pop(number)) as child:
+                    reply = child.reply()
                 yield number, reply
             if not ended:
                 time.sleep(PAUSE)
@@ -119,7 +113,10 @@ def ask_as_ended(
 @contextmanager
 def answering() -> Iterator[Callable[..., None]]:
     """Let a child process answer by `answer(name=value, ...)`; what libraries print goes to stderr."""
-    _leave_no_core()
+    with suppress(ImportError):  # Windows
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
     with os.fdopen(os.dup(1), "w", encoding="utf-8") as answers:
         os.dup2(2, 1)
 
@@ -141,25 +138,14 @@ def end_with_parent() -> None:
     threading.Thread(target=wait, daemon=True).start()
 
 
-def _leave_no_core() -> None:
-    try:
-        import resource
-    except ImportError:
-        return  # Windows
-    resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
-
-
 class _Child:
     """A running child process."""
 
     def __init__(self, question: Question) -> None:
         self._question = question
         # The same modules are found as in this process, wherever it was started from.
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(os.path.abspath(place) for place in sys.path)}
-        for name, value in question.environment.items():
-            environment.pop(name, None)
-            if value is not None:
-                environment[name] = value
+        path = os.pathsep.join(os.path.abspath(place) for place in sys.path)
+        environment = {**os.environ, "PYTHONPATH": path, **question.environment}
         self._grouped = question.leads_a_group and hasattr(os, "killpg")
         self._late = False
         self._said, self._complained = _sink(), _sink()
@@ -169,7 +155,7 @@ class _Child:
                 stdin=subprocess.PIPE if question.follows else subprocess.DEVNULL,
                 stdout=self._said,
                 stderr=self._complained,
-                env=environment,
+                env={name: value for name, value in environment.items() if value is not None},
                 start_new_session=question.follows,
                 **({"process_group": 0} if self._grouped else {}),
             )
@@ -193,12 +179,9 @@ class _Child:
         """Return its reply."""
         answer = {}
         for line in _text(self._said).splitlines():
-            try:
+            with suppress(ValueError):
                 value = json.loads(line)
-            except ValueError:
-                continue
-            if isinstance(value, dict):
-                answer |= value
+                answer |= value if isinstance(value, dict) else {}
         return Reply(answer, self._fault(answer), _text(self._complained)[-COMPLAINT_LENGTH:].strip())
 
     def close(self) -> None:
@@ -210,31 +193,23 @@ class _Child:
                 stream.close()
 
     def _end(self) -> None:
-        try:
+        with suppress(OSError, subprocess.TimeoutExpired):
             if self._grouped:
                 os.killpg(self._process.pid, signal.SIGKILL)
             else:
                 self._process.kill()
             self._process.wait(LAST_WAIT)
-        except (OSError, subprocess.TimeoutExpired):
-            pass
 
     def _fault(self, answer: dict) -> str:
         status = self._process.returncode
         if self._late:
             return f"took longer than {self._question.timeout:g} s"
         if status and status < 0:
-            return f"died by {_signal_name(-status)}"
+            named = -status in set(signal.Signals)
+            return f"died by {signal.Signals(-status).name if named else f'signal {-status}'}"
         if status:
             return f"exited with {status}"
         return "" if answer else "gave no answer"
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 def _sink() -> IO[bytes]:

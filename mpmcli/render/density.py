@@ -1,60 +1,28 @@
 """The density of the grid by the kernel of the solver (docs/theory.md, 2.1): an image in 2D, a slice in 3D."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.output.header import RunHeader
 from mpmcli.output.result import Result
-from mpmcli.render.color_by import color_map
-from mpmcli.render.coloring import Coloring
-from mpmcli.render.flat_colliders import FlatColliders
+from mpmcli.render.colliders import FlatColliders
+from mpmcli.render.coloring import Coloring, color_map
 from mpmcli.render.frame_choice import evenly_spaced
 from mpmcli.render.render_scene import RenderScene
-from mpmcli.render.theme import Theme, rgb_bytes
-from mpmcli.render.view import View
+from mpmcli.render.settings import Theme, rgb_bytes
+from mpmcli.render.view import Slice, View
 
-# Nodes beyond a wall that receive mass from inside, which is mirrored back (docs/theory.md, 3.1).
-GHOSTS = 2
-# Fraction of the upper limit below which the picture fades into the background.
-FADING = 0.1
-# Maximum number of frames from which the limits are computed.
-LOOKED_AT = 8
-# Fraction of the nodes with mass that may exceed the upper limit.
-OUTSIDE = 0.01
-
-
-@dataclass(frozen=True)
-class Slice:
-    """A plane through the domain: all of it in 2D.
-
-    Attributes:
-        across: the two axes of the picture, to the right and up.
-        normal: the axis through it, None in 2D; place: on it, m.
-    """
-
-    across: tuple[int, int]
-    normal: int | None = None
-    place: float = 0.0
-
-
-def slice_of(scene: RenderScene, camera: str) -> Slice:
-    """Return the plane in the middle of the domain that a camera looks at from the front; "iso" as "front"."""
-    if scene.dimension == 2:
-        return Slice((0, 1))
-    up = int(np.argmax(np.abs(scene.up)))
-    right, depth = (axis for axis in range(3) if axis != up)
-    across, normal = {"top": ((right, depth), up), "side": ((depth, up), right)}.get(camera, ((right, up), depth))
-    return Slice(across, normal, 0.5 * (scene.lower[normal] + scene.upper[normal]))
+GHOSTS = 2  # nodes beyond a wall that receive mass from inside, which is mirrored back (docs/theory.md, 3.1)
+FADING = 0.1  # fraction of the upper limit below which the picture fades into the background
+LOOKED_AT = 8  # maximum number of frames from which the limits are computed
+OUTSIDE = 0.01  # fraction of the nodes with mass that may exceed the upper limit
 
 
 def grid_density(frame: Frame, header: RunHeader, plane: Slice) -> np.ndarray:
     """Return the mass of the grid nodes of a plane over their volume, by quadratic B-splines, walls mirrored.
 
-    Returns:
-        (a, b) float64 along the axes of the plane, nodes on both walls included, kg/m^3: a 2D scene is a metre deep.
+    It is (a, b) float64 along the axes of the plane, nodes on both walls included, kg/m^3: a 2D scene is a metre deep.
     """
     h, d = header.spacing, header.dimension
     cells = np.rint((header.upper - header.origin) / h).astype(int)
@@ -73,12 +41,11 @@ def grid_density(frame: Frame, header: RunHeader, plane: Slice) -> np.ndarray:
     size = cells[list(plane.across)] + 1 + 2 * GHOSTS
     base = np.floor(place - 0.5).astype(np.intp)
     total = np.zeros(size[0] * size[1])
-    for i in range(3):
-        for j in range(3):
-            node = base + np.array([i, j])
-            share = weight * _kernel(place[:, 0] - node[:, 0]) * _kernel(place[:, 1] - node[:, 1])
-            index = (node[:, 0] + GHOSTS) * size[1] + node[:, 1] + GHOSTS
-            total += np.bincount(index, share, minlength=len(total))
+    for offset in np.ndindex(3, 3):
+        node = base + np.array(offset)
+        share = weight * _kernel(place[:, 0] - node[:, 0]) * _kernel(place[:, 1] - node[:, 1])
+        index = (node[:, 0] + GHOSTS) * size[1] + node[:, 1] + GHOSTS
+        total += np.bincount(index, share, minlength=len(total))
     return _folded(_folded(total.reshape(size)).T).T
 
 
@@ -91,8 +58,7 @@ def _kernel(x: np.ndarray) -> np.ndarray:
 def _folded(total: np.ndarray) -> np.ndarray:
     """Add the mirror images at both ends of the first axis to what lies within."""
     inner = total[GHOSTS:-GHOSTS].copy()
-    inner[0] *= 2.0
-    inner[-1] *= 2.0
+    inner[[0, -1]] *= 2.0
     for k in range(1, GHOSTS + 1):
         if len(inner) > 2 * k:
             inner[k] += total[GHOSTS - k]
@@ -110,21 +76,17 @@ def density_colors(
             "density needs all of them; run the scene without it, or choose another --mode."
         )
     if limits is None:
-        found = [0.0]
+        highest = 0.0
         for k in evenly_spaced(range(result.frame_count), LOOKED_AT):
             density = grid_density(result.frame(k, {STATUS} & set(result.field_names)), result.header, plane)
             if (density > 0).any():
-                found.append(float(np.quantile(density[density > 0], 1.0 - OUTSIDE)))
-        limits = 0.0, max(found) or 1.0
+                highest = max(highest, float(np.quantile(density[density > 0], 1.0 - OUTSIDE)))
+        limits = 0.0, highest or 1.0
     return Coloring("density", "kg/m³", (), lambda frame: np.empty(0), color_map(cmap), limits, theme.missing)
 
 
 class DensityPainter:
-    """Draws the density of the grid in a plane, which fades out where there is little.
-
-    Attributes:
-        fields: that are read of each frame: none.
-    """
+    """Draws the density of the grid in a plane, which fades out where there is little."""
 
     fields: tuple[str, ...] = ()
 
@@ -133,24 +95,8 @@ class DensityPainter:
     ) -> None:
         self._header, self._plane, self._colors = header, plane, colors
         self._size, self._ground = view.size, np.array(rgb_bytes(theme.ground), dtype=np.float64)
-        low, high = np.array(scene.lower), np.array(scene.upper)
-        corners = np.tile(0.5 * (low + high), (2, 1))
-        across = list(plane.across)
-        corners[:, across] = np.stack([low, high])[:, across]
-        self._box = view.pixels(corners)[:, :2]
-        (left, bottom), (right, top) = self._box.tolist()
-
-        backwards = np.array([right < left, bottom < top])
-        start = corners[0].copy()
-        start[across] = np.where(backwards, corners[1, across], corners[0, across])
-
-        def place(places: np.ndarray) -> np.ndarray:
-            points = np.tile(start, (len(places), 1))
-            points[:, across] += np.where(backwards, -places, places)
-            return points[:, : scene.dimension]
-
-        ends = (min(left, right), max(bottom, top), max(left, right), min(bottom, top))
-        self._solid = FlatColliders(scene, view, theme, place, ends)
+        self._box = view.pixels(plane.corners(scene))[:, :2]
+        self._solid = FlatColliders(scene, view, theme, plane)
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return (h, w, 3) uint8."""
@@ -161,8 +107,8 @@ class DensityPainter:
         v = (bottom - np.arange(height) - 0.5) / (bottom - top) * (density.shape[1] - 1)
         values = _between(_between(density, u).T, v)
         inside = ((v >= 0) & (v <= density.shape[1] - 1))[:, None] & ((u >= 0) & (u <= density.shape[0] - 1))
-        there = np.clip(values / (FADING * self._colors.limits[1]), 0.0, 1.0) * inside
-        picture = self._ground + there[:, :, None] * (self._colors.rgb(values) - self._ground)
+        alpha = np.clip(values / (FADING * self._colors.limits[1]), 0.0, 1.0) * inside
+        picture = self._ground + alpha[:, :, None] * (self._colors.rgb(values) - self._ground)
         picture /= 255.0
         self._solid.draw(picture, frame)
         return (255.0 * picture + 0.5).astype(np.uint8)

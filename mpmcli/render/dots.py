@@ -6,47 +6,35 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpmcli.frames.frame import Frame
-from mpmcli.render.collider_actors import ColliderActors
+from mpmcli.render.colliders import ColliderActors, FlatColliders
 from mpmcli.render.coloring import Categories, Coloring
-from mpmcli.render.depth_shading import depth_shaded
-from mpmcli.render.flat_colliders import flat_colliders
-from mpmcli.render.hidden import hidden
 from mpmcli.render.offscreen import OffscreenRenderer
 from mpmcli.render.render_scene import RenderScene
-from mpmcli.render.theme import Theme
-from mpmcli.render.view import View
+from mpmcli.render.settings import PIXELS_MAX, SIDE_MAX, Theme
+from mpmcli.render.view import Slice, View
 
 if TYPE_CHECKING:
     import pyvista as pv
 
 # Diameter of a dot over the distance between particles: neighbours overlap a little, so that a body looks whole.
 OVERLAP = 1.15
-# Smallest diameter of a dot, pixels, so that a single particle is visible.
-SMALLEST = 1.5
-# Up to this number of particles, each pixel is the average of four, which makes round edges smooth.
-SMOOTHED = 400_000
-# Largest diameter of a dot that is drawn, pixels.
-DOT_MAX = 255
-# Limits of software rendering: pixels along a side, beyond which it draws black, and in all, at 45 bytes each.
-SIDE_MAX, PIXELS_MAX = 16_384, 64_000_000
-# Number of sizes of dots in a perspective picture, one for each layer of distances.
-LAYERS = 12
-# Maximum number of squares on each side in which dots that hide another are sought.
-FARTHEST = 16
+SMALLEST = 1.5  # smallest diameter of a dot, pixels, so that a single particle is visible
+SMOOTHED = 400_000  # up to this number of particles, each pixel is the average of four, which makes round edges smooth
+DOT_MAX = 255  # largest diameter of a dot that is drawn, pixels
+LAYERS = 12  # number of sizes of dots in a perspective picture, one for each layer of distances
+FARTHEST = 16  # maximum number of squares on each side in which dots that hide another are sought
+STRENGTH = 0.55  # fraction of the light that a deep gap absorbs
+DEEP = 4.0  # depth of a deep gap, in diameters of a dot
+REACH = 1.2  # distance of the compared pixels, in diameters of a dot
+MOST = 1.5  # upper bound of a gap, in units of `DEEP`: what is farther away is another body
+DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 
 
 class DotsPainter:
-    """Draws frames as dots.
-
-    Args:
-        colors: of the particles.
-        count: particles of the largest frame.
-    """
+    """Draws frames, of which the largest has `count` particles, as dots."""
 
     def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | Categories, count: int) -> None:
-        self._scene = scene
-        self._view = view
-        self._colors = colors
+        self._scene, self._view, self._colors = scene, view, colors
         self.fields = colors.fields
         self._flat = scene.dimension == 2
         self._diameters = OVERLAP * np.array(scene.distances)
@@ -55,7 +43,7 @@ class DotsPainter:
         self._levels = self._all_levels()
         self._corner = np.array(scene.lower)
         self._actors: dict[int, tuple[pv.PolyData, pv.Actor]] = {}
-        self._ground = flat_colliders(scene, view, theme) if self._flat and scene.colliders else None
+        self._ground = FlatColliders(scene, view, theme, Slice((0, 1))) if self._flat and scene.colliders else None
         if not self._flat:
             self._offscreen.add_light()
             self._offscreen.add_box(scene.lower, scene.upper, theme.wall)
@@ -66,8 +54,10 @@ class DotsPainter:
         placed = np.isfinite(frame.position).all(axis=1)
         points = np.zeros((int(placed.sum()), 3))
         points[:, : self._scene.dimension] = frame.position[placed]
-        colors, body = self._colors.particle_rgb(frame)[placed], frame.body[placed]
-        sizes = self._pixels(points, body)
+        colors = self._colors.particle_rgb(frame)[placed]
+        diameters = self._diameters[np.clip(frame.body[placed], 0, len(self._diameters) - 1)]
+        scale = self._view.scale_at(np.maximum(self._view.pixels(points)[:, 2], self._view.near))
+        sizes = np.maximum(diameters * scale, SMALLEST)
         if not self._flat and len(points):
             seen = ~self._hidden(points, sizes)
             points, colors, sizes = points[seen], colors[seen], sizes[seen]
@@ -89,20 +79,10 @@ class DotsPainter:
 
     def _above_colliders(self, picture: np.ndarray, frame: Frame) -> np.ndarray:
         """Draw colliders between the dots: what lies in a collider is not hidden by it."""
-        samples, (width, height) = self._offscreen.samples, self._view.size
-        free = ~np.isfinite(self._offscreen.depth()).reshape(height, samples, width, samples)
+        free = _blocks(~np.isfinite(self._offscreen.depth()), self._offscreen.samples)
         image = picture / np.float32(255)
         self._ground.draw(image, frame, free.mean(axis=(1, 3), dtype=np.float32))
         return (255.0 * image + 0.5).astype(np.uint8)
-
-    def _pixels(self, points: np.ndarray, body: np.ndarray) -> np.ndarray:
-        """Return the diameter of each dot in pixels, (n,)."""
-        scale = self._view.pixels_per_metre
-        if not self._view.parallel:
-            depth = self._view.pixels(points)[:, 2]
-            scale = scale * self._view.distance / np.maximum(depth, self._view.near)
-        diameters = self._diameters[np.clip(body, 0, len(self._diameters) - 1)]
-        return np.maximum(diameters * scale, SMALLEST)
 
     def _hidden(self, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
         """Return which dots are wholly covered by others, (n,) bool: leaving them out changes no pixel."""
@@ -115,9 +95,8 @@ class DotsPainter:
         if side >= 0.5 * edge and inside.any():
             reach = math.ceil((0.5 * float(sizes[inside].max()) + edge) / side)
             # For a camera among the dots, comparing takes longer than drawing.
-            if reach > FARTHEST:
-                return result
-            result[inside] = hidden(pixels[inside], side, float(self._diameters.max()), reach, cover=1)
+            if reach <= FARTHEST:
+                result[inside] = hidden(pixels[inside], side, float(self._diameters.max()), reach, cover=1)
         return result
 
     def _all_levels(self) -> np.ndarray:
@@ -131,25 +110,14 @@ class DotsPainter:
         return np.geomspace(low, high, LAYERS) if high > 1.02 * low else np.array([high])
 
     def _set(self, level: int, points: np.ndarray, colors: np.ndarray, size: float) -> None:
-        """Set the points that the actor of a level shows."""
         import pyvista as pv
         from vtkmodules.util.numpy_support import numpy_to_vtk
 
         if level not in self._actors:
             mesh = pv.PolyData(np.zeros((1, 3), np.float32))
             mesh.point_data["rgb"] = np.zeros((1, 3), np.uint8)
-            actor = self._offscreen.plotter.add_points(
-                mesh,
-                scalars="rgb",
-                rgb=True,
-                render_points_as_spheres=True,
-                lighting=not self._flat,
-                # Flat dots have exactly the colours of the colour bar.
-                ambient=1.0 if self._flat else 0.45,
-                diffuse=0.0 if self._flat else 0.65,
-                specular=0.0,
-                reset_camera=False,
-            )
+            # Flat dots have exactly the colours of the colour bar.
+            actor = self._offscreen.add_dots(mesh, lit=not self._flat)
             # VTK stores positions in single precision, too coarse for a domain far from the origin.
             actor.position = tuple(self._corner.tolist())
             self._actors[level] = mesh, actor
@@ -169,3 +137,56 @@ def samples_of(size: tuple[int, int], count: int, largest: float) -> int:
     """Return the samples along each axis of a pixel, by the number of dots and the widest one."""
     possible = 2 * max(size) <= SIDE_MAX and 4 * size[0] * size[1] <= PIXELS_MAX and 2 * largest <= DOT_MAX
     return 2 if possible and count <= SMOOTHED else 1
+
+
+def _blocks(values: np.ndarray, samples: int) -> np.ndarray:
+    """Return values (h * samples, w * samples) as (h, samples, w, samples)."""
+    return values.reshape(len(values) // samples, samples, -1, samples)
+
+
+def depth_shaded(
+    picture: np.ndarray, depth: np.ndarray, diameter: float, view: View, samples: int, dots: np.ndarray | None = None
+) -> np.ndarray:
+    """Darken what lies deeper than its surroundings (eye-dome lighting, C. Boucheny, PhD thesis, Grenoble 2009).
+
+    VTK's eye-dome lighting and SSAO were compared with it, and take three to five times as long (docs/shading.md).
+    The picture is (h, w, 3) uint8, the depth (h * samples, w * samples), m, inf where there is nothing; `dots` is the
+    depth of what is compared, where there is more in the picture: the rest is not darkened.
+    """
+    # The nearest of the samples of a pixel: its edges belong to what is in front.
+    width, height = view.size
+    nearest = first = _blocks(depth, samples).min(axis=(1, 3))
+    if dots is not None:
+        nearest = _blocks(dots, samples).min(axis=(1, 3))
+    solid = np.isfinite(nearest)
+    if not solid.any():
+        return picture
+    # From very near a dot is larger than the picture.
+    reach = max(1, min(round(REACH * diameter * view.pixels_per_metre), max(view.size)))
+    bare = np.where(solid, nearest, np.float32(view.far))
+    padded = np.pad(bare, reach, mode="edge")
+    gap = np.zeros_like(bare)
+    for i, j in DIRECTIONS:
+        other = padded[reach + i * reach :, reach + j * reach :][:height, :width]
+        gap += np.clip((bare - other) / np.float32(DEEP * diameter), 0.0, MOST)
+    shade = np.exp(-STRENGTH * 2.0 * gap / len(DIRECTIONS) * 2.0)
+    shade[~solid | (first < nearest)] = 1.0
+    return (picture * shade[:, :, None] + 0.5).astype(np.uint8)
+
+
+def hidden(pixels: np.ndarray, cell: float, gap: float, reach: int = 1, cover: int = 0) -> np.ndarray:
+    """Return which particles are invisible (n,): others, nearer by `gap`, m, cover every square they may be seen in.
+
+    `pixels` are (n, 3), from the left and from the top, and the distance, m; squares of side `cell`, pixels, are
+    compared. `reach` and `cover` are squares on each side of its own that a particle may be seen in, and covers whole.
+    """
+    if len(pixels) == 0:
+        return np.zeros(0, dtype=bool)
+    low = np.floor(pixels[:, :2].min(axis=0) / cell).astype(np.int64)
+    column, row = (np.floor(pixels[:, :2] / cell).astype(np.int64) - low + reach).T
+    nearest = np.full((row.max() + reach + 1, column.max() + reach + 1), np.inf)
+    np.minimum.at(nearest, (row, column), pixels[:, 2])
+    for spread, rounds in ((np.minimum, cover), (np.maximum, reach)):
+        for axis in (0, 1) * rounds:
+            nearest = spread(nearest, spread(np.roll(nearest, 1, axis), np.roll(nearest, -1, axis)))
+    return pixels[:, 2] > nearest[row, column] + gap

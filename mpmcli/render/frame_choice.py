@@ -14,11 +14,7 @@ HINT = "give a number, first, last, all, or A:B:S, from A up to but not B in ste
 def choose_frames(text: str, result: Result) -> list[int]:
     """Return the positions in the result of the frames that a text selects, in order.
 
-    Args:
-        text: N, "first", "last", "all" or "A:B:S"; a negative number counts from the end.
-
-    Raises:
-        InputError: there is no such frame, or the text means nothing.
+    The text is N, "first", "last", "all" or "A:B:S"; a negative number counts from the end.
     """
     count = result.frame_count
     numbers = result.numbers.tolist()
@@ -30,14 +26,14 @@ def choose_frames(text: str, result: Result) -> list[int]:
         if wanted not in numbers:
             raise InputError(f"--frame {word}: {_holds(result)}.")
         return [numbers.index(wanted)]
-    found = re.fullmatch(r"(-?\d*):(-?\d*)(?::(-?\d*))?", word)
+    match = re.fullmatch(r"(-?\d*):(-?\d*)(?::(-?\d*))?", word)
     try:
-        parts = [int(part) if part else None for part in (found[1], found[2], found[3])] if found else None
+        start, end, step = (int(part) if part else None for part in match.groups()) if match else (0, 0, 0)
     except ValueError:
-        parts = None
-    if parts is None or parts[2] == 0:
+        step = 0
+    if step == 0:
         raise InputError(f'--frame "{text}" means no frame: {HINT}.')
-    chosen = list(range(count))[slice(*parts)]
+    chosen = list(range(count))[start:end:step]
     if not chosen:
         raise InputError(f"--frame {word} means no frame: {_holds(result)}.")
     return chosen
@@ -54,8 +50,5 @@ def evenly_spaced(ks: Sequence[int], count: int) -> list[int]:
 def _holds(result: Result) -> str:
     first, last = int(result.numbers[0]), int(result.numbers[-1])
     so_far = " so far, as its run goes on" if result.status == "running" else ""
-    return (
-        f"{result.path} holds frame {first} only{so_far}"
-        if first == last
-        else (f"{result.path} holds frames {first} to {last}{so_far}")
-    )
+    frames = f"frame {first} only" if first == last else f"frames {first} to {last}"
+    return f"{result.path} holds {frames}{so_far}"

@@ -4,28 +4,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mpmcli.render.theme import Theme
+from mpmcli.render.settings import Theme
 from mpmcli.render.view import View
 
 if TYPE_CHECKING:
-    from vtkmodules.vtkRenderingCore import vtkRenderWindow
-
-# Edges of the domain, as pairs of its corners; bit i of a corner's number is its side along axis i.
-EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
+    import pyvista as pv
 
 
 class OffscreenRenderer:
-    """A window of the size of a view, with the edges of the domain in it.
-
-    Args:
-        samples: pixels along each axis that are averaged to one.
-    """
+    """A window of the size of a view; `samples` of its pixels along each axis are averaged to one."""
 
     def __init__(self, view: View, theme: Theme, *, samples: int = 1) -> None:
         import pyvista as pv
 
-        self.view = view
-        self.samples = samples
+        self.view, self.samples = view, samples
         width, height = view.size
         self.plotter = pv.Plotter(off_screen=True, window_size=(width * samples, height * samples), lighting="none")
         self.plotter.render_window.SetMultiSamples(0)
@@ -37,11 +29,22 @@ class OffscreenRenderer:
         """Draw the edges of the domain."""
         import pyvista as pv
 
-        low, high = np.array(lower), np.array(upper)
-        corners = np.array([[high[i] if a >> i & 1 else low[i] for i in range(3)] for a in range(8)])
-        cells = np.array([(2, a, b) for a, b in EDGES]).ravel()
-        box = pv.PolyData(corners, lines=cells)
+        box = pv.Box(bounds=np.stack([lower, upper], axis=1).ravel().tolist()).extract_all_edges()
         self.plotter.add_mesh(box, color=color, line_width=width * self.samples, lighting=False, reset_camera=False)
+
+    def add_dots(self, cloud: "pv.PolyData", *, lit: bool = True) -> "pv.Actor":
+        """Draw points as round dots, in the colours "rgb" of the cloud exactly where they are not lit."""
+        return self.plotter.add_points(
+            cloud,
+            scalars="rgb",
+            rgb=True,
+            render_points_as_spheres=True,
+            lighting=lit,
+            ambient=0.45 if lit else 1.0,
+            diffuse=0.65 if lit else 0.0,
+            specular=0.0,
+            reset_camera=False,
+        )
 
     def add_light(self) -> None:
         """Light the scene from over the left shoulder of the camera."""
@@ -53,16 +56,32 @@ class OffscreenRenderer:
 
     def render(self) -> None:
         """Render the window, for `picture` and `depth` to read."""
-        self.view.place(self.plotter)
         if self.plotter.render_window.GetNeverRendered():
             # The first picture of a window is drawn without what plotters set up when they are first shown.
-            self.plotter.show(auto_close=False)
             self.view.place(self.plotter)
+            self.plotter.show(auto_close=False)
+        self.view.place(self.plotter)
         self.plotter.render_window.Render()
 
     def picture(self) -> np.ndarray:
         """Return the rows from the top, (h, w, 3) uint8, averaged over the samples of each pixel."""
-        return averaged(window_pixels(self.plotter.render_window), self.samples)
+        image, step = self.pixels(), self.samples
+        if step == 1:
+            return np.ascontiguousarray(image)
+        total = np.zeros((image.shape[0] // step, image.shape[1] // step, 3), np.uint16)
+        for i, j in np.ndindex(step, step):
+            total += image[i::step, j::step]
+        return ((total + step * step // 2) // (step * step)).astype(np.uint8)
+
+    def pixels(self) -> np.ndarray:
+        """Return the pixels of the window, rows from the top, (h, w, 3) uint8."""
+        from vtkmodules.util.numpy_support import vtk_to_numpy
+        from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
+
+        width, height = self.plotter.render_window.GetSize()
+        array = vtkUnsignedCharArray()
+        self.plotter.render_window.GetPixelData(0, 0, width - 1, height - 1, 0, array, 0)
+        return vtk_to_numpy(array).reshape(height, width, 3)[::-1]
 
     def depth(self) -> np.ndarray:
         """Return the distance of each sample from the camera, (h, w) float32, m; inf where nothing is drawn."""
@@ -77,30 +96,3 @@ class OffscreenRenderer:
         span = far - near
         distance = near + z * span if self.view.parallel else near * far / (far - z * span)
         return np.where(z >= 1.0, np.float32(np.inf), distance.astype(np.float32))
-
-    def close(self) -> None:
-        """Release the window."""
-        self.plotter.close()
-
-
-def window_pixels(window: "vtkRenderWindow") -> np.ndarray:
-    """Return the pixels of a window, rows from the top, (h, w, 3) uint8."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
-
-    width, height = window.GetSize()
-    array = vtkUnsignedCharArray()
-    window.GetPixelData(0, 0, width - 1, height - 1, 0, array, 0)
-    return vtk_to_numpy(array).reshape(height, width, 3)[::-1]
-
-
-def averaged(image: np.ndarray, step: int) -> np.ndarray:
-    """Return the means over blocks of `step` by `step` pixels, (h, w, 3) uint8."""
-    if step == 1:
-        return np.ascontiguousarray(image)
-    height, width = (length // step for length in image.shape[:2])
-    total = np.zeros((height, width, 3), np.uint16)
-    for i in range(step):
-        for j in range(step):
-            total += image[i::step, j::step]
-    return ((total + step * step // 2) // (step * step)).astype(np.uint8)

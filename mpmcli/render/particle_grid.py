@@ -1,22 +1,24 @@
-"""Particles on regular grids: their mirror images behind walls, their shares of nodes, and the blur of a grid."""
+"""Particles on regular grids: mirror images behind walls, shares of nodes, blurs, and the cover of a plane."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+
+STRAY = 4.0  # radii that a particle may lie outside of the domain and still be drawn
+SPREAD = 1.25  # standard deviation of the Gaussian of a particle's area, in distances between particles
+FINENESS = 3.0  # nodes of the grid to a distance, at least
+REACH = 3.2  # reach of the Gaussian, in standard deviations
+DISK = math.sqrt(1.0 / math.pi)  # radius of the disk that has the area of a particle, in distances
+# Cover of its own place, below which a particle stands alone and is drawn as a disk, and above which it is not.
+ALONE, TOGETHER = 0.34, 0.42
 
 
 def with_images(
     position: np.ndarray, reach: float, lower: Sequence[float] | np.ndarray, upper: Sequence[float] | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return particles with their mirror images behind the walls that are closer than `reach`.
-
-    Args:
-        position: (n, d).
-        lower, upper: corners of the domain, (d,) or more.
-
-    Returns:
-        (m, d) particles and images, and (m,) the row of the particle that each of them belongs to.
-    """
+    """Return particles (n, d) with their images behind walls closer than `reach`, and the row of each's source."""
     source = np.arange(len(position))
     for axis in range(position.shape[1]):
         images, sources = [position], [source]
@@ -30,22 +32,27 @@ def with_images(
     return position, source
 
 
-def deposited(place: np.ndarray, amounts: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return the sum of what particles bring to each node, (rows, columns): each is shared among four, by area.
+def drawable(position: np.ndarray, lower: Sequence[float], upper: Sequence[float], distance: float) -> np.ndarray:
+    """Return which of the particles (n, d) are numbers, and in the domain or close to it: (n,) bool."""
+    d = position.shape[1]
+    stray = 0.5 * STRAY * distance
+    # A comparison with a NaN is false, which is what is wanted.
+    return ((position >= np.array(lower[:d]) - stray) & (position <= np.array(upper[:d]) + stray)).all(axis=1)
 
-    Args:
-        place: (n, 2), columns and rows from the first node, in cells; what falls outside is dropped.
-        amounts: (n,).
+
+def deposited(place: np.ndarray, amounts: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return the sum (rows, columns) of the amounts (n,) of particles, each shared by area among four nodes.
+
+    Places (n, 2) are columns and rows from the first node, in cells; what falls outside is dropped.
     """
     base = np.floor(place).astype(np.int64)
     part = place - base
     total = np.zeros(shape[0] * shape[1])
-    for right in (0, 1):
-        for down in (0, 1):
-            column, row = base[:, 0] + right, base[:, 1] + down
-            share = (part[:, 0] if right else 1.0 - part[:, 0]) * (part[:, 1] if down else 1.0 - part[:, 1]) * amounts
-            inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
-            total += np.bincount(row[inside] * shape[1] + column[inside], share[inside], len(total))
+    for right, down in np.ndindex(2, 2):
+        column, row = base[:, 0] + right, base[:, 1] + down
+        share = (part[:, 0] if right else 1.0 - part[:, 0]) * (part[:, 1] if down else 1.0 - part[:, 1]) * amounts
+        inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
+        total += np.bincount(row[inside] * shape[1] + column[inside], share[inside], len(total))
     return total.reshape(shape)
 
 
@@ -70,3 +77,89 @@ def blurred_along(values: np.ndarray, axis: int) -> np.ndarray:
     result[0] += 0.25 * values[0]
     result[-1] += 0.25 * values[-1]
     return np.moveaxis(result, 0, axis)
+
+
+def gaussian(values: np.ndarray, deviation: float, reach: int) -> np.ndarray:
+    """Return values (rows, columns) blurred by a Gaussian, cut off `reach` cells away; beyond the edges they are 0."""
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / deviation) ** 2)
+    weights = (weights / weights.sum()).astype(values.dtype)
+    for _ in range(2):
+        rows = len(values)
+        padded = np.pad(values, ((reach, reach), (0, 0)))
+        total = weights[reach] * values
+        for k in range(1, reach + 1):
+            pair = padded[reach - k : reach - k + rows] + padded[reach + k : reach + k + rows]
+            pair *= weights[reach + k]
+            total += pair
+        values = np.ascontiguousarray(total.T)
+    return values
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Nodes over a rectangle."""
+
+    corner: tuple[float, float]  # of the lower left node, m
+    edge: float  # between nodes, m
+    shape: tuple[int, int]  # numbers of rows, upwards, and columns
+
+
+def grid_over(lower: Sequence[float], upper: Sequence[float], edge: float) -> Grid:
+    """Return the grid of nodes in the middles of cells that cover a rectangle from its lower left corner."""
+    columns, rows = (max(math.ceil((high - low) / edge - 1e-6), 1) for low, high in zip(lower, upper, strict=True))
+    return Grid((lower[0] + 0.5 * edge, lower[1] + 0.5 * edge), edge, (rows, columns))
+
+
+def cover_of(
+    position: np.ndarray, distance: float, lower: Sequence[float], upper: Sequence[float], grid: Grid
+) -> np.ndarray:
+    """Return the share (rows, columns) of each node's surroundings that particles (n, 2) cover.
+
+    It is 1 within a body, 1/2 on its straight edge, and does not fade at the walls of the domain, which are mirrors.
+    A particle that stands alone is a disk of its own area, 1/2 on its rim.
+    """
+    images = with_images(position, REACH * SPREAD * distance, lower, upper)[0]
+    deviation = SPREAD * distance
+    cover = spread(images, np.full(len(images), distance**2), deviation, grid)
+    nearest = np.rint((position - np.array(grid.corner)) / grid.edge).astype(int)
+    column, row = np.clip(nearest[:, 0], 0, grid.shape[1] - 1), np.clip(nearest[:, 1], 0, grid.shape[0] - 1)
+    share = cover[row, column]
+    loose = share < TOGETHER
+    if loose.any():
+        alone = np.clip((TOGETHER - share[loose]) / (TOGETHER - ALONE), 0.0, 1.0)
+        radii = DISK * distance * np.sqrt(alone)
+        # As steep on the rim of a disk as on an edge.
+        slope = 1.0 / (deviation * math.sqrt(2.0 * math.pi))
+        flat = cover.reshape(-1)
+        for rows, nodes, away in disk_nodes(position[loose], float(radii.max()) + grid.edge, grid):
+            np.maximum.at(flat, nodes, (0.5 + slope * (radii[rows] - away)).astype(np.float32))
+    return cover
+
+
+def spread(position: np.ndarray, weights: np.ndarray, deviation: float, grid: Grid) -> np.ndarray:
+    """Return the sum (rows, columns) of Gaussians of integral `weights` (n,) about particles (n, 2), by area."""
+    margin = math.ceil(REACH * deviation / grid.edge) + 1
+    shape = (grid.shape[0] + 2 * margin, grid.shape[1] + 2 * margin)
+    place = (position - np.array(grid.corner)) / grid.edge + margin
+    total = deposited(place, weights, shape)
+    # Sharing out between two nodes has blurred already, by a sixth of a cell squared on average.
+    width = math.sqrt(max((deviation / grid.edge) ** 2 - 1.0 / 6.0, 0.0))
+    return soft(total.astype(np.float32), width)[margin:-margin, margin:-margin] / np.float32(grid.edge**2)
+
+
+def soft(values: np.ndarray, deviation: float) -> np.ndarray:
+    """Return values (rows, columns) blurred by a Gaussian of a deviation in cells, if it is wide enough to matter."""
+    return values if deviation < 0.15 else gaussian(values, deviation, max(math.ceil(REACH * deviation), 1))
+
+
+def disk_nodes(position: np.ndarray, reach: float, grid: Grid) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yield the nodes about particles (n, 2), in turn: rows, nodes and distances, m, (k,)."""
+    place = (position - np.array(grid.corner)) / grid.edge
+    base = np.rint(place).astype(np.int64)
+    count = math.ceil(reach / grid.edge)
+    for down, right in np.ndindex(2 * count + 1, 2 * count + 1):
+        column, row = base[:, 0] + right - count, base[:, 1] + down - count
+        away = grid.edge * np.hypot(column - place[:, 0], row - place[:, 1])
+        hit = (away <= reach) & (column >= 0) & (column < grid.shape[1]) & (row >= 0) & (row < grid.shape[0])
+        rows = np.flatnonzero(hit)
+        yield rows, row[rows] * grid.shape[1] + column[rows], away[rows]

@@ -1,20 +1,21 @@
 """The layout of a picture: title, time, colour bar or legend, scale bar, the walls of a flat domain."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mpmcli.render.coloring import Categories, Coloring
-from mpmcli.render.labels import cut, font_of, length_text, round_length, ticks_of, time_text
 from mpmcli.render.render_scene import RenderScene
-from mpmcli.render.theme import Theme, rgb_bytes
+from mpmcli.render.settings import Theme, rgb_bytes
 from mpmcli.render.view import View
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
+    from PIL.ImageFont import FreeTypeFont
 
 # Sizes in pixels for a picture of 1280x720; they scale with the picture, down to the smallest legible scale.
 PIXELS = 1280 * 720
@@ -22,39 +23,32 @@ SMALLEST = 0.55
 TEXT, SMALL = 17, 14
 PAD = 16
 TOP, BOTTOM, LABEL, GAP = 44, 44, 26, 8
-# Least pixels along each side of the viewport.
-LEAST = 16
+LEAST = 16  # least pixels along each side of the viewport
 BAR_WIDTH, TICK = 18, 6
 SWATCH = 16
-# Largest fraction of the width for legends; longer names are shortened.
-LEGEND_SHARE = 0.3
-# Largest length of a scale bar, as a fraction of the width.
-SCALE_SHARE = 0.18
+LEGEND_SHARE = 0.3  # largest fraction of the width for legends; longer names are shortened
+SCALE_SHARE = 0.18  # largest length of a scale bar, as a fraction of the width
 TICKS = 6
 NO_NUMBER = "no number"
+LENGTHS = ((1e3, "km"), (1.0, "m"), (1e-2, "cm"), (1e-3, "mm"), (1e-6, "µm"))  # units of length, m, from the longest
+PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""))
+TIMES = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
+DIGITS_MAX = 6
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
 class PictureLayout:
-    """The frame of all pictures of one film, or of the pictures of a montage.
+    """The frame of all pictures of one film, or of the pictures of a montage."""
 
-    Args:
-        size: of the whole picture, pixels, (width, height).
-        times: of the frames of the result, s, which determine the digits of times.
-        colors: explained by a colour bar or a legend; None without either.
-        grid: columns and rows of pictures of the scene.
-        walls: whether the walls of the domain are drawn around each of them.
-        scale_bar: whether there is room for one below.
-    """
-
-    size: tuple[int, int]
+    size: tuple[int, int]  # of the whole picture, pixels, (width, height)
     scene: RenderScene
     theme: Theme
-    times: tuple[float, ...]
-    colors: Coloring | Categories | None
-    grid: tuple[int, int] = (1, 1)
-    walls: bool = True
-    scale_bar: bool = True
+    times: tuple[float, ...]  # of the frames of the result, s, which determine the digits of times
+    colors: Coloring | Categories | None  # explained by a colour bar or a legend; None without either
+    grid: tuple[int, int] = (1, 1)  # columns and rows of pictures of the scene
+    walls: bool = True  # whether the walls of the domain are drawn around each of them
+    scale_bar: bool = True  # whether there is room for one below
 
     @property
     def viewport_size(self) -> tuple[int, int]:
@@ -74,13 +68,10 @@ class PictureLayout:
         missing: int = 0,
         captions: Sequence[str] | None = None,
     ) -> np.ndarray:
-        """Return the whole picture, (height, width, 3) uint8.
+        """Return the whole picture (height, width, 3) uint8 from pictures of the scene, row by row, and their times, s.
 
-        Args:
-            pictures: of the scene, of the size of the viewport, row by row.
-            times: of each, s.
-            missing: particles whose value is not a number.
-            captions: above each picture of a montage, cut where they are too long; None for times.
+        It tells whether particles are `missing`, whose value is not a number. The captions, or else the times, stand
+        above each picture of a montage, cut where they are too long.
         """
         from PIL import Image, ImageDraw
 
@@ -90,7 +81,7 @@ class PictureLayout:
             x, y = self._place(k)
             whole.paste(Image.fromarray(picture), (x, y))
             if self._label:
-                self._caption(draw, captions[k] if captions else time, (x, y - self._label // 2))
+                self._caption(draw, captions[k] if captions else time, x, y - self._label // 2)
             if self.walls:
                 self._walls(draw, view, (x, y))
         if self.scale_bar:
@@ -129,52 +120,54 @@ class PictureLayout:
         (width, height), (left, top, _, _), gap = self.viewport_size, self._scene_box, self._px(GAP)
         return left + column * (width + gap), top + row * (height + self._label + gap) + self._label
 
-    @property
-    def _scale(self) -> float:
-        return max(math.sqrt(self.size[0] * self.size[1] / PIXELS), SMALLEST)
-
     def _px(self, length: float) -> int:
-        return max(1, round(length * self._scale))
+        scale = max(math.sqrt(self.size[0] * self.size[1] / PIXELS), SMALLEST)
+        return max(1, round(length * scale))
+
+    @property
+    def _small(self) -> "FreeTypeFont":
+        return font_of(self._px(SMALL))
+
+    def _cut(self, text: str, room: float) -> str:
+        return cut(text, lambda text: self._small.getlength(text) <= room)
+
+    def _write(self, draw: "ImageDraw", x: float, y: float, text: str, color: str = "", anchor: str = "lm") -> None:
+        """Draw a small text in a colour, by default that of texts."""
+        draw.text((x, y), text, color or self.theme.text, self._small, anchor=anchor)
 
     @property
     def _column(self) -> int:
-        """Width of what stands on the right."""
+        length = self._small.getlength
         if self.colors is None:
             return 0
-        small = font_of(self._px(SMALL))
         if isinstance(self.colors, Coloring):
             texts, head = self._ticks(self.colors)[1], self._bar_heading(self.colors)
-            ticks = self._px(BAR_WIDTH + TICK + 6) + max(small.getlength(text) for text in texts)
-            rest = self._px(BAR_WIDTH + 6) + small.getlength(NO_NUMBER)
-            wide = max(ticks, rest, *(small.getlength(line) for line in head))
+            ticks = self._px(BAR_WIDTH + TICK + 6) + max(map(length, texts))
+            wide = max(ticks, self._px(BAR_WIDTH + 6) + length(NO_NUMBER), *map(length, head))
         else:
-            wide = self._px(SWATCH + 8) + max(small.getlength(name) for name in self.colors.names)
+            wide = self._px(SWATCH + 8) + max(map(length, self.colors.names))
             wide = min(wide, LEGEND_SHARE * self.size[0])
         return math.ceil(wide) + 2 * self._px(PAD)
 
     def _heading(self, draw: "ImageDraw", time: float | None) -> None:
-        font, small = font_of(self._px(TEXT), bold=True), font_of(self._px(TEXT))
+        bold, plain = font_of(self._px(TEXT), bold=True), font_of(self._px(TEXT))
         pad, middle = self._px(PAD), self._px(TOP) // 2
         room = self.size[0] - 2 * pad
         if time is not None:
-            told = time_text(time, self.times)
-            draw.text((self.size[0] - pad, middle), told, self.theme.text, small, anchor="rm")
+            text = time_text(time, self.times)
+            draw.text((self.size[0] - pad, middle), text, self.theme.text, plain, anchor="rm")
             # Space for the longest time, so that a title keeps its length throughout a film.
-            room -= pad + max(small.getlength(time_text(t, self.times)) for t in (*self.times[-1:], time))
-        title = cut(self.scene.title, lambda text: font.getlength(text) <= room)
-        draw.text((pad, middle), title, self.theme.text, font, anchor="lm")
+            room -= pad + max(plain.getlength(time_text(t, self.times)) for t in (*self.times[-1:], time))
+        title = cut(self.scene.title, lambda text: bold.getlength(text) <= room)
+        draw.text((pad, middle), title, self.theme.text, bold, anchor="lm")
 
-    def _caption(self, draw: "ImageDraw", said: str | float, place: tuple[int, int]) -> None:
+    def _caption(self, draw: "ImageDraw", caption: str | float, x: int, y: int) -> None:
         """Draw what fits of a text above a picture of a montage, or a time if all of it fits."""
-        font, room = font_of(self._px(SMALL)), self.viewport_size[0]
-        if isinstance(said, str):
-            told = cut(said, lambda text: font.getlength(text) <= room)
-        else:
-            told = time_text(said, self.times)
-        free = room - font.getlength(told)
+        room = self.viewport_size[0]
+        text = self._cut(caption, room) if isinstance(caption, str) else time_text(caption, self.times)
+        free = room - self._small.getlength(text)
         if free >= 0:
-            start = place[0] + min(self._px(PAD), free)
-            draw.text((start, place[1]), told, self.theme.text, font, anchor="lm")
+            self._write(draw, x + min(self._px(PAD), free), y, text)
 
     def _walls(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
         """Draw the walls just outside of the domain, so that nothing inside is hidden."""
@@ -182,10 +175,7 @@ class PictureLayout:
         edges = np.rint(corners[:, :2] + place).astype(int)
         (x0, y0), (x1, y1) = edges.min(axis=0).tolist(), edges.max(axis=0).tolist()
         w = self._px(2)
-        level = [(x0 - w, y0 - w, x1 + w, y0), (x0 - w, y1, x1 + w, y1 + w)]
-        upright = [(x0 - w, y0 - w, x0, y1 + w), (x1, y0 - w, x1 + w, y1 + w)]
-        for left, top, right, bottom in (*level, *upright):
-            draw.rectangle((left, top, right - 1, bottom - 1), fill=self.theme.wall)
+        draw.rectangle((x0 - w, y0 - w, x1 + w - 1, y1 + w - 1), outline=self.theme.wall, width=w)
 
     def _draw_scale_bar(self, draw: "ImageDraw", view: View) -> None:
         length = round_length(SCALE_SHARE * self.size[0] / view.pixels_per_metre)
@@ -196,25 +186,22 @@ class PictureLayout:
         draw.rectangle((pad, y - w // 2, pad + pixels - 1, y - w // 2 + w - 1), fill=self.theme.text)
         for x in (pad, pad + pixels - w):
             draw.rectangle((x, y - tip, x + w - 1, y + tip), fill=self.theme.text)
-        font = font_of(self._px(SMALL))
-        draw.text((pad + pixels + self._px(8), y), length_text(length), self.theme.text, font, anchor="lm")
+        self._write(draw, pad + pixels + self._px(8), y, length_text(length))
 
     def _legend(self, draw: "ImageDraw", colors: Categories) -> None:
-        font = font_of(self._px(SMALL))
-        x = self._scene_box[2] + self._px(PAD)
-        room = self.size[0] - x - self._px(PAD) - self._px(SWATCH + 8)
-        swatch, step = self._px(SWATCH), self._px(SWATCH + 10)
-        y = self._scene_box[1] + self._px(PAD)
-        rows = max(1, int((self.size[1] - self._px(PAD) - swatch - y) / step) + 1)
-        told = rows - 1 if len(colors.names) > rows else rows
-        for name, ink in zip(colors.names[:told], colors.inks, strict=False):
+        pad, swatch, step = self._px(PAD), self._px(SWATCH), self._px(SWATCH + 10)
+        x, y = self._scene_box[2] + pad, self._scene_box[1] + pad
+        beside = x + swatch + self._px(8)
+        room = self.size[0] - x - pad - self._px(SWATCH + 8)
+        rows = max(1, int((self.size[1] - pad - swatch - y) / step) + 1)
+        named = rows - 1 if len(colors.names) > rows else rows
+        for name, ink in zip(colors.names[:named], colors.inks, strict=False):
             draw.ellipse((x, y, x + swatch, y + swatch), fill=ink, outline=self.theme.faint)
-            text = cut(name, lambda text: font.getlength(text) <= room)
-            draw.text((x + swatch + self._px(8), y + swatch / 2), text, self.theme.text, font, anchor="lm")
+            self._write(draw, beside, y + swatch / 2, self._cut(name, room))
             y += step
-        if told < len(colors.names):
-            more = cut(f"and {len(colors.names) - told} more", lambda text: font.getlength(text) <= room)
-            draw.text((x + swatch + self._px(8), y + swatch / 2), more, self.theme.faint, font, anchor="lm")
+        if named < len(colors.names):
+            more = self._cut(f"and {len(colors.names) - named} more", room)
+            self._write(draw, beside, y + swatch / 2, more, self.theme.faint)
 
     def _bar_heading(self, colors: Coloring) -> list[str]:
         unit = self._ticks(colors)[2]
@@ -232,28 +219,96 @@ class PictureLayout:
         return ticks_of(colors, max(1, min(TICKS, int((bottom - top) / (1.5 * self._px(SMALL))))))
 
     def _color_bar(self, draw: "ImageDraw", colors: Coloring, missing: int) -> None:
-        font = font_of(self._px(SMALL))
-        x = self._scene_box[2] + self._px(PAD)
-        line = self._px(SMALL + 6)
-        y = self._scene_box[1] + self._px(4)
+        line, width = self._px(SMALL + 6), self._px(BAR_WIDTH)
+        x, y = self._scene_box[2] + self._px(PAD), self._scene_box[1] + self._px(4)
         for text in self._bar_heading(colors):
-            draw.text((x, y), text, self.theme.text, font, anchor="lt")
+            self._write(draw, x, y, text, anchor="lt")
             y += line
         top, bottom = y + self._px(8), self._bar_span(colors)[1]
         if bottom - top < 2 * line:
             return
-        width = self._px(BAR_WIDTH)
         low, high = colors.limits
         rows = np.linspace(high, low, max(bottom - top, 2))
         for k, color in enumerate(colors.rgb(rows).tolist()):
             draw.rectangle((x, top + k, x + width - 1, top + k), fill=tuple(color))
         places, texts, _ = self._ticks(colors)
+        start, end = x + width, x + width + self._px(TICK)
         for place, text in zip(places, texts, strict=True):
             row = bottom - (place - low) / (high - low) * (bottom - top)
-            start = x + width
-            draw.rectangle((start, round(row), start + self._px(TICK) - 1, round(row)), fill=self.theme.faint)
-            draw.text((start + self._px(TICK + 6), row), text, self.theme.text, font, anchor="lm")
+            draw.rectangle((start, round(row), end - 1, round(row)), fill=self.theme.faint)
+            self._write(draw, start + self._px(TICK + 6), row, text)
         if missing:
             y = bottom + line
             draw.rectangle((x, y, x + width - 1, y + width - 1), fill=self.theme.missing)
-            draw.text((x + width + self._px(6), y + width / 2), NO_NUMBER, self.theme.text, font, anchor="lm")
+            self._write(draw, x + width + self._px(6), y + width / 2, NO_NUMBER)
+
+
+@cache
+def ticks_of(colors: Coloring, most: int) -> tuple[list[float], list[str], str]:
+    """Return places and texts of up to `most` ticks, and the unit with the power of ten of the texts."""
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = colors.limits
+    ticks = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high).tolist()
+    places = [place for place in ticks if low <= place <= high] or [low, high]
+    largest = max(abs(low), abs(high))
+    factor, unit = 1.0, colors.unit
+    if unit == "Pa" and 1e3 <= largest < 1e13:
+        factor, prefix = next((f, p) for f, p in PREFIXES if largest >= f)
+        unit = prefix + unit
+    elif largest >= 1e5 or largest < 1e-2:
+        power = math.floor(math.log10(largest))
+        factor = 10.0**power
+        unit = f"10{str(power).translate(SUPERSCRIPTS)} {unit}".strip()
+    step = (places[1] - places[0]) / factor if len(places) > 1 else largest / factor
+    digits = max(0, -math.floor(math.log10(abs(step)) + 1e-9)) if step else 0
+    if round(step, digits) and abs(step - round(step, digits)) > 1e-6 * abs(step):
+        digits += 1
+    texts = [f"{place / factor:.{digits}f}".replace("-", "\u2212") for place in places]
+    return places, texts, unit
+
+
+def time_text(time: float, times: Sequence[float]) -> str:
+    """Return a time with enough digits to distinguish the times of a film, for example "t = 0.250 s"."""
+    longest = max([abs(t) for t in times], default=0.0) or abs(time) or 1.0
+    factor, unit = next(((f, u) for f, u in TIMES if longest >= 0.1 * f), TIMES[-1])
+    ordered = np.unique(np.asarray(times, dtype=np.float64)) / factor
+    step = float(np.median(np.diff(ordered))) if len(ordered) > 1 else 0.1
+    if not 0.0 < step < math.inf:
+        # Of times in a damaged file, whose differences may be too large or too small for numbers.
+        step = 0.1
+    least = min(max(0, math.ceil(-math.log10(step) - 1e-9)), DIGITS_MAX)
+    # The digits of an exact step such as 0.25; one more than necessary for others such as 1/3.
+    exact = (least + more for more in range(3) if abs(step * 10 ** (least + more) % 1 - 0.5) >= 0.45)
+    digits = min(next(exact, least + 1), DIGITS_MAX)
+    return f"t = {time / factor:.{digits}f} {unit}"
+
+
+def round_length(longest: float) -> float:
+    """Return the largest of 1, 2 and 5 times a power of ten that is no longer."""
+    power = 10.0 ** math.floor(math.log10(longest))
+    return max(m * power for m in (1, 2, 5) if m * power <= longest * (1 + 1e-9))
+
+
+def length_text(length: float) -> str:
+    """Return a length in the unit that gives a short number."""
+    factor, unit = next(((f, u) for f, u in LENGTHS if length >= 0.999 * f), LENGTHS[-1])
+    return f"{length / factor:g} {unit}"
+
+
+def cut(text: str, fits: Callable[[str], bool]) -> str:
+    """Shorten a text until it fits."""
+    if fits(text):
+        return text
+    while text and not fits(text + "…"):
+        text = text[:-1].rstrip()
+    return text + "…" if text else ""
+
+
+@cache
+def font_of(size: int, bold: bool = False) -> "FreeTypeFont":
+    from matplotlib import get_data_path
+    from PIL import ImageFont
+
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(f"{get_data_path()}/fonts/ttf/{name}", size)

@@ -1,9 +1,10 @@
-"""Pictures of frames as files: which of them are missing or outdated, and drawing these in several processes."""
+"""Pictures of frames: their painters, which files are missing or outdated, and drawing these in several processes."""
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -11,40 +12,133 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.output.result import Result, open_result
 from mpmcli.processes.pool import render_frames
-from mpmcli.render.coloring import Coloring
-from mpmcli.render.files.picture_file import digest_of, settings_digest, write_picture
-from mpmcli.render.labels import time_text
-from mpmcli.render.painter import Painter, RenderSetup, expected_times, set_up
-from mpmcli.render.settings import Settings
+from mpmcli.render.coloring import Categories, Coloring, color_by, material_colors
+from mpmcli.render.density import DensityPainter, density_colors
+from mpmcli.render.dots import DotsPainter
+from mpmcli.render.outline import OutlinePainter
+from mpmcli.render.picture_file import digest_of, settings_digest, write_picture
+from mpmcli.render.picture_layout import PictureLayout, time_text
+from mpmcli.render.render_scene import RenderScene, render_scene_of
+from mpmcli.render.settings import THEMES, Settings, Theme, require_possible
+from mpmcli.render.view import View, aspect_of, slice_of, view_of
 from mpmcli.render.window import choose_window
 
+# Least ratio of height to width, and inverse of the largest, of pictures whose height follows from the scene.
+FLATTEST = 0.2
+FITTING_ROUNDS = 4  # iterations in which the sizes of the texts and of the picture settle
 FOREIGN = "{path} is there already, and mpmcli render did not make it: give another place with -o, or --overwrite."
+
+
+class Painter(Protocol):
+    """Draws the scene of a frame; `fields` are read of each frame. It is made once in each process."""
+
+    fields: tuple[str, ...]
+
+    def draw(self, frame: Frame) -> np.ndarray:
+        """Return (h, w, 3) uint8, of the size of the view."""
+        ...
+
+
+@dataclass(frozen=True)
+class RenderSetup:
+    """Everything that the pictures of one result with one setting share, except the painter and its window."""
+
+    result: Result
+    settings: Settings  # with the limits of the colours filled in
+    scene: RenderScene
+    colors: Coloring | Categories | None  # explained by a colour bar or a legend; None without either
+    layout: PictureLayout
+    view: View
+    captions: tuple[str, ...] = ()  # above the pictures of a montage, by frame; empty for their times
+
+    def painter(self) -> Painter:
+        """Make the painter; it opens a window."""
+        settings, scene, view, colors = self.settings, self.scene, self.view, self.colors
+        theme = THEMES[settings.theme]
+        if settings.mode == "density":
+            assert isinstance(colors, Coloring)
+            return DensityPainter(self.result.header, scene, view, theme, slice_of(scene, settings.camera), colors)
+        if settings.mode == "fluid" and scene.dimension == 3:
+            from mpmcli.render.fluid import FluidPainter
+
+            return FluidPainter(scene, view, theme)
+        if settings.mode == "fluid":
+            # Every material that is not liquid is drawn as grains.
+            looks = (look if look.liquid else replace(look, finish="grains") for look in scene.appearances)
+            return surface_painter(replace(scene, appearances=tuple(looks)), view, theme)
+        if settings.mode == "surface":
+            return surface_painter(scene, view, theme, colors if isinstance(colors, Coloring) else None)
+        assert colors is not None
+        return DotsPainter(scene, view, theme, colors, int(self.result.particle_counts.max()))
+
+
+def surface_painter(scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> Painter:
+    """Return the painter of smooth bodies: by triangles in 3D, by the density of particles in 2D."""
+    if scene.dimension == 2:
+        return OutlinePainter(scene, view, theme, colors)
+    from mpmcli.render.surface_renderer import SurfaceRenderer
+
+    return SurfaceRenderer(scene, view, theme, colors)
+
+
+def set_up(result: Result, settings: Settings) -> RenderSetup:
+    """Return what the pictures of a result share, and fill in what the settings leave open."""
+    scene, theme = render_scene_of(result), THEMES[settings.theme]
+    colliders = () if settings.colliders == "none" else scene.colliders
+    scene = replace(scene, colliders=colliders, clear=settings.colliders == "clear")
+    if settings.mode == "dots" and settings.color is None:
+        settings = replace(settings, color="material" if len(scene.appearances) > 1 else "speed")
+    camera = settings.camera
+    colors: Coloring | Categories | None
+    if settings.mode == "density":
+        colors = density_colors(result, slice_of(scene, camera), theme, settings.limits, settings.cmap)
+        camera = "front" if camera not in ("side", "top") else camera
+    elif settings.color is None or (settings.mode == "surface" and settings.color == "material"):
+        inks = [appearance.color for appearance in scene.appearances]
+        colors = material_colors(scene, inks) if len(inks) > 1 else None
+    else:
+        colors = color_by(settings.color, result, scene, theme, settings.limits, settings.cmap)
+    if isinstance(colors, Coloring):
+        settings = replace(settings, limits=colors.limits)
+    width, height = settings.size
+    # In other 3D pictures the walls are the edges of a box, part of the scene.
+    walls = scene.dimension == 2 or settings.mode == "density"
+    # A scale bar has no meaning in perspective.
+    parallel = view_of(scene, camera, (width, width)).parallel
+    size, times = (width, height or width), expected_times(result)
+    layout = PictureLayout(size, scene, theme, times, colors, settings.grid, walls, parallel)
+    if height is None:
+        aspect = min(max(aspect_of(scene, camera), FLATTEST), 1.0 / FLATTEST)
+        for _ in range(FITTING_ROUNDS):
+            layout = replace(layout, size=(width, layout.height_for(aspect)))
+        settings = replace(settings, size=layout.size)
+        require_possible(*layout.size, f"{width}xauto")
+    return RenderSetup(result, settings, scene, colors, layout, view_of(scene, camera, layout.viewport_size))
+
+
+def expected_times(result: Result) -> tuple[float, ...]:
+    """Return the times, s, of the whole run, also while it goes on: labels have their digits and unit from them."""
+    header = result.header
+    if header.end is not None and header.frames is not None and header.frames > 1:
+        step = header.end / (header.frames - 1)
+        if np.allclose(result.times, result.numbers * step, rtol=1e-3, atol=1e-3 * step):
+            return 0.0, step, min(2 * step, header.end), header.end
+    return tuple(result.times.tolist())
 
 
 @dataclass(frozen=True)
 class PlannedPicture:
-    """The picture file of one frame, or of a montage.
+    """The picture file of one frame, or of a montage."""
 
-    Attributes:
-        k: position of the frame in the result.
-        digest: of everything that it depends on.
-        made: whether the file exists with this digest.
-    """
-
-    k: int
+    k: int  # position of the frame in the result
     path: Path
-    digest: str
-    made: bool
+    digest: str  # of everything that it depends on
+    made: bool  # whether the file exists with this digest
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Numbers of particles of a frame that could not be drawn.
-
-    Attributes:
-        missing: particles whose value is not a number.
-        lost: particles without a place.
-    """
+    """Numbers of particles of a frame whose value is not a number, and of those without a place."""
 
     missing: int
     lost: int
@@ -52,16 +146,10 @@ class Outcome:
 
 @dataclass(frozen=True)
 class PictureJob:
-    """Pictures of some frames, as a worker process makes them.
-
-    Attributes:
-        source: path of the result.
-        settings: with the limits of the colours filled in.
-        plan: by frame.
-    """
+    """Pictures of some frames of a result at a path, as a worker process makes them; the plan is by frame."""
 
     source: Path
-    settings: Settings
+    settings: Settings  # as `set_up` has filled them in
     plan: dict[int, PlannedPicture] = field(repr=False)
 
     def start(self) -> Callable[[int], Outcome]:
@@ -87,16 +175,11 @@ class PictureRenderer:
         self._painter: Painter = setup.painter()
 
     def picture(self, ks: Sequence[int], watch: Callable[[int, Outcome], None] = lambda k, outcome: None) -> np.ndarray:
-        """Return the picture of a frame, or the montage of several, (h, w, 3) uint8.
-
-        Args:
-            watch: called with each frame that has been drawn, and its outcome.
-        """
+        """Return the picture of a frame, or the montage of several, (h, w, 3) uint8; `watch` is called with each."""
         setup, drawn, times, missing = self._setup, [], [], 0
         captions = [setup.captions[k] for k in ks] if setup.captions else None
-        density = setup.settings.mode == "density"
         for k in ks:
-            if density:
+            if setup.settings.mode == "density":
                 # Which needs to know how many particles share the mass of a body.
                 frame = setup.result.frame(k, (*self._painter.fields, *({STATUS} & set(setup.result.field_names))))
             else:
@@ -129,60 +212,26 @@ def picture_digest(result: Result, settings: Settings, ks: Sequence[int]) -> str
     )
 
 
-def plan_pictures(
-    result: Result, settings: Settings, ks: Sequence[int], path_of: Callable[[int], Path], *, overwrite: bool
-) -> list[PlannedPicture]:
-    """Return the pictures of some frames, and whether each exists and is up to date.
+def plan_picture(
+    result: Result, settings: Settings, ks: Sequence[int], path: Path, *, overwrite: bool
+) -> PlannedPicture:
+    """Return the picture of a frame, or a montage of several, and whether its file exists and is up to date.
 
-    Args:
-        path_of: where the picture of a frame goes, by its position in the result.
-        overwrite: draw all of them again, and replace any existing file.
-
-    Raises:
-        InputError: a file exists that mpmcli did not make.
+    InputError is raised where the file exists and mpmcli did not make it; `overwrite` replaces it, and draws it again.
     """
-    plan = []
-    for k in ks:
-        path, digest = path_of(k), picture_digest(result, settings, [k])
-        there = digest_of(path)
-        if is_foreign(there) and not overwrite:
-            raise InputError(FOREIGN.format(path=path))
-        plan.append(PlannedPicture(k, path, digest, there == digest and not overwrite))
-    return plan
-
-
-def is_foreign(there: str | None) -> bool:
-    """Return whether a digest, from `digest_of`, belongs to a file that is no picture of frames, such as a ledger's."""
-    return there is not None and not re.fullmatch("[0-9a-f]{32}", there)
+    digest, present = picture_digest(result, settings, ks), digest_of(path)
+    # A digest of another form is of a file that is no picture of frames, such as a ledger's.
+    if present is not None and not re.fullmatch("[0-9a-f]{32}", present) and not overwrite:
+        raise InputError(FOREIGN.format(path=path))
+    return PlannedPicture(ks[0], path, digest, present == digest and not overwrite)
 
 
 def make_pictures(
-    source: Path,
-    settings: Settings,
-    plan: Sequence[PlannedPicture],
-    workers: int,
-    *,
-    watch: Callable[[int, Outcome], None] = lambda k, outcome: None,
-    stop: Callable[[], bool] = lambda: False,
+    source: Path, settings: Settings, plan: Sequence[PlannedPicture], workers: int, **calls: Callable[..., Any]
 ) -> None:
-    """Draw the pictures of a plan that do not exist yet.
-
-    Args:
-        source: path of the result; settings: as `set_up` has filled them in.
-        workers, watch, stop: see `render_frames`.
-
-    Raises:
-        InputError: nothing draws on this machine, or a place cannot be written to.
-        RunError: a process crashed, or the disk is full.
-        KeyboardInterrupt: `stop` returned True.
-    """
+    """Draw the pictures of a plan that do not exist yet; `calls` are of `render_frames`."""
     due = {planned.k: planned for planned in plan if not planned.made}
     if due:
         # Chosen once, and inherited by the workers.
         choose_window()
-        render_frames(PictureJob(source, settings, due), list(due), workers, watch=watch, stop=stop)
-
-
-def picture_name(mode: str, number: int) -> str:
-    """Return the name of the file of a frame with this number."""
-    return f"{mode}_{number:06d}.png"
+        render_frames(PictureJob(source, settings, due), list(due), workers, **calls)

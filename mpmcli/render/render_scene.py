@@ -1,8 +1,9 @@
-"""The scene of a picture: the domain of a run, its bodies and the appearance of their materials."""
+"""The scene of a picture: the domain of a run, the appearance of its materials, and the particles drawn as one body."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -11,112 +12,176 @@ from mpmcli.frames.frame import Frame
 from mpmcli.output.header import BodyHeader
 from mpmcli.output.result import Result
 from mpmcli.plain_text import one_line
-from mpmcli.render.appearance import OTHERS, Appearance, appearance_of
+from mpmcli.render.particle_grid import drawable
 from mpmcli.scene.colliders import Collider
-from mpmcli.scene.lattice import usual_particles_per_cell
+from mpmcli.scene.presets import PRESETS
+from mpmcli.scene.schema import usual_particles_per_cell
+
+# Kinds of shading: clear and thin, clear and thick, scattering inside, white crumbs, loose grains, bare metal, dull.
+Finish = Literal["water", "syrup", "translucent", "crumbly", "grains", "metal", "matte"]
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """The appearance of one material; colours are "#rrggbb"."""
+
+    name: str  # of the preset that it is nearest to, or of its law
+    color: str  # of the lit surface
+    ink: str  # of dots and legends: distinguishable from every other on a light and on a dark background
+    finish: Finish
+    liquid: bool = False  # flows as one body, so that dots hide what it is
+
+
+APPEARANCES = {
+    "water": Appearance("water", "#3b8fd4", "#2f7fd0", "water", liquid=True),
+    "honey": Appearance("honey", "#e8960c", "#e88a00", "syrup", liquid=True),
+    "lava": Appearance("lava", "#c8321a", "#d62f1f", "syrup", liquid=True),
+    "mud": Appearance("mud", "#74543a", "#8a5a33", "matte", liquid=True),
+    "jelly": Appearance("jelly", "#58b84c", "#3fa34d", "translucent"),
+    "rubber": Appearance("rubber", "#5a4a8a", "#7a5fc0", "matte"),
+    "snow": Appearance("snow", "#f2f6fb", "#8fb8dc", "crumbly"),
+    "sand": Appearance("sand", "#d9b56d", "#c9a040", "grains"),
+    "clay": Appearance("clay", "#b8694a", "#c4704e", "matte"),
+    "metal": Appearance("metal", "#a4acb6", "#8a95a3", "metal"),
+}
+# Laws without a preset, in the order in which they come.
+OTHERS = ("#0f9d8a", "#c2569b", "#7d8a2e", "#4e6fb8", "#b0563c")
+FAR = 1e6  # upper bound of the ratio of two values of a parameter in the distance between materials
+
+
+def appearance_of(law: str, parameters: dict[str, Any], others: int = 0) -> Appearance:
+    """Return the appearance of the nearest preset: among those of the law and of laws with the same parameters.
+
+    Parameters are those of the effective scene; `others` is how many laws without a preset came before.
+    """
+    names = parameters.keys() - {"law"}
+    known = {
+        name: preset.parameters
+        for name, preset in PRESETS.items()
+        if name in APPEARANCES and (preset.law == law or preset.parameters.keys() == names)
+    }
+    if not known:
+        color = OTHERS[others % len(OTHERS)]
+        return Appearance(law, color, color, "matte")
+    return APPEARANCES[min(known, key=lambda name: _distance(known[name], parameters))]
+
+
+def _distance(preset: dict[str, Any], parameters: dict[str, Any]) -> float:
+    """Return how far apart two sets of parameters are: the sum of the squared logarithms of their ratios."""
+    total = 0.0
+    for name, wanted in preset.items():
+        given = parameters.get(name)
+        if any(isinstance(value, bool) or not isinstance(value, int | float) for value in (wanted, given)):
+            continue
+        if wanted > 0.0:
+            total += min(abs(math.log(max(given, wanted / FAR) / wanted)), math.log(FAR)) ** 2
+    return total
 
 
 @dataclass(frozen=True)
 class RenderScene:
-    """Facts of a run; b bodies, m materials. Everything is in three dimensions: z = 0 in 2D.
-
-    Attributes:
-        title: of the scene.
-        dimension: 2 or 3.
-        lower, upper: corners of the domain, (3,), m.
-        spacing: of the grid, m.
-        up: direction against gravity, along an axis, (3,).
-        bodies: b names.
-        appearances: m appearances, of materials that differ; two of one kind differ in their names.
-        material_of: (b,) index into `appearances`.
-        distances: (b,) between neighbouring particles at the start, m.
-        densities: (b,) at rest, kg/m^3.
-        fields: names of the stored fields, without position, velocity, body and material.
-        colliders: that are drawn; collider_frames: the frame that each is in, by its number, None where all are in all.
-        clear: whether things in 3D show their far sides only, as containers do, so that they hide nothing.
-    """
+    """Facts of a run; b bodies, m materials. Everything is in three dimensions: z = 0 in 2D."""
 
     title: str
     dimension: int
-    lower: tuple[float, ...]
+    lower: tuple[float, ...]  # corners of the domain, (3,), m
     upper: tuple[float, ...]
-    spacing: float
-    up: tuple[float, ...]
-    bodies: tuple[str, ...]
-    appearances: tuple[Appearance, ...]
-    material_of: tuple[int, ...]
-    distances: tuple[float, ...]
-    densities: tuple[float, ...]
-    fields: tuple[str, ...]
-    colliders: tuple[Collider, ...] = ()
-    collider_frames: tuple[int, ...] | None = None
-    clear: bool = False
+    up: tuple[float, ...]  # direction against gravity, along an axis, (3,)
+    bodies: tuple[str, ...]  # b names
+    appearances: tuple[Appearance, ...]  # m, of materials that differ; two of one kind differ in their names
+    material_of: tuple[int, ...]  # (b,) index into `appearances`
+    distances: tuple[float, ...]  # (b,) between neighbouring particles at the start, m
+    densities: tuple[float, ...]  # (b,) at rest, kg/m^3
+    colliders: tuple[Collider, ...] = ()  # that are drawn
+    collider_frames: tuple[int, ...] | None = None  # the frame that each collider is in; None where all are in all
+    clear: bool = False  # colliders in 3D show only their far sides, as containers do, so that they hide nothing
 
     def shows(self, number: int, frame: Frame) -> bool:
-        """Say whether a collider is in a frame."""
+        """Return whether a collider is in a frame."""
         return self.collider_frames is None or self.collider_frames[number] == frame.index
 
 
 def render_scene_of(result: Result) -> RenderScene:
-    """Read the facts off the header of a result.
-
-    Raises:
-        InputError: the header lacks the domain.
-    """
+    """Read the scene of a result from its header; InputError where that lacks the domain."""
     header, d = result.header, result.dimension
     if header.origin is None or not header.spacing:
         raise InputError(f"{result.path} does not say what its domain is, so that no picture can be framed.")
     bodies = header.bodies or (BodyHeader("all", {}, None, usual_particles_per_cell(d)),)
     names = tuple(one_line(body.name) for body in bodies)
     appearances, material_of = _materials(names, [body.material for body in bodies])
-    flat = [0.0] * (3 - d)
+    flat, up, gravity = [0.0] * (3 - d), np.zeros(3), header.steady_gravity
+    # In 2D, and where there is no gravity, the last axis is upwards.
+    up[d - 1] = 1.0
+    if d == 3 and gravity is not None and gravity.any():
+        axis = int(np.argmax(np.abs(gravity)))
+        up = np.where(np.arange(3) == axis, -np.sign(gravity[axis]), 0.0)
     return RenderScene(
         title=one_line(header.title),
         dimension=d,
         lower=(*header.origin.tolist(), *flat),
         upper=(*header.upper.tolist(), *flat),
-        spacing=header.spacing,
-        up=_up(header.steady_gravity, d),
+        up=tuple(up.tolist()),
         bodies=names,
         appearances=appearances,
         material_of=material_of,
         distances=tuple(header.spacing / body.particles_per_cell ** (1 / d) for body in bodies),
         densities=tuple(body.density or 1000.0 for body in bodies),
-        fields=result.field_names,
         colliders=result.colliders,
         collider_frames=result.collider_frames,
     )
 
 
-def _up(gravity: np.ndarray | None, d: int) -> tuple[float, ...]:
-    """Return the axis against gravity; in 2D, and where there is none, the last one."""
-    up = np.zeros(3)
-    if d == 3 and gravity is not None and gravity.any():
-        axis = int(np.argmax(np.abs(gravity)))
-        up[axis] = -np.sign(gravity[axis])
-    else:
-        up[d - 1] = 1.0
-    return tuple(up.tolist())
-
-
 def _materials(
     bodies: Sequence[str], tables: Sequence[Mapping[str, Any]]
 ) -> tuple[tuple[Appearance, ...], tuple[int, ...]]:
-    """Return the appearances of the distinct materials, and the index of each body's material."""
     kinds: list[Mapping[str, Any]] = []
     firsts: list[str] = []
     appearances: list[Appearance] = []
-    material_of = []
     for body, table in zip(bodies, tables, strict=True):
         if table not in kinds:
             others = sum(appearance.ink in OTHERS for appearance in appearances)
             appearances.append(appearance_of(table.get("law", "material"), table, others))
             kinds.append(table)
             firsts.append(body)
-        material_of.append(kinds.index(table))
     names = [appearance.name for appearance in appearances]
-    told = [
-        appearance if names.count(appearance.name) == 1 else replace(appearance, name=f"{appearance.name} ({body})")
-        for appearance, body in zip(appearances, firsts, strict=True)
-    ]
-    return tuple(told), tuple(material_of)
+    for k, (name, body) in enumerate(zip(names, firsts, strict=True)):
+        if names.count(name) > 1:
+            appearances[k] = replace(appearances[k], name=f"{name} ({body})")
+    return tuple(appearances), tuple(kinds.index(table) for table in tables)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Particles that are drawn as one body: those of one liquid, or those of one solid body."""
+
+    key: tuple[int, int]  # the material, and the body where bodies of one material stay apart
+    appearance: Appearance
+    rows: np.ndarray  # (n,) of the frame
+    position: np.ndarray  # (n, d) float64, m
+    distance: float  # between neighbouring particles at the start, m; the largest of its bodies
+
+    @property
+    def hashes(self) -> np.ndarray:
+        """Three numbers from -1 to 1 of each particle, (n, 3) float32: always the same of the same row."""
+        words = self.rows.astype(np.uint32)[:, None] * np.uint32(3) + np.arange(3, dtype=np.uint32)
+        # The finaliser of MurmurHash3 (Appleby).
+        for factor, shift in ((0x85EBCA6B, 16), (0xC2B2AE35, 13)):
+            words = (words ^ (words >> np.uint32(shift))) * np.uint32(factor)
+        words ^= words >> np.uint32(16)
+        return (words.astype(np.float64) / 2.0**31 - 1.0).astype(np.float32)
+
+
+def groups_of(scene: RenderScene, frame: Frame) -> list[Group]:
+    """Return the groups of a frame that have particles to be drawn, in the order of materials and bodies."""
+    material_of, distances = np.array(scene.material_of), np.array(scene.distances)
+    body = np.clip(frame.body, 0, len(material_of) - 1)
+    sound = drawable(frame.position, scene.lower, scene.upper, max(scene.distances))
+    groups = []
+    for m, appearance in enumerate(scene.appearances):
+        bodies = np.flatnonzero(material_of == m).tolist()
+        for key, members in [((m, -1), bodies)] if appearance.liquid else [((m, b), [b]) for b in bodies]:
+            rows = np.flatnonzero(sound & np.isin(body, members))
+            if len(rows):
+                distance = float(distances[members].max())
+                groups.append(Group(key, appearance, rows, frame.position[rows].astype(np.float64), distance))
+    return groups

@@ -1,29 +1,36 @@
-"""The options of `mpmcli render`, validated before anything is drawn."""
+"""The options of `mpmcli render`, validated before anything is drawn, and the plan that carries them out."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.output.result import Result
+from mpmcli.plain_text import counted
 from mpmcli.render.coloring import Coloring
-from mpmcli.render.files.film import check_film, film_digest
-from mpmcli.render.files.picture_file import digest_of, require_writable
+from mpmcli.render.film import check_film, film_digest, write_film
 from mpmcli.render.frame_choice import choose_frames, evenly_spaced
-from mpmcli.render.painter import set_up, usual_color
-from mpmcli.render.pictures import FOREIGN, PlannedPicture, is_foreign, picture_digest, picture_name, plan_pictures
-from mpmcli.render.render_plan import RenderPlan
-from mpmcli.render.render_scene import render_scene_of
+from mpmcli.render.picture_file import require_writable, settings_digest, write_picture
+from mpmcli.render.pictures import (
+    FOREIGN,
+    Outcome,
+    PictureRenderer,
+    PlannedPicture,
+    RenderSetup,
+    make_pictures,
+    plan_picture,
+    set_up,
+)
+from mpmcli.render.reconstruction import save_surfaces, surface_paths
 from mpmcli.render.settings import Colliders, Mode, Settings, parse_grid, parse_limits, parse_size
-from mpmcli.render.surfaces.save_surface import surface_paths
 from mpmcli.render.view import CAMERAS
 
-# Directory of pictures in that of the result.
-DIRECTORY = "render"
+DIRECTORY = "render"  # directory of pictures in that of the result
 USUAL_FPS = 30.0
 USUAL_SIZE, USUAL_MONTAGE_SIZE = "1280x720", "1280xauto"
-# Modes in which particles have the colours of a value.
-COLORED = ("dots", "surface")
+COLORED = ("dots", "surface")  # modes in which particles have the colours of a value
 
 
 @dataclass(frozen=True)
@@ -52,14 +59,126 @@ class Request:
         return USUAL_FPS if self.fps is None else self.fps
 
 
+@dataclass(frozen=True)
+class RenderSummary:
+    """What carrying out a plan produced."""
+
+    pictures: list[Path]  # files, by frame; the one of a montage
+    made: int  # number of them that were drawn now
+    film: Path | None  # None for pictures only
+    surfaces: Path | None  # the directory of the surfaces, None where none was asked for
+    warnings: list[str]  # sentences
+
+    @property
+    def paths(self) -> list[Path]:
+        """The requested outputs: the film or else the pictures, and the directory of the surfaces."""
+        return [*([self.film] if self.film else self.pictures), *([self.surfaces] if self.surfaces else [])]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it in the form of JSON."""
+        pictures, film = [str(path) for path in self.pictures], str(self.film) if self.film else None
+        return {"pictures": pictures, "made": self.made, "film": film, "warnings": self.warnings}
+
+
+@dataclass(frozen=True)
+class RenderPlan:
+    """A validated request for pictures, a film or a montage of a result; nothing is drawn yet."""
+
+    setup: RenderSetup  # shared by all pictures
+    ks: list[int]  # positions of the frames in the result
+    plan: list[PlannedPicture]  # the picture files, one for each frame; one for a montage
+    movie: Path | None
+    fps: float
+    save_surface: Path | None
+    overwrite: bool
+
+    @property
+    def due(self) -> int:
+        """Number of frames that have to be drawn, or their surfaces written."""
+        frames = len(self.ks) if self._is_montage else 1
+        return sum(frames for planned in self.plan if not planned.made) + len(self.ks) * (self.save_surface is not None)
+
+    @property
+    def _is_montage(self) -> bool:
+        return self.setup.settings.grid != (1, 1)
+
+    def carry_out(
+        self,
+        workers: int | None = None,
+        *,
+        watch: Callable[[int], None] = lambda done: None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> RenderSummary:
+        """Draw the missing pictures, and write the film.
+
+        Args:
+            workers: processes at a time, as many as cores for None.
+            watch: called with the number of frames drawn so far.
+            stop: polled; true ends the work.
+
+        Raises:
+            InputError: no OpenGL window opens on this machine, or a file cannot be written.
+            RunError: a process crashed, or the disk is full.
+            KeyboardInterrupt: `stop` returned true; finished pictures stay.
+        """
+        workers = workers or available_cores()
+        source, settings = self.setup.result.path, self.setup.settings
+        outcomes: dict[int, Outcome] = {}
+        done = 0
+
+        def seen(k: int, outcome: Outcome | None) -> None:
+            nonlocal done
+            done += 1
+            watch(done)
+            if outcome is not None:
+                outcomes[k] = outcome
+
+        def check_stop(*_: object) -> None:
+            if stop():
+                raise KeyboardInterrupt
+
+        def seen_here(k: int, outcome: Outcome) -> None:
+            seen(k, outcome)
+            check_stop()
+
+        if not self._is_montage:
+            make_pictures(source, settings, self.plan, workers, watch=seen, stop=stop)
+        elif not self.plan[0].made:
+            picture = PictureRenderer(self.setup).picture(self.ks, seen_here)
+            write_picture(self.plan[0].path, picture, self.plan[0].digest)
+        if self.save_surface is not None:
+            save_surfaces(self.setup.result, self.ks, self.save_surface, workers, watch=seen, stop=stop)
+        if self.movie is not None:
+            digest = settings_digest({"pictures": [planned.digest for planned in self.plan], "fps": self.fps})
+            if self.overwrite or film_digest(self.movie) != digest:
+                pictures = [planned.path for planned in self.plan]
+                write_film(pictures, self.movie, self.fps, digest=digest, watch=check_stop)
+        made = sum(not planned.made for planned in self.plan)
+        paths = [planned.path for planned in self.plan]
+        return RenderSummary(paths, made, self.movie, self.save_surface, self._warnings(outcomes))
+
+    def _warnings(self, outcomes: dict[int, Outcome]) -> list[str]:
+        """Return sentences on particles that could not be drawn, one for all frames."""
+
+        def first_of(counts: dict[int, int]) -> str:
+            most, first = max(counts.values()), self.setup.result.numbers[min(counts)]
+            upto = "up to " if len(counts) > 1 and min(counts.values()) < most else ""
+            return f"of {upto}{counted(most, 'particle')} is not a number, first in frame {first}"
+
+        warnings, colors = [], self.setup.colors
+        missing = {k: outcome.missing for k, outcome in outcomes.items() if outcome.missing}
+        if missing and isinstance(colors, Coloring):
+            warnings.append(f"the {colors.name} {first_of(missing)}: drawn in {colors.missing}")
+        lost = {k: outcome.lost for k, outcome in outcomes.items() if outcome.lost}
+        if lost:
+            warnings.append(f"the position {first_of(lost)}: not drawn")
+        return warnings
+
+
 def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()) -> RenderPlan:
-    """Validate a request and return the plan that carries it out.
+    """Validate a request and return the plan that carries it out; InputError where it is not possible.
 
-    Args:
-        captions: of the frames of the result in a montage; empty for their times.
-
-    Raises:
-        InputError: the request is not possible.
+    `captions` are of the frames of the result in a montage; empty for their times.
     """
     _require_sense(request)
     if request.movie is not None:
@@ -71,11 +190,10 @@ def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()
     ks = choose_frames(request.frames or ("all" if several else "last"), result)
     if request.montage:
         ks = evenly_spaced(ks, grid[0] * grid[1])
-    usual = USUAL_MONTAGE_SIZE if request.montage else USUAL_SIZE
     settings = Settings(
         mode=request.mode,
-        color=request.color or (usual_color(render_scene_of(result)) if request.mode == "dots" else None),
-        size=parse_size(request.size or usual),
+        color=request.color or None,
+        size=parse_size(request.size or (USUAL_MONTAGE_SIZE if request.montage else USUAL_SIZE)),
         camera=request.camera,
         theme=request.theme,
         limits=parse_limits(request.clim) if request.clim else None,
@@ -87,21 +205,17 @@ def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()
     if (request.clim or request.cmap) and not isinstance(setup.colors, Coloring):
         option = "--clim" if request.clim else "--cmap"
         raise InputError(f"{option} is for colours that stand for a value: give --color-by speed, or another one.")
-    if request.montage:
-        path = _montage_path(result, settings.mode, request.output)
-        digest = picture_digest(result, setup.settings, ks)
-        there = digest_of(path)
-        if is_foreign(there) and not request.overwrite:
-            raise InputError(FOREIGN.format(path=path))
-        plan = [PlannedPicture(ks[0], path, digest, there == digest and not request.overwrite)]
-    else:
-        path_of = _paths(result, settings.mode, request, len(ks))
-        plan = plan_pictures(result, setup.settings, ks, path_of, overwrite=request.overwrite)
-    if request.save_surface is not None and not request.overwrite:
+    path_of = _paths(result, request, len(ks))
+    plan = [
+        plan_picture(result, setup.settings, chosen, path_of(chosen[0]), overwrite=request.overwrite)
+        for chosen in ([ks] if request.montage else [[k] for k in ks])
+    ]
+    surface = None
+    if request.save_surface is not None:
+        surface = request.save_surface / "surface"
         for path in (path for k in ks for path in surface_paths(setup.scene, request.save_surface, k)):
-            if path.exists():
+            if path.exists() and not request.overwrite:
                 raise InputError(f"{path} is there already: give another directory, or --overwrite.")
-    surface = None if request.save_surface is None else request.save_surface / "surface"
     for path in (plan[0].path, request.movie, surface):
         if path is not None:
             require_writable(path)
@@ -128,35 +242,21 @@ def _require_sense(request: Request) -> None:
             )
 
 
-def _directory(result: Result) -> Path:
-    """Return where pictures of a result go."""
-    return (result.path if result.path.is_dir() else result.path.parent) / DIRECTORY
-
-
-def _montage_path(result: Result, mode: str, output: Path | None) -> Path:
-    """Return the path of a montage."""
+def _paths(result: Result, request: Request, count: int) -> Callable[[int], Path]:
+    """Return the path of the picture of each frame, or of the montage for any frame."""
+    output, mode = request.output, request.mode
     if output is not None and output.suffix and not output.is_dir():
-        _require_png(output)
-        return output
-    return (output or _directory(result)) / f"{mode}_montage.png"
-
-
-def _require_png(output: Path) -> None:
-    if output.suffix.lower() != ".png":
-        film = output.suffix.lower() in (".mp4", ".gif")
-        hint = "for a film, give --movie" if film else "pictures are .png, and a directory with a dot has to be there"
-        raise InputError(f"-o {output} would be no picture: {hint}.")
-
-
-def _paths(result: Result, mode: str, request: Request, count: int) -> Callable[[int], Path]:
-    """Return the path of the picture of each frame."""
-    output = request.output
-    if output is not None and output.suffix and not output.is_dir():
-        _require_png(output)
-        if count > 1:
+        if output.suffix.lower() in (".mp4", ".gif"):
+            raise InputError(f"-o {output} would be no picture: for a film, give --movie.")
+        if output.suffix.lower() != ".png":
+            hint = "pictures are .png, and a directory with a dot has to be there"
+            raise InputError(f"-o {output} would be no picture: {hint}.")
+        if count > 1 and not request.montage:
             raise InputError(f"-o {output} is one picture and {count} were asked for: name a directory.")
         return lambda k: output
-    directory = output or _directory(result)
+    directory = output or (result.path if result.path.is_dir() else result.path.parent) / DIRECTORY
+    if request.montage:
+        return lambda k: directory / f"{mode}_montage.png"
     if directory.exists() and not directory.is_dir():
         raise InputError(f"{directory} is a file, not a directory: give another place with -o.")
-    return lambda k: directory / picture_name(mode, int(result.numbers[k]))
+    return lambda k: directory / f"{mode}_{int(result.numbers[k]):06d}.png"

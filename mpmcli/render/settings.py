@@ -1,4 +1,4 @@
-"""The settings of a picture, and the parsing of their texts."""
+"""The settings of a picture, the parsing of their texts, and the light and the dark theme."""
 
 import math
 import re
@@ -11,50 +11,71 @@ Mode = Literal["dots", "surface", "fluid", "density"]
 MODES: tuple[Mode, ...] = ("dots", "surface", "fluid", "density")
 Colliders = Literal["solid", "clear", "none"]
 COLLIDERS: tuple[Colliders, ...] = ("solid", "clear", "none")
+ThemeName = Literal["light", "dark"]
 # Pixels along a side, and in all: more would not fit into the memory of a renderer.
 SIDE_MIN, SIDE_MAX = 64, 16_384
 PIXELS_MAX = 64_000_000
 # Largest limit of colours and least distance between two, well within double precision; least distance relative to the
 # limits, as closer ones round to the same number.
 LIMIT_MAX, LIMIT_MIN, NARROWEST = 1e300, 1e-300, 1e-12
-# Pictures in a montage, along each side.
-GRID_MAX = 20
+GRID_MAX = 20  # pictures in a montage, along each side
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything that a picture depends on, except the frame.
-
-    Attributes:
-        color: as `--color-by`; None for materials that look like what they are.
-        size: of the whole picture, pixels, (width, height); None for a height that follows from the scene.
-        limits: of the colours, None where they have none.
-        cmap: colour map of matplotlib, None for the one that suits the values.
-        grid: columns and rows of a montage, (1, 1) for a picture of one frame.
-        colliders: how they are drawn; "clear": in 3D their far sides only, as containers are.
-    """
+    """Everything that a picture depends on, except the frame."""
 
     mode: Mode
-    color: str | None
-    size: tuple[int, int | None]
+    color: str | None  # as `--color-by`; None for the usual one of dots, and for materials as they look
+    size: tuple[int, int | None]  # of the whole picture, pixels; None for a height that follows from the scene
     camera: str = "iso"
     theme: str = "light"
-    limits: tuple[float, float] | None = None
-    cmap: str | None = None
-    grid: tuple[int, int] = (1, 1)
-    colliders: Colliders = "solid"
+    limits: tuple[float, float] | None = None  # of the colours, None where they have none
+    cmap: str | None = None  # colour map of matplotlib, None for the one that suits the values
+    grid: tuple[int, int] = (1, 1)  # columns and rows of a montage, (1, 1) for a picture of one frame
+    colliders: Colliders = "solid"  # "clear": in 3D only their far sides are drawn, as those of containers are
+
+
+@dataclass(frozen=True)
+class Theme:
+    """The colours, "#rrggbb", of everything except particles."""
+
+    name: ThemeName
+    ground: str  # background of the picture, and behind the particles in 2D
+    sky: str  # of the background of a 3D scene, above; `horizon` below
+    horizon: str
+    floor: str  # what shadows fall on
+    text: str  # titles and numbers; `faint`: secondary marks
+    faint: str
+    wall: str  # lines of the domain; `solid`: colliders
+    solid: str
+    missing: str = "#ff00c8"  # values that are not numbers
+
+
+THEMES: dict[str, Theme] = {
+    "light": Theme("light", "#ffffff", "#dfe8f2", "#ffffff", "#eceff3", "#1c2330", "#6b7482", "#3f4856", "#8e97a6"),
+    "dark": Theme("dark", "#11141a", "#0d1016", "#232a36", "#1b2029", "#e8ebf1", "#8b94a4", "#aeb7c6", "#6d7686"),
+}
+
+
+def rgb_bytes(color: str) -> tuple[int, int, int]:
+    """Return "#rrggbb" as three numbers from 0 to 255."""
+    red, green, blue = (int(color[k : k + 2], 16) for k in (1, 3, 5))
+    return red, green, blue
+
+
+def rgb(color: str) -> tuple[float, float, float]:
+    """Return "#rrggbb" as three numbers from 0 to 1."""
+    red, green, blue = rgb_bytes(color)
+    return red / 255.0, green / 255.0, blue / 255.0
 
 
 def parse_size(text: str) -> tuple[int, int | None]:
-    """Read "1280x720", or "1280xauto" for a height that follows from the scene: None.
-
-    Raises:
-        InputError: it is no size, or an absurd one.
-    """
-    found = re.fullmatch(r"(\d{1,9})[xX](\d{1,9}|auto)", text.strip())
-    if not found:
+    """Read "1280x720", or "1280xauto" for a height that follows from the scene: None; InputError for anything else."""
+    match = re.fullmatch(r"(\d{1,9})[xX](\d{1,9}|auto)", text.strip())
+    if not match:
         raise InputError(f'--size "{text}" is no size: give width and height in pixels, such as 1280x720 or 1280xauto.')
-    width, height = int(found[1]), None if found[2] == "auto" else int(found[2])
+    width, height = int(match[1]), None if match[2] == "auto" else int(match[2])
     require_possible(width, height or width, text)
     return width, height
 
@@ -69,32 +90,22 @@ def require_possible(width: int, height: int, text: str) -> None:
 
 
 def parse_grid(text: str) -> tuple[int, int]:
-    """Read "3x2", columns and rows.
-
-    Raises:
-        InputError: it is no such thing.
-    """
-    found = re.fullmatch(r"(\d{1,9})[xX](\d{1,9})", text.strip())
-    grid = (int(found[1]), int(found[2])) if found else None
-    if grid is None or not (min(grid) >= 1 and max(grid) <= GRID_MAX):
+    """Read "3x2", columns and rows; InputError for anything else."""
+    match = re.fullmatch(r"(\d{1,9})[xX](\d{1,9})", text.strip())
+    grid = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not (min(grid) >= 1 and max(grid) <= GRID_MAX):
         raise InputError(f'--montage "{text}" is not possible: give columns and rows, 1x1 to {GRID_MAX}x{GRID_MAX}.')
     return grid
 
 
 def parse_limits(text: str) -> tuple[float, float]:
-    """Read "0,2.5".
-
-    Raises:
-        InputError: it is no two finite numbers that rise.
-    """
-    words = text.split(",")
+    """Read "0,2.5", two finite numbers that rise; raise InputError for anything else."""
     try:
-        numbers = [float(word) for word in words]
+        low, high = map(float, text.split(","))
     except ValueError:
-        numbers = []
-    if len(numbers) != 2 or not all(map(math.isfinite, numbers)) or not numbers[0] < numbers[1]:
+        low = high = math.nan
+    if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise InputError(f'--clim "{text}" is no range: give the lower and the upper limit, such as 0,2.5.')
-    low, high = numbers
     if max(-low, high) > LIMIT_MAX or not high - low >= max(LIMIT_MIN, NARROWEST * max(abs(low), abs(high))):
         raise InputError(f'--clim "{text}" is too wide or too narrow for colours: give limits such as 0,2.5.')
     return low, high

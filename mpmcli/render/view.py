@@ -13,39 +13,25 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 CAMERAS = ("iso", "front", "side", "top")
-# Full vertical angle of a perspective view, degrees: a long lens distorts little.
-ANGLE = 24.0
-# Margin around the domain on each side, as a fraction of the picture.
-MARGIN = 0.04
-# Angles of the camera "iso" to the right of the front and above the ground, degrees.
-AZIMUTH, ELEVATION = 32.0, 24.0
-# Pixels along the sides of the auxiliary picture that gives the aspect ratio.
-SQUARE = 1000
-# Largest distance of a camera, in sizes of the domain, which then covers a hundredth of a pixel.
-FARTHEST = 1e5
-# Iterations that centre the projected domain in the picture.
-CENTRING_ROUNDS = 8
+ANGLE = 24.0  # full vertical angle of a perspective view, degrees: a long lens distorts little
+MARGIN = 0.04  # margin around the domain on each side, as a fraction of the picture
+AZIMUTH, ELEVATION = 32.0, 24.0  # angles of the camera "iso" to the right of the front and above the ground, degrees
+SQUARE = 1000  # pixels along the sides of the auxiliary picture that gives the aspect ratio
+FARTHEST = 1e5  # largest distance of a camera, in sizes of the domain, which then covers a hundredth of a pixel
+CENTRING_ROUNDS = 8  # iterations that centre the projected domain in the picture
 
 
 @dataclass(frozen=True)
 class View:
-    """A camera and the size of its picture.
+    """A camera and the size of its picture."""
 
-    Attributes:
-        size: pixels, (width, height).
-        position, focus, up: of the camera, (3,), m; `up` is a direction.
-        height: length at the focus that the full height of the picture shows, m.
-        parallel: parallel projection, in which a scale bar has a meaning.
-        near, far: distances from the camera between which the domain lies, m.
-    """
-
-    size: tuple[int, int]
-    position: tuple[float, ...]
-    focus: tuple[float, ...]
-    up: tuple[float, ...]
-    height: float
-    parallel: bool
-    near: float
+    size: tuple[int, int]  # pixels, (width, height)
+    position: tuple[float, ...]  # of the camera, (3,), m
+    focus: tuple[float, ...]  # (3,), m
+    up: tuple[float, ...]  # direction (3,)
+    height: float  # length at the focus that the full height of the picture shows, m
+    parallel: bool  # parallel projection, in which a scale bar has a meaning
+    near: float  # distances from the camera between which the domain lies, m
     far: float
 
     @property
@@ -71,6 +57,31 @@ class View:
         width, height = self.size
         return np.stack([0.5 * width + right * scale, 0.5 * height - up * scale, depth], axis=1)
 
+    def scale_at(self, distance: np.ndarray) -> np.ndarray:
+        """Return pixels to the metre at distances from the camera, m."""
+        if self.parallel:
+            return np.full(np.shape(distance), self.pixels_per_metre)
+        return self.pixels_per_metre * self.distance / distance
+
+    def plane(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return how far places x and y, pixels from the left and the top, lie to the right and up of the middle.
+
+        In metres, or in a perspective view in metres at a distance of 1 m.
+        """
+        width, height = self.size
+        unit = 1 / self.pixels_per_metre if self.parallel else 1 / (self.pixels_per_metre * self.distance)
+        return (x - 0.5 * width) * unit, (0.5 * height - y) * unit
+
+    def rays(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return starts and directions (..., 3) of lines of sight, in the scene: start + z * direction is z away."""
+        across, up = self.plane(x, y)
+        right, rise, back = self.axes
+        offset = across[..., None] * right + up[..., None] * rise
+        start = np.array(self.position)
+        if self.parallel:
+            return start + offset, np.broadcast_to(-back, offset.shape)
+        return np.broadcast_to(start, offset.shape), offset - back
+
     def place(self, plotter: "pv.Plotter") -> None:
         """Set the camera of a plotter to this view."""
         camera = plotter.camera
@@ -82,15 +93,10 @@ class View:
 
 
 def view_of(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
-    """Frame the domain of a run.
+    """Return the view of the domain of a run from a camera.
 
-    Args:
-        camera: one of `CAMERAS`, or six numbers with commas between: where it stands and what it looks at, m. A 2D
-            scene is always looked at from the front.
-        size: pixels, (width, height).
-
-    Raises:
-        InputError: `camera` is none of these, or not for a scene in 2D.
+    A camera is one of `CAMERAS`, or six numbers with commas between: where it stands and what it looks at, m. A 2D
+    scene is always looked at from the front. InputError where it is none of these, or not for a scene in 2D.
     """
     if scene.dimension == 2 and camera not in ("iso", "front"):
         raise InputError(f"--camera {camera} is for scenes in 3D: this one is in 2D, and drawn in its plane.")
@@ -99,22 +105,45 @@ def view_of(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
     up = np.array(scene.up)
     right = np.eye(3)[int(np.argmin(np.abs(up)))]
     front = np.cross(right, up)
-    if scene.dimension == 2 or camera == "front":
-        return _framed(scene, front, up, size, parallel=True)
-    if camera == "side":
-        return _framed(scene, right, up, size, parallel=True)
-    if camera == "top":
-        return _framed(scene, up, -front, size, parallel=True)
+    if scene.dimension == 2 or camera != "iso":
+        back, upright = {"side": (right, up), "top": (up, -front)}.get(camera, (front, up))
+        return _framed(scene, back, upright, size, parallel=True)
     turn, rise = math.radians(AZIMUTH), math.radians(ELEVATION)
     level = math.cos(turn) * front + math.sin(turn) * right
     return _framed(scene, math.cos(rise) * level + math.sin(rise) * up, up, size, parallel=False)
 
 
+@dataclass(frozen=True)
+class Slice:
+    """A plane through the domain: all of it in 2D."""
+
+    across: tuple[int, int]  # the two axes of the picture, to the right and up
+    normal: int | None = None  # the axis through it, None in 2D
+    place: float = 0.0  # of the plane along its normal, m
+
+    def corners(self, scene: RenderScene) -> np.ndarray:
+        """Return the lower and the upper corner of the domain in the middle plane along the normal, (2, 3), m."""
+        low, high = np.array(scene.lower), np.array(scene.upper)
+        ends, across = np.tile(0.5 * (low + high), (2, 1)), list(self.across)
+        ends[:, across] = np.stack([low, high])[:, across]
+        return ends
+
+
+def slice_of(scene: RenderScene, camera: str) -> Slice:
+    """Return the plane in the middle of the domain that a camera looks at from the front; "iso" as "front"."""
+    if scene.dimension == 2:
+        return Slice((0, 1))
+    up = int(np.argmax(np.abs(scene.up)))
+    right, depth = (axis for axis in range(3) if axis != up)
+    across, normal = {"top": ((right, depth), up), "side": ((depth, up), right)}.get(camera, ((right, up), depth))
+    return Slice(across, normal, 0.5 * (scene.lower[normal] + scene.upper[normal]))
+
+
 def aspect_of(scene: RenderScene, camera: str) -> float:
     """Return the height of the domain over its width, as a camera sees it, with the margin around it."""
     view = view_of(scene, camera, (SQUARE, SQUARE))
-    seen = np.ptp(view.pixels(_corners(scene))[:, :2], axis=0) + 2 * MARGIN * SQUARE
-    return float(seen[1] / seen[0])
+    width, height = np.ptp(view.pixels(_corners(scene))[:, :2], axis=0) + 2 * MARGIN * SQUARE
+    return float(height / width)
 
 
 def _axes(back: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -125,9 +154,8 @@ def _axes(back: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def _corners(scene: RenderScene) -> np.ndarray:
-    low, high = np.array(scene.lower), np.array(scene.upper)
     picks = np.array([[i >> axis & 1 for axis in range(3)] for i in range(8)])
-    return np.where(picks == 1, high, low)
+    return np.where(picks == 1, np.array(scene.upper), np.array(scene.lower))
 
 
 def _framed(scene: RenderScene, back: np.ndarray, up: np.ndarray, size: tuple[int, int], *, parallel: bool) -> View:
@@ -151,7 +179,7 @@ def _framed(scene: RenderScene, back: np.ndarray, up: np.ndarray, size: tuple[in
         shift = 0.5 * (outline.min(axis=1) + outline.max(axis=1)) * distance * room
         focus = focus + shift @ axes[:2]
     position = focus + distance * axes[2]
-    return _view(scene, size, position, focus, up, 2 * tangent * distance, parallel)
+    return _view(scene, size, (position, focus, up), 2 * tangent * distance, parallel)
 
 
 def _free_view(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
@@ -173,23 +201,18 @@ def _free_view(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
         # Looking straight up or down, any other direction serves as the upward one.
         up = np.eye(3)[(int(np.argmax(np.abs(up))) + 1) % 3]
     height = 2 * math.tan(math.radians(0.5 * ANGLE)) * float(np.linalg.norm(back))
-    return _view(scene, size, position, focus, up, height, parallel=False)
+    return _view(scene, size, (position, focus, up), height, parallel=False)
 
 
 def _view(
-    scene: RenderScene,
-    size: tuple[int, int],
-    position: np.ndarray,
-    focus: np.ndarray,
-    up: np.ndarray,
-    height: float,
-    parallel: bool,
+    scene: RenderScene, size: tuple[int, int], vectors: tuple[np.ndarray, ...], height: float, parallel: bool
 ) -> View:
-    axes = _axes(position - focus, up)
-    depths = (position - _corners(scene)) @ axes[2]
+    """Return the view from a position to a focus with a direction upwards, the `vectors`."""
+    position, focus, up = vectors
+    depths = (position - _corners(scene)) @ _axes(position - focus, up)[2]
     # A margin for shadows and for particles that have left the domain.
     spare = 0.1 * float(np.ptp(_corners(scene), axis=0).max())
     near, far = float(depths.min()) - spare, float(depths.max()) + spare
     near = max(near, 1e-3 * float(np.linalg.norm(position - focus)))
-    plain = [tuple(float(number) for number in vector) for vector in (position, focus, up)]
+    plain = [tuple(map(float, vector)) for vector in vectors]
     return View(size, *plain, height, parallel, near, max(far, 1.1 * near))

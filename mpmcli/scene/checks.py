@@ -8,19 +8,182 @@ from typing import get_args
 
 import numpy as np
 
-from mpmcli.scene.collider_checks import collider_problems
-from mpmcli.scene.emitter_checks import emitter_problems
-from mpmcli.scene.initial import has_expressions, initial_faults
+from mpmcli.scene.colliders import Collider, Plane, has_jump, slope_of
+from mpmcli.scene.entry import entries_in
+from mpmcli.scene.expression import Expression
 from mpmcli.scene.mesh import Mesh, leaving, moved_inside
-from mpmcli.scene.problem import Problem
-from mpmcli.scene.quantity import AXES
-from mpmcli.scene.sampling import holds_particles, lattice_points, lattice_spacing, no_particles, particle_places
-from mpmcli.scene.schema import Body, ParticleField, Scene
-from mpmcli.scene.sentences import listed, nearest
-from mpmcli.scene.shapes import Box
+from mpmcli.scene.primitives import Polygon, grid_points
+from mpmcli.scene.problem import Problem, hint_at, listed
+from mpmcli.scene.quadrature import integral_of
+from mpmcli.scene.quantity import AXES, place_text
+from mpmcli.scene.sampling import (
+    has_expressions,
+    holds_particles,
+    initial_faults,
+    lattice_points,
+    lattice_spacing,
+    no_particles,
+    particle_places,
+)
+from mpmcli.scene.schema import Body, Emitter, ParticleField, Scene
+from mpmcli.scene.shapes import Box, Composite
+from mpmcli.scene.sheets import most_in_mouth, mouth_of, sheets_of, sheets_until
 
 # Lengths below this fraction of the grid spacing are round-off.
 _TOLERANCE = 1e-6
+# Particles that a run can number.
+_MOST = 2**31 - 1
+# Particles of one sheet.
+_MOST_IN_MOUTH = 10_000_000
+
+
+def emitter_problems(scene: Scene) -> Iterator[Problem]:
+    """Find emitters that cannot be, and solvers that know neither emitters nor open faces."""
+    for k, emitter in enumerate(scene.emitters):
+        where = ("emitters", k)
+        count = most_in_mouth(emitter, scene.domain.spacing)
+        if not count <= _MOST_IN_MOUTH:
+            said = f'the mouth of "{emitter.name}" could hold {count:.3g} particles at once, and {_MOST_IN_MOUTH:g} is '
+            yield Problem((*where, "shape"), said + "the most; make it narrower, or the grid coarser")
+            continue
+        mouth = mouth_of(emitter, scene.domain.spacing)
+        if not mouth.filled.any():
+            said = (
+                f'"{emitter.name}" has no particle in its mouth, the section through the centre of its shape across '
+                f"the velocity: they would be {mouth.spacing[0]:.6g} m apart; make it wider, or the grid finer"
+            )
+            yield Problem((*where, "shape"), said)
+            continue
+        places, origin, upper = mouth.places, np.array(scene.domain.origin), np.array(scene.domain.upper)
+        beyond = np.maximum(origin - places, places - upper).max(axis=0)
+        for axis in np.flatnonzero(beyond > _TOLERANCE * scene.domain.spacing):
+            said = f'the mouth of "{emitter.name}" reaches out of the domain along {AXES[axis]} by {beyond[axis]:.6g} m'
+            yield Problem((*where, "shape"), said + "; move it or enlarge the domain")
+        if emitter.start >= scene.time.end:
+            said = f"must be before the end of the scene, {scene.time.end:g} s; found {emitter.start:g}"
+            yield Problem((*where, "start"), said)
+            continue
+        yield from (Problem((*where, key), said) for key, said in _emitted(emitter, scene))
+    yield from _unsuited(scene)
+
+
+def _emitted(emitter: Emitter, scene: Scene) -> Iterator[tuple[str, str]]:
+    sheets = sheets_of(emitter, scene)
+    most = sheets_until(emitter, scene, sheets.period)
+    n = len(sheets.places)
+    for key, unit, one in (("particles", "particles", n), ("volume", "m^3", n * sheets.volume)):
+        asked = getattr(emitter, key)
+        if asked is not None and round(asked / one) > most:
+            end = "end" if emitter.end is not None else "time.end"
+            unit = "m^2" if key == "volume" and scene.dimension == 2 else unit
+            yield (
+                key,
+                f'takes {round(asked / one) * sheets.period:.4g} s to flow out of "{emitter.name}", which has '
+                f"{most * sheets.period:.4g} s until {end}; {most * one:.6g} {unit} at most come out by then",
+            )
+    if sheets.particles > _MOST:
+        yield "particles", f"would be {sheets.particles:.3g}, more than a run can number, {_MOST}; give fewer"
+
+
+def _unsuited(scene: Scene) -> Iterator[Problem]:
+    if scene.output.drop_retired and not scene.comes_and_goes:
+        said = "is for scenes with emitters or open faces, where particles come and go; leave it out"
+        yield Problem(("output", "drop_retired"), said)
+    opens = scene.domain.walls.any_open(scene.dimension)
+    found = [("emitters",)] * bool(scene.emitters) + [("domain", "walls")] * opens
+    if scene.solver.solids == "total" and found:
+        what = "emitters" if scene.emitters else "open faces"
+        said = f'solver.solids = "total" knows no {what}: give solids = "updated", or leave them out'
+        yield Problem(found[0], said)
+    if scene.solver.walls == "zeroed" and opens:
+        yield Problem(("domain", "walls"), 'solver.walls = "zeroed" knows no open faces: give walls = "folded"')
+
+
+# Cells that a particle may lie inside of a collider: of round-off, and of curved surfaces that are given by chords.
+_SLACK = 0.1
+# Lattices above this size are not looked at.
+_MOST_PLACES = 1_000_000
+# Cells within the bounding box of a collider whose distances are kept on a grid, of as many nodes.
+_MOST_CELLS = 100_000_000
+
+
+def collider_problems(scene: Scene) -> Iterator[Problem]:
+    """Find colliders that share a name, that bodies overlap, that nothing can meet, and that jump."""
+    if scene.colliders and scene.solver.solids == "total":
+        said = '"total" knows walls only, and the scene has colliders: give solids = "updated"'
+        yield Problem(("solver", "solids"), said)
+    first: dict[str, int] = {}
+    placed = True
+    for k, collider in enumerate(scene.colliders):
+        if first.setdefault(collider.name, k) != k:
+            said = f'"{collider.name}" is the name of colliders[{first[collider.name]}] already; each needs its own'
+            yield Problem(("colliders", k, "name"), said)
+        unfit = list(_unfit(collider, k, scene.time.end))
+        yield from unfit
+        placed = placed and not unfit
+        if not unfit:
+            yield from _out_of_reach(collider, k, scene)
+            yield from _too_large(collider, k, scene)
+    if placed:
+        yield from _in_colliders(scene)
+
+
+def _unfit(collider: Collider, index: int, end: float) -> Iterator[Problem]:
+    """Find motions that are not finite, and places that jump."""
+    for key in ("velocity", "angular_velocity", "offset", "angle"):
+        for path, entry in entries_in(getattr(collider, key), ("colliders", index, key)):
+            if isinstance(entry, Expression):
+                values = [float(entry(t=time)) for time in (0.0, 0.5 * end, end)]
+                if not np.isfinite([*values, integral_of(entry.tree, 0.0, end)]).all():
+                    yield Problem(path, "must be finite from time 0 to time.end; it is not, as 1 / t at 0 is not")
+                    return
+    for key in ("offset", "angle"):
+        for path, entry in entries_in(getattr(collider, key), ("colliders", index, key)):
+            if isinstance(entry, Expression) and has_jump(entry.tree, slope_of(entry), end):
+                said = "jumps between 0 and time.end, and a collider must move; let it go from place to place in "
+                yield Problem(path, said + "some time")
+
+
+def _out_of_reach(collider: Collider, index: int, scene: Scene) -> Iterator[Problem]:
+    domain = scene.domain
+    motion, inside = collider.motion, collider.side == "inside"
+    if isinstance(collider.form, Plane) or inside or motion.moves or motion.angle != 0.0:
+        return
+    (lower, upper), shift = collider.form.bounds(), np.array(motion.offset)
+    if np.any(upper + shift < domain.origin) or np.any(lower + shift > domain.upper):
+        spans, box = (" x ".join(f"{size:.4g}" for size in sizes) for sizes in (upper - lower, domain.size))
+        cure = "give its mesh scale = 0.001, if it is in millimetres" if collider.shape.files else "leave it out"
+        said = f'collider "{collider.name}" ({spans} m) lies outside of the domain ({box} m); move it, or {cure}'
+        yield Problem(("colliders", index, "shape"), said)
+
+
+def _too_large(collider: Collider, index: int, scene: Scene) -> Iterator[Problem]:
+    """Find colliders whose distances would be computed at too many nodes."""
+    if isinstance(collider.form, Mesh | Composite | Polygon):
+        spans = np.ptp(np.array(collider.form.bounds()), axis=0) / scene.domain.spacing
+        if not (count := float(np.prod(spans + 1))) <= _MOST_CELLS:
+            said = f'"{collider.name}" spans {count:.3g} cells, and {_MOST_CELLS:g} is the most for meshes, polygons '
+            yield Problem(("colliders", index, "shape"), said + "and shapes of several; leave out what is out of reach")
+
+
+def _in_colliders(scene: Scene) -> Iterator[Problem]:
+    """Find bodies of which a particle starts in a collider."""
+    h = scene.domain.spacing
+    for i, body in enumerate(scene.bodies if scene.colliders else ()):
+        if lattice_points(body, h) > _MOST_PLACES:
+            continue
+        places = particle_places(body, i, h)
+        for k, collider in enumerate(scene.colliders if len(places) else ()):
+            distance = collider.signed_distance(places)
+            if distance.min() < -_SLACK * h:
+                where = place_text(places[distance.argmin()])
+                said = (
+                    f'body "{body.name}" overlaps collider "{collider.name}" at the start, for example at {where}; '
+                    "move one of them, or subtract the shape of the collider from that of the body"
+                )
+                yield Problem(("colliders", k, "shape"), said)
+
+
 # Cells from a wall beyond which no kernel of a body reaches it.
 _CLEAR = 2
 # Cells between bodies beyond which they share no node.
@@ -74,8 +237,7 @@ def _outside(scene: Scene) -> Iterator[Problem]:
             if isinstance(form := body.shape.form, Mesh):
                 too_large, instead = leaving(form, *corners), f"give translate = {moved_inside(form, *corners)}"
             how = f": {too_large}" if too_large else f" through {ways}; {instead} or enlarge the domain"
-            sentence = f'body "{body.name}" leaves the domain{how}'
-            yield Problem(("bodies", i, "shape"), sentence)
+            yield Problem(("bodies", i, "shape"), f'body "{body.name}" leaves the domain{how}')
 
 
 def _overlaps(scene: Scene) -> Iterator[Problem]:
@@ -89,19 +251,12 @@ def _overlaps(scene: Scene) -> Iterator[Problem]:
             first, second = scene.bodies[i], scene.bodies[j]
             point = _common_point(first, second, lower[i], upper[i], h)
             if point is not None:
-                where = ", ".join(f"{x:.6g}" for x in point)
-                sentence = (
-                    f'body "{second.name}" overlaps body "{first.name}", for example at [{where}]; '
-                    "bodies may touch but not overlap"
-                )
-                yield Problem(("bodies", j, "shape"), sentence)
+                said = f'body "{second.name}" overlaps body "{first.name}", for example at {place_text(point)}; '
+                yield Problem(("bodies", j, "shape"), said + "bodies may touch but not overlap")
 
 
 def _common_point(first: Body, second: Body, lower: np.ndarray, upper: np.ndarray, h: float) -> np.ndarray | None:
-    """Return a point well inside both bodies, of those tried between `lower` and `upper`, or None.
-
-    Points are tried on a lattice of half the distance between particles, at least 8 along each axis.
-    """
+    """Return a point well inside both bodies, of a lattice of half the distance of particles, or None."""
     forms = first.shape.form, second.shape.form
     if all(isinstance(form, Box) for form in forms):
         return (lower + upper) / 2
@@ -109,7 +264,7 @@ def _common_point(first: Body, second: Body, lower: np.ndarray, upper: np.ndarra
     finest = min(lattice_spacing(first, h), lattice_spacing(second, h)) / 2
     counts = [int(np.clip(math.ceil(min(r, most)), 8, most)) for r in (upper - lower) / finest]
     axes = [lo + (np.arange(n) + 0.5) * (hi - lo) / n for lo, hi, n in zip(lower, upper, counts, strict=True)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(lower))
+    points = grid_points(*axes)
     # Distances from a surface cost more than the side, and points of both are few.
     for inset in (0.0, _TOLERANCE * h):
         for form in forms:
@@ -120,9 +275,9 @@ def _common_point(first: Body, second: Body, lower: np.ndarray, upper: np.ndarra
 def _empty(scene: Scene) -> Iterator[Problem]:
     h = scene.domain.spacing
     for i, body in enumerate(scene.bodies):
-        if isinstance(body.shape.form, Box) and body.sampling != "poisson":
-            continue  # its lattice is fitted to it, and has a point at least
-        if lattice_points(body, h) <= _MOST_SEARCHED and not holds_particles(body, i, h):
+        # The lattice of a box is fitted to it, and has a point at least.
+        fitted = isinstance(body.shape.form, Box) and body.sampling != "poisson"
+        if not fitted and lattice_points(body, h) <= _MOST_SEARCHED and not holds_particles(body, i, h):
             yield Problem(("bodies", i, "shape"), no_particles(body, h))
 
 
@@ -164,13 +319,11 @@ def _hydrostatic(body: Body, scene: Scene) -> Iterator[tuple[str, str]]:
 
 
 def _pushed(scene: Scene) -> Iterator[Problem]:
-    """Find forces on bodies that do not exist."""
     names = [body.name for body in scene.sources]
     for table, entries in (("forces", scene.forces), ("impulses", scene.impulses)):
         for k, force in enumerate(entries):
             if force.body is not None and force.body not in names:
-                guess = nearest(force.body, names)
-                hint = f'did you mean "{guess}"?' if guess else f"the bodies are {listed(names, 'and')}"
+                hint = hint_at(force.body, names, f"the bodies are {listed(names, 'and')}")
                 yield Problem((table, k, "body"), f'no body has the name "{force.body}"; {hint}')
 
 

@@ -1,22 +1,117 @@
 """Colliders: rigid things that the material meets, at rest or moving as the scene says."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
-from mpmcli.scene.derivative import derivative
 from mpmcli.scene.domain import Domain
 from mpmcli.scene.entry import Entry, OfTime, TimeVector, tree_of
-from mpmcli.scene.expression import Expression, Tree, evaluate
+from mpmcli.scene.expression import Expression, Name, Tree, apply, derivative, evaluate
 from mpmcli.scene.expression import Number as Constant
-from mpmcli.scene.motion import Motion, between_keys
-from mpmcli.scene.primitives import unit
-from mpmcli.scene.quantity import NAME, NotNegative, Number, Table, Vector, flaw, list_of_axes, scene_dimension
+from mpmcli.scene.primitives import rotation, unit
+from mpmcli.scene.quadrature import integral_of, largest_of
+from mpmcli.scene.quantity import (
+    NAME,
+    NotNegative,
+    Number,
+    Table,
+    Vector,
+    direction_as,
+    flaw,
+    list_of_axes,
+    scene_dimension,
+)
 from mpmcli.scene.shapes import Form, Shape, exactly_one_form
 
+TIME = Name("t")
+# In which jumps are looked for one by one, so that a pair of them does not cancel.
+PIECES = 8
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The motion of a rigid thing about a pivot that moves with it.
+
+    A point that starts at X is at pivot + offset + R(angle) (X - pivot), R the rotation about a fixed axis.
+    """
+
+    pivot: tuple[float, ...]  # at the start, before `offset`, (d,), m
+    axis: tuple[float, ...]  # of rotation, a unit vector, (3,); z in 2D
+    offset: tuple[float, ...]  # at time 0, (d,), m
+    angle: float  # at time 0, rad
+    velocity: tuple[Tree, ...]  # of the pivot, m/s, one tree of t per axis
+    spin: Tree  # rate of the angle, rad/s
+
+    @property
+    def rates(self) -> tuple[Tree, ...]:
+        """Velocity and spin, d + 1 trees."""
+        return (*self.velocity, self.spin)
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything changes with time."""
+        return any(tree != Constant(0.0) for tree in self.rates)
+
+    @property
+    def turns(self) -> bool:
+        """Whether the angle changes with time."""
+        return self.spin != Constant(0.0)
+
+    def at(self, time: float) -> tuple[np.ndarray, float]:
+        """Return the offset, (d,), m, and the angle, rad, at a time, s."""
+        gone = [integral_of(tree, 0.0, time) for tree in self.rates]
+        return np.array(self.offset) + gone[:-1], self.angle + gone[-1]
+
+    def pose(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the pivot is, (d,), m, and the rotation, (d, d), at a time, s."""
+        offset, angle = self.at(time)
+        d = len(self.pivot)
+        return np.array(self.pivot) + offset, rotation(self.axis, angle)[:d, :d]
+
+    def placed(self, points: np.ndarray, time: float) -> np.ndarray:
+        """Return where points (n, d) that start at these places are at a time, s; the start is that without offset."""
+        place, turned = self.pose(time)
+        return place + (points - np.array(self.pivot)) @ turned.T
+
+    def taken_back(self, points: np.ndarray, time: float) -> np.ndarray:
+        """Undo `placed`: where points (n, d) would have to start."""
+        place, turned = self.pose(time)
+        return np.array(self.pivot) + (points - place) @ turned
+
+    def fastest(self, reach: float, end: float) -> float:
+        """Return a bound on the speed of points within `reach` (m) of the pivot between 0 and `end` (s), m/s."""
+        speeds = [largest_of(tree, 0.0, end) for tree in self.rates]
+        turning = speeds[-1] * reach if speeds[-1] > 0 else 0.0
+        return math.hypot(*speeds[:-1]) + turning
+
+
+def between_keys(times: Sequence[float], values: Sequence[float]) -> Tree:
+    """Return the slope of what goes linearly through values at times that rise, and stays before and after; a tree."""
+    result: Tree = Constant(0.0)
+    for (t0, v0), (t1, v1) in reversed(list(pairwise(zip(times, values, strict=True)))):
+        result = apply("if", apply("<", TIME, Constant(t1)), Constant((v1 - v0) / (t1 - t0)), result)
+    if times[0] > 0 and len(times) > 1:
+        result = apply("if", apply("<", TIME, Constant(times[0])), Constant(0.0), result)
+    return result
+
+
+def has_jump(tree: Tree, slope: Tree, end: float) -> bool:
+    """Say whether a tree of t jumps between 0 and `end` (s): whether the integral of its slope misses it."""
+    times = np.linspace(0.0, end, PIECES + 1)
+    values = [float(evaluate(tree, {"t": time})) for time in times]
+    scale = max(largest_of(tree, 0.0, end), 1e-12)
+    return any(
+        not abs(v1 - v0 - integral_of(slope, t0, t1)) <= 1e-6 * scale
+        for (t0, t1), (v0, v1) in zip(pairwise(times.tolist()), pairwise(values), strict=True)
+    )
+
+
+Normal = direction_as("[0, 1] has in 2D")
 # What a surface does, as walls of the domain.
 SurfaceWord = Literal["slip", "stick", "separate"]
 ZERO = Constant(0.0)
@@ -25,14 +120,8 @@ ZERO = Constant(0.0)
 class Plane(Table):
     """A half space: all that lies behind a plane."""
 
-    point: Annotated[Vector, Field(description="A point of the plane, m.")]
-    normal: Annotated[Vector, Field(description="Direction out of the collider, into the material, of any length.")]
-
-    @model_validator(mode="after")
-    def _normal_has_a_direction(self) -> "Plane":
-        if not any(self.normal):
-            raise flaw("must have a direction, as [0, 1] has in 2D; found zeros", "normal")
-        return self
+    point: Vector = Field(description="A point of the plane, m.")
+    normal: Normal = Field(description="Direction out of the collider, into the material, of any length.")
 
     @property
     def direction(self) -> np.ndarray:
@@ -47,64 +136,55 @@ class Plane(Table):
 class ColliderShape(Shape):
     """The shape of a collider: one of the forms of bodies, or a plane."""
 
-    plane: Annotated[Plane | None, Field(description="A half space: all that lies behind a plane.")] = None
+    plane: Plane | None = Field(None, description="A half space: all that lies behind a plane.")
 
 
 OneColliderShape = Annotated[
-    ColliderShape,
-    AfterValidator(exactly_one_form),
-    Field(json_schema_extra={"minProperties": 1}),
+    ColliderShape, AfterValidator(exactly_one_form), Field(json_schema_extra={"minProperties": 1})
 ]
 
 
 class Keyframe(Table):
     """Where a collider is at a time."""
 
-    time: Annotated[NotNegative, Field(description="s.")]
-    offset: Annotated[
-        Vector, Field(validate_default=True, description="Offset from where its shape stands, m. Default: zeros.")
-    ] = None  # type: ignore[assignment]
-    angle: Annotated[Number, Field(description="Angle that it is turned by, rad.")] = 0.0
+    time: NotNegative = Field(description="s.")
+    offset: Vector = Field(
+        None, validate_default=True, description="Offset from where its shape stands, m. Default: zeros."
+    )
+    angle: Number = Field(0.0, description="Angle that it is turned by, rad.")
 
 
 class Collider(Table):
     """A rigid thing that the material meets."""
 
-    name: Annotated[str, Field(pattern=NAME, description="Name of the collider, for messages and --set.")]
-    shape: Annotated[OneColliderShape, Field(description="What it is made of: a form as bodies have, or a plane.")]
-    side: Annotated[
-        Literal["outside", "inside"],
-        Field(description="Where the material is: outside of the shape, or inside, as in a container."),
-    ] = "outside"
-    wall: Annotated[SurfaceWord, Field(description="What its surface does: slip, stick or separate.")] = "separate"
-    friction: Annotated[NotNegative, Field(description="Coefficient of friction, unless it sticks.")] = 0.0
-    velocity: Annotated[
-        TimeVector,
-        Field(
-            validate_default=True,
-            description="Velocity, m/s; numbers, or expressions of the time t (s). Default: at rest.",
-        ),
-    ] = None  # type: ignore[assignment]
-    angular_velocity: Annotated[OfTime, Field(description="Rate at which it turns about its axis, rad/s.")] = 0.0
-    offset: Annotated[
-        list_of_axes(OfTime) | None,
-        Field(description="Offset from where its shape stands, m, in place of the velocity. Default: none."),
-    ] = None
-    angle: Annotated[
-        OfTime | None, Field(description="Angle that it is turned by, rad, in place of the rate. Default: none.")
-    ] = None
-    keyframes: Annotated[
-        tuple[Keyframe, ...],
-        Field(description="Offsets and angles at some times, in place of all these; linear between them."),
-    ] = ()
-    axis: Annotated[
-        tuple[Number, Number, Number] | None,
-        Field(description="Direction of the axis that it turns about; 3D only. Default: [0, 0, 1]."),
-    ] = None
-    pivot: Annotated[
-        Vector | None,
-        Field(description="Point of the axis, m; it moves along. Default: the centre of the shape."),
-    ] = None
+    name: str = Field(pattern=NAME, description="Name of the collider, for messages and --set.")
+    shape: OneColliderShape = Field(description="What it is made of: a form as bodies have, or a plane.")
+    side: Literal["outside", "inside"] = Field(
+        "outside", description="Where the material is: outside of the shape, or inside, as in a container."
+    )
+    wall: SurfaceWord = Field("separate", description="What its surface does: slip, stick or separate.")
+    friction: NotNegative = Field(0.0, description="Coefficient of friction, unless it sticks.")
+    velocity: TimeVector = Field(
+        None,
+        validate_default=True,
+        description="Velocity, m/s; numbers, or expressions of the time t (s). Default: at rest.",
+    )
+    angular_velocity: OfTime = Field(0.0, description="Rate at which it turns about its axis, rad/s.")
+    offset: list_of_axes(OfTime) | None = Field(
+        None, description="Offset from where its shape stands, m, in place of the velocity. Default: none."
+    )
+    angle: OfTime | None = Field(
+        None, description="Angle that it is turned by, rad, in place of the rate. Default: none."
+    )
+    keyframes: tuple[Keyframe, ...] = Field(
+        (), description="Offsets and angles at some times, in place of all these; linear between them."
+    )
+    axis: tuple[Number, Number, Number] | None = Field(
+        None, description="Direction of the axis that it turns about; 3D only. Default: [0, 0, 1]."
+    )
+    pivot: Vector | None = Field(
+        None, description="Point of the axis, m; it moves along. Default: the centre of the shape."
+    )
 
     @field_validator("axis", mode="before")
     @classmethod
@@ -137,7 +217,6 @@ class Collider(Table):
 
     @property
     def form(self) -> Form | Plane:
-        """The form of its shape."""
         return self.shape.form
 
     @property

@@ -1,35 +1,147 @@
 """The domain of a scene: a box of whole grid cells, gravity, and what its walls do."""
 
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
-from mpmcli.scene.cell_counts import MOST_CELLS, cells_of, spacing_of
 from mpmcli.scene.entry import TimeVector, value_of, varies
+from mpmcli.scene.problem import listed, quoted
 from mpmcli.scene.quantity import (
     AXES,
     NUMBER_WORDS,
     Integer,
     NotNegative,
+    Number,
     Positive,
     Table,
     Vector,
     flaw,
+    list_of_axes,
     scene_dimension,
 )
-from mpmcli.scene.wall_rules import PERIODIC, WallVelocity, require_grip, require_pairs
+
+MOST_CELLS = 2**31 - 1
+
+
+def cells_of(size: tuple[float, ...], spacing: float) -> tuple[int, ...]:
+    """Return the cells per axis; refuse a size (m) that is no whole number of them."""
+    ratios = [s / spacing for s in size]
+    if max(ratios) > MOST_CELLS:
+        raise flaw(f"makes more than {MOST_CELLS} cells along an axis; make it coarser", "spacing")
+    # A relative 1e-6 counts as round-off, but never more than a hundredth of a cell.
+    broken = [k for k, r in enumerate(ratios) if round(r) < 1 or abs(r - round(r)) > min(1e-6 * r, 1e-2)]
+    if not broken:
+        return tuple(round(r) for r in ratios)
+    said = []
+    for k in broken:
+        below = int(ratios[k])
+        nearest = " or ".join(f"{n * spacing:.8g}" for n in (below, below + 1) if n)
+        said.append(f"{size[k]:.8g} m is {ratios[k]:.6g} cells along {AXES[k]}, {nearest} m would fit")
+    raise flaw(f"must be a whole number of cells of spacing {spacing:.8g} m: {'; '.join(said)}", "size")
+
+
+def spacing_of(size: tuple[float, ...], cells: tuple[int, ...]) -> float:
+    """Return the spacing, m; refuse cells that are not square or cubic."""
+    if len(cells) != len(size):
+        raise flaw(f"needs {NUMBER_WORDS[len(size)]} numbers, as domain.size has; found {len(cells)}", "cells")
+    spacings = [s / n for s, n in zip(size, cells, strict=True)]
+    if max(spacings) - min(spacings) > 1e-6 * max(spacings):
+        found = ", ".join(f"{h:.6g} m along {axis}" for axis, h in zip(AXES, spacings, strict=False))
+        fitting = ", ".join(str(max(1, round(s / spacings[0]))) for s in size)
+        raise flaw(
+            f"must make {'square' if len(size) == 2 else 'cubic'} cells; found {found}; "
+            f"nearest to the size is [{fitting}]",
+            "cells",
+        )
+    return spacings[0]
+
+
+PERIODIC = "periodic"
+# Particles are put back into the domain when they are sorted. Until then they reach up to three nodes beyond a face,
+# and no node may have two images.
+FEWEST_PERIODIC_CELLS = 7
+
+Velocity = list_of_axes(Number)
+
+
+class Faces(Table):
+    """A table with a key for each face, None where nothing is given."""
+
+    @field_validator("z_min", "z_max", check_fields=False)
+    @classmethod
+    def _needs_a_third_axis(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is not None and scene_dimension(info) == 2:
+            raise flaw("is a face of a 3D scene and this one is 2D; leave it out")
+        return value
+
+    def of(self, face: str) -> Any:
+        """Return what is given for a face by its name, None where there is nothing."""
+        return getattr(self, face)
+
+
+class WallVelocity(Faces):
+    """Velocity of each face that moves along itself: one that sticks, or that has friction."""
+
+    x_min: Velocity | None = Field(None, description="Of the lower face along x, m/s.")
+    x_max: Velocity | None = Field(None, description="Of the upper face along x, m/s.")
+    y_min: Velocity | None = Field(None, description="Of the lower face along y, m/s.")
+    y_max: Velocity | None = Field(None, description="Of the upper face along y, m/s.")
+    z_min: Velocity | None = Field(None, description="Of the lower face along z, m/s; 3D only.")
+    z_max: Velocity | None = Field(None, description="Of the upper face along z, m/s; 3D only.")
+
+
+def require_pairs(words: Mapping[str, str], cells: Sequence[int]) -> None:
+    for axis, count in zip(AXES, cells, strict=False):
+        pair = words[f"{axis}_min"], words[f"{axis}_max"]
+        if PERIODIC not in pair:
+            continue
+        if set(pair) != {PERIODIC}:
+            face, other = (f"{axis}_min", f"{axis}_max")[:: 1 if pair[0] == PERIODIC else -1]
+            raise flaw(
+                f'is "periodic" and {other} is "{words[other]}": material that leaves through one face enters through '
+                f'the other, so that both need "periodic"',
+                f"walls.{face}",
+            )
+        if count < FEWEST_PERIODIC_CELLS:
+            raise flaw(
+                f'has "periodic" for faces with {count} cells between them; they need at least {FEWEST_PERIODIC_CELLS}',
+                "walls",
+            )
+
+
+def require_grip(velocity: WallVelocity, words: Mapping[str, str], frictions: Mapping[str, float]) -> None:
+    """Refuse the velocity of a wall through itself, and that of one which nothing holds to the material."""
+    for face in words:
+        found = velocity.of(face)
+        if found is None:
+            continue
+        axis = AXES.index(face[0])
+        key = f"wall_velocity.{face}"
+        if found[axis] != 0:
+            raise flaw(
+                f"is along the wall, so that its entry {axis + 1}, through it, must be 0; found {found[axis]:g}", key
+            )
+        if words[face] == PERIODIC:
+            raise flaw(f'is for a wall, and domain.walls has "periodic" for {face}; leave it out', key)
+        if words[face] != "stick" and frictions[face] == 0:
+            raise flaw(
+                f'acts on nothing: domain.walls has "{words[face]}" for {face}, without friction; give "stick", or '
+                f"domain.friction",
+                key,
+            )
+
 
 Wall = Literal["slip", "stick", "separate", "periodic", "open"]
 WALLS: tuple[str, ...] = get_args(Wall)
-# Those on which nothing slips.
 # Each wall acts on nodes up to two cells away from it, and no node may belong to both walls of an axis.
 FEWEST_CELLS = 5
 # Faces without friction: nothing slips along them, or they are no wall.
 _NEVER_SLIP = ("stick", PERIODIC, "open")
 
 
-class Walls(Table):
+class Walls(Faces):
     """What each face of the domain does to the material that meets it.
 
     slip: no motion through the wall, free motion along it. stick: no motion at all.
@@ -37,23 +149,18 @@ class Walls(Table):
     open: no wall; what passes the face is gone.
     """
 
-    default: Annotated[Wall, Field(description="For every face that is not named.")] = "separate"
-    x_min: Annotated[Wall | None, Field(description="Lower face along x.")] = None
-    x_max: Annotated[Wall | None, Field(description="Upper face along x.")] = None
-    y_min: Annotated[Wall | None, Field(description="Lower face along y.")] = None
-    y_max: Annotated[Wall | None, Field(description="Upper face along y.")] = None
-    z_min: Annotated[Wall | None, Field(description="Lower face along z; 3D only.")] = None
-    z_max: Annotated[Wall | None, Field(description="Upper face along z; 3D only.")] = None
-
-    @field_validator("z_min", "z_max")
-    @classmethod
-    def _needs_a_third_axis(cls, wall: Wall | None, info: ValidationInfo) -> Wall | None:
-        return _in_3d(wall, info)
+    default: Wall = Field("separate", description="For every face that is not named.")
+    x_min: Wall | None = Field(None, description="Lower face along x.")
+    x_max: Wall | None = Field(None, description="Upper face along x.")
+    y_min: Wall | None = Field(None, description="Lower face along y.")
+    y_max: Wall | None = Field(None, description="Upper face along y.")
+    z_min: Wall | None = Field(None, description="Lower face along z; 3D only.")
+    z_max: Wall | None = Field(None, description="Upper face along z; 3D only.")
 
     def faces(self, dimension: int) -> tuple[tuple[Wall, Wall], ...]:
         """Return what the lower and the upper face along each axis do."""
         return tuple(
-            (getattr(self, f"{axis}_min") or self.default, getattr(self, f"{axis}_max") or self.default)
+            (self.of(f"{axis}_min") or self.default, self.of(f"{axis}_max") or self.default)
             for axis in AXES[:dimension]
         )
 
@@ -62,34 +169,19 @@ class Walls(Table):
         return any("open" in pair for pair in self.faces(dimension))
 
 
-class Friction(Table):
+class Friction(Faces):
     """Coefficient of Coulomb friction of each face that slips or separates.
 
     The wall takes at most the coefficient times the normal force from the force along it that would make it stick.
     """
 
-    default: Annotated[NotNegative, Field(description="For every face that is not named and does not stick.")] = 0.0
-    x_min: Annotated[NotNegative | None, Field(description="Lower face along x.")] = None
-    x_max: Annotated[NotNegative | None, Field(description="Upper face along x.")] = None
-    y_min: Annotated[NotNegative | None, Field(description="Lower face along y.")] = None
-    y_max: Annotated[NotNegative | None, Field(description="Upper face along y.")] = None
-    z_min: Annotated[NotNegative | None, Field(description="Lower face along z; 3D only.")] = None
-    z_max: Annotated[NotNegative | None, Field(description="Upper face along z; 3D only.")] = None
-
-    @field_validator("z_min", "z_max")
-    @classmethod
-    def _needs_a_third_axis(cls, value: float | None, info: ValidationInfo) -> float | None:
-        return _in_3d(value, info)
-
-    def of(self, face: str) -> float | None:
-        """Return the coefficient that is given for a face by its name, None where there is none."""
-        return getattr(self, face)
-
-
-def _in_3d(value: Any, info: ValidationInfo) -> Any:
-    if value is not None and scene_dimension(info) == 2:
-        raise flaw("is a face of a 3D scene and this one is 2D; leave it out")
-    return value
+    default: NotNegative = Field(0.0, description="For every face that is not named and does not stick.")
+    x_min: NotNegative | None = Field(None, description="Lower face along x.")
+    x_max: NotNegative | None = Field(None, description="Upper face along x.")
+    y_min: NotNegative | None = Field(None, description="Lower face along y.")
+    y_max: NotNegative | None = Field(None, description="Upper face along y.")
+    z_min: NotNegative | None = Field(None, description="Lower face along z; 3D only.")
+    z_max: NotNegative | None = Field(None, description="Upper face along z; 3D only.")
 
 
 def _one_number_for_all(value: object) -> object:
@@ -104,76 +196,57 @@ def _one_word_for_all(value: object) -> object:
     if not isinstance(value, str):
         return value
     if value not in WALLS:
-        words = [f'"{word}"' for word in WALLS]
-        raise flaw(
-            f'must be {", ".join(words[:-1])} or {words[-1]}, or a table with one of them per face; found "{value}"'
-        )
+        words = listed(quoted(list(WALLS)))
+        raise flaw(f'must be {words}, or a table with one of them per face; found "{value}"')
     return {"default": value}
 
 
-def _friction_schema(schema: dict[str, Any]) -> None:
-    table = {key: schema.pop(key) for key in ("$ref", "allOf") if key in schema}
-    schema["anyOf"] = [{"type": "number", "minimum": 0}, table]
-    schema["default"] = 0
+def _or_table(single: dict[str, Any], default: object) -> Callable[[dict[str, Any]], None]:
+    """Return what lets a JSON Schema of a table take a single value for all faces too."""
 
+    def change(schema: dict[str, Any]) -> None:
+        table = {key: schema.pop(key) for key in ("$ref", "allOf") if key in schema}
+        schema |= {"anyOf": [single, table], "default": default}
 
-def _walls_schema(schema: dict[str, Any]) -> None:
-    table = {key: schema.pop(key) for key in ("$ref", "allOf") if key in schema}
-    schema["anyOf"] = [{"enum": list(WALLS)}, table]
-    schema["default"] = "separate"
+    return change
 
 
 class Domain(Table):
     """A box of square (2D) or cubic (3D) grid cells."""
 
-    size: Annotated[
-        tuple[Positive, ...],
-        Field(
-            description="Edge lengths, m; two numbers make a 2D scene, three a 3D one.",
-            json_schema_extra={"minItems": 2, "maxItems": 3},
-        ),
-    ]
-    origin: Annotated[
-        Vector,
-        Field(validate_default=True, description="Coordinates of the lower corner, m. Default: zeros."),
-    ] = None  # type: ignore[assignment]
-    spacing: Annotated[
-        Positive,
-        Field(description="Grid spacing h, m, of which the size is a whole multiple; or give cells."),
-    ] = None  # type: ignore[assignment]
-    cells: Annotated[
-        tuple[Annotated[Integer, Field(ge=1, le=MOST_CELLS)], ...],
-        Field(
-            description="Number of cells along each axis; or give spacing.",
-            json_schema_extra={"minItems": 2, "maxItems": 3},
-        ),
-    ] = None  # type: ignore[assignment]
-    gravity: Annotated[
-        TimeVector,
-        Field(
-            validate_default=True,
-            description="Gravity, m/s^2; numbers, or expressions of the time t (s). Default: none.",
-        ),
-    ] = None  # type: ignore[assignment]
-    walls: Annotated[
-        Walls,
-        BeforeValidator(_one_word_for_all),
-        Field(
-            description="slip, stick, separate, periodic or open: one word for all faces, or a table.",
-            json_schema_extra=_walls_schema,
-        ),
-    ] = Walls()
-    friction: Annotated[
-        Friction,
-        BeforeValidator(_one_number_for_all),
-        Field(
-            description="Coefficient of friction of walls that slip or separate: one number for all, or a table.",
-            json_schema_extra=_friction_schema,
-        ),
-    ] = Friction()
-    wall_velocity: Annotated[
-        WallVelocity | None, Field(description="Velocity along themselves of walls that stick or have friction, m/s.")
-    ] = None
+    size: tuple[Positive, ...] = Field(
+        description="Edge lengths, m; two numbers make a 2D scene, three a 3D one.",
+        json_schema_extra={"minItems": 2, "maxItems": 3},
+    )
+    origin: Vector = Field(
+        None, validate_default=True, description="Coordinates of the lower corner, m. Default: zeros."
+    )
+    spacing: Positive = Field(
+        None, description="Grid spacing h, m, of which the size is a whole multiple; or give cells."
+    )
+    cells: tuple[Annotated[Integer, Field(ge=1, le=MOST_CELLS)], ...] = Field(
+        None,
+        description="Number of cells along each axis; or give spacing.",
+        json_schema_extra={"minItems": 2, "maxItems": 3},
+    )
+    gravity: TimeVector = Field(
+        None,
+        validate_default=True,
+        description="Gravity, m/s^2; numbers, or expressions of the time t (s). Default: none.",
+    )
+    walls: Annotated[Walls, BeforeValidator(_one_word_for_all)] = Field(
+        Walls(),
+        description="slip, stick, separate, periodic or open: one word for all faces, or a table.",
+        json_schema_extra=_or_table({"enum": list(WALLS)}, "separate"),
+    )
+    friction: Annotated[Friction, BeforeValidator(_one_number_for_all)] = Field(
+        Friction(),
+        description="Coefficient of friction of walls that slip or separate: one number for all, or a table.",
+        json_schema_extra=_or_table({"type": "number", "minimum": 0}, 0),
+    )
+    wall_velocity: WallVelocity | None = Field(
+        None, description="Velocity along themselves of walls that stick or have friction, m/s."
+    )
 
     @field_validator("size")
     @classmethod
@@ -202,7 +275,7 @@ class Domain(Table):
         return self.model_copy(update={"spacing": spacing, "cells": cells})
 
     @model_validator(mode="after")
-    def _friction_of_walls_that_slip(self) -> "Domain":
+    def _faces_that_belong_together(self) -> "Domain":
         words = self._words()
         for face, word in words.items():
             if word in _NEVER_SLIP and self.friction.of(face) is not None:
@@ -214,11 +287,6 @@ class Domain(Table):
         if self.friction.default > 0 and set(words.values()) <= {*_NEVER_SLIP}:
             found = " or ".join(f'"{word}"' for word in sorted({*words.values()}, reverse=True))
             raise flaw(f"is for walls that can slip, and domain.walls has {found} for all; leave it out", "friction")
-        return self
-
-    @model_validator(mode="after")
-    def _walls_that_belong_together(self) -> "Domain":
-        words = self._words()
         require_pairs(words, self.cells)
         if self.wall_velocity is not None:
             require_grip(self.wall_velocity, words, dict(zip(words, sum(self.frictions, ()), strict=True)))

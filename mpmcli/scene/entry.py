@@ -1,16 +1,29 @@
-"""Values of a scene that are numbers or expressions: which names each may hold, and how it is read and written."""
+"""Values of a scene that are numbers or expressions, and the constants that expressions may use."""
 
+import ast
 import math
+import re
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Discriminator, GetCoreSchemaHandler, GetJsonSchemaHandler, Tag
 from pydantic_core import CoreSchema, core_schema
 
-from mpmcli.scene.expression import INITIAL, POSITION, Expression, ExpressionError, Number, Tree
+from mpmcli.scene.expression import (
+    CONSTANTS,
+    FUNCTIONS,
+    INITIAL,
+    POSITION,
+    QUANTITIES,
+    Expression,
+    ExpressionError,
+    Number,
+    Tree,
+)
 from mpmcli.scene.expression_reader import parse
+from mpmcli.scene.problem import Path, written
 from mpmcli.scene.quantity import LARGEST, flaw, list_of_axes, scene_dimension
-from mpmcli.scene.sentences import written
 
 Entry = float | Expression
 
@@ -22,13 +35,11 @@ class EntryOf:
         self.names = names
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return the schema that reads an entry, and writes the text of an expression back."""
         return core_schema.with_info_plain_validator_function(
             self.read, serialization=core_schema.plain_serializer_function_ser_schema(plain)
         )
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        """Return number | string."""
         text = {"type": "string", "description": f"An expression of {', '.join(self.names)}."}
         return {"anyOf": [{"type": "number"}, text]}
 
@@ -72,13 +83,18 @@ def tree_of(entry: Entry) -> Tree:
     return entry.tree if isinstance(entry, Expression) else Number(float(entry))
 
 
+def entries_in(value: Any, path: Path = ()) -> Iterator[tuple[Path, Entry]]:
+    """Yield the entry that a value is, or those of a vector or matrix, each with its path; nothing for None."""
+    if isinstance(value, tuple):
+        for k, inner in enumerate(value):
+            yield from entries_in(inner, (*path, k))
+    elif value is not None:
+        yield path, value
+
+
 def varies(*entries: Entry) -> bool:
     """Say whether any of the entries is an expression."""
     return any(isinstance(entry, Expression) for entry in entries)
-
-
-def _is_list(value: object) -> str:
-    return "F" if isinstance(value, list | tuple) else "J"
 
 
 OfTime = Annotated[Entry, EntryOf("t")]
@@ -90,4 +106,64 @@ PlaceVector = list_of_axes(OfPlace)
 StartVector = list_of_axes(OfStart, zeros=True)
 StartMatrix = list_of_axes(list_of_axes(OfStart))
 # J, or F as rows.
-StartDeformation = Annotated[Annotated[OfStart, Tag("J")] | Annotated[StartMatrix, Tag("F")], Discriminator(_is_list)]
+StartDeformation = Annotated[
+    Annotated[OfStart, Tag("J")] | Annotated[StartMatrix, Tag("F")],
+    Discriminator(lambda value: "F" if isinstance(value, list | tuple) else "J"),
+]
+
+
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+
+
+class Constants(dict[str, "float | str"]):
+    """The constants as they were written: a number, or the text of an expression, by name."""
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(tuple(self.items()))
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.with_info_plain_validator_function(
+            cls._read, serialization=core_schema.plain_serializer_function_ser_schema(dict)
+        )
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        entry = {"anyOf": [{"type": "number"}, {"type": "string", "description": "An expression."}]}
+        return {"type": "object", "additionalProperties": entry}
+
+    @classmethod
+    def _read(cls, value: object, info: core_schema.ValidationInfo) -> "Constants":
+        if not isinstance(value, dict):
+            raise flaw(f"must be a table of names, such as {{ depth = 0.3 }}; found {written(value)}")
+        _, faults = definitions(value, scene_dimension(info))
+        for name, sentence in faults.items():
+            raise flaw(sentence, name)
+        return cls(value)
+
+
+def definitions(table: object, dimension: int | None) -> tuple[dict[str, ast.expr], dict[str, str]]:
+    """Return what each constant of the table [constants] stands for, and what is wrong with others, by name."""
+    found: dict[str, ast.expr] = {}
+    faults: dict[str, str] = {}
+    quantities = [name for name in QUANTITIES if dimension != 2 or name not in (POSITION[2], INITIAL[2])]
+    for name, value in table.items() if isinstance(table, Mapping) else ():
+        if not _NAME.fullmatch(name):
+            faults[name] = "is no name for an expression; use letters, digits and _, and begin with a letter"
+        elif name in QUANTITIES or name in CONSTANTS or name in FUNCTIONS:
+            faults[name] = "has a meaning in every expression already; take another name"
+        else:
+            # What uses a constant that is wrong has no fault of its own.
+            read: Expression | float = 1.0
+            if isinstance(value, str):
+                try:
+                    read = parse(value, quantities, found)
+                except ExpressionError as error:
+                    faults[name] = str(error)
+            elif isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+                faults[name] = f"must be a number up to {LARGEST:g}, or an expression in quotes; found {written(value)}"
+            else:
+                read = float(value)
+            text = read.text if isinstance(read, Expression) else repr(read)
+            found[name] = ast.parse(text, mode="eval").body
+    return found, faults

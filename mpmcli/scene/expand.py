@@ -8,34 +8,20 @@ import copy
 from dataclasses import dataclass, field
 from typing import Any
 
-from mpmcli.scene.knobs import Knob, knobs_of
-from mpmcli.scene.material import MaterialParameters
+from mpmcli.scene.material import Knob, Laws, MaterialParameters, knobs_of, unit_of
 from mpmcli.scene.presets import PRESETS
-from mpmcli.scene.problem import Path, Problem
-from mpmcli.scene.repair import Renames
-from mpmcli.scene.sentences import listed, nearest, quoted, written
-from mpmcli.scene.units import unit_of
-
-Laws = tuple[type[MaterialParameters], ...]
+from mpmcli.scene.problem import Path, Problem, Renames, listed, nearest, quoted, written
 
 
 @dataclass
 class Expansion:
-    """Parsed TOML whose materials are tables of laws.
-
-    Attributes:
-        data: the scene; a material that is too faulty to go on with is None.
-        problems: what is wrong with presets and knobs.
-        renames: path of each parameter that a knob set -> path of the knob.
-        faulty: paths of the materials that are None.
-        notes: by table and index of the body or emitter, what each knob did.
-    """
+    """Parsed TOML whose materials are tables of laws; a material that is too faulty to go on with is None."""
 
     data: dict[str, Any]
-    problems: list[Problem] = field(default_factory=list)
-    renames: Renames = field(default_factory=dict)
-    faulty: set[Path] = field(default_factory=set)
-    notes: dict[tuple[str, int], list[str]] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)  # of presets and knobs
+    renames: Renames = field(default_factory=dict)  # path of each parameter that a knob set -> path of the knob
+    faulty: set[Path] = field(default_factory=set)  # paths of the materials that are None
+    notes: dict[tuple[str, int], list[str]] = field(default_factory=dict)  # what each knob did, by table and index
 
     def hides(self, path: Path) -> bool:
         """Say whether a path lies in a material that has its problem already."""
@@ -43,12 +29,7 @@ class Expansion:
 
 
 def expand_materials(data: dict[str, Any], laws: Laws) -> Expansion:
-    """Return parsed TOML with every material as its law's table; what is no material at all stays as it is.
-
-    Args:
-        data: parsed TOML, which is not changed.
-        laws: parameter models of the constitutive laws that a material may follow.
-    """
+    """Return parsed TOML, copied, with every material as its law's table; what is no material at all stays as it is."""
     expansion = Expansion(copy.deepcopy(data))
     for table in ("bodies", "emitters"):
         bodies = expansion.data.get(table)
@@ -68,8 +49,6 @@ def available_presets(laws: Laws) -> list[str]:
 
 
 class _Material:
-    """One material of a scene on its way to a law's table."""
-
     def __init__(self, expansion: Expansion, body: tuple[str, int], laws: Laws) -> None:
         self.expansion = expansion
         self.body = body
@@ -77,28 +56,21 @@ class _Material:
         self.laws = {_law_name(law): law for law in laws}
         self.presets = available_presets(laws)
 
-    def expanded(self, written_so: object) -> dict[str, Any] | None:
+    def expanded(self, material: object) -> dict[str, Any] | None:
         """Return the table of the law, or None after a problem without which it cannot be made."""
-        if isinstance(written_so, str):
-            preset = self._preset(written_so, self.path)
-            return self._table(preset, {}) if preset else None
-        if isinstance(written_so, dict):
-            return self._from_table(dict(written_so))
-        sentence = f"must be a preset in quotes, or a table with a law or a preset; found {written(written_so)}"
-        return self._fault(self.path, sentence)
-
-    def _from_table(self, table: dict[str, Any]) -> dict[str, Any] | None:
-        found = self._kind(table)
-        if found is None:
+        if isinstance(material, str):
+            return self._table("preset", material, {}) if self._names("preset", material, self.path) else None
+        if not isinstance(material, dict):
+            sentence = f"must be a preset in quotes, or a table with a law or a preset; found {written(material)}"
+            return self._fault(self.path, sentence)
+        if (found := self._kind(material)) is None:
             return None
         key, kind = found
-        path, word = (*self.path, key), table.pop(key)
+        path, word = (*self.path, key), material[key]
         if not isinstance(word, str):
             return self._fault(path, f"must be text in quotes; found {written(word)}")
-        if kind == "law":
-            return self._table("", {"law": word, **table}) if self._is_law(word, path) else None
-        preset = self._preset(word, path)
-        return self._table(preset, table) if preset else None
+        others = {name: value for name, value in material.items() if name != key}
+        return self._table(kind, word, others) if self._names(kind, word, path) else None
 
     def _kind(self, table: dict[str, Any]) -> tuple[str, str] | None:
         """Return the key that names the material, `law` or `preset`, perhaps misspelled, and its meaning."""
@@ -115,28 +87,26 @@ class _Material:
         laws, presets = listed(quoted(sorted(self.laws))), listed(quoted(self.presets))
         return self._fault((*self.path, "law"), f"missing key: the constitutive law, {laws}; or a preset, {presets}")
 
-    def _preset(self, name: str, path: Path) -> str | None:
-        if name in self.presets:
-            return name
-        if name in self.laws:
-            sentence = f'"{name}" is a law, and needs its parameters: {{ law = "{name}", density = ... }}'
-        else:
-            sentence = _unknown("preset", name, self.presets)
-        return self._fault(path, sentence)
-
-    def _is_law(self, name: str, path: Path) -> bool:
-        if name in self.laws:
+    def _names(self, kind: str, word: str, path: Path) -> bool:
+        """Say whether a word names a law or a preset, as `kind` says; report a problem where it does not."""
+        laws, presets = sorted(self.laws), self.presets
+        known, others = (laws, presets) if kind == "law" else (presets, laws)
+        if word in known:
             return True
-        if name in self.presets:
-            self._fault(path, f'"{name}" is a preset: write preset = "{name}"')
+        if word not in others:
+            hint = f'did you mean "{guess}"? ' if (guess := nearest(word, known)) else ""
+            sentence = f"unknown {kind} {written(word)}; {hint}The {kind}s are {listed(quoted(known), 'and')}"
+        elif kind == "law":
+            sentence = f'"{word}" is a preset: write preset = "{word}"'
         else:
-            self._fault(path, _unknown("law", name, sorted(self.laws)))
+            sentence = f'"{word}" is a law, and needs its parameters: {{ law = "{word}", density = ... }}'
+        self._fault(path, sentence)
         return False
 
-    def _table(self, preset: str, said: dict[str, Any]) -> dict[str, Any]:
-        """Return the law's table from a preset, or "" for none, and what the scene says itself."""
-        values = dict(PRESETS[preset].parameters) if preset else {}
-        law = PRESETS[preset].law if preset else said["law"]
+    def _table(self, kind: str, word: str, said: dict[str, Any]) -> dict[str, Any]:
+        """Return the table of a law, or of that of a preset with its values, and what the scene says itself."""
+        preset = PRESETS[word] if kind == "preset" else None
+        law = preset.law if preset else word
         model = self.laws[law]
         knobs = knobs_of(model)
         own = {key: value for key, value in said.items() if key not in knobs}
@@ -144,13 +114,13 @@ class _Material:
             if sentence := self._foreign(key, law):
                 self._fault((*self.path, key), sentence)
                 del own[key]
-        result = {"law": law, **values, **own}
+        result = {"law": law, **(preset.parameters if preset else {}), **own}
         for key in [key for key in said if key in knobs]:
             parameter, knob = knobs[key]
             if sentence := _beside(knob, parameter, own):
                 self._fault((*self.path, key), sentence)
                 continue
-            result[parameter] = self._turned(knob, said[key], parameter, model, preset)
+            result[parameter] = self._turned(knob, said[key], parameter, model, word if preset else "")
         return result
 
     def _foreign(self, key: str, law: str) -> str | None:
@@ -158,9 +128,13 @@ class _Material:
         fields, knobs = self.laws[law].model_fields, knobs_of(self.laws[law])
         if key in fields:
             return None
-        for kind, own, other in (("knob", list(knobs), knobs_of), ("parameter", list(fields), _parameters)):
-            if any(key in other(model) for model in self.laws.values()):
-                names = [name for name in sorted(own) if name != "law"]
+        models = self.laws.values()
+        for kind, known, elsewhere in (
+            ("knob", knobs, any(key in knobs_of(model) for model in models)),
+            ("parameter", fields, any(key in model.model_fields for model in models)),
+        ):
+            if elsewhere:
+                names = [name for name in sorted(known) if name != "law"]
                 its = f"its {kind}{'s are' if len(names) > 1 else ' is'} {listed(quoted(names), 'and')}"
                 return f'the law {law} has no {kind} "{key}"; {its if names else "it has none"}'
         return None
@@ -189,20 +163,9 @@ def _beside(knob: Knob, parameter: str, said: dict[str, Any]) -> str | None:
     """Return what is wrong with a knob beside the parameters that the scene gives, or None."""
     if parameter in said:
         return f"sets {parameter}, which is given as well; leave one of them out"
-    for other in knob.excludes:
-        if other in said and said[other] != "auto":
-            return f"sets {parameter}, which {other} = {written(said[other])} overrules; leave one of them out"
-    return None
-
-
-def _unknown(kind: str, name: str, known: list[str]) -> str:
-    guess = nearest(name, known)
-    hint = f'did you mean "{guess}"? ' if guess else ""
-    return f"unknown {kind} {written(name)}; {hint}The {kind}s are {listed(quoted(known), 'and')}"
-
-
-def _parameters(law: type[MaterialParameters]) -> list[str]:
-    return list(law.model_fields)
+    overrules = (f"{other} = {written(said[other])}" for other in knob.excludes if said.get(other, "auto") != "auto")
+    first = next(overrules, None)
+    return f"sets {parameter}, which {first} overrules; leave one of them out" if first else None
 
 
 def _law_name(law: type[MaterialParameters]) -> str:

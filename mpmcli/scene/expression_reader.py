@@ -1,6 +1,6 @@
 """Reads expressions from text, which is never run as Python.
 
-Python's parser splits the text, and of what it returns only what stands in the tables of `functions` is taken. A
+Python's parser splits the text, and of what it returns only what stands in the tables of `expression` is taken. A
 comparison is true or false and no number: it may stand where a condition is needed, in `a if c else b`, `and`, `or` and
 `not`, and nowhere else.
 """
@@ -11,9 +11,13 @@ import math
 import warnings
 from collections import Counter
 from collections.abc import Collection, Mapping
+from functools import reduce
+from itertools import pairwise
 from types import MappingProxyType
 
 from mpmcli.scene.expression import (
+    CONSTANTS,
+    FUNCTIONS,
     QUANTITIES,
     Apply,
     Expression,
@@ -25,7 +29,7 @@ from mpmcli.scene.expression import (
     kind_of,
     names_in,
 )
-from mpmcli.scene.functions import CONSTANTS, FUNCTIONS
+from mpmcli.scene.problem import listed
 
 # An expression of a scene is a formula that a person has written; kernels hold all of it.
 MOST_CHARACTERS = 2000
@@ -46,18 +50,9 @@ _INSTEAD = {
 def parse(
     text: str, names: Collection[str], constants: Mapping[str, ast.expr] = MappingProxyType({})
 ) -> Expression | float:
-    """Read an expression.
+    """Read an expression of some names, and of constants that stand for others; its value where it depends on nothing.
 
-    Args:
-        text: what stands in the scene.
-        names: the quantities that may occur in it.
-        constants: what further names stand for.
-
-    Returns:
-        The expression, or its value where it depends on nothing.
-
-    Raises:
-        ExpressionError: one sentence, which goes on after the place of the value.
+    The sentence of an ExpressionError goes on after the place of the value.
     """
     if len(text) > MOST_CHARACTERS:
         raise ExpressionError(f"is too long for an expression: {len(text)} characters, {MOST_CHARACTERS} at most")
@@ -79,7 +74,9 @@ def parse(
     for name in used:
         inner = {node.id for node in ast.walk(constants[name]) if isinstance(node, ast.Name)}
         for quantity in sorted(inner & set(QUANTITIES) - set(names)):
-            raise ExpressionError(f'uses "{name}", which depends on "{quantity}"; the names here are {_listed(names)}')
+            raise ExpressionError(
+                f'uses "{name}", which depends on "{quantity}"; the names here are {listed(list(names), "and")}'
+            )
     if used:
         length = len(source) + sum(count * len(ast.unparse(constants[name])) for name, count in used.items())
         if length > MOST_EXPANDED:
@@ -162,12 +159,13 @@ class _Reader:
                 return apply(_BINARY[type(node.op)], left, right)
             case ast.BoolOp():
                 word = "and" if isinstance(node.op, ast.And) else "or"
-                return self._joined(word, [self._truth(value, depth) for value in node.values])
+                truths = [self._truth(value, depth) for value in node.values]
+                return reduce(lambda left, right: Apply(word, (left, right)), truths)
             case ast.Compare() if all(type(op) in _COMPARED for op in node.ops):
                 sides = [self._number(side, depth) for side in (node.left, *node.comparators)]
                 signs = [_COMPARED[type(op)] for op in node.ops]
-                pairs = zip(signs, sides[:-1], sides[1:], strict=True)
-                return self._joined("and", [Apply(sign, (left, right)) for sign, left, right in pairs])
+                truths = [Apply(sign, pair) for sign, pair in zip(signs, pairwise(sides), strict=True)]
+                return reduce(lambda left, right: Apply("and", (left, right)), truths)
             case ast.IfExp():
                 condition = self._truth(node.test, depth)
                 return apply("if", condition, self._number(node.body, depth), self._number(node.orelse, depth))
@@ -179,13 +177,6 @@ class _Reader:
             f'cannot hold "{self._said(node)}"{instead or "; it takes numbers, names, + - * / ** %, comparisons, "}'
             f"{'' if instead else '`a if c else b` and functions'}"
         )
-
-    @staticmethod
-    def _joined(word: str, truths: list[Tree]) -> Tree:
-        tree = truths[0]
-        for other in truths[1:]:
-            tree = Apply(word, (tree, other))
-        return tree
 
     def _said(self, node: ast.expr) -> str:
         return _cut(ast.get_source_segment(self.source, node) or ast.unparse(node))
@@ -207,7 +198,9 @@ class _Reader:
         if name in FUNCTIONS:
             raise ExpressionError(f'needs what "{name}" is to be taken of: {name}(...)')
         if {"z": "y", "Z": "Y"}.get(name) in self.names:
-            raise ExpressionError(f'has no "{name}" in a 2D scene; the names here are {_listed(self.names)}')
+            raise ExpressionError(
+                f'has no "{name}" in a 2D scene; the names here are {listed(list(self.names), "and")}'
+            )
         raise ExpressionError(_unknown("name", name, self.names, (*self.names, *CONSTANTS)))
 
     def _call(self, node: ast.Call, depth: int) -> Tree:
@@ -229,11 +222,6 @@ class _Reader:
         return apply(name, *[self._number(argument, depth) for argument in node.args])
 
 
-def _listed(words: Collection[str]) -> str:
-    words = list(words)
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
-
-
 def _unknown(kind: str, word: str, shown: Collection[str], known: tuple[str, ...]) -> str:
     # A name that differs in its case alone is nearest.
     cased = [one for one in known if one.lower() == word.lower()]
@@ -241,4 +229,5 @@ def _unknown(kind: str, word: str, shown: Collection[str], known: tuple[str, ...
     hint = f'did you mean "{guess}"? ' if guess else ""
     here = " here" if kind == "name" else ""
     are = f"s{here} are" if len(shown) > 1 else f"{here} is"
-    return f'has an unknown {kind} "{_cut(word)}"; {hint}{"The" if guess else "the"} {kind}{are} {_listed(shown)}'
+    the = f"{'The' if guess else 'the'} {kind}{are} {listed(list(shown), 'and')}"
+    return f'has an unknown {kind} "{_cut(word)}"; {hint}{the}'

@@ -9,22 +9,67 @@ from pathlib import Path as File
 from types import MappingProxyType
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from mpmcli.errors import InputError
 from mpmcli.scene.bounds import scene_bounds
 from mpmcli.scene.checks import problems_in
-from mpmcli.scene.constants import definitions
-from mpmcli.scene.expand import Laws, expand_materials
-from mpmcli.scene.locate import key_lines, line_of
-from mpmcli.scene.overrides import apply_overrides
-from mpmcli.scene.problem import Path, Problem, path_text
+from mpmcli.scene.entry import definitions
+from mpmcli.scene.expand import expand_materials
+from mpmcli.scene.material import Laws
+from mpmcli.scene.problem import (
+    Path,
+    Problem,
+    Renames,
+    known_keys,
+    nearest,
+    nearest_entry,
+    path_in,
+    path_text,
+    problems_of,
+    value_at,
+)
 from mpmcli.scene.quantity import dimension_of
-from mpmcli.scene.repair import Renames, original_path, repaired
 from mpmcli.scene.sampling import points_per_cell
 from mpmcli.scene.schema import Scene, scene_model
-from mpmcli.scene.sentences import problems_of
-from mpmcli.scene.tables import too_deep
+from mpmcli.scene.toml_file import apply_overrides, copied, key_lines, line_of, too_deep
+
+
+def repaired(
+    data: dict[str, Any], unknown: list[Path], model: type[BaseModel]
+) -> tuple[set[Path], dict[str, Any], Renames]:
+    """Return the paths of keys at pydantic's locations `unknown`, the data without them, and which got other names.
+
+    A misspelled key is taken for its nearest neighbour, any other is dropped. Only to find what else is wrong; a scene
+    with an unknown key is always refused.
+    """
+    paths: set[Path] = set()
+    renames: Renames = {}
+    result = copied(data)
+    for loc in unknown:
+        path = path_in(data, loc)
+        paths.add(path)
+        table: Any = value_at(result, path[:-1])
+        value = table.pop(path[-1])
+        guess = nearest(str(path[-1]), known_keys(model, loc[:-1]))
+        if guess and guess not in table:
+            table[guess] = value
+            renames[(*path[:-1], guess)] = path
+    return paths, result, renames
+
+
+def original_path(path: Path, renames: Renames) -> Path:
+    """Return a path in repaired data as it is in the scene as it was written."""
+    found = nearest_entry(path, renames)
+    return path if found is None else (*found[0], *found[1])
+
+
+def _as_written(problems: list[Problem], *renames: Renames) -> list[Problem]:
+    """Return problems at their paths in the scene as it was written; of several renames the latest come first."""
+    for one in renames:
+        problems = [Problem(original_path(p.path, one), p.sentence) for p in problems]
+    return problems
+
 
 _POSITION = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 # Messages of tomllib that a plainer sentence replaces.
@@ -58,7 +103,7 @@ def load_scene(path: str | PathLike[str], overrides: Sequence[str] = (), *, laws
 
     Args:
         path: the file.
-        overrides: values to replace, `KEY=VALUE` each; see `overrides.apply_overrides`.
+        overrides: values to replace, `KEY=VALUE` each; see `toml_file.apply_overrides`.
         laws: parameter models of the constitutive laws that a material may follow.
 
     Raises:
@@ -115,10 +160,6 @@ def _validate(
     renames: Renames = {}
     while True:
         expansion = expand_materials(data, laws)
-
-        def as_written(path: Path, expanded: Renames = expansion.renames, repaired: Renames = renames) -> Path:
-            return original_path(original_path(path, expanded), repaired)
-
         unknown: list[Path] = []
         found: list[Problem] = []
         scene = None
@@ -132,9 +173,9 @@ def _validate(
             found = [p for p in problems_of(error, expansion.data, model) if not expansion.hides(p.path)]
         if not unknown:
             found += expansion.problems + (problems_in(scene) if scene is not None else [])
-            return scene, problems + [Problem(as_written(p.path), p.sentence) for p in found], expansion.notes
+            return scene, problems + _as_written(found, expansion.renames, renames), expansion.notes
         unknown_paths, data, new = repaired(data, unknown, model)
-        problems += [Problem(as_written(p.path), p.sentence) for p in found if p.path in unknown_paths]
+        problems += _as_written([p for p in found if p.path in unknown_paths], expansion.renames, renames)
         renames = {**renames, **{p: original_path(old, renames) for p, old in new.items()}}
 
 
@@ -166,21 +207,12 @@ def report(
         text: its TOML text, for line numbers.
         overridden: texts of the overrides by the paths that they set.
     """
-    lines = key_lines(text)
-    ordered = sorted(problems, key=lambda p: line_of(p.path, lines) or 0)
-    return "\n".join(_line(p, source, lines, overridden) for p in ordered)
-
-
-def _line(problem: Problem, source: str, lines: dict[Path, int], overridden: Mapping[Path, str]) -> str:
-    """Write a problem with its place: the override that made it, or the file and its line."""
-    for end in range(len(problem.path), 0, -1):
-        if problem.path[:end] in overridden:
-            place = overridden[problem.path[:end]]
-            break
-    else:
-        line = line_of(problem.path, lines)
-        place = source if line is None else f"{source}:{line}"
-    return ": ".join(filter(None, [place, path_text(problem.path), problem.sentence]))
+    lines, rows = key_lines(text), []
+    for problem in sorted(problems, key=lambda p: line_of(p.path, lines) or 0):
+        line, override = line_of(problem.path, lines), nearest_entry(problem.path, overridden)
+        place = override[0] if override else source if line is None else f"{source}:{line}"
+        rows.append(": ".join(filter(None, [place, path_text(problem.path), problem.sentence])))
+    return "\n".join(rows)
 
 
 def read_toml(path: str | PathLike[str], kind: str = "scene") -> tuple[str, dict[str, Any]]:
@@ -193,14 +225,10 @@ def read_toml(path: str | PathLike[str], kind: str = "scene") -> tuple[str, dict
     Raises:
         InputError: the file cannot be read, or is not valid TOML.
     """
-    text = _read(File(path), kind)
-    return text, _parse(text, str(path))
-
-
-def _read(file: File, kind: str) -> str:
+    file = File(path)
     try:
         # utf-8-sig: some editors begin a file with a byte order mark.
-        return file.read_text(encoding="utf-8-sig")
+        text = file.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError(f"{file}: there is no such file; give the path of a {kind} in TOML") from None
     except IsADirectoryError:
@@ -215,6 +243,7 @@ def _read(file: File, kind: str) -> str:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{file}: the file cannot be read: {reason}") from None
+    return text, _parse(text, str(path))
 
 
 def _parse(text: str, source: str) -> dict[str, Any]:

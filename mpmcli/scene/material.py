@@ -1,12 +1,82 @@
-"""The base class of the parameters of every law."""
+"""What a law's parameters are: their model, the knobs that set them, and their units."""
 
+import math
+import re
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal, NamedTuple, Self
+from typing import ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from mpmcli.scene.quantity import Positive
+
+
+@dataclass(frozen=True)
+class Knob:
+    """A word, and a position from 0 to 1, for one parameter of a law.
+
+    It is an entry of the metadata of that parameter:
+    `viscosity: Annotated[NotNegative, Knob("thickness", 1e-3, 1e2, "...")] = Field(0.0, description=...)`.
+
+    Attributes:
+        name: the key that a scene says.
+        low: value of the parameter at position 0, in its own unit.
+        high: value at position 1; below `low` where the word means less of the parameter.
+        meaning: what some positions are like, a sentence without its full stop.
+        scale: equal steps of a logarithmic knob multiply the parameter, of a linear one add to it.
+        excludes: further parameters that settle the same thing, so that the knob is refused beside them.
+    """
+
+    name: str
+    low: float
+    high: float
+    meaning: str
+    scale: Literal["logarithmic", "linear"] = "logarithmic"
+    excludes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.scale == "logarithmic" and min(self.low, self.high) <= 0:
+            raise ValueError(f'The knob "{self.name}" is logarithmic, so both of its ends must be greater than 0.')
+
+    def value(self, position: float) -> float:
+        """Return the parameter at a position from 0 to 1; exactly `low` and `high` at the ends."""
+        if self.scale == "linear":
+            return float(self.low * (1 - position) + self.high * position)
+        return float(self.low ** (1 - position) * self.high**position)
+
+    def position(self, value: float) -> float | None:
+        """Return where the knob stands for a value of the parameter, or None where that is beyond its ends."""
+        low, high, x = self.low, self.high, value
+        if not min(low, high) <= x <= max(low, high):
+            return None
+        if self.scale == "logarithmic":
+            low, high, x = math.log(low), math.log(high), math.log(x)
+        return (x - low) / (high - low)
+
+    def reach(self, unit: str) -> str:
+        """Write the parameter at both ends, and the scale: `0.001 to 100 Pa s, logarithmic`."""
+        return f"{f'{self.low:g} to {self.high:g} {unit}'.rstrip()}, {self.scale}"
+
+
+def knobs_of(model: type[BaseModel]) -> dict[str, tuple[str, Knob]]:
+    """Return (parameter, knob) of every knob of a parameter model, by the knob's name."""
+    return {
+        entry.name: (parameter, entry)
+        for parameter, field in model.model_fields.items()
+        for entry in field.metadata
+        if isinstance(entry, Knob)
+    }
+
+
+# After a comma: kg/m^3, Pa s, degrees, ...; then the sentence ends or goes on after a mark.
+_SYMBOL = r"(?:kg|Pa|mol|degrees|rad|[mskJNKW1])(?:\^(?:-?\d+|n))?"
+_UNIT = re.compile(rf", ({_SYMBOL}(?:[ /]{_SYMBOL})*)(?=[.,;:)]|$)")
+
+
+def unit_of(description: str | None) -> str:
+    """Return the unit in a description such as "Viscosity, Pa s; water 1e-3.", or "" where it names none."""
+    found = _UNIT.search(description or "")
+    return found[1] if found else ""
 
 
 @dataclass(frozen=True)
@@ -61,8 +131,8 @@ class MaterialParameters(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
-    law: Annotated[str, Field(description="Name of the constitutive law.")]
-    density: Annotated[Positive, Field(description="Density at rest, kg/m^3.")]
+    law: str = Field(description="Name of the constitutive law.")
+    density: Positive = Field(description="Density at rest, kg/m^3.")
 
     internal: ClassVar[tuple[Internal, ...]] = ()
     stores: ClassVar[Literal["J", "F"]] = "F"
@@ -81,3 +151,6 @@ class MaterialParameters(BaseModel):
     def volume_ratio_under(self, load: np.ndarray) -> np.ndarray:
         """Return the J, (n,), at which the material at rest has J p = `load`, (n,), Pa; nan where none does."""
         raise NotImplementedError
+
+
+Laws = tuple[type[MaterialParameters], ...]

@@ -1,60 +1,115 @@
-"""A body in the form of a closed mesh, read from a file."""
+"""A body in the form of a closed mesh from a file: welded, closed, facing outwards."""
 
 import math
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 import numpy as np
 from pydantic import Field, PrivateAttr, ValidationInfo, model_validator
 
-from mpmcli.scene.mesh_file import MeshFileError, read_mesh
-from mpmcli.scene.quantity import Number, Positive, Table, Vector, flaw
-from mpmcli.scene.triangle_distance import surface_distance
-from mpmcli.scene.triangles import Surface
+from mpmcli.scene.geometry_file import GeometryFileError, file_version, read_geometry, scene_file
+from mpmcli.scene.primitives import Solid, grid_points, rotation
+from mpmcli.scene.quantity import Axis, Number, Positive, Table, Vector, flaw, place_text
+from mpmcli.scene.triangles import ClosedSurface, surface_distance
+
+# Points per axis at which the surface is tried for parts that overlap or are inside out.
+_TRIED = 24
+
+
+class MeshFileError(Exception):
+    """A file makes no closed surface; the text says why, in words that follow the name of the file."""
+
+
+def read_mesh(
+    path: str | Path,
+    scale: float = 1.0,
+    axis: tuple[float, ...] | None = None,
+    angle: float = 0.0,
+    translate: tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the closed surface in a file: vertices (n, 3), m, and triangles (m, 3) that face outwards.
+
+    The vertices are multiplied by `scale`, turned by `angle` degrees about `axis` through the origin, and moved by
+    `translate`. Vertices at the same place are one. A mesh of cells gives its surface.
+    """
+    vertices, triangles = _closed(*_welded(*_read(Path(path))))
+    vertices = vertices * scale
+    if axis is not None:
+        vertices = vertices @ rotation(axis, math.radians(angle)).T
+    return vertices + np.array(translate), triangles
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (n, 3) and triangles (m, 3) of the surface of what a file holds."""
+    try:
+        found = read_geometry(path)
+    except GeometryFileError as error:
+        raise MeshFileError(str(error) or "it is no mesh that can be read (STL, OBJ, PLY and VTU are)") from None
+    if not len(found.triangles):
+        raise MeshFileError("it holds no triangle")
+    if not np.isfinite(found.vertices[np.unique(found.triangles)]).all():
+        raise MeshFileError("it holds a vertex that is not finite")
+    return found.vertices, found.triangles
+
+
+def _welded(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Make vertices at the same place one, and drop the triangles that become edges by it."""
+    vertices, which = np.unique(points, axis=0, return_inverse=True)
+    triangles = which.reshape(-1)[triangles]
+    flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
+    used, triangles = np.unique(triangles[~flat], return_inverse=True)
+    return vertices[used], triangles.reshape(-1, 3)
+
+
+def _closed(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a surface with its triangles facing outwards, or raise what keeps it from being closed."""
+    directed = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
+    edges, which = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
+    which = which.reshape(-1)
+    uses = np.bincount(which, minlength=len(edges))
+    if odd := int(np.sum(uses % 2)):
+        raise MeshFileError(f"its surface is open: {odd} of {len(edges)} edges have a triangle on one side only")
+    ways = np.bincount(which, weights=np.where(directed[:, 0] < directed[:, 1], 1, -1), minlength=len(edges))
+    if turned := int(np.sum(ways != 0)):
+        raise MeshFileError(
+            f"its triangles face different sides across {turned} of {len(edges)} edges; orient them alike"
+        )
+    surface = ClosedSurface(vertices, triangles)
+    if surface.volume < 0:
+        triangles = triangles[:, ::-1]
+        surface = ClosedSurface(vertices, triangles)
+    lower, upper = surface.bounds()
+    if not surface.volume > 1e-12 * float(np.prod(upper - lower)):
+        raise MeshFileError("its surface encloses no volume")
+    steps = [np.linspace(a, b, _TRIED + 2)[1:-1] for a, b in zip(lower, upper, strict=True)]
+    points = grid_points(*steps)
+    winding = surface.winding(points)
+    for wrong, said in ((winding < 0, "a part of its surface is inside out"), (winding > 1, "its parts overlap")):
+        if wrong.any():
+            where = place_text(points[np.argmax(wrong)])
+            raise MeshFileError(f"{said}, for example at {where} in its own units")
+    return vertices, triangles
+
 
 MILLIMETRE = 1e-3
-
-
-def scene_file(name: str, info: ValidationInfo) -> Path:
-    """Return the path of a file that a scene names, which is relative to the directory of the scene."""
-    directory = info.context.get("directory") if isinstance(info.context, dict) else None
-    return Path(directory or ".") / name
-
-
-def file_version(path: Path) -> tuple[int, int]:
-    """Return what tells versions of a file apart: when it was changed, ns, and its bytes; zeros where there is none."""
-    try:
-        stat = path.stat()
-    # Of a name with a null character, ValueError.
-    except (OSError, ValueError):
-        return 0, 0
-    return stat.st_mtime_ns, stat.st_size
 
 
 class Rotation(Table):
     """A rotation about an axis through the origin."""
 
-    axis: Annotated[Vector, Field(description="Axis, of any length.")]
-    angle: Annotated[Number, Field(description="Angle, degrees, counter-clockwise seen against the axis.")]
-
-    @model_validator(mode="after")
-    def _axis_has_a_direction(self) -> "Rotation":
-        if not any(self.axis):
-            raise flaw("must have a direction, as [0, 0, 1] has; found zeros", "axis")
-        return self
+    axis: Axis = Field(description="Axis, of any length.")
+    angle: Number = Field(description="Angle, degrees, counter-clockwise seen against the axis.")
 
 
-class Mesh(Table):
+class Mesh(Table, Solid):
     """What a closed surface encloses, from a file; 3D only."""
 
-    file: Annotated[str, Field(description="The file, relative to the scene: STL, OBJ, PLY, VTU, ...")]
-    scale: Annotated[Positive, Field(description="Metres per unit of the file; 0.001 for millimetres.")] = 1.0
-    rotate: Annotated[Rotation | None, Field(description="Rotation, after scaling. Default: none.")] = None
-    translate: Annotated[
-        Vector, Field(validate_default=True, description="What is added to all vertices in the end, m.")
-    ] = None  # type: ignore[assignment]
-    _surface: Surface = PrivateAttr()
+    file: str = Field(description="The file, relative to the scene: STL, OBJ, PLY, VTU, ...")
+    scale: Positive = Field(1.0, description="Metres per unit of the file; 0.001 for millimetres.")
+    rotate: Rotation | None = Field(None, description="Rotation, after scaling. Default: none.")
+    translate: Vector = Field(None, validate_default=True, description="What is added to all vertices in the end, m.")
+    _surface: ClosedSurface = PrivateAttr()
 
     @model_validator(mode="after")
     def _read(self, info: ValidationInfo) -> "Mesh":
@@ -67,21 +122,18 @@ class Mesh(Table):
         return self
 
     @property
-    def surface(self) -> Surface:
+    def surface(self) -> ClosedSurface:
         """The closed surface, m."""
         return self._surface
 
     @property
     def volume(self) -> float:
-        """Enclosed volume, m^3, by the divergence theorem."""
         return self._surface.volume
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower and the upper corner of the bounding box, (3,) each, m."""
         return self._surface.bounds()
 
     def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
-        """Say of each point (n, 3) whether it lies inside, at least `inset` metres from the surface."""
         inside = self._surface.winding(points) > 0
         if inset > 0:
             inside[inside] = surface_distance(self._surface, points[inside]) >= inset
@@ -90,17 +142,14 @@ class Mesh(Table):
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of each point (n, 3) from the surface, (n,), m; negative inside.
 
-        See `triangle_distance.SurfaceDistance` for what is exact.
+        See `triangles.SurfaceDistance` for what is exact.
         """
         distance = surface_distance(self._surface, points)
         return np.where(self._surface.winding(points) > 0, -distance, distance)
 
 
 def leaving(mesh: Mesh, lower: np.ndarray, upper: np.ndarray) -> str:
-    """Say how a mesh leaves a domain with these corners, (3,) each, m, by its size alone, and what would be right.
-
-    Empty where its place is at fault; see `moved_inside`.
-    """
+    """Say how a mesh leaves a domain by its size alone, and what would be right; "" where its place is at fault."""
     size, room = np.ptp(mesh.bounds(), axis=0), upper - lower
     if np.all(size <= room):
         return ""
@@ -125,13 +174,6 @@ def moved_inside(mesh: Mesh, lower: np.ndarray, upper: np.ndarray) -> str:
 
 
 @lru_cache(maxsize=32)
-def _surface_of(
-    path: Path,
-    version: tuple[int, int],
-    scale: float,
-    axis: tuple[float, ...] | None,
-    angle: float,
-    translate: tuple[float, ...],
-) -> Surface:
+def _surface_of(path: Path, version: tuple[int, int], *placement: Any) -> ClosedSurface:
     """Return the surface in a file; `version` tells versions of the file apart. Scenes that share it share one."""
-    return Surface(*read_mesh(path, scale, axis, angle, translate))
+    return ClosedSurface(*read_mesh(path, *placement))

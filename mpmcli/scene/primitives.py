@@ -1,7 +1,4 @@
-"""The convex forms: which points lie inside, how far they reach, their exact volume and distance.
-
-In 2D a volume is an area, m^2: that of a slice one metre deep. Signed distances are negative inside.
-"""
+"""Forms given by numbers: which points lie inside, how far they reach, their exact volume and distance."""
 
 import math
 from collections.abc import Sequence
@@ -10,13 +7,18 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, model_validator
 
-from mpmcli.scene.quantity import AXES, Positive, Table, Vector, flaw
+from mpmcli.scene.quantity import AXES, Axis, Number, Positive, Table, Vector, flaw
 
 
 def unit(vector: Sequence[float]) -> np.ndarray:
     """Return a vector of length 1 in the direction of one of any length but 0, however large or small, (d,)."""
     scaled = np.array(vector) / np.max(np.abs(vector))
     return scaled / np.linalg.norm(scaled)
+
+
+def grid_points(*axes: np.ndarray) -> np.ndarray:
+    """Return all points with coordinates from these axes, (n, d), the last axis fastest."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
 def distance_to_segment(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -31,11 +33,32 @@ def _distance_to_edges(beyond: np.ndarray) -> np.ndarray:
     return outside + np.minimum(beyond.max(axis=1), 0.0)
 
 
-class Box(Table):
+class Solid:
+    """What every form can say. In 2D a volume is an area, m^2: that of a slice one metre deep."""
+
+    @property
+    def volume(self) -> float:
+        """Volume, m^3."""
+        raise NotImplementedError
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lower and the upper corner of the bounding box, (d,) each, m."""
+        raise NotImplementedError
+
+    def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
+        """Say of each point (n, d) whether it lies inside, at least `inset` metres from the surface."""
+        return self.signed_distance(points) <= -inset
+
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each point (n, d) from the surface, (n,), m; negative inside."""
+        raise NotImplementedError
+
+
+class Box(Table, Solid):
     """A box with faces along the axes; a rectangle in 2D."""
 
-    min: Annotated[Vector, Field(description="Lower corner, m.")]
-    max: Annotated[Vector, Field(description="Upper corner, m.")]
+    min: Vector = Field(description="Lower corner, m.")
+    max: Vector = Field(description="Upper corner, m.")
 
     @model_validator(mode="after")
     def _upper_corner_above_lower(self) -> "Box":
@@ -46,67 +69,52 @@ class Box(Table):
 
     @property
     def volume(self) -> float:
-        """Product of the edge lengths."""
         return math.prod(hi - lo for lo, hi in zip(self.min, self.max, strict=True))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower and the upper corner of the bounding box, (d,) each, m."""
         return np.array(self.min), np.array(self.max)
 
     def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
-        """Say of each point (n, d) whether it lies inside, at least `inset` metres from the surface."""
         lo, hi = self.bounds()
         return np.all((points >= lo + inset) & (points <= hi - inset), axis=1)
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of each point (n, d) from the surface, (n,), m; negative inside."""
         lo, hi = self.bounds()
         return _distance_to_edges(np.maximum(lo - points, points - hi))
 
 
-class Ball(Table):
+class Ball(Table, Solid):
     """A ball; a disc in 2D."""
 
-    center: Annotated[Vector, Field(description="Centre, m.")]
-    radius: Annotated[Positive, Field(description="Radius, m.")]
+    center: Vector = Field(description="Centre, m.")
+    radius: Positive = Field(description="Radius, m.")
 
     @property
     def volume(self) -> float:
-        """pi r^2 in 2D, 4/3 pi r^3 in 3D."""
         return math.pi * self.radius**2 if len(self.center) == 2 else 4 / 3 * math.pi * self.radius**3
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower and the upper corner of the bounding box, (d,) each, m."""
         center = np.array(self.center)
         return center - self.radius, center + self.radius
 
     def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
-        """Say of each point (n, d) whether it lies inside, at least `inset` metres from the surface."""
         radius = self.radius - inset
         return (radius >= 0) & (np.sum((points - np.array(self.center)) ** 2, axis=1) <= radius**2)
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of each point (n, d) from the surface, (n,), m; negative inside."""
         return np.linalg.norm(points - np.array(self.center), axis=1) - self.radius
 
 
-class Cylinder(Table):
+class Cylinder(Table, Solid):
     """A round cylinder with flat ends, in any direction; 3D only."""
 
-    base: Annotated[Vector, Field(description="Centre of the first end, m.")]
-    axis: Annotated[Vector, Field(description="Direction from the first end to the other, of any length.")]
-    radius: Annotated[Positive, Field(description="Radius, m.")]
-    height: Annotated[Positive, Field(description="Distance between the two ends, m.")]
-
-    @model_validator(mode="after")
-    def _axis_has_a_direction(self) -> "Cylinder":
-        if not any(self.axis):
-            raise flaw("must have a direction, as [0, 0, 1] has; found zeros", "axis")
-        return self
+    base: Vector = Field(description="Centre of the first end, m.")
+    axis: Axis = Field(description="Direction from the first end to the other, of any length.")
+    radius: Positive = Field(description="Radius, m.")
+    height: Positive = Field(description="Distance between the two ends, m.")
 
     @property
     def volume(self) -> float:
-        """pi r^2 times the height."""
         return math.pi * self.radius**2 * self.height
 
     @property
@@ -115,22 +123,17 @@ class Cylinder(Table):
         return unit(self.axis)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower and the upper corner of the bounding box, (3,) each, m.
-
-        A disc of normal a and radius r reaches r sqrt(1 - a_k^2) along axis k.
-        """
+        # A disc of normal a and radius r reaches r sqrt(1 - a_k^2) along axis k.
         a, base = self.direction, np.array(self.base)
         top = base + self.height * a
         reach = self.radius * np.sqrt(np.maximum(0.0, 1.0 - a**2))
         return np.minimum(base, top) - reach, np.maximum(base, top) + reach
 
     def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
-        """Say of each point (n, 3) whether it lies inside, at least `inset` metres from the surface."""
         along, across = self._places(points)
         return (along >= inset) & (along <= self.height - inset) & (across <= self.radius - inset)
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of each point (n, 3) from the surface, (n,), m; negative inside."""
         along, across = self._places(points)
         return _distance_to_edges(np.stack([np.maximum(-along, along - self.height), across - self.radius], axis=1))
 
@@ -141,12 +144,12 @@ class Cylinder(Table):
         return along, np.linalg.norm(offset - along[:, None] * self.direction, axis=1)
 
 
-class Capsule(Table):
+class Capsule(Table, Solid):
     """All points within a radius of a segment: a cylinder with round ends, in any direction; in 2D a stadium."""
 
-    start: Annotated[Vector, Field(description="Centre of the first round end, m.")]
-    end: Annotated[Vector, Field(description="Centre of the other round end, m.")]
-    radius: Annotated[Positive, Field(description="Radius, m.")]
+    start: Vector = Field(description="Centre of the first round end, m.")
+    end: Vector = Field(description="Centre of the other round end, m.")
+    radius: Positive = Field(description="Radius, m.")
 
     @model_validator(mode="after")
     def _ends_are_apart(self) -> "Capsule":
@@ -161,20 +164,109 @@ class Capsule(Table):
 
     @property
     def volume(self) -> float:
-        """Sum of the straight part and of a ball."""
         r = self.radius
         if len(self.start) == 2:
             return 2 * r * self.length + math.pi * r**2
         return math.pi * r**2 * self.length + 4 / 3 * math.pi * r**3
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lower and the upper corner of the bounding box, (d,) each, m."""
         return np.minimum(self.start, self.end) - self.radius, np.maximum(self.start, self.end) + self.radius
 
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        return distance_to_segment(points, np.array(self.start), np.array(self.end)) - self.radius
+
+
+def rotation(axis: Sequence[float], angle: float) -> np.ndarray:
+    """Return the rotation by an angle (rad) about an axis (3,) of any length, (3, 3). Formula of Rodrigues."""
+    x, y, z = unit(axis)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)
+
+
+def edge_distances(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Return the distance of each point, (n, 2), from the outline of a polygon, (k, 2): (n,), m."""
+    nearest = np.full(len(points), np.inf)
+    for a, b in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
+        nearest = np.minimum(nearest, distance_to_segment(points, a, b))
+    return nearest
+
+
+class Polygon(Table, Solid):
+    """A polygon given by its vertices in order, either way round; 2D only. Edges may not cross or touch."""
+
+    vertices: tuple[Annotated[tuple[Number, ...], Field(min_length=2, max_length=2)], ...] = Field(
+        min_length=3, description="Vertices in order, m; the last is joined to the first."
+    )
+
+    @model_validator(mode="after")
+    def _is_simple(self) -> "Polygon":
+        sentence = _fault_of_polygon(np.array(self.vertices))
+        if sentence:
+            raise flaw(sentence, "vertices")
+        return self
+
+    @property
+    def volume(self) -> float:
+        # The shoelace formula, about the first vertex so that a far origin costs no digits.
+        x, y = (np.array(self.vertices) - np.array(self.vertices[0])).T
+        return float(abs(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        vertices = np.array(self.vertices)
+        return vertices.min(axis=0), vertices.max(axis=0)
+
     def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
-        """Say of each point (n, d) whether it lies inside, at least `inset` metres from the surface."""
-        return self.signed_distance(points) <= -inset
+        # A point is inside when a ray from it along x crosses the edges an odd number of times.
+        x, y = points[:, 0], points[:, 1]
+        inside = np.zeros(len(points), dtype=bool)
+        near = np.zeros(len(points), dtype=bool)
+        vertices = np.array(self.vertices)
+        for a, b in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
+            crossing = (a[1] > y) != (b[1] > y)
+            if a[1] != b[1]:
+                inside ^= crossing & (x < a[0] + (y - a[1]) * (b[0] - a[0]) / (b[1] - a[1]))
+            if inset > 0:
+                t = np.clip((points - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
+                near |= np.sum((points - a - t[:, None] * (b - a)) ** 2, axis=1) < inset**2
+        return inside & ~near
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of each point (n, d) from the surface, (n,), m; negative inside."""
-        return distance_to_segment(points, np.array(self.start), np.array(self.end)) - self.radius
+        distance = edge_distances(points, np.array(self.vertices))
+        return np.where(self.contains(points), -distance, distance)
+
+
+def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+
+def _fault_of_polygon(vertices: np.ndarray) -> str:
+    """Return what keeps vertices (n, 2) from making a simple polygon, or "" when nothing does."""
+    n = len(vertices)
+    vertices = vertices / max(1.0, np.max(np.abs(vertices)))  # so that no product overflows
+    ahead = np.roll(vertices, -1, axis=0)
+    edges = ahead - vertices
+    lengths = np.hypot(edges[:, 0], edges[:, 1])
+    if lengths[-1] == 0:
+        return "the last vertex repeats the first: leave it out, the polygon closes by itself"
+    if np.any(lengths == 0):
+        return f"vertex {int(np.argmin(lengths)) + 1} repeats the one before it: leave it out"
+    following = np.roll(edges, -1, axis=0)
+    back = (_cross(edges, following) == 0) & (np.sum(edges * following, axis=1) < 0)
+    if np.any(back):
+        return f"the outline runs back on itself at vertex {(int(np.argmax(back)) + 1) % n}"
+    for i in range(n - 2):
+        # Edges that share no vertex with edge i; the last edge is a neighbour of the first.
+        others = np.arange(i + 2, n if i else n - 1)
+        if others.size and np.any(hit := _meet(vertices[i], ahead[i], vertices[others], ahead[others])):
+            j = int(others[np.argmax(hit)])
+            return f"the edges after vertices {i} and {j} cross or touch: list the vertices in order round the outline"
+    return ""
+
+
+def _meet(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Say which of the segments c-d, (n, 2) each, share a point with the segment a-b."""
+    side_c, side_d = _cross(b - a, c - a), _cross(b - a, d - a)
+    side_a, side_b = _cross(d - c, a - c), _cross(d - c, b - c)
+    # Collinear segments have four zero sides, so their bounding boxes must meet as well.
+    boxes = np.all((np.minimum(c, d) <= np.maximum(a, b)) & (np.maximum(c, d) >= np.minimum(a, b)), axis=1)
+    return boxes & (np.sign(side_c) * np.sign(side_d) <= 0) & (np.sign(side_a) * np.sign(side_b) <= 0)

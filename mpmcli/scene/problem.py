@@ -1,18 +1,23 @@
-"""One thing that is wrong with a scene, and where."""
+"""What is wrong with a scene, where, and what would be right: one problem per value, in sentences."""
 
+import difflib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from datetime import date, datetime, time
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from mpmcli.scene.material import MaterialParameters, knobs_of
 
 Path = tuple[str | int, ...]
+# Path in data that were changed on the way -> path in the scene as it was written.
+Renames = dict[Path, Path]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A fault of one value of a scene.
-
-    Attributes:
-        path: keys and indices that lead to the value; the last one may be missing in the scene.
-        sentence: what is wrong, and what would be right.
-    """
+    """A fault of one value of a scene: its path, whose last key may be missing, and what would be right."""
 
     path: Path
     sentence: str
@@ -26,12 +31,16 @@ def path_text(path: Path) -> str:
     return text
 
 
-def value_at(data: object, path: Path) -> object:
-    """Return the value that a path leads to in parsed TOML.
+def nearest_entry(path: Path, entries: Mapping[Path, Any]) -> tuple[Any, Path] | None:
+    """Return the entry of a path, or of the nearest table around it, and the rest of the path; None without any."""
+    for end in range(len(path), 0, -1):
+        if path[:end] in entries:
+            return entries[path[:end]], path[end:]
+    return None
 
-    Raises:
-        LookupError: there is no such value.
-    """
+
+def value_at(data: object, path: Path) -> object:
+    """Return the value that a path leads to in parsed TOML, or raise a LookupError."""
     for part in path:
         if (isinstance(data, dict) and part in data) or (
             isinstance(data, list) and isinstance(part, int) and part < len(data)
@@ -40,3 +49,179 @@ def value_at(data: object, path: Path) -> object:
         else:
             raise LookupError(path_text(path))
     return data
+
+
+_KINDS = {
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "int_type": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "text in quotes",
+    "tuple_type": "a list in brackets",
+    "list_type": "a list in brackets",
+    "model_type": "a table",
+    "model_attributes_type": "a table",
+    "dict_type": "a table",
+}
+_RANGES = {
+    "greater_than": ("greater than", "gt"),
+    "greater_than_equal": ("at least", "ge"),
+    "less_than": ("less than", "lt"),
+    "less_than_equal": ("at most", "le"),
+}
+
+
+def problems_of(error: ValidationError, data: dict[str, Any], model: type[BaseModel]) -> list[Problem]:
+    """Return one problem per value that `model` found faulty in parsed TOML, in pydantic's order."""
+    by_path: dict[Path, list[Any]] = {}
+    for one in error.errors(include_url=False):
+        if one["type"] == "too_short" and len(one["input"]) >= one["ctx"]["min_length"]:
+            continue  # pydantic counts only valid entries, and the others have errors of their own
+        by_path.setdefault(path_in(data, one["loc"], one["type"] == "missing"), []).append(one)
+    return [_problem(path, errors, model) for path, errors in by_path.items()]
+
+
+def nearest(word: str, known: list[str]) -> str | None:
+    """Return the known word that a misspelled one most likely means, or None."""
+    return next(iter(difflib.get_close_matches(word.lower(), known, n=1)), None)
+
+
+def hint_at(word: str, known: list[str], otherwise: str) -> str:
+    """Return a question for the word that a misspelled one most likely means, or what to say where there is none."""
+    return f'did you mean "{guess}"?' if (guess := nearest(word, known)) else otherwise
+
+
+def listed(words: list[str], last: str = "or") -> str:
+    """Write ["a", "b", "c"] as `a, b or c`."""
+    return f" {last} ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def quoted(words: list[str]) -> list[str]:
+    """Write each word as text in TOML."""
+    return [f'"{word}"' for word in words]
+
+
+def known_keys(model: type[BaseModel], loc: Path) -> list[str]:
+    """Return the keys of the table that pydantic's location leads to, union tags, knobs and presets included."""
+    tables = list(_tables_at(model, loc))
+    keys = {name for table in tables for name in (*table.model_fields, *knobs_of(table))}
+    return sorted(keys | {"preset" for table in tables if issubclass(table, MaterialParameters)})
+
+
+def written(value: object) -> str:
+    """Write a value as it would stand in a scene, cut after 60 characters."""
+    match value:
+        case bool():
+            text = str(value).lower()
+        case str():
+            text = f'"{value}"'
+        case dict():
+            text = f"a table with {listed(sorted(map(str, value)), 'and')}" if value else "an empty table"
+        case list() | tuple():
+            text = f"[{', '.join(written(v) for v in value[:9])}{', ...' if len(value) > 9 else ''}]"
+        case datetime() | date() | time():
+            text = value.isoformat()
+        case int() if abs(value) >= 10**20:
+            text = "a number of more than 20 digits"
+        case _:
+            text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def path_in(data: object, loc: Path, missing: bool = False) -> Path:
+    """Return pydantic's location without the names of union members; `missing` where its last key is not there."""
+    path: Path = ()
+    for position, part in enumerate(loc):
+        try:
+            value_at(data, (*path, part))
+        except LookupError:
+            if not (missing and position == len(loc) - 1):
+                continue
+        path += (part,)
+    return path
+
+
+def _problem(path: Path, errors: list[Any], model: type[BaseModel]) -> Problem:
+    first = errors[0]
+    kind, ctx, value = first["type"], first.get("ctx", {}), first["input"]
+    match kind:
+        case "flaw":
+            return Problem((*path, ctx["key"]) if ctx["key"] else path, ctx["sentence"])
+        case "extra_forbidden":
+            return Problem(path, _unknown_key(first["loc"], model))
+        case "missing":
+            return Problem(path, _missing_key(first["loc"], model))
+        case "string_pattern_mismatch":
+            right = "must begin with a letter and hold only letters, digits, spaces, - and _"
+            return Problem(path, f"{right}; found {written(value)}")
+        case "too_short" | "too_long":
+            words, bound = ("at least", ctx["min_length"]) if kind == "too_short" else ("at most", ctx["max_length"])
+            entries = "entry" if bound == 1 else "entries"
+            return Problem(path, f"needs {words} {bound} {entries}; found {ctx['actual_length']}")
+    return Problem(path, _wrong_value(errors, value))
+
+
+def _unknown_key(loc: Path, model: type[BaseModel]) -> str:
+    key, known = str(loc[-1]), known_keys(model, loc[:-1])
+    if guess := nearest(key, known):
+        return f'unknown key; did you mean "{guess}"?'
+    tables = [("domain",), ("time",), ("output",), ("solver",), ()]
+    if home := next((t for t in tables if t != loc[:-1] and key in known_keys(model, t)), None):
+        return f"unknown key here; it belongs to [{home[0]}]" if home else "unknown key here; it belongs at the top"
+    return f"unknown key; the keys here are {listed(known, 'and')}"
+
+
+def _missing_key(loc: Path, model: type[BaseModel]) -> str:
+    for table in _tables_at(model, loc[:-1]):
+        field = table.model_fields.get(str(loc[-1]))
+        if field and field.description:
+            knobs = [name for name, (parameter, _) in knobs_of(table).items() if parameter == loc[-1]]
+            instead = "".join(f"; or its knob {name}, 0 to 1" for name in knobs)
+            return f"missing key: {field.description.rstrip('.')}{instead}"
+    return "missing key"
+
+
+def _wrong_value(errors: list[Any], value: object) -> str:
+    """Join what the members of a union would have taken, for example `a number or "auto"`."""
+    right: list[str] = []
+    choices: list[str] = []
+    for one in errors:
+        kind, ctx = one["type"], one.get("ctx", {})
+        if kind == "literal_error":
+            choices += ctx["expected"].replace(" or ", ", ").replace("'", "").split(", ")
+            continue
+        if kind in _RANGES:
+            words, key = _RANGES[kind]
+            phrase = f"{words} {ctx[key] if isinstance(ctx[key], int) else format(ctx[key], 'g')}"
+        else:
+            phrase = _KINDS.get(kind, one["msg"][:1].lower() + one["msg"][1:])
+        if phrase not in right:
+            right.append(phrase)
+    guess = nearest(value, choices) if isinstance(value, str) else None
+    hint = f'; did you mean "{guess}"?' if guess else ""
+    return f"must be {listed(right + quoted(choices))}; found {written(value)}{hint}"
+
+
+def _tables_at(model: type[BaseModel], loc: Path) -> list[type[BaseModel]]:
+    """Return the models that a value at pydantic's location may be validated against."""
+    tables = [model]
+    for part in loc:
+        if isinstance(part, int):
+            continue
+        deeper = [
+            inner
+            for table in tables
+            if part in table.model_fields
+            for inner in _models_in(table.model_fields[part].annotation)
+        ]
+        # A part that is no key is the tag of a union, and chooses among its members.
+        tagged = [t for t in tables if "law" in t.model_fields and t.model_fields["law"].default == part]
+        tables = deeper or tagged
+    return tables
+
+
+def _models_in(annotation: object) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _models_in(argument)

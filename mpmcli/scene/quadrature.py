@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.scene.expression import Tree, evaluate
-from mpmcli.scene.intervals import bounds_of
+from mpmcli.scene.expression import Tree, bounds_of, evaluate
 
 # Nodes and weights of Gauss and Legendre's rule on (-1, 1).
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -33,35 +32,22 @@ WINDOWS, KEPT = 128, 8
 
 @dataclass(frozen=True)
 class Parts:
-    """A subdivision of an interval of time.
-
-    Attributes:
-        low, high: ends of the parts, (n,), s.
-        values: at the nodes of each, (n, NODES).
-    """
+    """A subdivision of an interval of time: ends of the parts, (n,), s, and values at the nodes of each, (n, NODES)."""
 
     low: np.ndarray
     high: np.ndarray
     values: np.ndarray
 
     def times(self) -> np.ndarray:
-        """Return the times of the nodes, (n, NODES), s."""
         return 0.5 * (self.low + self.high)[:, None] + 0.5 * (self.high - self.low)[:, None] * NODES
 
 
+@np.errstate(all="ignore")
 def parts_of(tree: Tree, start: float, end: float, *, precise: bool = True) -> Parts:
-    """Subdivide the time from `start` to `end` (s) so that every part of a tree of t is resolved.
+    """Subdivide the time from `start` to `end` (s) so that every part of a tree of t is resolved; a truth is 1 or 0.
 
-    Args:
-        tree: of the name t alone; a condition counts 1 or 0.
-        start, end: of the interval, s.
-        precise: whether the parts suit an integral; otherwise every feature is found and no more.
+    If `precise`, the parts suit an integral; otherwise every feature is found and no more.
     """
-    with np.errstate(all="ignore"):
-        return _divided(tree, start, end, precise=precise)
-
-
-def _divided(tree: Tree, start: float, end: float, *, precise: bool) -> Parts:
     edges = start + (end - start) * FIRST
     low, high = edges[:-1], edges[1:]
     done: list[tuple[np.ndarray, ...]] = []
@@ -132,7 +118,6 @@ class _Window:
         self._coefficients = self.rows[:, COEFFICIENTS:].tolist()
 
     def __call__(self, time: float) -> float:
-        """Return the integral up to a time, s."""
         k = max(0, bisect_right(self._low, time) - 1)
         place = (time - self._middle[k]) / self._half[k]
         result = 0.0

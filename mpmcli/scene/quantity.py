@@ -1,5 +1,6 @@
 """The kinds of values that a scene is made of: numbers, counts, and vectors as long as the scene has axes."""
 
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
@@ -19,12 +20,7 @@ class Table(BaseModel):
 
 
 def flaw(sentence: str, key: str = "") -> PydanticCustomError:
-    """Return the error that a validator raises for a fault that has its own sentence.
-
-    Args:
-        sentence: what is wrong and what would be right.
-        key: the key of the validated table that the sentence is about; empty for the value itself.
-    """
+    """Return the error that a validator raises for a fault of a value, or of a key of the table that it validates."""
     return PydanticCustomError("flaw", "{sentence}", {"sentence": sentence, "key": key})
 
 
@@ -36,18 +32,15 @@ def dimension_of(data: object) -> int | None:
 
 
 def scene_dimension(info: ValidationInfo) -> int | None:
-    """Return the dimension that the validation context carries; None when the scene's size is not readable.
-
-    Raises:
-        RuntimeError: there is no context, so defaults that depend on the dimension cannot be filled in.
-    """
+    """Return the dimension that the validation context carries; None when the scene's size is not readable."""
     if not isinstance(info.context, dict):
         raise RuntimeError("A Scene is built by load_scene or parse_scene, which know its dimension.")
     return info.context["dimension"]
 
 
-def numbers_needed(dimension: int, found: int) -> str:
-    return f"needs {NUMBER_WORDS[dimension]} numbers in this {dimension}D scene (as many as domain.size); found {found}"
+def place_text(place: Iterable[float]) -> str:
+    """Write a place as a list of numbers in TOML, to six digits."""
+    return f"[{', '.join(f'{x:.6g}' for x in place)}]"
 
 
 def _zeros(value: object, info: ValidationInfo) -> object:
@@ -57,7 +50,8 @@ def _zeros(value: object, info: ValidationInfo) -> object:
 def _as_long_as_the_scene(value: tuple, info: ValidationInfo) -> tuple:
     dimension = scene_dimension(info)
     if dimension is not None and len(value) != dimension:
-        raise flaw(numbers_needed(dimension, len(value)))
+        need = f"{NUMBER_WORDS[dimension]} numbers in this {dimension}D scene (as many as domain.size)"
+        raise flaw(f"needs {need}; found {len(value)}")
     return value
 
 
@@ -76,10 +70,7 @@ def _not_minute(value: float) -> float:
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False), AfterValidator(_not_enormous)]
 Positive = Annotated[
-    float,
-    Field(strict=True, allow_inf_nan=False, gt=0),
-    AfterValidator(_not_enormous),
-    AfterValidator(_not_minute),
+    float, Field(strict=True, allow_inf_nan=False, gt=0), AfterValidator(_not_enormous), AfterValidator(_not_minute)
 ]
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0), AfterValidator(_not_enormous)]
 Integer = Annotated[int, Field(strict=True)]
@@ -96,3 +87,18 @@ def list_of_axes(kind: Any, *, zeros: bool = False) -> Any:
 
 # One number per axis; None means the default, zeros.
 Vector = list_of_axes(Number, zeros=True)
+
+
+def direction_as(example: str) -> Any:
+    """Return the type of a vector that is not zero, such as the example."""
+
+    def check(vector: tuple[float, ...]) -> tuple[float, ...]:
+        if not any(vector):
+            raise flaw(f"must have a direction, as {example}; found zeros")
+        return vector
+
+    return Annotated[Vector, AfterValidator(check)]
+
+
+# Of an axis in 3D.
+Axis = direction_as("[0, 0, 1] has")

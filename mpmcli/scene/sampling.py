@@ -1,21 +1,247 @@
-"""Particles of bodies: where they start, how fast they move, and how much volume and mass each one has."""
+"""Particles of bodies: where they start, how they move and are deformed, and how much volume and mass each has."""
 
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.scene.domain import Domain
-from mpmcli.scene.emitters import Emitter
-from mpmcli.scene.initial import initial_deformation, initial_faults, initial_motion
+from mpmcli.scene.entry import Entry, entries_in, value_of, varies
+from mpmcli.scene.expression import INITIAL, Expression, derivative, evaluate
 from mpmcli.scene.points import Points
-from mpmcli.scene.poisson_disk import disk_radius, poisson_disk
 from mpmcli.scene.primitives import Box
-from mpmcli.scene.problem import path_text
-from mpmcli.scene.schema import Body, Scene
+from mpmcli.scene.problem import Path, path_text
+from mpmcli.scene.quantity import place_text
+from mpmcli.scene.schema import Body, Emitter, Scene
 from mpmcli.scene.sheets import sheets_of
+
+# Points per radius^d of a sample, as measured, in 2D and 3D. Without end it would be 0.6965 and 0.7334.
+DENSITY = {2: 0.680, 3: 0.652}
+# Cells per radius along an axis, rounds in which some of those with room offer a point, and points per radius^d that
+# are offered in each.
+_FINE, _ROUNDS, _OFFERED = {2: 6, 3: 4}, 14, 1.0
+# Radii by which the box is enlarged: points at an edge lie more closely, as nothing competes with them beyond it.
+_MARGIN = 3
+_PLACES_AT_ONCE = 2_000
+
+
+def disk_radius(spacing: float, d: int) -> float:
+    """Return the radius at which a sample has as many points as a lattice of this spacing, m."""
+    return DENSITY[d] ** (1 / d) * spacing
+
+
+def poisson_disk(lower: np.ndarray, upper: np.ndarray, radius: float, generator: np.random.Generator) -> np.ndarray:
+    """Return points in a box with corners (d,), at least `radius` apart, and nearly everywhere within it of each other.
+
+    Dart throwing in cells that have room, after Ebeida et al. (2012): in each round some cells offer a point, those too
+    close to a point that is there or to one offered before it are refused, and cells that a point covers are dropped.
+    The same generator always gives the same points, (n, d), m; about DENSITY[d] per radius^d.
+    """
+    from scipy.spatial import KDTree
+
+    d = len(lower)
+    width = radius / _FINE[d]
+    # Beyond the margin there are cells that points cover, and that offer none.
+    pad = _FINE[d] + 1
+    start = lower - _MARGIN * radius - pad * width
+    counts = np.ceil((upper + _MARGIN * radius - start) / width).astype(int) + pad
+    free = np.zeros(counts, dtype=bool)
+    free[(slice(pad, -pad),) * d] = True
+    free = free.reshape(-1)
+    share = _OFFERED / _FINE[d] ** d
+    many = int(np.prod(counts - 2 * pad) * share) + 1
+    found = np.empty((0, d))
+    for _ in range(_ROUNDS):
+        room = np.flatnonzero(free)
+        if not len(room):
+            break
+        chosen = generator.choice(room, min(many, len(room)), replace=False)
+        offered = np.stack(np.unravel_index(chosen, counts), axis=1) + generator.random((len(chosen), d))
+        offered = start + width * offered
+        if len(found):
+            offered = offered[np.isinf(KDTree(found).query(offered, distance_upper_bound=radius, workers=-1)[0])]
+        new = offered[first_come(KDTree(offered).query_pairs(radius, output_type="ndarray"), len(offered))]
+        found = np.concatenate([found, new])
+        for first in range(0, len(new), _PLACES_AT_ONCE):
+            free[_covered((new[first : first + _PLACES_AT_ONCE] - start) / width, counts)] = False
+    return found[np.all((found >= lower) & (found <= upper), axis=1)]
+
+
+def _covered(places: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the numbers of the cells whose corners are all within a radius of a place, (n, d), in cells."""
+    d = places.shape[1]
+    fine = _FINE[d]
+    offsets = np.array(list(product(range(-fine, fine + 1), repeat=d)))
+    offsets = offsets[np.sum(np.maximum(np.abs(offsets) - 0.5, 0.0) ** 2, axis=1) <= fine**2]
+    cells = np.floor(places).astype(np.int64)
+    inside = np.zeros((len(places), len(offsets)))
+    for k in range(d):
+        # The farthest corner of a cell is half a cell beyond its centre along each axis.
+        inside += (np.abs(offsets[:, k] + (cells[:, k] + 0.5 - places[:, k])[:, None]) + 0.5) ** 2
+    strides = np.cumprod([1, *counts[:0:-1]])[::-1]
+    return ((cells @ strides)[:, None] + offsets @ strides)[inside <= fine**2]
+
+
+def first_come(pairs: np.ndarray, n: int) -> np.ndarray:
+    """Return which of n points stay, (n,) bool, if each in turn is refused for one that stays before it.
+
+    `pairs`, (k, 2), are the numbers of points that are too close to each other, the smaller one first.
+    """
+    stays, undecided = np.zeros(n, dtype=bool), np.ones(n, dtype=bool)
+    while len(pairs):
+        waits = np.zeros(n, dtype=bool)
+        waits[pairs[:, 1]] = True
+        stays |= undecided & ~waits
+        undecided &= waits
+        undecided[pairs[stays[pairs[:, 0]], 1]] = False
+        pairs = pairs[undecided[pairs[:, 1]] & (undecided[pairs[:, 0]])]
+    return stays | undecided
+
+
+def has_expressions(body: Body) -> bool:
+    """Say whether anything that a body starts with depends on the place."""
+    return moves_unevenly(body) or body.deformation is not None
+
+
+def moves_unevenly(body: Body) -> bool:
+    """Say whether the velocity of a body, or its gradient, is an expression."""
+    return varies(*body.velocity) or replaces_gradient(body)
+
+
+def replaces_gradient(body: Body) -> bool:
+    """Say whether velocity_gradient is the affine velocity C itself, and adds nothing to the velocity."""
+    return varies(*(entry for _, entry in entries_in(body.velocity_gradient)))
+
+
+def initial_motion(body: Body, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the velocity, (n, d), m/s, and the affine velocity C, (n, d, d), 1/s, at some places, (n, d), m.
+
+    C is grad(velocity) + L, and the velocity velocity(X) + L (X - c), where velocity_gradient L is all numbers, c the
+    centre of the bounding box; an L with an expression in it is C alone.
+    """
+    n, d = position.shape
+    if not moves_unevenly(body):
+        velocity = np.broadcast_to(np.array(body.velocity), position.shape)
+        affine = np.zeros((d, d))
+        if body.velocity_gradient is not None:
+            affine = np.array(body.velocity_gradient)
+            velocity = velocity + _offset(body, position) @ affine.T
+        return velocity, np.broadcast_to(affine, (n, d, d))
+    velocity = entries_at(body.velocity, position)
+    if replaces_gradient(body):
+        return velocity, matrix_at(body.velocity_gradient, position)
+    affine = np.zeros((n, d, d))
+    for c, entry in enumerate(body.velocity):
+        if isinstance(entry, Expression):
+            for a, name in enumerate(INITIAL[:d]):
+                affine[:, c, a] = evaluate(derivative(entry.tree, name), _places(position))
+    if body.velocity_gradient is not None:
+        L = np.array(body.velocity_gradient)
+        velocity = velocity + _offset(body, position) @ L.T
+        affine = affine + L
+    return velocity, affine
+
+
+def initial_deformation(body: Body, position: np.ndarray, domain: Domain) -> np.ndarray | None:
+    """Return J, (n,), or F, (n, d, d), at some places, (n, d), m; None where the body starts undeformed."""
+    if body.initial_pressure == "hydrostatic":
+        return body.material.volume_ratio_under(hydrostatic_load(body, position, domain))
+    if body.deformation is None:
+        return None
+    if isinstance(body.deformation, tuple):
+        return matrix_at(body.deformation, position)
+    return _at(body.deformation, position).astype(np.float64)
+
+
+def hydrostatic_load(body: Body, position: np.ndarray, domain: Domain) -> np.ndarray:
+    """Return density g depth, (n,), Pa, the depth below the top of the bounding box of the body, against gravity.
+
+    Particles start evenly spaced, with the mass that their spacing has at rest, and act with J p times their volume at
+    rest: it is J p that has to carry their weight.
+    """
+    gravity = domain.gravity_at(0.0)
+    lower, upper = body.shape.form.bounds()
+    top = np.minimum(gravity * lower, gravity * upper).sum()
+    return body.material.density * (position @ gravity - top)
+
+
+def initial_faults(body: Body, position: np.ndarray, domain: Domain) -> Iterator[tuple[Path, str]]:
+    """Yield the keys of a body whose values are not usable at some place, each with a sentence on the first place."""
+    d = position.shape[1]
+    for c, entry in enumerate(body.velocity):
+        yield from _not_finite(("velocity", c), entry, position)
+        if isinstance(entry, Expression) and not replaces_gradient(body):
+            for name in INITIAL[:d]:
+                slope = np.broadcast_to(evaluate(derivative(entry.tree, name), _places(position)), len(position))
+                where = _first(~np.isfinite(slope), position)
+                if where and np.isfinite(_at(entry, position)).all():
+                    said = f"has no finite slope along {name} at the particle {where}; give velocity_gradient as well"
+                    yield ("velocity", c), said
+    for path, entry in entries_in(body.velocity_gradient, ("velocity_gradient",)):
+        yield from _not_finite(path, entry, position)
+    if body.deformation is not None:
+        yield from _deformation_faults(body, position, domain)
+    elif body.initial_pressure == "hydrostatic" and getattr(body.material, "bulk_modulus", None) != "auto":
+        load = hydrostatic_load(body, position, domain)
+        where = _first(~np.isfinite(body.material.volume_ratio_under(load)), position)
+        if where:
+            said = f"asks for {load.max():.4g} Pa, more than the material can press with; give it a larger bulk_modulus"
+            yield ("initial_pressure",), said
+
+
+def _deformation_faults(body: Body, position: np.ndarray, domain: Domain) -> Iterator[tuple[Path, str]]:
+    entries = entries_in(body.deformation, ("deformation",))
+    found = [fault for path, entry in entries for fault in _not_finite(path, entry, position)]
+    yield from found
+    if found or not len(position):
+        return
+    values = initial_deformation(body, position, domain)
+    J = values if values.ndim == 1 else np.linalg.det(values)
+    where = _first(~(J > 0), position)
+    if where:
+        name = "J" if values.ndim == 1 else "det F"
+        sentence = f"must keep {name} above 0; it is {J[np.argmax(~(J > 0))]:.4g} at the particle {where}"
+        yield ("deformation",), sentence
+
+
+def entries_at(entries: tuple[Entry, ...], position: np.ndarray) -> np.ndarray:
+    """Return a list of k entries at some places, (n, d), as (n, k)."""
+    return np.stack([_at(entry, position) for entry in entries], axis=1)
+
+
+def matrix_at(rows: tuple[tuple[Entry, ...], ...], position: np.ndarray) -> np.ndarray:
+    """Return a matrix of entries at some places, (n, d), as (n, d, d)."""
+    return np.stack([entries_at(row, position) for row in rows], axis=1)
+
+
+def _offset(body: Body, position: np.ndarray) -> np.ndarray:
+    return position - np.mean(body.shape.form.bounds(), axis=0)
+
+
+def _places(position: np.ndarray) -> dict[str, np.ndarray]:
+    return dict(zip(INITIAL, position.T, strict=False))
+
+
+def _at(entry: Entry, position: np.ndarray) -> np.ndarray:
+    return np.broadcast_to(value_of(entry, **_places(position)), len(position))
+
+
+def _not_finite(key: Path, entry: Entry, position: np.ndarray) -> Iterator[tuple[Path, str]]:
+    if isinstance(entry, Expression):
+        values = _at(entry, position)
+        where = _first(~np.isfinite(values), position)
+        if where:
+            found = values[np.argmax(~np.isfinite(values))]
+            yield key, f"is {found} at the particle {where}; it must be finite everywhere"
+
+
+def _first(wrong: np.ndarray, position: np.ndarray) -> str:
+    """Return the place of the first particle that is wrong, "" where none is."""
+    return f"at {place_text(position[np.argmax(wrong)])}" if wrong.any() else ""
+
 
 # Lattice points that are looked at together; bounds the memory that sampling needs beyond its result.
 _POINTS_AT_ONCE = 2**16
@@ -116,8 +342,7 @@ def lattice_points(body: Body, h: float) -> int:
 def _lattice_counts(body: Body, h: float) -> list[int]:
     """Return the number of lattice points along each axis.
 
-    The lattice of a box is stretched to fit it; that of another shape keeps its spacing, is
-    centred on the bounding box, and covers it.
+    That of a box is stretched to fit it; another one keeps its spacing, is centred on the bounding box, and covers it.
     """
     lower, upper = body.shape.form.bounds()
     ratios = ((upper - lower) / lattice_spacing(body, h)).tolist()
@@ -152,15 +377,8 @@ def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
     if isinstance(form, Points) and form.file_velocity is not None:
         velocity = velocity + form.file_velocity
     volume = form.volume / len(position)
-    return BodyParticles(
-        name=body.name,
-        position=position,
-        velocity=velocity,
-        affine=affine,
-        volume=volume,
-        mass=body.material.density * volume,
-        deformation=initial_deformation(body, position, domain),
-    )
+    deformation = initial_deformation(body, position, domain)
+    return BodyParticles(body.name, position, velocity, affine, volume, body.material.density * volume, deformation)
 
 
 def _generator(body: Body, index: int) -> np.random.Generator:
@@ -178,7 +396,6 @@ def holds_particles(body: Body, index: int, h: float) -> bool:
 
 
 def no_particles(body: Body, h: float) -> str:
-    """Say that a body holds no particle, and what would be right."""
     return (
         f'body "{body.name}" is too thin to hold a particle: its particles would be '
         f"{lattice_spacing(body, h):.6g} m apart; make it thicker, or the grid finer"

@@ -3,19 +3,246 @@
 from functools import lru_cache
 from typing import Annotated, Any, Literal, Union, get_args
 
-from pydantic import AfterValidator, Field, create_model
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidationInfo,
+    create_model,
+    field_validator,
+    model_validator,
+)
 
 from mpmcli.scene.colliders import Collider
-from mpmcli.scene.constants import Constants
 from mpmcli.scene.domain import Domain
-from mpmcli.scene.emitters import Emitter
-from mpmcli.scene.entry import PlaceVector, StartDeformation, StartMatrix, StartVector
-from mpmcli.scene.impulses import Impulse
-from mpmcli.scene.lattice import ParticlesPerCell
+from mpmcli.scene.entry import Constants, Entry, PlaceVector, StartDeformation, StartMatrix, StartVector
+from mpmcli.scene.expression import POSITION
+from mpmcli.scene.expression_reader import parse
 from mpmcli.scene.material import MaterialParameters
-from mpmcli.scene.quantity import NAME, Flag, Integer, Positive, Table, flaw
+from mpmcli.scene.quantity import (
+    NAME,
+    Flag,
+    Integer,
+    NotNegative,
+    Number,
+    Positive,
+    Table,
+    Vector,
+    flaw,
+    scene_dimension,
+)
 from mpmcli.scene.shapes import OneShape
-from mpmcli.scene.solver_settings import SolverSettings
+
+
+def usual_particles_per_cell(dimension: int) -> int:
+    """Return the particles per cell of a body that does not give them: two per axis."""
+    return 2**dimension
+
+
+def _filled_lattice(value: object, info: ValidationInfo) -> object:
+    return usual_particles_per_cell(scene_dimension(info) or 2) if value is None else value
+
+
+def _whole_lattice(count: int, info: ValidationInfo) -> int:
+    """Refuse a lattice whose number of particles per cell is no square (2D) or cube (3D)."""
+    dimension = scene_dimension(info)
+    shape = info.data.get("shape")
+    of_points = shape is not None and getattr(shape, "points", None)
+    if dimension is None or info.data.get("sampling", "lattice") != "lattice" or of_points:
+        return count
+    root = round(count ** (1 / dimension))
+    if root**dimension == count:
+        return count
+    below = root if root**dimension < count else root - 1
+    nearest = f"{below**dimension} or {(below + 1) ** dimension}"
+    raise flaw(
+        f"must be a {'square' if dimension == 2 else 'cube'} number for a lattice in {dimension}D, "
+        f'for example {nearest}; found {count}. With sampling = "jittered" any number will do'
+    )
+
+
+ParticlesPerCell = Annotated[
+    Integer,
+    Field(ge=1, le=10**4),
+    BeforeValidator(_filled_lattice),
+    AfterValidator(_whole_lattice),
+    Field(
+        validate_default=True,
+        description="Particles per cell of the grid; a square (2D) or cube (3D) number for a lattice. "
+        "Default: 4 in 2D, 8 in 3D; that of the points where the shape is points.",
+    ),
+]
+
+
+Material = Annotated[
+    MaterialParameters,
+    Field(description="A preset in quotes, or a table: a law or a preset, with parameters and knobs."),
+]
+
+
+class Emitter(Table):
+    """A mouth that material flows out of at a steady velocity.
+
+    The mouth is the section of the shape through its centre, across the velocity. Particles lie on a lattice that moves
+    with the velocity: a sheet of it enters each time the one before has moved on by the distance of two sheets.
+    """
+
+    name: str = Field(pattern=NAME, description="Name of the emitter, used in messages and --set.")
+    material: Material
+    shape: OneShape = Field(description="Its section through the centre, across the velocity, is the mouth.")
+    velocity: Vector = Field(description="Velocity of what flows in, m/s; not zero.")
+    start: NotNegative = Field(0.0, description="When the first sheet enters, s.")
+    end: Positive | None = Field(None, description="No sheet enters from then on, s. Default: the end of the scene.")
+    particles: Integer | None = Field(
+        None, ge=1, description="Particles in all, as far as whole sheets allow; or give volume. Default: until end."
+    )
+    volume: Positive | None = Field(
+        None, description="Volume at rest in all, m^3 (m^2 in 2D); or give particles. Default: until end."
+    )
+    particles_per_cell: ParticlesPerCell = None  # type: ignore[assignment]
+
+    @field_validator("velocity")
+    @classmethod
+    def _moves(cls, velocity: tuple[float, ...]) -> tuple[float, ...]:
+        if not any(velocity):
+            raise flaw("must not be zero, as nothing would flow; give the velocity of the material in m/s")
+        return velocity
+
+    @model_validator(mode="after")
+    def _one_total(self) -> "Emitter":
+        if self.particles is not None and self.volume is not None:
+            raise flaw("particles is given as well; leave one of them out", "volume")
+        if self.end is not None and self.end <= self.start:
+            raise flaw(f"must be after start, {self.start:g} s; found {self.end:g}", "end")
+        return self
+
+
+# What is left of a push at a distance r, in radii; nothing beyond 1. A Gaussian has a third as its standard deviation.
+# The pushes of an impulse are forces, whose means are exact.
+FALLOFF = {"none": "1", "linear": "(1 - sqrt({r2}))", "gaussian": "exp(-4.5 * {r2})"}
+# Length of an impulse at a time, as a part of the interval between frames.
+INSTANT = 1e-3
+# Radii around the centre in which a radial push falls to zero.
+CORE = 1e-3
+
+
+class Impulse(Table):
+    """A push on what is within a radius of a place, as a hand gives it."""
+
+    name: str | None = Field(None, pattern=NAME, description="Name of the impulse, for --set.")
+    body: str | None = Field(None, description="Name of the body that it acts on. Default: all of them.")
+    start: NotNegative = Field(description="When it begins, s.")
+    end: Positive | None = Field(
+        None, description="When it ends, s. Default: a thousandth of the interval between frames after it begins."
+    )
+    center: Vector = Field(description="Where it is strongest, m.")
+    radius: Positive = Field(description="Distance from the centre beyond which nothing is pushed, m.")
+    strength: Number = Field(
+        description="Change of velocity at the centre in all, m/s; a negative one pulls, or pushes backwards."
+    )
+    direction: Vector | None = Field(None, description="Of the push, of any length. Default: away from the centre.")
+    falloff: Literal["none", "linear", "gaussian"] = Field(
+        "linear",
+        description="How the push falls with the distance: not at all, linearly to the radius, or as a Gaussian.",
+    )
+
+    @model_validator(mode="after")
+    def _lasts_and_points(self) -> "Impulse":
+        if self.end is not None and self.end <= self.start:
+            raise flaw(f"must be after start, {self.start:g} s; found {self.end:g}", "end")
+        if self.direction is not None and not any(self.direction):
+            raise flaw("must not be zero; leave it out for a push away from the centre", "direction")
+        return self
+
+    def acceleration(self, interval: float) -> tuple[Entry, ...]:
+        """Return the acceleration, m/s^2, expressions of t and the position; `interval` is that between frames, s."""
+        end = self.start + INSTANT * interval if self.end is None else self.end
+        axes = POSITION[: len(self.center)]
+        away = [f"({x} - ({c!r}))" for x, c in zip(axes, self.center, strict=True)]
+        r2 = "(" + " + ".join(f"({a} / {self.radius!r})**2" for a in away) + ")"
+        push = f"({self.strength / (end - self.start)!r} if t >= {self.start!r} and t < {end!r} else 0)"
+        near = f"({FALLOFF[self.falloff].format(r2=r2)} if {r2} < 1 else 0)"
+        if self.direction is None:
+            pointing = [f"({a} / {self.radius!r} / max(sqrt({r2}), {CORE}))" for a in away]
+        else:
+            length = sum(n**2 for n in self.direction) ** 0.5
+            pointing = [repr(n / length) for n in self.direction]
+        return tuple(0.0 if one == "0.0" else parse(f"{push} * {near} * ({one})", ("t", *axes), {}) for one in pointing)
+
+
+# Poisson's ratio above which bodies lock without `f_bar`: a beam of four cells is 5 % too stiff at 0.45, 13 % at 0.49.
+NEARLY_INCOMPRESSIBLE = 0.45
+# Default of FLIP's share in AFLIP: a twentieth of the loss of APIC.
+USUAL_FLIP = 0.95
+
+
+def _only_with_aflip(flip: float | None, info: ValidationInfo) -> float | None:
+    """Fill in the share of FLIP where there is one, and refuse it where there is none."""
+    # An invalid transfer has a message of its own, and is absent from the data.
+    transfer = info.data.get("transfer", "aflip")
+    if flip is not None and transfer != "aflip":
+        raise flaw(f'is the share of FLIP in transfer = "aflip"; with transfer = "{transfer}" leave it out')
+    return USUAL_FLIP if flip is None and transfer == "aflip" else flip
+
+
+class SolverSettings(Table):
+    """How the scene is computed. What is not chosen is not in the compiled step."""
+
+    precision: Literal["f32", "f64"] = Field("f32", description="Floating-point numbers of the solver: 32 or 64 bits.")
+    kernel: Literal["quadratic", "cubic"] = Field(
+        "quadratic",
+        description='B-spline between particles and nodes. "quadratic" reaches 3 nodes per axis. "cubic" reaches '
+        "4: smoother, and stable at steps 1.15 times as long, but waves are 1.4 times further off and lose twice "
+        "as much in a step, for 16/9 of the work on nodes in 2D, 64/27 in 3D.",
+    )
+    transfer: Literal["apic", "pic", "aflip"] = Field(
+        "apic",
+        description='What particles hand to the nodes and take back. "apic": velocity and its gradient, which '
+        'keeps angular momentum exactly. "pic": the velocity alone; the dissipative reference, at 0.71 of the '
+        'step. "aflip": APIC with FLIP\'s velocities: waves and splashes lose far less, fast rotation more, and '
+        "angular momentum is kept to first order in the step only; twice the memory of the grid, and some noise.",
+    )
+    flip: Annotated[
+        float | None,
+        Field(
+            strict=True,
+            ge=0,
+            le=1,
+            description='With transfer = "aflip": share of a particle\'s velocity that is its own, changed by what '
+            "changes the nodes; the rest is APIC's, which damps what the grid does not see. 0 is APIC, 1 damps "
+            f"nothing. Default: {USUAL_FLIP:g}.",
+        ),
+        AfterValidator(_only_with_aflip),
+        Field(validate_default=True),
+    ] = None
+    solids: Literal["updated", "total"] = Field(
+        "updated",
+        description='Grid of elastic solids. "updated": that of all materials. "total": of their state at rest '
+        "(total Lagrangian): more accurate, without tears; for scenes of one elastic law, whose bodies begin apart.",
+    )
+    f_bar: Flag | Literal["auto"] = Field(
+        "auto",
+        description="Whether particles of a cell share their change of volume (F-bar), so that material that "
+        'hardly changes its volume does not lock. "auto": those of laws of which a body has a Poisson\'s ratio of '
+        f"more than {NEARLY_INCOMPRESSIBLE:g}, and does not flow.",
+    )
+    walls: Literal["folded", "zeroed"] = Field(
+        "folded",
+        description='How walls act. "folded" mirrors what lies behind them: second-order accurate. "zeroed" sets '
+        "the velocity of nodes on and behind them to zero, as is usual: first-order, to compare with.",
+    )
+    grid: Literal["auto", "dense", "sparse"] = Field(
+        "auto",
+        description='Nodes of the background grid. "dense": all of the domain. "sparse": those near particles, in '
+        'blocks, on the CPU; for large domains that are nearly empty. "auto": sparse where a domain has at least '
+        "8 million cells and material fills at most a twentieth of them.",
+    )
+    deterministic: Flag = Field(
+        False,
+        description="Whether a GPU adds in fixed point, so that two runs have the same bytes. On the CPU they have "
+        "them in any case, and nothing changes.",
+    )
+
 
 ParticleField = Literal[
     "velocity",
@@ -33,100 +260,67 @@ ParticleField = Literal[
 class Time(Table):
     """How long the scene runs, how often it is stored, and how it is stepped."""
 
-    end: Annotated[Positive, Field(description="Simulated time, s; the scene starts at 0.")]
-    frames: Annotated[
-        Integer,
-        Field(
-            ge=1,
-            le=10**9,
-            description="Number of equal intervals between stored frames; one frame more is stored.",
-        ),
-    ]
-    step: Annotated[
-        Positive | Literal["auto"],
-        Field(description='Largest time step, s; "auto" leaves it to the stability limits alone.'),
-    ] = "auto"
-    safety: Annotated[
-        float,
-        Field(
-            strict=True,
-            gt=0,
-            le=1,
-            description="Fraction of the smallest stability limit that a step takes, 0 to 1.",
-        ),
-        # At 0.9 a lone droplet that bounces along a separating wall gains energy until the run ends; at 0.8 none did.
-    ] = 0.8
+    end: Positive = Field(description="Simulated time, s; the scene starts at 0.")
+    frames: Integer = Field(
+        ge=1, le=10**9, description="Number of equal intervals between stored frames; one frame more is stored."
+    )
+    step: Positive | Literal["auto"] = Field(
+        "auto", description='Largest time step, s; "auto" leaves it to the stability limits alone.'
+    )
+    # At 0.9 a lone droplet that bounces along a separating wall gains energy until the run ends; at 0.8 none did.
+    safety: float = Field(
+        0.8, strict=True, gt=0, le=1, description="Fraction of the smallest stability limit that a step takes, 0 to 1."
+    )
 
 
 class Body(Table):
     """One body: a shape filled with particles of one material."""
 
-    name: Annotated[str, Field(pattern=NAME, description="Name of the body, used in messages and --set.")]
-    material: Annotated[
-        MaterialParameters,
-        Field(description="A preset in quotes, or a table: a law or a preset, with parameters and knobs."),
-    ]
-    shape: Annotated[
-        OneShape,
-        Field(
-            description="Exactly one of box, ball, capsule, cylinder or mesh (3D), polygon (2D), points; add, subtract."
-        ),
-    ]
-    velocity: Annotated[
-        StartVector,
-        Field(
-            validate_default=True,
-            description="Initial velocity, m/s; numbers, or expressions of the place X, Y, Z (m), whose gradient is "
-            "the initial affine velocity C. Default: at rest.",
-        ),
-    ] = None  # type: ignore[assignment]
-    velocity_gradient: Annotated[
-        StartMatrix | None,
-        Field(
-            description="Velocity gradient, 1/s, one row per axis. Numbers L add L (x - c) to the velocity, c the "
-            "centre of the bounding box of the shape, and L to C. With an expression of X, Y, Z in it, it is C alone, "
-            "in place of the gradient of the velocity. Default: none."
-        ),
-    ] = None
-    deformation: Annotated[
-        StartDeformation | None,
-        Field(
-            description="Initial deformation, numbers or expressions of X, Y, Z: the volume ratio J of a law that "
-            "stores it, else F, one row per axis (its elastic part where the law has plastic flow). Default: none."
-        ),
-    ] = None
-    initial_pressure: Annotated[
-        Literal["hydrostatic"] | None,
-        Field(
-            description='"hydrostatic": a fluid starts with the J at which it carries its own weight, density g times '
-            "the depth below the top of its bounding box. Default: none."
-        ),
-    ] = None
-    sampling: Annotated[
-        Literal["lattice", "jittered", "poisson"],
-        Field(
-            description="Particles on a lattice, one at random in each cell of that lattice, or a Poisson-disk sample: "
-            "as many at random, none closer than 0.82 (2D) or 0.87 (3D) of its spacing to another."
-        ),
-    ] = "lattice"
+    name: str = Field(pattern=NAME, description="Name of the body, used in messages and --set.")
+    material: Material
+    shape: OneShape = Field(
+        description="Exactly one of box, ball, capsule, cylinder or mesh (3D), polygon (2D), points; add, subtract."
+    )
+    velocity: StartVector = Field(
+        None,
+        validate_default=True,
+        description="Initial velocity, m/s; numbers, or expressions of the place X, Y, Z (m), whose gradient is "
+        "the initial affine velocity C. Default: at rest.",
+    )
+    velocity_gradient: StartMatrix | None = Field(
+        None,
+        description="Velocity gradient, 1/s, one row per axis. Numbers L add L (x - c) to the velocity, c the "
+        "centre of the bounding box of the shape, and L to C. With an expression of X, Y, Z in it, it is C alone, "
+        "in place of the gradient of the velocity. Default: none.",
+    )
+    deformation: StartDeformation | None = Field(
+        None,
+        description="Initial deformation, numbers or expressions of X, Y, Z: the volume ratio J of a law that "
+        "stores it, else F, one row per axis (its elastic part where the law has plastic flow). Default: none.",
+    )
+    initial_pressure: Literal["hydrostatic"] | None = Field(
+        None,
+        description='"hydrostatic": a fluid starts with the J at which it carries its own weight, density g times '
+        "the depth below the top of its bounding box. Default: none.",
+    )
+    sampling: Literal["lattice", "jittered", "poisson"] = Field(
+        "lattice",
+        description="Particles on a lattice, one at random in each cell of that lattice, or a Poisson-disk sample: "
+        "as many at random, none closer than 0.82 (2D) or 0.87 (3D) of its spacing to another.",
+    )
     particles_per_cell: ParticlesPerCell = None  # type: ignore[assignment]
-    seed: Annotated[
-        Integer, Field(ge=0, le=2**63 - 1, description="Seed of the random positions; unused by a lattice.")
-    ] = 0
+    seed: Integer = Field(0, ge=0, le=2**63 - 1, description="Seed of the random positions; unused by a lattice.")
 
 
 class Force(Table):
     """An acceleration that acts on one body, or on all of them."""
 
-    name: Annotated[str | None, Field(pattern=NAME, description="Name of the force, for --set.")] = None
-    body: Annotated[str | None, Field(description="Name of the body that it acts on. Default: all of them.")] = None
-    acceleration: Annotated[
-        PlaceVector,
-        Field(
-            description="m/s^2, one entry per axis: numbers, or expressions of the time t (s), the position x, y, z "
-            "and the initial position X, Y, Z of a particle (m)."
-        ),
-    ]
+    name: str | None = Field(None, pattern=NAME, description="Name of the force, for --set.")
+    body: str | None = Field(None, description="Name of the body that it acts on. Default: all of them.")
+    acceleration: PlaceVector = Field(
+        description="m/s^2, one entry per axis: numbers, or expressions of the time t (s), the position x, y, z "
+        "and the initial position X, Y, Z of a particle (m)."
+    )
 
 
 def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:
@@ -139,21 +333,15 @@ def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:
 class Output(Table):
     """What is stored of each particle, besides its position, body and material."""
 
-    fields: Annotated[
-        tuple[ParticleField, ...],
-        AfterValidator(_no_repeats),
-        Field(
-            description="Fields of each stored frame: velocity (m/s), density (kg/m^3), pressure (Pa), "
-            "volume_ratio J, deformation_gradient F, affine C (1/s), stress (Cauchy, Pa), mass (kg), "
-            "initial_position (m)."
-        ),
-    ] = ("velocity", "density", "pressure")
-    drop_retired: Annotated[
-        Flag, Field(description="Store only the particles that are there, so that frames differ in their numbers.")
-    ] = False
-    compress: Annotated[
-        Flag, Field(description="Compress the stored file with gzip: smaller, and slower to write.")
-    ] = False
+    fields: Annotated[tuple[ParticleField, ...], AfterValidator(_no_repeats)] = Field(
+        ("velocity", "density", "pressure"),
+        description="Fields of each stored frame: velocity (m/s), density (kg/m^3), pressure (Pa), volume_ratio J, "
+        "deformation_gradient F, affine C (1/s), stress (Cauchy, Pa), mass (kg), initial_position (m).",
+    )
+    drop_retired: Flag = Field(
+        False, description="Store only the particles that are there, so that frames differ in their numbers."
+    )
+    compress: Flag = Field(False, description="Compress the stored file with gzip: smaller, and slower to write.")
 
 
 class Scene(Table):
@@ -162,29 +350,23 @@ class Scene(Table):
     Built by `load_scene` or `parse_scene`. In 2D all extensive quantities are per metre of depth.
     """
 
-    title: Annotated[str, Field(description="One line that says what the scene is.")] = ""
-    constants: Annotated[
-        Constants | None,
-        Field(
-            description="Names for numbers, or for expressions of t, x, y, z, X, Y, Z and of the names above them, "
-            "which every expression of the scene may use. Default: none."
-        ),
-    ] = None
-    domain: Annotated[Domain, Field(description="The box that the scene lives in, and its grid.")]
-    time: Annotated[Time, Field(description="How long, how many frames, which steps.")]
-    bodies: Annotated[tuple[Body, ...], Field(min_length=1, description="The bodies, at least one.")]
-    emitters: Annotated[tuple[Emitter, ...], Field(description="Where material flows in. Default: none.")] = ()
-    forces: Annotated[
-        tuple[Force, ...], Field(description="Accelerations beside gravity; what acts on a particle adds up.")
-    ] = ()
-    colliders: Annotated[
-        tuple[Collider, ...], Field(description="Rigid things that the material meets, at rest or moving.")
-    ] = ()
-    impulses: Annotated[
-        tuple[Impulse, ...], Field(description="Pushes on what is near a place, at a time or over an interval.")
-    ] = ()
-    output: Annotated[Output, Field(description="What is stored.")] = Output()
-    solver: Annotated[SolverSettings, Field(description="How it is computed.")] = SolverSettings()
+    title: str = Field("", description="One line that says what the scene is.")
+    constants: Constants | None = Field(
+        None,
+        description="Names for numbers, or for expressions of t, x, y, z, X, Y, Z and of the names above them, "
+        "which every expression of the scene may use. Default: none.",
+    )
+    domain: Domain = Field(description="The box that the scene lives in, and its grid.")
+    time: Time = Field(description="How long, how many frames, which steps.")
+    bodies: tuple[Body, ...] = Field(min_length=1, description="The bodies, at least one.")
+    emitters: tuple[Emitter, ...] = Field((), description="Where material flows in. Default: none.")
+    forces: tuple[Force, ...] = Field((), description="Accelerations beside gravity; what acts on a particle adds up.")
+    colliders: tuple[Collider, ...] = Field((), description="Rigid things that the material meets, at rest or moving.")
+    impulses: tuple[Impulse, ...] = Field(
+        (), description="Pushes on what is near a place, at a time or over an interval."
+    )
+    output: Output = Field(Output(), description="What is stored.")
+    solver: SolverSettings = Field(SolverSettings(), description="How it is computed.")
 
     @property
     def dimension(self) -> int:
@@ -221,25 +403,19 @@ def scene_model(laws: tuple[type[MaterialParameters], ...]) -> type[Scene]:
     """
     material: Any = laws[0] if len(laws) == 1 else Annotated[Union[laws], Field(discriminator="law")]  # noqa: UP007
     described = Annotated[material, Field(description=Body.model_fields["material"].description)]
-    body = create_model("Body", __base__=Body, __doc__=Body.__doc__, material=(described, ...))
-    bodies = Annotated[
-        tuple[body, ...],  # type: ignore[valid-type]
-        Field(min_length=1, description=Scene.model_fields["bodies"].description),
-    ]
-    emitter = create_model("Emitter", __base__=Emitter, __doc__=Emitter.__doc__, material=(described, ...))
-    emitters = Annotated[
-        tuple[emitter, ...],  # type: ignore[valid-type]
-        Field(description=Scene.model_fields["emitters"].description),
-    ]
+    body, emitter = (
+        create_model(base.__name__, __base__=base, __doc__=base.__doc__, material=(described, ...))
+        for base in (Body, Emitter)
+    )
     output = _output_model(laws)
-    described_output = Annotated[output, Field(description=Scene.model_fields["output"].description)]
+    texts = {name: field.description for name, field in Scene.model_fields.items()}
     return create_model(
         "Scene",
         __base__=Scene,
         __doc__=Scene.__doc__,
-        bodies=(bodies, ...),
-        emitters=(emitters, ()),
-        output=(described_output, output()),
+        bodies=(tuple[body, ...], Field(min_length=1, description=texts["bodies"])),
+        emitters=(tuple[emitter, ...], Field((), description=texts["emitters"])),
+        output=(output, Field(output(), description=texts["output"])),
     )
 
 
@@ -251,9 +427,6 @@ def _output_model(laws: tuple[type[MaterialParameters], ...]) -> type[Output]:
     field = Output.model_fields["fields"]
     also = "; ".join(f"{name}: {variable.description.rstrip('.')}" for name, variable in variables.items())
     names = Literal[(*get_args(ParticleField), *variables)]  # type: ignore[valid-type]
-    annotation = Annotated[
-        tuple[names, ...],
-        AfterValidator(_no_repeats),
-        Field(description=f"{field.description} Where a body stores it, also {also}."),
-    ]
-    return create_model("Output", __base__=Output, __doc__=Output.__doc__, fields=(annotation, field.default))
+    annotation = Annotated[tuple[names, ...], AfterValidator(_no_repeats)]
+    described = Field(field.default, description=f"{field.description} Where a body stores it, also {also}.")
+    return create_model("Output", __base__=Output, __doc__=Output.__doc__, fields=(annotation, described))

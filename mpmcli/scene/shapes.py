@@ -1,15 +1,148 @@
 """Shapes: forms, each with its volume, its bounds, an inside test and a signed distance, and composites of them."""
 
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations, product
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
 
-from mpmcli.scene.composite import Composite
 from mpmcli.scene.mesh import Mesh
 from mpmcli.scene.points import Points
-from mpmcli.scene.polygon import Polygon
-from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder
+from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon, Solid, grid_points
 from mpmcli.scene.quantity import Table, flaw, scene_dimension
+from mpmcli.scene.triangles import node_distances
+
+# Cells along the longest axis of the bounding box, of the coarsest lattice, and times that those on the surface are
+# halved, in 2D and 3D.
+_CELLS, _HALVINGS = 8, {2: 8, 3: 4}
+_POINTS_AT_ONCE = 200_000
+
+
+def enclosed_volume(solid: Solid, fewer: int = 0) -> float:
+    """Return the volume where a signed distance is negative, m^3 (m^2 in 2D).
+
+    Cells that the distance shows to lie inside count as a whole. Those on the surface are halved, and in the end cut by
+    the plane with the distance and the gradient of their centre. The error falls as the square of their size, and is
+    extrapolated from cells of 1/1024 and 1/2048 (2D), 1/64 and 1/128 (3D) of the extent: below 5e-7 (2D) and 1e-5 (3D)
+    of the volume in the tests. Each of `fewer` halvings that are left out makes it some four times as large.
+    """
+    lower, upper = solid.bounds()
+    d = len(lower)
+    size = float((upper - lower).max()) / _CELLS
+    counts = np.ceil((upper - lower) / size - 1e-9).astype(int)
+    corners = grid_points(*map(np.arange, counts))
+    centers = lower + (corners + 0.5) * size
+    offsets = np.array(list(product((-0.25, 0.25), repeat=d)))
+    whole, found, halvings = 0.0, [], _HALVINGS[d] - fewer
+    for halving in range(halvings + 1):
+        distance = _distances(solid, centers)
+        reach = math.sqrt(d) / 2 * size
+        whole += float(np.count_nonzero(distance <= -reach)) * size**d
+        surface = np.abs(distance) < reach
+        centers, distance = centers[surface], distance[surface]
+        if halving >= halvings - 1:
+            ahead, behind = (
+                [_distances(solid, centers + way * step) for step in np.eye(d) * size / 4] for way in (1, -1)
+            )
+            rise = 2 * np.abs(np.array(ahead) - np.array(behind)).T
+            found.append(whole + float(_shares(distance, rise).sum()) * size**d)
+        centers = (centers[:, None] + offsets * size).reshape(-1, d)
+        size /= 2
+    return (4 * found[1] - found[0]) / 3
+
+
+def _distances(solid: Solid, points: np.ndarray) -> np.ndarray:
+    parts = [solid.signed_distance(points[i : i + _POINTS_AT_ONCE]) for i in range(0, len(points), _POINTS_AT_ONCE)]
+    return np.concatenate(parts) if parts else np.zeros(0)
+
+
+def _shares(distance: np.ndarray, rise: np.ndarray) -> np.ndarray:
+    """Return the share of cells (n,) below the plane that is `distance` at their centre and rises by (n, d) across.
+
+    The volume of the simplex that the plane cuts from a corner, less those beyond the other corners and so on.
+    """
+    d = rise.shape[1]
+    # A plane along an axis is that of a slight slope, which cuts as much.
+    rise = np.maximum(rise, 1e-3 * rise.max(axis=1, keepdims=True, initial=1e-300))
+    level = rise.sum(axis=1) / 2 - distance
+    found = sum(
+        (-1) ** sum(corner) * np.maximum(0.0, level - rise @ np.array(corner)) ** d
+        for corner in product((0, 1), repeat=d)
+    )
+    return np.clip(found / (math.factorial(d) * rise.prod(axis=1)), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Composite(Solid):
+    """What lies in any of the forms `added`, at least one, and in none of those `removed`."""
+
+    added: tuple[Solid, ...]
+    removed: tuple[Solid, ...] = ()
+
+    @property
+    def volume(self) -> float:
+        """Exact where no two forms intersect, else by quadrature; see `enclosed_volume` for its error."""
+        return _volume(self)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        lowers, uppers = zip(*(form.bounds() for form in self.added), strict=True)
+        return np.min(lowers, axis=0), np.max(uppers, axis=0)
+
+    def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
+        """Say whether points lie inside; with an inset, those are left out that are that deep in no single form."""
+        if inset > 0:
+            return self.signed_distance(points) <= -inset
+        inside = np.any([form.contains(points) for form in self.added], axis=0)
+        for form in self.removed:
+            inside[inside] = ~form.contains(points[inside])
+        return inside
+
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the smallest distance of what is added, and the largest of it and what is left by what is removed.
+
+        No point is nearer to the surface; where forms intersect, some are farther.
+        """
+        distance = np.min([form.signed_distance(points) for form in self.added], axis=0)
+        for form in self.removed:
+            distance = np.maximum(distance, -form.signed_distance(points))
+        return distance
+
+
+@lru_cache(maxsize=256)
+def _volume(form: Composite) -> float:
+    if all(any(_holds(other, one) for other in form.removed) for one in form.added):
+        return 0.0
+    # What does not meet the bounding box of anything takes nothing from it.
+    removed = [one for one in form.removed if any(_boxes_meet(one, other) for other in form.added)]
+    lone = not any(_boxes_meet(*pair) for forms in (form.added, removed) for pair in combinations(forms, 2))
+    if lone and all(any(_holds(other, one) for other in form.added) for one in removed):
+        return sum(one.volume for one in form.added) - sum(one.volume for one in removed)
+    return enclosed_volume(form, fewer=1 if any(isinstance(one, Mesh) for one in (*form.added, *removed)) else 0)
+
+
+def _boxes_meet(first: Solid, second: Solid) -> bool:
+    (a, b), (c, d) = first.bounds(), second.bounds()
+    return bool(np.all((b > c) & (d > a)))
+
+
+def _holds(outer: Solid, inner: Solid) -> bool:
+    """Say whether a convex form holds another one as a whole; False where it is not known."""
+    if not isinstance(outer, Box | Ball | Capsule | Cylinder):
+        return False
+    match inner:
+        case Ball():
+            return bool(outer.contains(np.array([inner.center]), inset=inner.radius).all())
+        case Capsule():
+            return bool(outer.contains(np.array([inner.start, inner.end]), inset=inner.radius).all())
+        case Box():
+            return bool(outer.contains(np.array(list(product(*zip(*inner.bounds(), strict=True))))).all())
+        case Polygon():
+            return bool(outer.contains(np.array(inner.vertices)).all())
+    return False
+
 
 Form = Box | Ball | Capsule | Composite | Cylinder | Mesh | Points | Polygon
 
@@ -36,33 +169,30 @@ def exactly_one_form(shape: "Shape") -> "Shape":
     return shape
 
 
+Others = tuple[Annotated["Shape", AfterValidator(exactly_one_form)], ...] | None
+
+
 class Shape(Table):
     """A form: exactly one of those below, with others added to it and taken from it."""
 
-    box: Annotated[Box | None, Field(description="A box with faces along the axes.")] = None
-    ball: Annotated[Ball | None, Field(description="A ball; a disc in 2D.")] = None
-    capsule: Annotated[
-        Capsule | None, Field(description="A cylinder with round ends: all points within a radius of a segment.")
-    ] = None
-    cylinder: Annotated[
-        Cylinder | None, _only_in(3, "box, ball, capsule or polygon"), Field(description="A round cylinder; 3D only.")
-    ] = None
-    mesh: Annotated[
-        Mesh | None,
-        _only_in(3, "box, ball, capsule or polygon"),
-        Field(description="What a closed surface encloses, from a file; 3D only."),
-    ] = None
-    polygon: Annotated[
-        Polygon | None, _only_in(2, "box, ball, capsule, cylinder or mesh"), Field(description="A polygon; 2D only.")
-    ] = None
-    add: Annotated[
-        tuple[Annotated["Shape", AfterValidator(exactly_one_form)], ...] | None,
-        Field(description="Shapes that belong to it as well. Default: none."),
-    ] = None
-    subtract: Annotated[
-        tuple[Annotated["Shape", AfterValidator(exactly_one_form)], ...] | None,
-        Field(description="Shapes that are taken from the form and from what is added. Default: none."),
-    ] = None
+    box: Box | None = Field(None, description="A box with faces along the axes.")
+    ball: Ball | None = Field(None, description="A ball; a disc in 2D.")
+    capsule: Capsule | None = Field(
+        None, description="A cylinder with round ends: all points within a radius of a segment."
+    )
+    cylinder: Annotated[Cylinder | None, _only_in(3, "box, ball, capsule or polygon")] = Field(
+        None, description="A round cylinder; 3D only."
+    )
+    mesh: Annotated[Mesh | None, _only_in(3, "box, ball, capsule or polygon")] = Field(
+        None, description="What a closed surface encloses, from a file; 3D only."
+    )
+    polygon: Annotated[Polygon | None, _only_in(2, "box, ball, capsule, cylinder or mesh")] = Field(
+        None, description="A polygon; 2D only."
+    )
+    add: Others = Field(None, description="Shapes that belong to it as well. Default: none.")
+    subtract: Others = Field(
+        None, description="Shapes that are taken from the form and from what is added. Default: none."
+    )
 
     @property
     def form(self) -> Form:
@@ -75,7 +205,6 @@ class Shape(Table):
 
     @property
     def files(self) -> list[str]:
-        """The files that the shape is read from."""
         others = [file for shape in (*(self.add or ()), *(self.subtract or ())) for file in shape.files]
         return [self.mesh.file, *others] if self.mesh else others
 
@@ -83,9 +212,7 @@ class Shape(Table):
 class BodyShape(Shape):
     """The shape of a body: a form as other shapes, or points from a file."""
 
-    points: Annotated[
-        Points | None, Field(description="Points from a file, each of which is a particle of the body.")
-    ] = None
+    points: Points | None = Field(None, description="Points from a file, each of which is a particle of the body.")
 
     @model_validator(mode="after")
     def _points_are_alone(self) -> "BodyShape":
@@ -95,12 +222,39 @@ class BodyShape(Shape):
 
     @property
     def files(self) -> list[str]:
-        """The files that the shape is read from."""
         return [self.points.file] if self.points else super().files
 
 
-OneShape = Annotated[
-    BodyShape,
-    AfterValidator(exactly_one_form),
-    Field(json_schema_extra={"minProperties": 1}),
-]
+OneShape = Annotated[BodyShape, AfterValidator(exactly_one_form), Field(json_schema_extra={"minProperties": 1})]
+
+
+_NODES_AT_ONCE = 500_000
+
+
+def distance_grid(form: Form, spacing: float, margin: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the signed distance from a form on a grid that covers its bounding box and a margin around it.
+
+    Args:
+        form: any form of a shape.
+        spacing: of the nodes, m.
+        margin: m; the grid reaches at least as far beyond the bounding box.
+
+    Returns:
+        values: float32, (n1, ..., nd), m, negative inside. That of a mesh is the distance of a triangle, never too
+            small: within four cells of the surface that of the nearest one, where triangles are much smaller than cells
+            to 0.04 cells; farther away too large by three cells at most. The sign is always right.
+        origin: place of the first node, (d,), m.
+        spacing: as given; node i lies at origin + i spacing.
+    """
+    lower, upper = form.bounds()
+    cells = np.ceil((upper - lower + 2 * margin) / spacing - 1e-9).astype(int)
+    shape = tuple(int(n) for n in np.maximum(cells, 1) + 1)
+    origin = (lower + upper - (np.array(shape) - 1) * spacing) / 2
+    if isinstance(form, Mesh):
+        return node_distances(form.surface, origin, spacing, shape).astype(np.float32), origin, spacing
+    total = int(np.prod(shape))
+    values = np.empty(total, dtype=np.float32)
+    for first in range(0, total, _NODES_AT_ONCE):
+        some = np.arange(first, min(first + _NODES_AT_ONCE, total))
+        values[some] = form.signed_distance(origin + spacing * np.stack(np.unravel_index(some, shape), axis=1))
+    return values.reshape(shape), origin, spacing

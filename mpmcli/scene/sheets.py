@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from mpmcli.scene.emitters import Emitter
-from mpmcli.scene.schema import Scene
+from mpmcli.scene.primitives import grid_points
+from mpmcli.scene.schema import Emitter, Scene
 from mpmcli.scene.shapes import Shape
 
 # Points along each axis of a mouth at which its area is measured, in 2D and 3D: to 3e-4 and to 1e-3.
@@ -18,25 +18,16 @@ _SLACK = 1e-9
 
 @dataclass(frozen=True)
 class Mouth:
-    """The section of the shape of an emitter, and the lattice on it.
+    """The section of the shape of an emitter, and the lattice on it."""
 
-    Attributes:
-        centre: (d,), m, in the coordinates of the scene.
-        direction: of the flow, (d,), of length 1; across: d - 1 more axes, (d - 1, d).
-        spacing: between sheets and between particles, m.
-        low: (d - 1,), m, where cell 0 of the lattice begins, from the centre; counts: cells along each axis across.
-        filled: which of the cells hold a particle, of shape `counts`.
-        area: of the section, m^2 (m in 2D).
-    """
-
-    centre: np.ndarray
-    direction: np.ndarray
-    across: np.ndarray
-    spacing: np.ndarray
-    low: np.ndarray
-    counts: tuple[int, ...]
-    filled: np.ndarray
-    area: float
+    centre: np.ndarray  # (d,), m, in the coordinates of the scene
+    direction: np.ndarray  # of the flow, (d,), of length 1
+    across: np.ndarray  # d - 1 more axes, (d - 1, d)
+    spacing: np.ndarray  # between sheets and between particles, m
+    low: np.ndarray  # (d - 1,), m, where cell 0 of the lattice begins, from the centre
+    counts: tuple[int, ...]  # cells along each axis across
+    filled: np.ndarray  # which of the cells hold a particle, of shape `counts`
+    area: float  # of the section, m^2 (m in 2D)
 
     @property
     def places(self) -> np.ndarray:
@@ -47,20 +38,14 @@ class Mouth:
 
 @dataclass(frozen=True)
 class Sheets:
-    """All sheets of an emitter.
-
-    Attributes:
-        places: of the particles of one, (n, d), m; count: number of sheets.
-        period: s between two of them; start: when the first one is due, s.
-        volume: of a particle at rest, m^3 (m^2 in 2D).
-    """
+    """All sheets of an emitter."""
 
     mouth: Mouth
-    places: np.ndarray
+    places: np.ndarray  # of the particles of one, (n, d), m
     count: int
-    period: float
-    start: float
-    volume: float
+    period: float  # between two of them, s
+    start: float  # when the first one is due, s
+    volume: float  # of a particle at rest, m^3 (m^2 in 2D)
 
     @property
     def particles(self) -> int:
@@ -75,15 +60,13 @@ def mouth_of(emitter: Emitter, h: float) -> Mouth:
 
 @lru_cache(maxsize=64)
 def _mouth(shape: Shape, velocity: tuple[float, ...], particles_per_cell: int, h: float) -> Mouth:
+    d, form = len(velocity), shape.form
     direction = np.array(velocity) / np.linalg.norm(velocity)
-    d = len(velocity)
-    form = shape.form
     centre, axes, reach = _section(shape, direction)
     # The section, finely: its extent and its area.
     n = _MEASURED[d]
     steps = 2 * reach / n
-    fine = np.stack(np.meshgrid(*[-r + (np.arange(n) + 0.5) * s for r, s in zip(reach, steps, strict=True)],
-                                indexing="ij"), axis=-1).reshape(-1, d - 1)  # fmt: skip
+    fine = grid_points(*[-r + (np.arange(n) + 0.5) * s for r, s in zip(reach, steps, strict=True)])
     inside = form.contains(centre + fine @ axes).reshape((n,) * (d - 1))
     area = float(inside.sum() * np.prod(steps))
     spacing = h / particles_per_cell ** (1 / d)
@@ -97,7 +80,7 @@ def _mouth(shape: Shape, velocity: tuple[float, ...], particles_per_cell: int, h
         counts.append(count)
         spacings.append(width / count)
         low.append(-reach[a] + first * steps[a])
-    cells = np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), axis=-1).reshape(-1, d - 1)
+    cells = grid_points(*map(np.arange, counts))
     places = centre + (np.array(low) + (cells + 0.5) * np.array(spacings[1:])) @ axes
     filled = form.contains(places).reshape(counts)
     return Mouth(centre, direction, axes, np.array(spacings), np.array(low), tuple(counts), filled, area)
@@ -150,5 +133,4 @@ def sheets_until(emitter: Emitter, scene: Scene, period: float) -> int:
 
 def emitted_volumes(scene: Scene) -> list[float]:
     """Return the volume at rest of all particles of each emitter, m^3 (m^2 in 2D)."""
-    found = [sheets_of(emitter, scene) for emitter in scene.emitters]
-    return [sheets.particles * sheets.volume for sheets in found]
+    return [sheets.particles * sheets.volume for sheets in (sheets_of(emitter, scene) for emitter in scene.emitters)]

@@ -1,23 +1,28 @@
-"""Surfaces of rigid things: outlines of segments in 2D, triangles in 3D, and what lies of them within a box."""
+"""Surfaces of forms and colliders: outlines of segments in 2D, triangles in 3D, and points on them."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
+
+from mpmcli.scene.colliders import Collider, Plane
+from mpmcli.scene.mesh import Mesh
+from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon
+from mpmcli.scene.sampling import first_come
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
     """The surface of a thing.
 
-    Attributes:
-        points: (n, d), m.
-        cells: (m, d) int64, indices of points. A segment has the thing on its left; a triangle has it behind, seen from
-            where its corners run counterclockwise.
+    A segment has the thing on its left; a triangle has it behind, seen from where its corners run counterclockwise.
     """
 
-    points: np.ndarray
-    cells: np.ndarray
+    points: np.ndarray  # (n, d), m
+    cells: np.ndarray  # (m, d) int64, indices of points
 
     @property
     def flipped(self) -> "Surface":
@@ -27,22 +32,23 @@ class Surface:
     @property
     def normals(self) -> np.ndarray:
         """Unit normals of the cells, away from the thing, (m, d); zeros where a cell has no extent."""
-        corners = self.points[self.cells]
-        along = corners[:, 1] - corners[:, 0]
-        if self.points.shape[1] == 2:
-            across = np.stack([along[:, 1], -along[:, 0]], axis=1)
-        else:
-            across = np.cross(along, corners[:, 2] - corners[:, 0])
+        across = self._across
         return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
 
     @property
     def sizes(self) -> np.ndarray:
         """Lengths of the segments, m, or areas of the triangles, m^2, (m,)."""
+        lengths = np.linalg.norm(self._across, axis=1)
+        return lengths if self.points.shape[1] == 2 else 0.5 * lengths
+
+    @property
+    def _across(self) -> np.ndarray:
+        """Normals of the cells as long as a segment, or as twice the area of a triangle."""
         corners = self.points[self.cells]
         along = corners[:, 1] - corners[:, 0]
         if self.points.shape[1] == 2:
-            return np.linalg.norm(along, axis=1)
-        return 0.5 * np.linalg.norm(np.cross(along, corners[:, 2] - corners[:, 0]), axis=1)
+            return np.stack([along[:, 1], -along[:, 0]], axis=1)
+        return np.cross(along, corners[:, 2] - corners[:, 0])
 
     def chains(self) -> list[np.ndarray]:
         """Return the segments of a 2D surface joined to lines, points (k, 2) each; the last is the first of a ring."""
@@ -78,12 +84,7 @@ def ring(points: np.ndarray) -> Surface:
 
 
 def within(surface: Surface, lower: np.ndarray, upper: np.ndarray, *, caps: bool) -> Surface:
-    """Return what lies of a surface within a box.
-
-    Args:
-        lower, upper: corners of the box, (d,), m.
-        caps: whether a closed surface in 3D is closed again where the box cuts it.
-    """
+    """Return what lies of a surface within a box; with `caps`, closed again where the box cuts it (3D)."""
     if len(surface.points) == 0:
         return surface
     if (surface.points.min(axis=0) >= lower).all() and (surface.points.max(axis=0) <= upper).all():
@@ -126,14 +127,13 @@ def _triangles_within(surface: Surface, lower: np.ndarray, upper: np.ndarray, ca
     clip.SetScalarModeToLabels()
     clip.TriangulationErrorDisplayOff()
     clip.Update()
-    result = clip.GetOutput()
-    found = surface_of(result)
+    found = surface_of(clip.GetOutput())
     if caps or len(found.cells) == 0:
         return found
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     # Label 0 marks what the input had.
-    labels = vtk_to_numpy(result.GetCellData().GetScalars())
+    labels = vtk_to_numpy(clip.GetOutput().GetCellData().GetScalars())
     return Surface(found.points, found.cells[labels == 0])
 
 
@@ -162,3 +162,265 @@ def surface_of(data: Any) -> Surface:
     points = vtk_to_numpy(data.GetPoints().GetData()).astype(np.float64)
     cells = vtk_to_numpy(data.GetPolys().GetConnectivityArray()).astype(np.int64)
     return Surface(points, cells.reshape(-1, 3))
+
+
+# Straight pieces of a half circle, and cells along the longest side of a form that is found as a level set.
+ARC, CELLS = 32, 96
+# Outwards, counterclockwise; bit i of a corner's number is its side along axis i.
+BOX = [(0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4, 5, 7, 6)]
+
+
+def form_surface(form: Any) -> Surface:
+    """Return the closed surface of a form: corners, turned profiles of round forms, level sets of all others."""
+    if isinstance(form, Polygon):
+        return ring(np.array(form.vertices))
+    if isinstance(form, Box):
+        return _box(*form.bounds())
+    if isinstance(form, Ball):
+        center = np.array(form.center)
+        if len(center) == 2:
+            return ring(center + form.radius * _arc(0.0, 2 * math.pi))
+        pole = np.array([0.0, 0.0, 1.0])
+        return _turned(center, pole, form.radius * _arc(0.0, math.pi))
+    if isinstance(form, Capsule):
+        start, along = np.array(form.start), np.subtract(form.end, form.start)
+        axis = along / np.linalg.norm(along)
+        first = form.radius * _arc(0.5 * math.pi, math.pi)
+        last = form.radius * _arc(0.0, 0.5 * math.pi) + [form.length, 0.0]
+        profile = np.concatenate([last, first])
+        if len(start) == 2:
+            whole = np.concatenate([profile, profile[-2:0:-1] * [1.0, -1.0]])
+            return ring(start + whole[:, :1] * axis + whole[:, 1:] * np.array([-axis[1], axis[0]]))
+        return _turned(start, axis, profile)
+    if isinstance(form, Cylinder):
+        r, h = form.radius, form.height
+        return _turned(np.array(form.base), form.direction, np.array([[h, 0.0], [h, r], [0.0, r], [0.0, 0.0]]))
+    if isinstance(form, Mesh):
+        return Surface(form.surface.vertices, form.surface.triangles)
+    return level_surface(form.signed_distance, *form.bounds())
+
+
+def level_surface(
+    distance: Callable[[np.ndarray], np.ndarray], lower: np.ndarray, upper: np.ndarray, cells: int = CELLS
+) -> Surface:
+    """Return where a signed distance is zero between two corners, on a grid of `cells` along the longest side."""
+    import pyvista as pv
+
+    d = len(lower)
+    edge = float(np.max(upper - lower)) / cells
+    corner = lower - 1.5 * edge
+    shape = np.ceil((upper - lower) / edge - 1e-9).astype(int) + 4
+    places = np.stack(
+        np.meshgrid(*(c + edge * np.arange(n) for c, n in zip(corner, shape, strict=True)), indexing="ij")
+    )
+    values = distance(places.reshape(d, -1).T).reshape(shape)
+    flat = [0.0] * (3 - d)
+    grid = pv.ImageData(dimensions=(*shape, *[1] * (3 - d)), spacing=[edge] * 3, origin=[*corner, *flat])
+    grid.point_data["distance"] = values.ravel(order="F")
+    found = grid.contour([0.0], scalars="distance")
+    if d == 3:
+        return oriented(surface_of(found.triangulate()), distance)
+    if found.n_points == 0:
+        return Surface(np.empty((0, 2)), np.empty((0, 2), np.int64))
+    return oriented(Surface(np.asarray(found.points, float)[:, :2], found.lines.reshape(-1, 3)[:, 1:]), distance)
+
+
+def oriented(surface: Surface, distance: Callable[[np.ndarray], np.ndarray]) -> Surface:
+    """Return a surface whose cells each have the inside of a signed distance behind them, or on the left."""
+    if len(surface.cells) == 0:
+        return surface
+    middle = surface.points[surface.cells].mean(axis=1)
+    step = 1e-3 * np.sqrt(surface.sizes)[:, None] if surface.points.shape[1] == 3 else 1e-3 * surface.sizes[:, None]
+    wrong = distance(middle + step * surface.normals) < distance(middle - step * surface.normals)
+    return Surface(surface.points, np.where(wrong[:, None], surface.cells[:, ::-1], surface.cells))
+
+
+def without_doubles(surface: Surface) -> Surface:
+    """Return triangles whose corners at one place are one point."""
+    from vtkmodules.vtkFiltersCore import vtkCleanPolyData
+
+    clean = vtkCleanPolyData()
+    clean.SetInputData(poly_data(surface))
+    clean.SetTolerance(0.0)
+    clean.ConvertPolysToLinesOff()
+    clean.Update()
+    return surface_of(clean.GetOutput())
+
+
+def _arc(start: float, end: float) -> np.ndarray:
+    """Return points (n, 2) of a unit circle between two angles; the last of a whole circle is left out."""
+    count = max(round((end - start) / math.pi * ARC), 1)
+    angles = np.linspace(start, end, count + 1)[: count if end - start > 6.0 else None]
+    points = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    points[np.abs(points) < 1e-15] = 0.0
+    return points
+
+
+def _box(lower: np.ndarray, upper: np.ndarray) -> Surface:
+    d = len(lower)
+    corners = np.array([[upper[a] if k >> a & 1 else lower[a] for a in range(d)] for k in range(2**d)])
+    if d == 2:
+        return ring(corners[[0, 1, 3, 2]])
+    return Surface(corners, np.array([t for a, b, c, e in BOX for t in ((a, b, c), (a, c, e))], dtype=np.int64))
+
+
+def _beside(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return two unit vectors that are normal to a third one and to each other."""
+    u = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    u /= np.linalg.norm(u)
+    return u, np.cross(axis, u)
+
+
+def _turned(start: np.ndarray, axis: np.ndarray, profile: np.ndarray) -> Surface:
+    """Return the surface of a profile that turns about an axis, a unit vector, through a place `start`, (3,), m.
+
+    The profile has places along the axis, falling, and distances from it, (n, 2), m; 0 at both ends.
+    """
+    around = 2 * ARC
+    u, v = _beside(axis)
+    angle = 2 * math.pi * np.arange(around) / around
+    circle = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
+    rings = start + profile[1:-1, :1, None] * axis + profile[1:-1, 1:, None] * circle
+    points = np.concatenate([[start + profile[0, 0] * axis], rings.reshape(-1, 3), [start + profile[-1, 0] * axis]])
+    here = np.arange(around)
+    ahead = np.roll(here, -1)
+    last = len(points) - 1
+    cells = [np.stack([np.zeros_like(here), 1 + here, 1 + ahead], axis=1)]
+    for k in range(len(rings) - 1):
+        a, b = 1 + k * around, 1 + (k + 1) * around
+        cells.append(np.stack([a + here, b + here, b + ahead], axis=1))
+        cells.append(np.stack([a + here, b + ahead, a + ahead], axis=1))
+    bottom = 1 + (len(rings) - 1) * around
+    cells.append(np.stack([bottom + here, np.full_like(here, last), bottom + ahead], axis=1))
+    return Surface(points, np.concatenate(cells).astype(np.int64))
+
+
+# Cosine of the angle from which on an edge is sharp.
+SHARP = math.cos(math.radians(30.0))
+# Least distance in spacings: as close as random disks lie on average, one to a square of the spacing.
+APART = 0.78
+# Candidates to a square of the spacing.
+CANDIDATES = 24
+SEED = 0
+
+
+def surface_points(surface: Surface, spacing: float) -> np.ndarray:
+    """Return points on a surface, (n, d), about one to a length (2D) or square (3D) of the spacing, m.
+
+    Corners in 2D, and sharp edges in 3D, have points of their own. The same surface always gives the same.
+    """
+    if len(surface.cells) == 0:
+        return np.empty((0, surface.points.shape[1]))
+    if surface.points.shape[1] == 2:
+        return np.concatenate([_along(chain, spacing) for chain in surface.chains()])
+    return _apart(surface, spacing)
+
+
+def _along(chain: np.ndarray, spacing: float) -> np.ndarray:
+    """Return points at equal distances between the corners of a line (k, 2)."""
+    chain = chain[[True, *(np.diff(chain, axis=0) != 0).any(axis=1)]]
+    closed = len(chain) > 2 and np.array_equal(chain[0], chain[-1])
+    if closed:
+        # It begins at a corner, if there is one.
+        turns = np.flatnonzero(_turns(np.concatenate([chain[-2:-1], chain])))
+        chain = np.roll(chain[:-1], -int(turns[0]) if len(turns) else 0, axis=0)
+        chain = np.concatenate([chain, chain[:1]])
+    cuts = [0, *(1 + np.flatnonzero(_turns(chain))).tolist(), len(chain) - 1]
+    found = [_even(chain[a : b + 1], spacing) for a, b in pairwise(cuts)]
+    return np.concatenate(found if closed else [*found, chain[-1:]])
+
+
+def _turns(chain: np.ndarray) -> np.ndarray:
+    """Say of the points of a line (k, 2), but for its ends, whether it turns there, (k - 2,)."""
+    along = np.diff(chain, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    return np.sum(along[1:] * along[:-1], axis=1) < SHARP
+
+
+def _even(chain: np.ndarray, spacing: float) -> np.ndarray:
+    """Return points at equal distances on a line (k, d), the first one and not the last."""
+    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(chain, axis=0), axis=1))])
+    count = max(round(gone[-1] / spacing), 1)
+    places = gone[-1] * np.arange(count) / count
+    return np.stack([np.interp(places, gone, axis) for axis in chain.T], axis=1)
+
+
+def _apart(surface: Surface, spacing: float) -> np.ndarray:
+    """Return random points on triangles that are apart from each other: on the sharp edges first.
+
+    Of the candidates, in random order, each is taken that has none before it within the least distance.
+    """
+    from scipy.spatial import cKDTree
+
+    random = np.random.default_rng(SEED)
+    shares = surface.sizes / surface.sizes.sum()
+    count = max(math.ceil(CANDIDATES * surface.sizes.sum() / spacing**2), 1)
+    cells = surface.cells[np.searchsorted(np.cumsum(shares), random.random(count) * (1 - 1e-12))]
+    u, v = random.random((2, count, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    a, b, c = (surface.points[cells[:, k]] for k in range(3))
+    points = np.concatenate([_edge_points(surface, spacing), a + u * (b - a) + v * (c - a)])
+    pairs = cKDTree(points).query_pairs(APART * spacing, output_type="ndarray")
+    return points[first_come(pairs, len(points))]
+
+
+def _edge_points(surface: Surface, spacing: float) -> np.ndarray:
+    """Return points on the sharp edges and rims of triangles, at most a spacing apart, (n, 3)."""
+    edges = np.concatenate([surface.cells[:, [k, (k + 1) % 3]] for k in range(3)])
+    cell = np.tile(np.arange(len(surface.cells)), 3)
+    ordered = np.sort(edges, axis=1)
+    order = np.lexsort((ordered[:, 1], ordered[:, 0]))
+    ordered, cell = ordered[order], cell[order]
+    same = (ordered[1:] == ordered[:-1]).all(axis=1)
+    normals = surface.normals
+    sharp = np.ones(len(ordered), bool)
+    flat = same & (np.sum(normals[cell[1:]] * normals[cell[:-1]], axis=1) >= SHARP)
+    sharp[1:][flat] = sharp[:-1][flat] = False
+    found = [np.empty((0, 3))]
+    for a, b in surface.points[np.unique(ordered[sharp], axis=0)]:
+        count = max(round(float(np.linalg.norm(b - a)) / spacing), 1)
+        found.append(a + np.arange(count + 1)[:, None] / count * (b - a))
+    return np.concatenate(found)
+
+
+def collider_surface(collider: Collider, lower: np.ndarray, upper: np.ndarray) -> Surface:
+    """Return the surface of a collider where its shape stands, before `Motion` moves it; the material is before it.
+
+    Planes, containers and what never moves are cut off at the domain, at time 0, with these corners, (d,), m.
+    """
+    if isinstance(collider.form, Plane):
+        return _plane(collider, lower, upper)
+    surface = form_surface(collider.form)
+    motion, inside = collider.motion, collider.side == "inside"
+    if inside or not motion.moves:
+        placed = Surface(motion.placed(surface.points, 0.0), surface.cells)
+        kept = within(placed, lower, upper, caps=not inside)
+        if kept is not placed:
+            surface = Surface(motion.taken_back(kept.points, 0.0), kept.cells)
+    return surface.flipped if inside else surface
+
+
+def _plane(collider: Collider, lower: np.ndarray, upper: np.ndarray) -> Surface:
+    """Return the part of a plane that lies in the domain; of one that misses it, of the parallel one that touches."""
+    motion, form = collider.motion, collider.form
+    inside = collider.side == "inside"
+    point = motion.placed(np.array([form.point]), 0.0)[0]
+    normal = motion.placed(np.array([form.point]) + form.direction, 0.0)[0] - point
+    normal /= np.linalg.norm(normal)
+    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
+    reach = float(np.abs(normal) @ half)
+    away = float((point - middle) @ normal)
+    # Where it lies on a face of the domain, rounding must not cut it off.
+    shift = away - np.clip(away, -(1 - 1e-12) * reach, (1 - 1e-12) * reach)
+    center = middle + (away - shift) * normal
+    far = 2.0 * float(np.linalg.norm(half))
+    if len(lower) == 2:
+        along = np.array([-normal[1], normal[0]])
+        quad = Surface(center + far * np.array([[-1.0], [1.0]]) * along, np.array([[0, 1]]))
+    else:
+        u, v = _beside(normal)
+        corners = center + far * np.array([-u - v, u - v, u + v, v - u])
+        quad = Surface(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    found = within(quad, lower - 1e-9 * half, upper + 1e-9 * half, caps=False)
+    back = motion.taken_back(found.points + shift * normal, 0.0)
+    return Surface(back, found.cells).flipped if inside else Surface(back, found.cells)

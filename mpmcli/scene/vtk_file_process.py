@@ -31,7 +31,9 @@ def main() -> None:
             warnings.simplefilter("ignore")
             found = pv.read(path)
             found = found.combine() if isinstance(found, pv.MultiBlock) else found
-            points, arrays = np.array(found.points, np.float64), _arrays(found)
+            points, data = np.array(found.points, np.float64), found.point_data
+            arrays = {str(name): np.asarray(data[name]) for name in data.keys()}  # noqa: SIM118
+            arrays = {name: array for name, array in arrays.items() if array.dtype.kind in "iuf"}
             surface, triangles = vtkDataSetSurfaceFilter(), vtkTriangleFilter()
             surface.SetInputData(found)
             triangles.SetInputConnection(surface.GetOutputPort())
@@ -48,13 +50,6 @@ def main() -> None:
         columns = {f"array_{k}": array for k, array in enumerate(arrays.values())}
         np.savez(out, points=points, vertices=vertices, triangles=corners, **columns)
         answer(arrays=list(arrays))
-
-
-def _arrays(found: object) -> dict[str, np.ndarray]:
-    """Return the values of the points that are numbers, by name."""
-    data = found.point_data
-    arrays = {str(name): np.asarray(data[name]) for name in data.keys()}  # noqa: SIM118
-    return {name: array for name, array in arrays.items() if array.dtype.kind in "iuf"}
 
 
 def _limit(size: int) -> None:

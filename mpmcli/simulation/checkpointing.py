@@ -8,7 +8,7 @@ from pathlib import Path
 from mpmcli.errors import RunError
 from mpmcli.output.checkpoints import Checkpoint, write_checkpoint
 from mpmcli.output.store import Store
-from mpmcli.solver.engine import Engine
+from mpmcli.solver.engine.run import Run
 
 # Share of the wall time that checkpoints may take, and the least time between two, s.
 SHARE, LEAST = 0.008, 5.0
@@ -17,16 +17,12 @@ FIRST, RATE = 1.0, 3e8
 
 
 class Checkpointer:
-    """Takes checkpoints of one run.
-
-    Attributes:
-        seconds: wall time spent so far; taken: number of checkpoints.
-    """
+    """Takes checkpoints of one run; `seconds` of wall time spent so far, and number `taken`."""
 
     def __init__(
         self,
         directory: Path,
-        engine: Engine,
+        run: Run,
         store: Store,
         backend: Mapping[str, object],
         *,
@@ -34,14 +30,8 @@ class Checkpointer:
         forced: bool,
         every: float | None = None,
     ) -> None:
-        """Begin.
-
-        Args:
-            size: bytes of the particles on the device.
-            forced: whether time.step is taken as it is.
-            every: s between two checkpoints; None for as often as costs SHARE of the time.
-        """
-        self._directory, self._engine, self._store = directory, engine, store
+        """Begin; `size` is of the particles, bytes, `every` s between two, None: at a cost of SHARE of the time."""
+        self._directory, self._run, self._store = directory, run, store
         self._backend = {name: str(backend[name]) for name in ("arch", "precision")}
         self._forced, self._every = forced, every
         self._cost = FIRST + size / RATE
@@ -54,16 +44,12 @@ class Checkpointer:
         return time.monotonic() - self._last >= wait
 
     def take(self) -> None:
-        """Seal the frames that wait and then the state; where the disk is full, the run goes on without.
-
-        Raises:
-            RunError: the frames cannot be written.
-        """
+        """Seal waiting frames, else RunError, and then the state; where the disk is full, go on without."""
         began = time.monotonic()
         self._store.seal()
         sealed = time.monotonic()
         with suppress(OSError, RunError):
-            saved = self._engine.save()
+            saved = self._run.save()
             numbers = saved.numbers
             point = Checkpoint(
                 frame=int(numbers["frames"][0]),

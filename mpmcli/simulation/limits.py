@@ -9,7 +9,7 @@ import psutil
 
 from mpmcli.errors import InputError
 from mpmcli.plain_text import size_text
-from mpmcli.solver.plan import Plan
+from mpmcli.solver.machine.plan import Plan
 
 # Time kept for the last records and the end of the process, s, and multiple of the longest pause between two questions
 # that is kept for the next one.
@@ -24,21 +24,13 @@ MEMORY_LOOKS = 0.1
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of one run.
-
-    Attributes:
-        max_time: wall time of the process, s; max_memory: its resident memory, bytes; None for no limit.
-    """
+    """Limits of one run, None for no limit: wall time of the process, s, and its resident memory, bytes."""
 
     max_time: float | None = None
     max_memory: int | None = None
 
     def require_room(self, plan: Plan) -> None:
-        """Refuse a plan that needs more memory than the limit.
-
-        Raises:
-            InputError: what the process takes now and the plan together exceed `max_memory`.
-        """
+        """Raise InputError where a plan and what the process takes now need more memory than the limit."""
         if self.max_memory is None:
             return
         need = resident_bytes() + plan.machine_bytes
@@ -50,20 +42,10 @@ class Limits:
 
 
 class Halt:
-    """Answers whether to end a run, which asks where it can stop.
-
-    Attributes:
-        status: "interrupted" by a signal, "stopped" at a limit, "" while the run may go on.
-        message: why, a sentence without a full stop; signal: its name, "" where none came.
-    """
+    """Answers whether to end a run: "interrupted" by `signal`, or "stopped" at a limit, and why in `message`."""
 
     def __init__(self, stop: Callable[[], bool | str], limits: Limits, *, compress: bool = False) -> None:
-        """Begin to watch.
-
-        Args:
-            stop: returns whether to interrupt the run, or the name of the signal that asks for it.
-            compress: whether packing compresses.
-        """
+        """Begin; `stop` tells whether to interrupt the run, or the signal that asks for it."""
         self._stop, self._limits, self._compress = stop, limits, compress
         self._end = None if limits.max_time is None else limits.max_time + _process_began()
         self._asked: float | None = None
@@ -78,7 +60,6 @@ class Halt:
         self._written, self._seconds = size, seconds
 
     def __call__(self) -> bool:
-        """Return whether to end the run here."""
         if self.status:
             return True
         now = time.monotonic()
@@ -87,7 +68,8 @@ class Halt:
         self._asked = now
         if self._ask_signal():
             return True
-        if self._end is not None and now + PAUSES * self._pause + self._packing_time > self._end - RESERVE:
+        packing = PACKING * self._seconds + (self._written / COMPRESSION if self._compress else 0.0)
+        if self._end is not None and now + PAUSES * self._pause + packing > self._end - RESERVE:
             return self._stop_for(f"the run stopped before its --max-time of {_clock(self._limits.max_time)}")
         return self._limits.max_memory is not None and self._exceeds_memory(now)
 
@@ -104,11 +86,6 @@ class Halt:
         if not self._ask_signal() and not self.status:
             self.status, self.message = "interrupted", "the run was interrupted"
             self._asked = time.monotonic()
-
-    @property
-    def _packing_time(self) -> float:
-        compressing = self._written / COMPRESSION if self._compress else 0.0
-        return PACKING * self._seconds + compressing
 
     def _ask_signal(self) -> bool:
         if said := self._stop():

@@ -3,29 +3,21 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from mpmcli.check.finding import Finding, Verdict
+from mpmcli.check.finding import Verdict
 from mpmcli.check.result_check import check_kept
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import Scene, scene_to_toml
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.diagnosis import LEFT, OUTRAN, UnstableRunError
-from mpmcli.solver.engine import Engine
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import LEFT, OUTRAN, UnstableRunError
+from mpmcli.solver.machine.backend import Backend
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A run with all its frames.
-
-    Attributes:
-        header: facts about the run.
-        frames, ledger: T each; fewer than the scene asks for where the run stopped.
-        steps, particles: counts.
-        verdict: of `mpmcli check`; "escaped" where a particle left the domain.
-        reason: why the verdict is not "stable", one sentence; "" where it is.
-    """
+    """A run with T frames and rows, fewer where it stopped, its verdict, and why that is not "stable"."""
 
     header: RunHeader
     frames: Sequence[Frame]
@@ -39,10 +31,10 @@ class Recording:
 class Recorder:
     """Keeps the frames of a run while it goes on."""
 
-    def __init__(self, engine: Engine, scene: Scene, backend: Backend) -> None:
+    def __init__(self, run: Run, scene: Scene, backend: Backend) -> None:
         facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
-        self._header = RunHeader.of(scene, scene_to_toml(scene), [laws()[name] for name in engine.laws], facts)
-        self._engine = engine
+        self._header = RunHeader.of(scene, scene_to_toml(scene), [laws()[name] for name in run.laws], facts)
+        self._run = run
         self._frames: list[Frame] = []
         self._ledger: list[LedgerRow] = []
 
@@ -54,7 +46,7 @@ class Recorder:
     def finished(self) -> Recording:
         """Return the recording of a run that has reached its end."""
         check = check_kept(self._header, self._frames, self._ledger)
-        return self._recording(check.verdict, _first(check.findings))
+        return self._recording(check.verdict, next((f.what for f in check.findings if f.severity != "note"), ""))
 
     def stopped(self, error: UnstableRunError) -> Recording:
         """Return the recording of a run that became unstable."""
@@ -62,27 +54,16 @@ class Recorder:
         return self._recording("escaped" if escaped else "unstable", str(error))
 
     def _recording(self, verdict: Verdict, reason: str) -> Recording:
-        engine = self._engine
-        return Recording(
-            self._header, self._frames, self._ledger, engine.step_count, engine.particle_count, verdict, reason
-        )
+        counts = self._run.step_count, self._run.particle_count
+        return Recording(self._header, self._frames, self._ledger, *counts, verdict, reason)
 
 
-def record(engine: Engine, scene: Scene, backend: Backend, stop: Callable[[], bool] = lambda: False) -> Recording:
-    """Run a scene to its end or to where it stops.
-
-    Raises:
-        KeyboardInterrupt: `stop` returned True.
-    """
-    recorder = Recorder(engine, scene, backend)
+def record(run: Run, scene: Scene, backend: Backend, stop: Callable[[], bool] = lambda: False) -> Recording:
+    """Run a scene to its end or to where it stops; KeyboardInterrupt where `stop` returned True."""
+    recorder = Recorder(run, scene, backend)
     try:
-        for frame, row in engine.frames(stop):
+        for frame, row in run.frames(stop):
             recorder.take(frame, row)
     except UnstableRunError as error:
         return recorder.stopped(error)
     return recorder.finished()
-
-
-def _first(findings: Sequence[Finding]) -> str:
-    """Return the gravest finding as a sentence, "" where there is none but notes."""
-    return next((finding.what for finding in findings if finding.severity != "note"), "")

@@ -4,7 +4,7 @@ import math
 import os
 import tomllib
 from collections.abc import Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -16,18 +16,18 @@ from mpmcli.output import read_record
 from mpmcli.output.checkpoints import Checkpoint, read_checkpoints
 from mpmcli.output.directory import SCENE
 from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory
-from mpmcli.output.frame_index import FrameIndex
+from mpmcli.output.layout import FrameIndex
 from mpmcli.output.lock import LOCK
 from mpmcli.output.result import open_result
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments, segment_name
 from mpmcli.output.series import SERIES
 from mpmcli.output.verify import verify_file
-from mpmcli.output.vtkhdf_reader import open_vtkhdf, read_index
+from mpmcli.output.vtkhdf import read_index_of
 from mpmcli.plain_text import counted
 from mpmcli.scene import LoadedScene, scene_to_toml
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.engine import Engine
-from mpmcli.solver.state import SavedState
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.saved_state import SavedState
+from mpmcli.solver.machine.backend import Backend
 
 # What may change between two parts of a run: it may end later, with frames as far apart, and its file be compressed.
 MAY_CHANGE = ("time.end", "time.frames", "output.compress")
@@ -36,14 +36,7 @@ _NONE = object()
 
 @dataclass(frozen=True)
 class Resumption:
-    """The start of a run that goes on.
-
-    Attributes:
-        index: of the sound frames from the first one on, None where there are none.
-        checkpoint: the newest one whose frames are all there; None where the run is computed from its start again.
-        complete: whether all frames are there, and no step is left to be taken.
-        record: content of run.json.
-    """
+    """Sound frames, the newest checkpoint among them, and the record of a run that goes on, unless `complete`."""
 
     index: FrameIndex | None
     checkpoint: Checkpoint | None
@@ -74,11 +67,7 @@ class Resumption:
 
 
 def find_resumption(loaded: LoadedScene, directory: Path, form: Literal["vtkhdf", "vtk"]) -> Resumption | None:
-    """Return how a scene goes on from what a directory holds; None where it holds nothing. Nothing is changed.
-
-    Raises:
-        InputError: the directory holds something else, or the result of another scene.
-    """
+    """Return how a scene goes on in a directory, None if it is empty; InputError: it holds something else."""
     record = read_record(directory) if directory.is_dir() else None
     if not (_has_frames(directory) or (directory / SERIES).exists()):
         # Killed before it had written anything, or not begun.
@@ -92,21 +81,17 @@ def find_resumption(loaded: LoadedScene, directory: Path, form: Literal["vtkhdf"
         raise InputError(f"{directory} holds a run with another --format: leave --format as it was.")
     _require_same_scene(loaded, directory)
     _require_same_files(loaded, record, directory)
-    index = _series_index(directory) if form == "vtk" else _sound_index(directory)
+    if form == "vtk":
+        index = open_result(directory / SERIES).index if (directory / SERIES).exists() else None
+    else:
+        index = _sound_index(directory)
     frames = 0 if index is None else len(index.times)
     found = (point for point in read_checkpoints(directory) if point.frame <= frames)
     return Resumption(index, next(found, None), frames == loaded.scene.time.frames + 1, record)
 
 
-def go_on(engine: Engine, resumption: Resumption, backend: Backend, *, forced: bool) -> None:
-    """Put the state of the checkpoint, if there is one, in place of the start of the run.
-
-    Args:
-        forced: whether time.step is taken as it is.
-
-    Raises:
-        InputError: the checkpoint is of another kind of backend, or of a scene whose particles differ.
-    """
+def go_on(run: Run, resumption: Resumption, backend: Backend, *, forced: bool) -> None:
+    """Put the checkpoint's state, if any, in place of the start; InputError: another backend, --force, or particles."""
     point = resumption.checkpoint
     if point is None:
         return
@@ -117,20 +102,13 @@ def go_on(engine: Engine, resumption: Resumption, backend: Backend, *, forced: b
     if point.forced != forced:
         raise InputError(f"The run was begun with{'' if point.forced else 'out'} --force: resume it in the same way.")
     try:
-        engine.load(SavedState(dict(point.numbers), dict(point.arrays)))
+        run.load(SavedState(dict(point.numbers), dict(point.arrays)))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"The checkpoint of step {point.step} holds something else than a state.") from error
 
 
 def require_same_run(resumption: Resumption, header: Mapping[str, Any], directory: Path) -> None:
-    """Refuse to add frames to those of another version or backend, which could not be packed with them.
-
-    Args:
-        header: that the new frames will have, see `RunHeader.stored`.
-
-    Raises:
-        InputError: the headers differ in more than the scene.
-    """
+    """Refuse with InputError to add frames of another header to those of a run, as they could not be packed."""
     before = {} if resumption.index is None else resumption.index.header
     for key in (key for key in header if before and key != "scene"):
         if before.get(key) != header[key]:
@@ -145,8 +123,7 @@ def take_over(directory: Path, resumption: Resumption) -> None:
     packed, folder = directory / PACKED, directory / SEGMENTS
     count = 0
     if packed.exists():
-        with closing(open_vtkhdf(packed)) as file:
-            count = len(read_index(file).times)
+        count = len(read_index_of(packed).times)
         folder.mkdir(exist_ok=True)
     for path in sealed_segments(directory):
         if not count <= int(path.stem.split("_")[1]) < resumption.frames:
@@ -173,10 +150,6 @@ def _has_frames(directory: Path) -> bool:
     return (directory / PACKED).exists() or bool(sealed_segments(directory))
 
 
-def _series_index(directory: Path) -> FrameIndex | None:
-    return open_result(directory / SERIES).index if (directory / SERIES).exists() else None
-
-
 def _sound_index(directory: Path) -> FrameIndex | None:
     """Return the index of the sound frames from the first one on."""
     found: list[FrameIndex] = []
@@ -190,8 +163,7 @@ def _sound_index(directory: Path) -> FrameIndex | None:
                     f"{faults} `mpmcli repair {directory}` keeps the frames before that; then resume the run."
                 )
             break
-        with closing(open_vtkhdf(path)) as file:
-            index = read_index(file)
+        index = read_index_of(path)
         first = int(index.frames[0])
         if first < count:
             # The packed file has it.

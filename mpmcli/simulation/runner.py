@@ -1,20 +1,20 @@
 """Computes many scenes, one after another, in one process: scenes of one kind share the device and its kernels."""
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from mpmcli.errors import MpmcliError
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.simulation.recording import Recorder, Recording, record
-from mpmcli.solver.backend import Arch, Backend, Optimisation, choose_backend, start, stop_backend
-from mpmcli.solver.batch import Batch
-from mpmcli.solver.batch_kind import Kind
-from mpmcli.solver.batch_run import BatchRun
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.engine import build_engine, suits_batch
-from mpmcli.solver.plan import make_plan, require_room
-from mpmcli.solver.sparse_choice import wants_sparse
+from mpmcli.solver.engine.batch import Batch
+from mpmcli.solver.engine.build import build_run, suits_batch
+from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.grid.sparse_grid import wants_sparse
+from mpmcli.solver.machine.backend import Arch, Backend, Optimisation, choose_backend, start, stop_backend
+from mpmcli.solver.machine.plan import make_plan, require_room
+from mpmcli.solver.machine.room import power_of_two
 
 # Kinds whose kernels are kept at once, and particles below which a scene is computed by kernels that are kept.
 MOST_KINDS, FEW_PARTICLES = 8, 20_000
@@ -25,8 +25,7 @@ MOST_RUNS = 256
 class Runner:
     """Computes scenes with kernels that stay compiled.
 
-    Taichi frees fields only where all of them are freed, so that memory stays flat by a restart of the backend: for
-    a kind that needs more room than an earlier one, and for each scene with many particles.
+    Taichi frees all fields at once: the backend restarts for kinds that need more room, and for large scenes.
     """
 
     def __init__(
@@ -37,12 +36,7 @@ class Runner:
         *,
         most_runs: int = MOST_RUNS,
     ) -> None:
-        """Choose the backend; nothing starts.
-
-        Args:
-            threads: CPU threads of a scene with many particles; one with few takes a single thread.
-            most_runs: that advance at once on a GPU.
-        """
+        """Choose the backend; `threads` are for many particles, and `most_runs` advance at once on a GPU."""
         self._arch, self._threads, self._optimisation = arch, threads, optimisation
         self._most_runs = most_runs
         self._backend: Backend | None = None
@@ -50,14 +44,14 @@ class Runner:
 
     def expect(self, scenes: Iterable[Scene]) -> None:
         """Make room for scenes to come, so that they need no restart."""
-        kinds: list[Kind] = []
+        kinds: list[CompiledKind] = []
         backend = None
         for scene in scenes:
             particles = sample_bodies(scene)
             backend = self._choose(scene)
             if not backend.on_cpu or not _keeps(scene, particles, backend):
                 continue
-            kind = Kind.of(scene, particles)
+            kind = CompiledKind.of(scene, particles)
             place = next((i for i, known in enumerate(kinds) if known.joined(kind) is not None), None)
             if place is None:
                 kinds.append(kind)
@@ -67,30 +61,22 @@ class Runner:
             self._batch_for(kind, backend)
 
     def run(self, scene: Scene, stop: Callable[[], bool] = lambda: False) -> Recording:
-        """Run a scene to its end or to where it stops.
-
-        Raises:
-            InputError: it cannot be run: a particle outside the domain, too little memory, no such backend.
-            KeyboardInterrupt: `stop` returned True.
-        """
+        """Run a scene to its end or where it stops; InputError: it cannot be run; KeyboardInterrupt: `stop` said so."""
         particles = sample_bodies(scene)
         backend = self._choose(scene)
         if _keeps(scene, particles, backend):
             backend = replace(backend, threads=1) if backend.on_cpu else backend
-            engine = BatchRun(self._batch_for(Kind.of(scene, particles), backend), 0, scene, particles)
+            run = Run(self._batch_for(CompiledKind.of(scene, particles), backend), 0, scene, particles)
         else:
             require_room(make_plan(scene, backend))
             self._restart(backend)
-            engine = build_engine(scene, backend, particles, batched=backend.on_cpu)
-        return record(engine, scene, backend, stop)
+            run = build_run(scene, backend, particles)
+        return record(run, scene, backend, stop)
 
     def run_all(self, scenes: Sequence[Scene]) -> Iterator[tuple[int, Recording | Exception]]:
-        """Yield the place of each scene with its recording, or with the error that it ended with, as they end.
-
-        On a GPU those of a kind with few particles advance at once.
-        """
+        """Yield the place of each scene with its recording or error, as they end; on a GPU small ones run at once."""
         alone: list[int] = []
-        kinds: list[tuple[Kind, list[int]]] = []
+        kinds: list[tuple[CompiledKind, list[int]]] = []
         sampled: dict[int, list[BodyParticles]] = {}
         for place, scene in enumerate(scenes):
             try:
@@ -103,7 +89,7 @@ class Runner:
                 alone.append(place)
                 continue
             sampled[place] = particles
-            kind = Kind.of(scene, particles)
+            kind = CompiledKind.of(scene, particles)
             for i, (known, own) in enumerate(kinds):
                 if len(own) < self._most_runs and (joined := known.joined(kind)):
                     kinds[i] = joined, [*own, place]
@@ -120,15 +106,14 @@ class Runner:
             yield from self._run_together(kind, {place: (scenes[place], sampled[place]) for place in places})
 
     def _run_together(
-        self, kind: Kind, scenes: Mapping[int, tuple[Scene, list[BodyParticles]]]
+        self, kind: CompiledKind, scenes: Mapping[int, tuple[Scene, list[BodyParticles]]]
     ) -> Iterator[tuple[int, Recording | Exception]]:
-        """Advance scenes of a kind at once; see `run_all`."""
         backend = self._choose(next(iter(scenes.values()))[0])
         batch = self._batch_for(kind, backend, len(scenes))
         runs: dict[int, tuple[Recorder, Iterator]] = {}
         for slot, (place, (scene, particles)) in enumerate(scenes.items()):
             try:
-                run = BatchRun(batch, slot, scene, particles)
+                run = Run(batch, slot, scene, particles)
                 runs[place] = Recorder(run, scene, backend), run.events()
             except Exception as error:
                 yield place, error
@@ -162,7 +147,7 @@ class Runner:
         stop_backend()
         self._backend = start(backend)
 
-    def _batch_for(self, kind: Kind, backend: Backend, runs: int = 1) -> Batch:
+    def _batch_for(self, kind: CompiledKind, backend: Backend, runs: int = 1) -> Batch:
         """Return a batch with room for so many runs of this kind."""
         if self._backend != backend:
             self._restart(backend)
@@ -174,7 +159,7 @@ class Runner:
             wanted = joined or wanted
         if wanted is not kind or len(self._batches) == MOST_KINDS:
             self._restart(backend)
-        self._batches.append(Batch(_roomy(wanted), backend, _power(runs)))
+        self._batches.append(Batch(wanted.roomy(), backend, power_of_two(runs)))
         return self._batches[-1]
 
 
@@ -183,27 +168,4 @@ def _keeps(scene: Scene, particles: Sequence[BodyParticles], backend: Backend) -
     count = sum(len(body.position) for body in particles)
     if wants_sparse(scene) and backend.on_cpu:
         return False
-    if (scene.comes_and_goes or scene.solver.deterministic) and not backend.on_cpu:
-        # There a batch does not sort, and does not add in fixed point.
-        return False
     return suits_batch(count, backend) and (count < FEW_PARTICLES or not backend.on_cpu)
-
-
-def _roomy(kind: Kind) -> Kind:
-    """Return a kind with some room to spare, so that few sizes occur and compiled kernels are found again."""
-    return replace(
-        kind,
-        particles=tuple(map(_rounded, kind.particles)),
-        bodies=tuple(map(_power, kind.bodies)),
-        comings=replace(kind.comings, cells=_power(kind.comings.cells) if kind.comings.cells else 0),
-    )
-
-
-def _rounded(count: int) -> int:
-    """Return the next quarter of a power of two."""
-    quarter = max(64, _power(count) // 8)
-    return math.ceil(count / quarter) * quarter
-
-
-def _power(count: int) -> int:
-    return 1 << max(0, count - 1).bit_length()

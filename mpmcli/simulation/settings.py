@@ -6,24 +6,16 @@ from pathlib import Path
 from typing import Literal
 
 from mpmcli.simulation.limits import Limits
-from mpmcli.solver.backend import Arch
+from mpmcli.solver.machine.backend import Arch
 
 
 @dataclass(frozen=True)
 class RunSettings:
     """Settings of a run that are not part of its scene.
 
-    Attributes:
-        directory: where the result goes.
-        arch: backend to use; threads: CPU threads, where None one for few particles and otherwise all.
-        form: "vtkhdf" for one packed file, "vtk" for a .vtu series.
-        overwrite: whether an earlier result in the directory may be replaced.
-        resume: whether to go on with the run in the directory, where there is one.
-        checkpoint_every: s between two checkpoints; None for as often as costs less than 1 %.
-        force: whether to run although the check finds errors, and to take time.step above the stable step too.
-        compile_cache: whether compiled kernels are kept for the next start.
-        limits: on time and memory.
-        command: the command line, for the record.
+    Of `threads`, None is one for few particles and otherwise all. `checkpoint_every` is in s, None for as often as
+    costs less than 1 %. `force` runs although the check finds errors, and takes time.step above the stable step;
+    `compile_cache` keeps compiled kernels for the next start; `command` is the command line, for the record.
     """
 
     directory: Path

@@ -17,18 +17,19 @@ from mpmcli.output.segments import sealed_segments
 from mpmcli.output.store import Store
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.checkpointing import Checkpointer
-from mpmcli.simulation.engine import choose_engine
+from mpmcli.simulation.engine import backend_for
 from mpmcli.simulation.limits import Halt
 from mpmcli.simulation.resume import Resumption, find_resumption, go_on, require_same_run, take_over
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.stopwatch import Stopwatch
 from mpmcli.simulation.stored_run import finish, new_record, new_store, new_summary, write_scene
 from mpmcli.simulation.summary import RunSummary
-from mpmcli.solver.backend import Backend, start
-from mpmcli.solver.device_memory import is_out_of_memory, out_of_memory_sentence
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.engine import Engine, build_engine
-from mpmcli.solver.plan import Plan, make_plan, require_room
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import Backend, start
+from mpmcli.solver.machine.device_memory import is_out_of_memory, out_of_memory_sentence
+from mpmcli.solver.machine.plan import Plan, make_plan, require_room
 
 
 def simulate(
@@ -59,13 +60,13 @@ def simulate(
     scene = loaded.scene
     check_directory(settings.directory, settings.overwrite, resume=settings.resume)
     earlier = find_resumption(loaded, settings.directory, settings.form) if settings.resume else None
-    backend, batched = choose_engine(scene, settings.arch, settings.threads, compile_cache=settings.compile_cache)
+    backend = backend_for(scene, settings.arch, settings.threads, compile_cache=settings.compile_cache)
     plan = make_plan(scene, backend)
     findings = check_scene(loaded, plan=plan, directory=settings.directory).findings
     if not (settings.force or passes(findings)):
         raise InputError(_refusal(loaded.source, findings))
     complete = earlier is not None and earlier.complete
-    solver = None if complete else _build(scene, settings, plan, backend, batched=batched)
+    run = None if complete else _build(scene, settings, plan, backend)
     if stop():
         raise KeyboardInterrupt
     # Last, since it removes an earlier result.
@@ -73,7 +74,7 @@ def simulate(
         if settings.resume:
             # Once more, as nobody else can write now.
             earlier = find_resumption(loaded, settings.directory, settings.form)
-            if solver is None and (earlier is None or not earlier.complete):
+            if run is None and (earlier is None or not earlier.complete):
                 raise InputError(
                     f"{settings.directory} was changed by another process meanwhile: give the command again."
                 )
@@ -81,14 +82,12 @@ def simulate(
                 taken.clear()
         notes = (*loaded.notes, *(finding.line for finding in findings if finding.severity != "note"))
         begun = _Begun(loaded, settings, plan, backend, earlier, notes, began, taken)
-        if solver is None:
+        if run is None:
             return _complete(begun, on_start, stop)
-        return _store_run(begun, solver, on_start, on_frame, stop)
+        return _store_run(begun, run, on_start, on_frame, stop)
 
 
 class _Begun(NamedTuple):
-    """A run whose directory is this process's to write."""
-
     loaded: LoadedScene
     settings: RunSettings
     plan: Plan
@@ -99,17 +98,13 @@ class _Begun(NamedTuple):
     taken: TakenDirectory
 
 
-def _build(scene: Scene, settings: RunSettings, plan: Plan, backend: Backend, *, batched: bool) -> Engine:
-    """Put a scene on the device.
-
-    Raises:
-        InputError: there is too little memory, or a particle is not in the domain.
-    """
+def _build(scene: Scene, settings: RunSettings, plan: Plan, backend: Backend) -> Run:
+    """Put a scene on the device; InputError: there is too little memory, or a particle is not in the domain."""
     require_room(plan)
     settings.limits.require_room(plan)
     start(backend)
     try:
-        return build_engine(scene, backend, batched=batched, force=settings.force)
+        return build_run(scene, backend, force=settings.force)
     except (RuntimeError, MemoryError) as error:
         if not is_out_of_memory(error):
             raise
@@ -118,21 +113,20 @@ def _build(scene: Scene, settings: RunSettings, plan: Plan, backend: Backend, *,
 
 def _store_run(
     begun: _Begun,
-    solver: Engine,
+    run: Run,
     on_start: Callable[[RunSummary], None],
     on_frame: Callable[[LedgerRow, RunSummary], None],
     stop: Callable[[], bool | str],
 ) -> RunSummary:
-    """Run a scene and store it; see `simulate`."""
     loaded, settings, plan, backend, earlier, notes, began, taken = begun
     scene = loaded.scene
     forced = settings.force and scene.time.step != "auto"
     text = scene_to_toml(scene)
     facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
-    header = RunHeader.of(scene, text, [laws()[name] for name in solver.laws], facts)
+    header = RunHeader.of(scene, text, [laws()[name] for name in run.laws], facts)
     if earlier is not None:
         require_same_run(earlier, header.stored, settings.directory)
-        go_on(solver, earlier, backend, forced=forced)
+        go_on(run, earlier, backend, forced=forced)
         take_over(settings.directory, earlier)
     summary = new_summary(loaded, settings, plan, backend, earlier, notes)
     on_start(summary)
@@ -140,21 +134,13 @@ def _store_run(
     record.write()
     write_scene(settings.directory, text)
     store = new_store(loaded, settings, header.stored, earlier)
-    checkpoints = Checkpointer(
-        settings.directory,
-        solver,
-        store,
-        summary.backend,
-        size=plan.particles * plan.bytes_per_particle,
-        forced=forced,
-        every=settings.checkpoint_every,
-    )
-
+    options = {"size": plan.particles * plan.bytes_per_particle, "every": settings.checkpoint_every}
+    checkpoints = Checkpointer(settings.directory, run, store, summary.backend, forced=forced, **options)
     clock = Stopwatch(summary.timings, began)
     halt = Halt(stop, settings.limits, compress=scene.output.compress)
     failure: dict = {}
     try:
-        _run(solver, store, checkpoints, record, summary, clock, on_frame, halt)
+        _compute(run, store, checkpoints, record, summary, clock, on_frame, halt)
         summary.status = "finished"
     except KeyboardInterrupt:
         halt.interrupted()
@@ -176,8 +162,8 @@ def _store_run(
             # A fault of mpmcli: the record must not state that the run is going on.
             store.give_up()
             record.close("failed", "an internal error ended the run")
-    summary.steps = solver.step_count
-    clock.book(solver.first_step_seconds, "compile_s")
+    summary.steps = run.step_count
+    clock.book(run.first_step_seconds, "compile_s")
     with clock.adding("output_s"):
         finish(store, summary, halt)
     clock.stop()
@@ -214,8 +200,8 @@ def _complete(begun: _Begun, on_start: Callable[[RunSummary], None], stop: Calla
     return summary
 
 
-def _run(
-    solver: Engine,
+def _compute(
+    run: Run,
     store: Store,
     checkpoints: Checkpointer,
     record: RunRecord,
@@ -241,10 +227,10 @@ def _run(
     def report() -> None:
         sealed = rows[summary.frames - kept : store.frames_written - kept]
         with clock.adding("output_s"):
-            clock.book(solver.first_step_seconds, "compile_s")
-            clock.book(solver.frame_seconds + checkpoints.seconds, "output_s")
-            summary.steps = solver.step_count
-            summary.timings["watch_s"] = solver.measure_seconds
+            clock.book(run.first_step_seconds, "compile_s")
+            clock.book(run.frame_seconds + checkpoints.seconds, "output_s")
+            summary.steps = run.step_count
+            summary.timings["watch_s"] = run.measure_seconds
             record.timings = summary.timings
             for row in sealed:
                 record.observe(row)
@@ -255,7 +241,7 @@ def _run(
             summary.first, summary.last = summary.first or row, row
             on_frame(row, summary)
 
-    frames = solver.frames(after_step)
+    frames = run.frames(after_step)
     try:
         while True:
             with clock.adding("solve_s"):

@@ -4,12 +4,7 @@ import time
 
 
 class Stopwatch:
-    """Adds up the wall time of the parts of a run.
-
-    Args:
-        timings: seconds by name, see `RunSummary`; kept up to date in place.
-        began: `time.perf_counter` at the start of the run.
-    """
+    """Adds up the wall time of parts of a run that `began`, in place, in the `timings` of a `RunSummary`."""
 
     def __init__(self, timings: dict[str, float], began: float) -> None:
         self._timings = timings

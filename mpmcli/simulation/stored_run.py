@@ -13,8 +13,8 @@ from mpmcli.simulation.limits import Halt
 from mpmcli.simulation.resume import Resumption, file_digests
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.summary import RunSummary
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.plan import Plan
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.machine.plan import Plan
 
 
 def new_summary(
@@ -53,11 +53,7 @@ def new_store(loaded: LoadedScene, settings: RunSettings, header: dict[str, Any]
 
 
 def write_scene(directory: Path, text: str) -> None:
-    """Write the effective scene beside the frames.
-
-    Raises:
-        RunError: the disk is full or refuses.
-    """
+    """Write the effective scene beside the frames; RunError: the disk is full or refuses."""
     try:
         write_text(directory / SCENE, text)
     except OSError as error:

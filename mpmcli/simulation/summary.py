@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.solver.plan import Plan
+from mpmcli.solver.machine.plan import Plan
 
 
 @dataclass
@@ -54,9 +54,7 @@ class RunSummary:
             "message": self.message,
             "path": None if self.path is None else str(self.path),
             "directory": str(self.directory),
-            "frames": self.frames,
-            "steps": self.steps,
-            "particles": self.particles,
+            **{name: getattr(self, name) for name in ("frames", "steps", "particles")},
             "particle_steps_per_s": self.rate,
             "backend": self.backend,
             "bytes_per_particle": self.plan.bytes_per_particle,

@@ -2,20 +2,17 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 
 from mpmcli.errors import MpmcliError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene
-from mpmcli.solver.backend import Backend, start_backend
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.solver import Solver
-from mpmcli.solver.sums import NO_STEPS, StepsTaken
-from mpmcli.validation.case import Case
-from mpmcli.validation.run_result import RunResult, failure, not_finite
-from mpmcli.validation.setting import Setting
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import Backend, start_backend
+from mpmcli.validation.case import Case, Setting
+from mpmcli.validation.runs import RunResult, failure, not_finite
 
 
 def scene_of(case: Case, n: int, setting: Setting) -> Scene:
@@ -39,14 +36,14 @@ def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = No
         scene = scene_of(case, n, setting)
         backend = backend or start_backend("cpu", 1, scene.solver.precision)
         facts = {"arch": backend.arch, "precision": backend.precision, "threads": backend.threads}
-        solver = TimedSolver(scene, backend)
+        timed = TimedRun(scene, backend)
     except MpmcliError as error:
         return failure(str(error), **facts)
-    facts |= {"particles": solver.particle_count, "start_seconds": time.perf_counter() - began}
+    facts |= {"particles": timed.run.particle_count, "start_seconds": time.perf_counter() - began}
     values: dict[str, float] = {}
     status, message = "finished", ""
     try:
-        values = {name: float(value) for name, value in case.measure(n, scene, solver.timed_frames()).items()}
+        values = {name: float(value) for name, value in case.measure(n, scene, timed.frames()).items()}
         message = not_finite(values)
         missing = [measure.name for measure in case.measures if measure.name not in values]
         if missing:
@@ -60,57 +57,36 @@ def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = No
     except (ArithmeticError, ValueError) as error:
         # The solver did not detect the instability, but the state cannot be evaluated.
         status, message = "failed", f"The frames cannot be measured: {error}."
-    return RunResult(status, message, values, **facts, **solver.facts())
+    return RunResult(status, message, values, **facts, **timed.facts())
 
 
-class TimedSolver(Solver):
-    """A solver that measures the processor time of its steps, which excludes that of other programs."""
+class TimedRun:
+    """A run whose steps are timed by the processor, which excludes the time of other programs."""
 
     def __init__(self, scene: Scene, backend: Backend) -> None:
-        super().__init__(scene, backend)
-        self._watched = self.measure_seconds
-        self._frames_seconds = self._excluded_seconds = 0.0
+        self.run = build_run(scene, backend)
+        self._seconds = 0.0
 
-    def timed_frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
-        """Yield the frames. The time that the caller spends on them is not counted."""
-        frames = self.frames()
+    def frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
+        """Yield the frames. Compiling, and what the caller does with frames, is not counted."""
+        self.run.begin()
+        frames = self.run.frames()
         while True:
-            began = time.process_time()
+            began, before = time.process_time(), self.run.frame_processor_seconds
             try:
                 found = next(frames, None)
             finally:
-                self._frames_seconds += time.process_time() - began
+                self._seconds += time.process_time() - began - (self.run.frame_processor_seconds - before)
             if found is None:
                 return
             yield found
 
-    def step(self, dt: float, until: float | None = None) -> None:
-        """Advance by dt, s. The first step compiles the kernels and is not counted."""
-        if self.step_count:
-            super().step(dt, until)
-        else:
-            with self._excluded():
-                super().step(dt, until)
-
-    def frame(self, index: int = 0, taken: StepsTaken = NO_STEPS) -> tuple[Frame, LedgerRow]:
-        """Return a frame. The time for building it is not counted."""
-        with self._excluded():
-            return super().frame(index, taken)
-
-    @contextmanager
-    def _excluded(self) -> Iterator[None]:
-        began = time.process_time()
-        try:
-            yield
-        finally:
-            self._excluded_seconds += time.process_time() - began
-
     def facts(self) -> dict[str, float]:
         """Return the step count and times of a `RunResult`."""
         return {
-            "steps": self.step_count,
-            "seconds": max(self._frames_seconds - self._excluded_seconds, 0.0),
-            "watch_seconds": self.measure_seconds - self._watched,
-            "compile_seconds": self.first_step_seconds,
-            "frame_seconds": self.frame_seconds,
+            "steps": self.run.step_count,
+            "seconds": max(self._seconds, 0.0),
+            "watch_seconds": self.run.measure_seconds,
+            "compile_seconds": self.run.first_step_seconds,
+            "frame_seconds": self.run.frame_seconds,
         }

@@ -1,103 +1,169 @@
 """A validation case: a problem with a known solution, its scene at any resolution, and its error measures."""
 
 import math
+import re
+import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
+from functools import cache
+from importlib.resources import files
 from typing import Any, ClassVar, Literal
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.tables import Tables
 
 Level = Literal["coarse", "default", "fine"]
+Levels = dict[Level, tuple[int, ...]]
 Frames = Iterable[tuple[Frame, LedgerRow]]
+# Of a measure, as the report prints it.
+DEFINITION = re.compile(r"(?P<name>[^(:]+?)(?: \((?P<unit>.+?)\))?: (?P<text>.+)")
+# The values of each field of `Setting` that are tried, and their labels.
+KNOBS: dict[str, dict[object, str]] = {
+    "precision": {"f64": "f64", "f32": "f32"},
+    "kernel": {"quadratic": "quadratic kernel", "cubic": "cubic kernel"},
+    "transfer": {"apic": "APIC", "pic": "PIC", "aflip": "AFLIP"},
+    "walls": {"folded": "folded walls", "zeroed": "zeroed walls"},
+    "per_axis": {1: "1 particle per axis", 2: "2 particles per axis", 3: "3 particles per axis"},
+    "safety": {value: f"Courant fraction {value:g}" for value in (0.1, 0.2, 0.4, 0.8, 0.95)},
+}
+DEFAULT = "default"
+# Defaults of a scene, omitted by `Setting.solver_table`.
+SCENE_DEFAULTS = {"precision": "f32", "kernel": "quadratic", "transfer": "apic", "walls": "folded"}
 
 
-def elastic(law: str, density: float, youngs_modulus: float, poissons_ratio: float, **more: float) -> dict[str, Any]:
-    """Return the table of a material with elastic moduli and further parameters, in SI units."""
-    moduli = {"youngs_modulus": youngs_modulus, "poissons_ratio": poissons_ratio}
-    return {"law": law, "density": density, **moduli, **more}
+@dataclass(frozen=True)
+class Setting:
+    """Numerical settings, which trade speed against error. The defaults are those of a scene, but for double precision.
 
+    `per_axis` is the number of particles per cell and axis, `safety` the time step over the stability limit (Courant
+    fraction).
+    """
 
-def unbounded(n: int) -> float:
-    """Return an infinite bound."""
-    return math.inf
+    precision: str = "f64"
+    kernel: str = "quadratic"
+    transfer: str = "apic"
+    walls: str = "folded"
+    per_axis: int = 2
+    safety: float = 0.8
 
+    @property
+    def label(self) -> str:
+        """The differences from the default setting."""
+        changed = self.changed_from(Setting())
+        return ", ".join(KNOBS[knob].get(value, f"{knob} {value}") for knob, value in changed.items()) or DEFAULT
 
-def rounded(n: int) -> float:
-    """Return what most values may come to by rounding in single precision."""
-    return 1e-4
+    def solver_table(self) -> Tables:
+        """Return the table [solver] of a scene, without entries at their default."""
+        return {key: getattr(self, key) for key, usual in SCENE_DEFAULTS.items() if getattr(self, key) != usual}
+
+    def changed_from(self, other: "Setting") -> dict[str, Any]:
+        """Return the fields that differ from those of another setting, by name."""
+        names = [entry.name for entry in fields(self)]
+        return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(other, name)}
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A scalar that a case computes from the frames of a run.
+    """A scalar that a case computes from the frames of a run; limit and rounding may be functions of n."""
 
-    Attributes:
-        name: two or three words.
-        unit: "" for a fraction.
-        text: definition, in one sentence.
-        bound: (n) -> the largest admissible |value| at resolution n, with the default setting in double precision.
-        order: the smallest admissible order of convergence of |value| between the two finest resolutions; None for no
-            requirement.
-        expected: the theoretical order, shown in the report; None if there is none.
-        order_to: the finest resolution used for the order; None for all. At finer ones another error dominates, as the
-            note of the case explains.
-        single: (n) -> the |value| that rounding alone may make in single precision, where a larger one may be 1.2
-            times that of double precision.
-    """
-
-    name: str
-    unit: str
-    text: str
-    bound: Callable[[int], float] = unbounded
+    definition: str  # "name (unit): One sentence.", without the unit for a fraction; the name has two or three words
+    # The largest admissible |value| with the default setting in double precision.
+    limit: float | Callable[[int], float] = math.inf
+    # The smallest admissible order of convergence of |value| between the two finest resolutions.
     order: float | None = None
-    expected: float | None = None
+    expected: float | None = None  # the theoretical order, shown in the report
+    # The finest resolution used for the order. At finer ones another error dominates, as the note of the case explains.
     order_to: int | None = None
-    single: Callable[[int], float] = rounded
+    # The |value| that rounding alone may make in single precision; a larger one may be 1.2 times that of double.
+    rounding: float | Callable[[int], float] = 1e-4
+
+    name: str = field(init=False)
+    unit: str = field(init=False)
+    text: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        for part, value in DEFINITION.fullmatch(self.definition).groupdict("").items():
+            object.__setattr__(self, part, value)
+
+    def bound(self, n: int) -> float:
+        """Return the largest admissible |value| at resolution n."""
+        return self.limit(n) if callable(self.limit) else self.limit
+
+    def rounding_at(self, n: int) -> float:
+        """Return the |value| that rounding alone may make in single precision at resolution n."""
+        return self.rounding(n) if callable(self.rounding) else self.rounding
 
     def has_order_at(self, n: int) -> bool:
         """Return whether resolution n is used for the order."""
         return self.order_to is None or n <= self.order_to
 
+    @property
+    def unit_suffix(self) -> str:
+        """The unit after a blank, or nothing."""
+        return f" {self.unit}" if self.unit else ""
+
+
+@dataclass(frozen=True)
+class CaseText:
+    """What the report says of a case, from `page/cases.toml`; `measures` are sentences by "name" or "name (unit)"."""
+
+    source: str = ""
+    resolution: str = ""
+    note: str = ""
+    measures: dict[str, str] = field(default_factory=dict)
+
+    def measure(self, name: str, *bounds: Any, **more: Any) -> Measure:
+        """Return a measure by "name" or "name (unit)", with its sentence, and with what else a `Measure` takes."""
+        return Measure(f"{name}: {self.measures[name]}", *bounds, **more)
+
+    def filled(self, **facts: Any) -> "CaseText":
+        """Return the text with facts in place of the {names} in its note and its sentences."""
+        measures = {name: sentence.format(**facts) for name, sentence in self.measures.items()}
+        return replace(self, note=self.note.format(**facts), measures=measures)
+
+
+def case_text(name: str) -> CaseText:
+    """Return the text of a case, or of several that share theirs."""
+    return CaseText(**_texts()[name])
+
+
+@cache
+def _texts() -> dict[str, dict]:
+    return tomllib.loads(files("mpmcli.validation").joinpath("page/cases.toml").read_text(encoding="utf-8"))
+
 
 class Case(ABC):
-    """A problem with a known solution.
+    """A problem with a known solution."""
 
-    Attributes:
-        name: identifier on the command line.
-        title: heading in the report.
-        group: chapter of the report.
-        source: reference of the problem and its solution.
-        resolution: what n counts, such as "cells along the bar".
-        levels: the resolutions of each level, from coarse to fine.
-        measures: the measures; the first one is the error of the case.
-        varies: the fields of `Setting` that are varied.
-        finer: factor on the particles per cell and axis of the setting.
-        solids: grid of elastic bodies, as in a scene; f_bar: whether volumes are averaged over cells, as in a scene.
-        note: remarks on the result, such as the origin of a bound; may be "".
-    """
-
-    name: ClassVar[str]
-    title: ClassVar[str]
-    group: ClassVar[Literal["solids", "fluids", "plastic", "invariants"]]
-    source: ClassVar[str]
-    resolution: ClassVar[str]
-    levels: ClassVar[dict[Level, tuple[int, ...]]]
-    measures: ClassVar[tuple[Measure, ...]]
+    name: ClassVar[str]  # on the command line
+    title: ClassVar[str]  # heading in the report
+    group: ClassVar[Literal["solids", "fluids", "plastic", "invariants"]]  # chapter of the report
+    source: ClassVar[str]  # reference of the problem and its solution
+    resolution: ClassVar[str]  # what n counts, such as "cells along the bar"
+    levels: ClassVar[Levels]  # the resolutions of each level, from coarse to fine
+    measures: ClassVar[tuple[Measure, ...]]  # the first one is the error of the case
+    # The fields of `Setting` that are varied.
     varies: ClassVar[tuple[str, ...]] = ("precision", "kernel", "transfer", "walls", "per_axis", "safety")
-    finer: ClassVar[int] = 1
-    solids: str = "updated"
-    f_bar: ClassVar[bool | str] = "auto"
-    note: ClassVar[str] = ""
+    finer: ClassVar[int] = 1  # factor on the particles per cell and axis of the setting
+    solids: str = "updated"  # grid of elastic bodies, as in a scene
+    f_bar: ClassVar[bool | str] = "auto"  # whether volumes are averaged over cells, as in a scene
+    note: ClassVar[str] = ""  # remarks on the result, such as the origin of a bound
+
+    text: ClassVar[CaseText]  # of a class that has one: its source, resolution and note are those of the case
+
+    def __init_subclass__(cls) -> None:
+        for name in ("source", "resolution", "note"):
+            if value := getattr(vars(cls).get("text"), name, ""):
+                setattr(cls, name, value)
 
     @abstractmethod
-    def tables(self, n: int) -> dict[str, Any]:
+    def tables(self, n: int) -> Tables:
         """Return the problem at resolution n, as the tables of a scene; `scene_tables` adds those of the setting."""
 
-    def scene_tables(self, n: int, setting: Setting) -> dict[str, Any]:
+    def scene_tables(self, n: int, setting: Setting) -> Tables:
         """Return the scene at resolution n, as the tables of a TOML file."""
         tables = self.tables(n)
         per_cell = (self.finer * setting.per_axis) ** len(tables["domain"]["size"])
@@ -113,8 +179,4 @@ class Case(ABC):
 
     @abstractmethod
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
-        """Return the value of each measure by name.
-
-        Args:
-            frames: the frames and ledger rows of a run of the scene, consumed in order.
-        """
+        """Return the value of each measure by name from the frames of a run of the scene, consumed in order."""

@@ -6,24 +6,15 @@ from functools import cached_property
 from typing import Any
 
 from mpmcli.plain_text import text_table
-from mpmcli.validation.case import Case, Level
+from mpmcli.validation.case import Case, Level, Setting
 from mpmcli.validation.comparison import Cheapest, Compared, Ratios, cheapest, compare_settings, points_of, series_of
-from mpmcli.validation.convergence import observed_order
-from mpmcli.validation.matrix import Run, label_of
-from mpmcli.validation.run_result import RunResult
-from mpmcli.validation.setting import Setting
-from mpmcli.validation.verdict import Results, Verdict, judge, verdict_of_run
+from mpmcli.validation.runs import Results, Run, RunResult
+from mpmcli.validation.verdict import Verdict, judge, observed_order, verdict_of_run
 
 
 @dataclass(frozen=True)
 class RunRow:
-    """One run in the report.
-
-    Attributes:
-        error: absolute value of the first measure; None if the run did not finish.
-        order: observed order relative to the next coarser run of the setting; None if there is none.
-        verdict: "pass", "fail", or None if no check concerns the run.
-    """
+    """One run: its error, order relative to the next coarser run of the setting, and "pass" or "fail", or None."""
 
     run: Run
     result: RunResult
@@ -31,16 +22,11 @@ class RunRow:
     order: float | None
     verdict: str | None
 
-    @property
-    def label(self) -> str:
-        """Label of the setting."""
-        return label_of(self.run.setting)
-
     def as_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
         return {
             "n": self.run.n,
-            "setting": self.label,
+            "setting": self.run.setting.label,
             "knobs": asdict(self.run.setting),
             "error": self.error,
             "order": self.order,
@@ -116,21 +102,15 @@ class CaseReport:
             "error": self.finest and self.finest[1],
             "order": self.order,
             "expected_order": case.measures[0].expected,
-            "cheapest_to_1_percent": best and {"setting": best.label, **asdict(best.cost)},
-            "checks": [{**asdict(check), "setting": label_of(check.setting)} for check in self.verdict.checks],
+            "cheapest_to_1_percent": best and {"setting": best.setting.label, **asdict(best.cost)},
+            "checks": [{**asdict(check), "setting": check.setting.label} for check in self.verdict.checks],
             "runs": [row.as_dict() for row in self.rows],
         }
 
 
 @dataclass(frozen=True)
 class Report:
-    """All cases of one run of the validation.
-
-    Attributes:
-        level: of the resolutions; environment: see `describe_environment`.
-        cases: in the order of the registry.
-        results: what came of every run.
-    """
+    """All cases of one run of the validation, with the environment as `describe_environment` has it."""
 
     level: Level
     environment: dict[str, Any]
@@ -164,7 +144,7 @@ class Report:
             "cases": [entry.as_dict() for entry in self.case_reports],
             "settings": [
                 {
-                    "setting": entry.label,
+                    "setting": entry.setting.label,
                     "error_ratio": _ratios(entry.error),
                     "seconds_ratio": _ratios(entry.seconds),
                     "seconds_to_equal_error_ratio": _ratios(entry.to_equal),
@@ -180,14 +160,8 @@ class Report:
         rows = [summary_row(entry) for entry in self.case_reports]
         failed = [f"{e.case.name}: {reason}" for e in self.case_reports for reason in e.verdict.reasons]
         count = sum(entry.verdict.passed for entry in self.case_reports)
-        return "\n".join(
-            [
-                text_table(SUMMARY, rows, left={0, 1, 5}),
-                *(["", *failed] if failed else []),
-                "",
-                f"{count} of {len(rows)} cases pass. Errors and orders are those of the default setting.",
-            ]
-        )
+        closing = f"{count} of {len(rows)} cases pass. Errors and orders are those of the default setting."
+        return "\n".join([text_table(SUMMARY, rows, left={0, 1, 5}), *(["", *failed] if failed else []), "", closing])
 
 
 # Columns of the table of cases.
@@ -200,15 +174,14 @@ def summary_row(entry: CaseReport) -> tuple[str, ...]:
     order = "" if entry.order is None else f"{entry.order:.2f}"
     if measure.expected is not None:
         order = f"{order or '-'} ({measure.expected:g})"
-    unit = f" {measure.unit}" if measure.unit else ""
     most = "≤ " if best is not None and best.cost.at_most else ""
     return (
         entry.case.name,
         entry.verdict.word,
-        "" if finest is None else f"{finest[1]:.2e}{unit}",
+        "" if finest is None else f"{finest[1]:.2e}{measure.unit_suffix}",
         "" if finest is None else str(finest[0]),
         order,
-        best.label if best is not None else "" if measure.unit else "none",
+        best.setting.label if best is not None else "" if measure.unit else "none",
         "" if best is None else f"{most}{seconds_text(best.cost.seconds)}",
         "" if best is None else f"{most}{best.cost.particle_steps:.2g}",
     )

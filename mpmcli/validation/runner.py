@@ -1,14 +1,22 @@
-"""Executes runs concurrently, each in a separate process, so that the failure of one does not affect the others."""
+"""Executes runs concurrently, each in a separate process, so that the failure of one does not affect the others.
+
+    python -m mpmcli.validation.runner CASE N '{"precision": "f32"}'
+
+is such a process: it writes the result of one run to stdout as one line of JSON. It exits when its standard input is
+closed, that is, when the parent process ends.
+"""
 
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 
-from mpmcli.processes.questions import Question, Reply, ask_as_ended
-from mpmcli.validation.matrix import Run
-from mpmcli.validation.run_result import RunResult, failure
-from mpmcli.validation.setting import Setting
+from mpmcli.processes.questions import Question, Reply, answering, ask_as_ended, end_with_parent
+from mpmcli.validation.carry_out import carry_out
+from mpmcli.validation.case import Setting
+from mpmcli.validation.cases import all_cases
+from mpmcli.validation.runs import Run, RunResult, failure
 
 # Default time limit of a run, s.
 TIMEOUT = 1800.0
@@ -21,7 +29,7 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 def case_command(run: Run) -> list[str]:
     """Return the command line of the process that executes a run."""
     setting = json.dumps(run.setting.changed_from(Setting()))
-    return [sys.executable, "-m", "mpmcli.validation.case_process", run.case, str(run.n), setting]
+    return [sys.executable, "-m", "mpmcli.validation.runner", run.case, str(run.n), setting]
 
 
 def carry_out_all(
@@ -31,16 +39,9 @@ def carry_out_all(
     stop: Callable[[], bool] = lambda: False,
     command: Callable[[Run], list[str]] = case_command,
 ) -> Iterator[tuple[Run, RunResult]]:
-    """Yield (run, result) in the order in which the runs end. A failure is reported in the result.
+    """Yield (run, result) in the order in which the runs end. A failure, or being late, is reported in the result.
 
-    Args:
-        workers: number of concurrent processes.
-        timeout: time limit of a run, s.
-        stop: polled while runs are in progress; True ends all of them.
-        command: returns the command line of a run; tests replace it.
-
-    Raises:
-        KeyboardInterrupt: `stop` returned True. No process is left running.
+    `stop` is polled while runs are in progress: where it returns True, all are ended and KeyboardInterrupt is raised.
     """
     # Taichi reads settings from variables TI_*, which would affect the result.
     environment = {**dict.fromkeys(name for name in os.environ if name.startswith("TI_")), **ONE_THREAD}
@@ -58,3 +59,17 @@ def _result(reply: Reply) -> RunResult:
         pass
     words = reply.complaint.splitlines()[-QUOTED:]
     return failure(" ".join([f"The process of the run {reply.fault or 'gave no result'}.", *words]))
+
+
+def main() -> None:
+    """Execute one run. Output of Taichi to stdout is redirected to stderr."""
+    began = time.perf_counter()
+    case, n, setting = sys.argv[1:]
+    end_with_parent()
+    with answering() as answer:
+        result = carry_out(all_cases()[case], int(n), Setting(**json.loads(setting)))
+        answer(**{**result.as_dict(), "wall_seconds": time.perf_counter() - began})
+
+
+if __name__ == "__main__":
+    main()

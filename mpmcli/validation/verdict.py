@@ -1,35 +1,30 @@
 """Verdict on a case: bounds of errors, orders of convergence, and single against double precision."""
 
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass, replace
 
-from mpmcli.validation.case import Case, Measure
-from mpmcli.validation.convergence import observed_order
-from mpmcli.validation.matrix import Run, label_of
-from mpmcli.validation.run_result import RunResult
-from mpmcli.validation.setting import Setting
+from mpmcli.validation.case import Case, Measure, Setting
+from mpmcli.validation.runs import Results, Run, RunResult
 
 # Largest ratio of values in f32 to those in f64, where those are above rounding (`Measure.single`).
 SINGLE_RATIO = 1.2
 
 SINGLE = replace(Setting(), precision="f32")
+# Errors below this are round-off of double precision, and have no order.
+ROUND_OFF = 1e-10
 
-Results = Mapping[Run, RunResult]
+
+def observed_order(coarse: tuple[float, float], fine: tuple[float, float]) -> float | None:
+    """Return log(e1 / e2) / log(n2 / n1) of two pairs (n, error); None for equal n or round-off."""
+    (n1, e1), (n2, e2) = coarse, fine
+    if n1 == n2 or not min(e1, e2) > ROUND_OFF:
+        return None
+    return math.log(e1 / e2) / math.log(n2 / n1)
 
 
 @dataclass(frozen=True)
 class Check:
-    """One criterion and its outcome.
-
-    Attributes:
-        subject: quantity, such as "period error".
-        setting: setting of the runs.
-        n: resolution; None if the check concerns several.
-        figure: value found; None if there is none.
-        bound: admissible values, as text.
-        passed: whether the criterion holds.
-        sentence: the outcome, in one sentence.
-    """
+    """The figure of a quantity, the bound that it must keep, and a sentence with the outcome; n is None for several."""
 
     subject: str
     setting: Setting
@@ -63,23 +58,15 @@ class Verdict:
 
 
 def judge(case: Case, results: Results) -> Verdict:
-    """Check the default setting against the bounds of the case, and f32 against f64.
-
-    Other settings have no bounds.
-    """
-    default = default_results(case, results)
+    """Check the default setting against the bounds of the case, and f32 against f64. Other settings have no bounds."""
+    mine = {run.n: result for run, result in results.items() if run.case == case.name and run.setting == Setting()}
+    default = dict(sorted(mine.items()))
     checks = [check for n, result in default.items() for check in _bound_checks(case, n, result)]
     checks += [check for measure in case.measures if (check := _order_check(measure, default)) is not None]
     for run, result in results.items():
         if run.case == case.name and run.setting == SINGLE:
             checks += _single_checks(case, run, default.get(run.n), result)
     return Verdict(tuple(checks))
-
-
-def default_results(case: Case, results: Results) -> dict[int, RunResult]:
-    """Return the results of the default setting by resolution, from coarse to fine."""
-    found = {run.n: result for run, result in results.items() if run.case == case.name and run.setting == Setting()}
-    return dict(sorted(found.items()))
 
 
 def verdict_of_run(verdict: Verdict, run: Run) -> str | None:
@@ -96,7 +83,7 @@ def _bound_checks(case: Case, n: int, result: RunResult) -> list[Check]:
     for measure in case.measures:
         value, bound = result.values[measure.name], measure.bound(n)
         passed = abs(value) <= bound
-        unit = f" {measure.unit}" if measure.unit else ""
+        unit = measure.unit_suffix
         where = f"At n = {n} the {measure.name} is {value:.3g}{unit}"
         sentence = f"{where}, {'within' if passed else 'beyond'} its bound of {bound:.3g}{unit}."
         checks.append(Check(measure.name, Setting(), n, value, f"{bound:.3g}", passed, sentence))
@@ -119,15 +106,15 @@ def _single_checks(case: Case, run: Run, double: RunResult | None, single: RunRe
     if double is None or not double.finished:
         return []
     if not single.finished:
-        sentence = f"At n = {run.n} the run in {label_of(run.setting)} {_ending(single)}"
+        sentence = f"At n = {run.n} the run in {run.setting.label} {_ending(single)}"
         return [Check("run in f32", run.setting, run.n, None, "finishes", False, sentence)]
     checks = []
     for measure in case.measures:
         figure, usual = abs(single.values[measure.name]), abs(double.values[measure.name])
-        bound = SINGLE_RATIO * max(usual, measure.single(run.n))
+        bound = SINGLE_RATIO * max(usual, measure.rounding_at(run.n))
         passed = figure <= bound
-        found = f"At n = {run.n} the {measure.name} is {figure:.3g} in f32 and {usual:.3g} in f64"
-        sentence = f"{found}, {'within' if passed else 'beyond'} {bound:.3g}."
+        both = f"At n = {run.n} the {measure.name} is {figure:.3g} in f32 and {usual:.3g} in f64"
+        sentence = f"{both}, {'within' if passed else 'beyond'} {bound:.3g}."
         checks.append(Check(f"f32, {measure.name}", run.setting, run.n, figure, f"{bound:.3g}", passed, sentence))
     return checks
 

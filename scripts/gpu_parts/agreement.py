@@ -108,19 +108,19 @@ def run_apart(arch: str, case: Case) -> tuple[np.ndarray, dict[str, float]]:
 
 def run(arch: str, case: Case) -> dict[str, np.ndarray | float]:
     """Return "position", in the order of ids, and energies after some equal steps."""
-    from mpmcli.solver.backend import choose_backend, start
-    from mpmcli.solver.solver import Solver
+    from mpmcli.solver.engine.build import build_run
+    from mpmcli.solver.machine.backend import choose_backend, start
 
     size = BenchCase(dimension=case.dimension, cells=CELLS[case.dimension], particles=0, step=STEP[case.dimension])
     data = scene_of([case.law], size, case.precision)
     scene = parse_scene(data, laws=parameter_models(), source=data["title"]).scene
     # On the CPU the bytes are the same, and compiled sooner.
     backend = choose_backend(arch, 1, case.precision, optimisation="few" if arch == "cpu" else None)
-    solver = Solver(scene, start(backend))
-    mass = solver.frame()[1].mass
+    found = build_run(scene, start(backend))
+    mass = found.frame()[1].mass
     for _ in range(case.steps):
-        solver.step(size.step)
-    frame, row = solver.frame()
+        found.step(size.step)
+    frame, row = found.frame()
     energies = {name: getattr(row, name) for name in ("kinetic", "elastic", "potential")}
     return {"position": frame.position, "kinetic at the start": 0.5 * mass * SPEED**2, **energies}
 

@@ -12,9 +12,9 @@ from gpu_parts import profile
 from gpu_parts.parts import Setup, Task
 from gpu_parts.report import measured
 from mpmcli.bench.cases import BenchCase
-from mpmcli.bench.compare import Setting, Worker, start_worker
+from mpmcli.bench.side import Setting, Worker, start_worker
 from mpmcli.errors import RunError
-from mpmcli.solver.device_memory import free_memory
+from mpmcli.solver.machine.device_memory import free_memory
 
 # Blocks of each contestant, and their length, s; the first one is not measured.
 BLOCKS, SECONDS = 3, 0.7
@@ -153,8 +153,8 @@ def no_room(size: Size, arch: str) -> str:
     from mpmcli.materials.registry import parameter_models
     from mpmcli.plain_text import size_text
     from mpmcli.scene import parse_scene
-    from mpmcli.solver.backend import choose_backend
-    from mpmcli.solver.plan import make_plan
+    from mpmcli.solver.machine.backend import choose_backend
+    from mpmcli.solver.machine.plan import make_plan
 
     need = 0
     for who in size.who:

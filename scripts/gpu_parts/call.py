@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None, output: IO[str]) -> int:
 
 def usual_arch() -> str:
     """Return "cuda" where Taichi can be expected to start on it, and "vulkan" elsewhere."""
-    from mpmcli.solver.backend import choose_backend
+    from mpmcli.solver.machine.backend import choose_backend
 
     return "cuda" if choose_backend("auto").arch == "cuda" else "vulkan"
 

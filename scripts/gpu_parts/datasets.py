@@ -54,7 +54,7 @@ def together(count: int, frames: int, arch: str) -> dict:
 
 def scenes(count: int, frames: int) -> list:
     """Return blocks of sand with angles of friction from 25 to 40 degrees."""
-    from mpmcli.bench.sand_block import INTERVAL, SCENE
+    from mpmcli.bench.throughput import INTERVAL, SCENE
     from mpmcli.materials.registry import parameter_models
     from mpmcli.scene import parse_scene
 

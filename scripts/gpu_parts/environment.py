@@ -69,8 +69,8 @@ def version_of(package: str) -> str | None:
 def device(arch: str) -> dict:
     """Start the backend and return the names of its devices, what is free there, and what nvidia-smi says."""
     from mpmcli.doctor.devices import device_names
-    from mpmcli.solver.backend import start_backend
-    from mpmcli.solver.device_memory import CUDA_LIBRARIES, free_memory
+    from mpmcli.solver.machine.backend import start_backend
+    from mpmcli.solver.machine.device_memory import CUDA_LIBRARIES, free_memory
 
     start_backend(arch)
     row = {

@@ -8,7 +8,7 @@ from page_section import markdown_table
 
 from gpu_parts.parts import Setup, Task
 from gpu_parts.report import measured
-from mpmcli.solver.backend import start_backend
+from mpmcli.solver.machine.backend import start_backend
 
 # Launches of a block, and blocks, of which the fastest counts.
 LAUNCHES, BLOCKS = 200, 5

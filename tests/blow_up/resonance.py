@@ -6,7 +6,7 @@ import numpy as np
 
 from blow_up.scenes import alone, liquid
 from blow_up.trial import Trial
-from mpmcli.solver.backend import Backend
+from mpmcli.solver.machine.backend import Backend
 
 # Steps over the bound at rest that are tried, and steps of one trial.
 RATIOS = np.round(np.arange(0.4, 1.1, 0.01), 2)

@@ -9,9 +9,9 @@ import numpy as np
 from blow_up.scenes import SPACING, BlowUpScene
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import BodyParticles, Scene, parse_scene
-from mpmcli.solver.backend import Backend
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import Backend
 from mpmcli.stability.limits import Limit
 from mpmcli.stability.transfer_factors import INVERSE_MOMENT
 
@@ -81,7 +81,7 @@ class Trial:
             scene.volume,
             density * scene.volume,
         )
-        self.solver = Solver(_scene_of(scene, knobs or {}), backend, [body])
+        self.solver = build_run(_scene_of(scene, knobs or {}), backend, [body])
         self._moment = 1 / INVERSE_MOMENT[self.solver.scene.solver.kernel]
         self.predicted = math.inf
         self._start(0.0)
@@ -95,20 +95,22 @@ class Trial:
         group = self.solver.groups[0]
         random = np.random.default_rng(0)
         noise = amplitude * SPACING / self.predicted
-        group.x.from_numpy(scene.position.astype(group.real))
-        group.set_motion(
-            scene.velocity + noise * random.standard_normal((n, d)), noise / SPACING * random.standard_normal((n, d, d))
-        )
         F = np.diag(scene.stretches)
-        group.set_deformation(np.full(n, np.linalg.det(F)) if group.law.deformation == "J" else np.tile(F, (n, 1, 1)))
-        for variable, values in zip(group.law.internal, group.internal, strict=True):
-            values.fill(scene.internal.get(variable.name, variable.at_rest))
-        group.id.from_numpy(np.arange(n, dtype=np.int32))
+        inner = [scene.internal.get(variable.name, variable.at_rest) for variable in group.law.internal]
+        group.replace(
+            x=scene.position,
+            v=scene.velocity + noise * random.standard_normal((n, d)),
+            C=noise / SPACING * random.standard_normal((n, d, d)),
+            deformation=np.full(n, np.linalg.det(F)) if group.law.deformation == "J" else np.tile(F, (n, 1, 1)),
+            internal=np.tile(inner, (n, 1)),
+            id=np.arange(n),
+        )
         self.solver.state_was_replaced()
 
     def kinetic_energy(self) -> float:
         """Return sum |v - mean v|^2 + D |C|^2, m^2/s^2: twice the energy per particle's mass; D = h^2/4 is usual."""
-        v, C = self.solver.groups[0].motion_to_numpy()
+        state = self.solver.groups[0].read()
+        v, C = state["v"], state["C"]
         v = v - v.mean(axis=0)
         return float((v * v).sum() + self._moment * SPACING**2 * (C * C).sum())
 
@@ -156,10 +158,10 @@ class Trial:
         if not self.scene.velocity.any():
             return
         group = self.solver.groups[0]
-        x = group.x.to_numpy()
+        x = group.read()["x"]
         cells = np.round((x - self.scene.position.mean(axis=0)).mean(axis=0) / SPACING)
         if cells.any():
-            group.x.from_numpy(x - cells * SPACING)
+            group.replace(x=x - cells * SPACING)
             self.solver.state_was_replaced()
 
     def blow_up_ratio(self, steps: int = TRIAL_STEPS) -> float:

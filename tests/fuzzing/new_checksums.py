@@ -9,7 +9,7 @@ import numpy as np
 from changed_result import accept_changes, changed
 
 from fuzzing.seeds import Files
-from mpmcli.output.sums_file import SUMS
+from mpmcli.output.checksums import SUMS
 
 # Values of one array: an HDF5 file states any number of them, at no cost to it.
 MOST_VALUES = 10**6

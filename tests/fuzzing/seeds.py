@@ -13,7 +13,7 @@ from command import CONFIGS
 from made_dataset import LAWS, made_dataset
 from made_result import made_frame, made_row
 
-from mpmcli.dataset.manifest import Manifest, Row
+from mpmcli.dataset.folder import Manifest, Row
 from mpmcli.dataset.shard import checksum
 from mpmcli.output import SegmentStore, VtkSeriesStore
 from mpmcli.output.checkpoints import Checkpoint, write_checkpoint

@@ -4,8 +4,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from mpmcli.solver.backend import stop_backend
-from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import stop_backend
 
 
 @dataclass(frozen=True)

@@ -6,59 +6,59 @@ import numpy as np
 
 from hard_cases.case import HardCase, Outcome
 from hard_cases.running import block, scene, start
-from mpmcli.solver.diagnosis import Diagnosis, UnstableRunError
-from mpmcli.solver.particles import ParticleGroup
+from mpmcli.solver.engine.run_group import RunGroup
+from mpmcli.solver.frames.diagnosis import Diagnosis, UnstableRunError
 
 H = 0.1
 PARTICLE = 7
 
 
-def poison_deformation(group: ParticleGroup, place: int) -> None:
+def poison_deformation(group: RunGroup, place: int) -> None:
     """Set J of one particle to NaN."""
-    values = group.deformation_to_numpy()
+    values = group.read()["deformation"]
     values[place] = np.nan
-    group.set_deformation(values)
+    group.replace(deformation=values)
 
 
-def poison_velocity(group: ParticleGroup, place: int) -> None:
+def poison_velocity(group: RunGroup, place: int) -> None:
     """Set the velocity of one particle to NaN."""
-    v, C = group.motion_to_numpy()
-    v[place] = np.nan
-    group.set_motion(v, C)
+    values = group.read()["v"]
+    values[place] = np.nan
+    group.replace(v=values)
 
 
-def poison_affine(group: ParticleGroup, place: int) -> None:
+def poison_affine(group: RunGroup, place: int) -> None:
     """Set the affine velocity of one particle to infinity."""
-    v, C = group.motion_to_numpy()
-    C[place] = np.inf
-    group.set_motion(v, C)
+    values = group.read()["C"]
+    values[place] = np.inf
+    group.replace(C=values)
 
 
-POISONS: dict[str, Callable[[ParticleGroup, int], None]] = {
+POISONS: dict[str, Callable[[RunGroup, int], None]] = {
     "J": poison_deformation,
     "v": poison_velocity,
     "C": poison_affine,
 }
 
 
-def stop_after(poison: Callable[[ParticleGroup, int], None]) -> tuple[Diagnosis | None, int]:
+def stop_after(poison: Callable[[RunGroup, int], None]) -> tuple[Diagnosis | None, int]:
     """Return the diagnosis of a run of two bodies that is poisoned after 20 steps, and the step then."""
     water = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e4}
     bodies = [
         block("drop", water, [0.2] * 2, [0.6] * 2, velocity=[0.1, 0.1]),
         block("second drop", {**water, "density": 700.0}, [1.0] * 2, [1.4] * 2, velocity=[-0.1, 0.1]),
     ]
-    solver = start(scene(bodies, [16, 16], H))
+    run = start(scene(bodies, [16, 16], H))
     for _ in range(20):
-        solver.step(1e-3)
-    group = solver.groups[0]
+        run.step(1e-3)
+    group = run.groups[0]
     # The particles of the first body are those with the smallest ids.
     first = 64
-    poison(group, int(np.flatnonzero(group.id.to_numpy() == first + PARTICLE)[0]))
-    began = solver.step_count
+    poison(group, int(np.flatnonzero(group.read()["id"] == first + PARTICLE)[0]))
+    began = run.step_count
     try:
         for _ in range(20):
-            solver.step(1e-3)
+            run.step(1e-3)
     except UnstableRunError as error:
         return error.diagnosis, began
     return None, began

@@ -7,7 +7,7 @@ import numpy as np
 from hard_cases.case import HardCase, Outcome
 from hard_cases.running import GRAVITY, block, growth, look, run, scene, start
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.diagnosis import UnstableRunError
+from mpmcli.solver.frames.diagnosis import UnstableRunError
 
 H, SIDE, DENSITY = 0.1, 0.8, 1000.0
 YOUNG, NU = 1e6, 0.3
@@ -26,7 +26,7 @@ def impact() -> Outcome:
         cube = block("cube", RUBBER, [0.4, 0.3], [1.2, 1.1], velocity=[0.0, -fraction * WAVE_SPEED])
         asked = scene([cube], [16, 16], H, end=4 * SIDE / WAVE_SPEED / fraction, frames=100)
         solver = start(asked)
-        begin = solver.state.save()
+        begin = solver.save().copied()
         done = run(solver)
         if done.stopped is not None:
             raise done.stopped
@@ -35,7 +35,7 @@ def impact() -> Outcome:
         adapts = min(steps) < 0.8 * steps[0]
         passed = passed and done.sound and done.ratios[0] > 0 and adapts and rise <= 1e-3
         figures.append(f"{100 * rise:.2f} % at {fraction:g} c")
-        solver.state.load(begin)
+        solver.load(begin)
         energy, even = [], min(row.step_min for row in done.rows[1:])
         while solver.time < asked.time.end:
             solver.step(even)
@@ -72,7 +72,7 @@ def crushed() -> Outcome:
         solver = start(asked)
         F = np.tile(np.eye(2), (cube.count, 1, 1))
         F[7] = np.diag([-1.0, 1.0])
-        solver.groups[0].set_deformation(F)
+        solver.groups[0].replace(deformation=F)
         try:
             solver.step(1e-4)
             right = False

@@ -11,7 +11,7 @@ from hard_cases.case import HardCase, Outcome
 from hard_cases.running import GRAVITY, block, look, run, scene, sound, start
 from mpmcli.errors import InputError
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.diagnosis import NOT_FINITE, UnstableRunError
+from mpmcli.solver.frames.diagnosis import NOT_FINITE, UnstableRunError
 
 H = 0.1
 BULK, DENSITY = 1e5, 1000.0
@@ -35,13 +35,13 @@ def droplets(steps: int) -> Outcome:
         sample = sample_bodies(asked)[0]
         velocity = random.uniform(-0.02, 0.02, places.shape) * WAVE_SPEED
         affine = random.uniform(-0.01, 0.01, (len(places), 2, 2)) * WAVE_SPEED / H
-        solver = start(asked, [replace(sample, position=places, velocity=velocity, affine=affine)])
+        run = start(asked, [replace(sample, position=places, velocity=velocity, affine=affine)])
         fall = np.sqrt(2 * GRAVITY * places[:, 1].max() + (velocity**2).sum(1).max())
         dt = 0.6 * H / WAVE_SPEED
         for step in range(steps):
-            solver.step(dt)
+            run.step(dt)
             if step % (20 if step < 2000 else 500) == 0 or step == steps - 1:
-                frame, row = look(solver)
+                frame, row = look(run)
                 fine = fine and sound(frame, row)
                 worst = max(worst, row.speed_max / fall)
                 low, high = min(low, row.volume_ratio_min), max(high, row.volume_ratio_max)
@@ -64,8 +64,8 @@ def edge_of_a_node() -> Outcome:
     water = block("water", {"law": "fluid", "density": DENSITY, "bulk_modulus": BULK}, [0, 0], [2 * H, H])
     asked = scene([{**water, "particles_per_cell": 1}], [16, 16], H, precision="f64")
     sample = sample_bodies(asked)[0]
-    solver = start(asked, [sample])
-    group = solver.groups[0]
+    run = start(asked, [sample])
+    group = run.groups[0]
     bound = 6 * tau / (DENSITY * H)
     edge = np.array([6.5 + 0.999, 6.5 + 0.999])
     settings = {
@@ -76,13 +76,11 @@ def edge_of_a_node() -> Outcome:
     }
     found = {}
     for name, places in settings.items():
-        group.x.from_numpy(np.array(places) * H)
-        group.set_motion(np.zeros((2, 2)), np.zeros((2, 2, 2)))
-        group.set_deformation(np.array([J, 1.0]))
-        group.id.from_numpy(np.arange(2, dtype=np.int32))
-        solver.state_was_replaced()
-        solver.step(dt)
-        nodes = solver.grid.nodes.to_numpy()
+        at_rest = {"v": np.zeros((2, 2)), "C": np.zeros((2, 2, 2)), "deformation": np.array([J, 1.0])}
+        group.replace(x=np.array(places) * H, id=np.arange(2), **at_rest)
+        run.state_was_replaced()
+        run.step(dt)
+        nodes = run.grid.nodes.to_numpy()
         found[name] = float(np.abs(nodes[nodes[:, 2] > 0, :2]).max() / dt / bound)
     worst = max(found.values())
     return Outcome(

@@ -22,13 +22,13 @@ def packed_snow() -> Outcome:
     rate = -speed / (SIDE / 2)
     velocity = rate * (cube.position - cube.position.mean(0))
     affine = np.tile(rate * np.eye(2), (cube.count, 1, 1))
-    solver = start(asked, [replace(cube, velocity=velocity, affine=affine)])
+    run = start(asked, [replace(cube, velocity=velocity, affine=affine)])
     frames, hardness, waves, fine = [], [], [], True
-    for frame, row in solver.frames():
+    for frame, row in run.frames():
         frames.append(frame)
         fine = fine and sound(frame, row)
         hardness.append(float(np.exp(10 * (1 - frame.fields["plastic_volume_ratio"])).max()))
-        waves.append(min(limit.value for limit in solver.limits() if limit.name == "wave"))
+        waves.append(min(limit.value for limit in run.limits() if limit.name == "wave"))
     stored = min(frame.fields["volume_ratio"].min() for frame in frames)
     # Waves are faster by the root of the hardening, so that the limit must fall by as much at every frame.
     follows = np.max(np.array(waves) / waves[0] * np.sqrt(hardness))
@@ -39,7 +39,7 @@ def packed_snow() -> Outcome:
         fine and mean < 0.5 and max(hardness) <= 100 * (1 + 1e-4) and follows <= 1.01,
         f"crushed to {mean:.2f} of its area, hardening up to {max(hardness):.0f}, "
         f"wave limit down to {min(waves) / waves[0]:.3f} of the first",
-        f"{solver.step_count} steps. J as it is stored goes down to {stored:.2f} only, where the hardening limit ends "
+        f"{run.step_count} steps. J as it is stored goes down to {stored:.2f} only, where the hardening limit ends "
         "the packing, although the particles lie closer than that.",
     )
 
@@ -120,20 +120,20 @@ def steep_sand() -> Outcome:
         velocity=(cube.position - cube.position.mean(0)) @ shear.T,
         affine=np.tile(shear, (cube.count, 1, 1)),
     )
-    solver = start(asked, [start_at])
-    solver.groups[0].set_deformation(np.tile(np.exp(-strain) * np.eye(3), (cube.count, 1, 1)))
-    solver.state_was_replaced()
+    run = start(asked, [start_at])
+    run.groups[0].replace(deformation=np.tile(np.exp(-strain) * np.eye(3), (cube.count, 1, 1)))
+    run.state_was_replaced()
     middle = np.linalg.norm((cube.position - cube.position.mean(0))[:, :2], axis=1) < 1.2 * H
     ratios = []
-    while solver.time < time:
-        solver.step(min(solver.stable_step()[0] / 2, time - solver.time + 1e-12))
-        frame, _ = look(solver)
+    while run.time < time:
+        run.step(min(run.stable_step()[0] / 2, time - run.time + 1e-12))
+        frame, _ = look(run)
         stress = frame.fields["stress"].reshape(-1, 3, 3)[middle, :2, :2].astype(np.float64)
         s3, s1 = np.linalg.eigvalsh(stress).mean(0)
         ratios.append((s1 - s3) / -(s1 + s3))
     found = float(np.degrees(np.arcsin(min(1.0, ratios[-1]))))
     return Outcome(
-        sound(*look(solver)) and abs(found - phi) < 0.5 and abs(ratios[-1] - ratios[-2]) < 1e-3,
+        sound(*look(run)) and abs(found - phi) < 0.5 and abs(ratios[-1] - ratios[-2]) < 1e-3,
         f"yields at {found:.2f} degrees",
         f"After a shear of {100 * strain * 6:.1f} %; the ratio of stresses no longer changes.",
     )

@@ -32,15 +32,15 @@ def stiff_cube() -> Outcome:
         asked = scene(
             [body], [40, 24], h, gravity=GRAVITY, precision=precision, fields=["velocity", "stress", "volume_ratio"]
         )
-        solver = start(asked)
+        run = start(asked)
         # The stiffness grows by no more than the strain: the first step serves for all.
-        bound = solver.stable_step()[0]
+        bound = run.stable_step()[0]
         steps = int(np.ceil(crossing / bound))
         for crossings in range(1, 11):
             for _ in range(steps):
-                solver.step(crossing / steps)
+                run.step(crossing / steps)
             if crossings in (1, 10):
-                frame, row = look(solver)
+                frame, row = look(run)
                 fine = fine and sound(frame, row)
                 stresses[precision, crossings] = frame.fields["stress"].astype(np.float64)
     for crossings in (1, 10):
@@ -76,11 +76,11 @@ def far_origin() -> Outcome:
     origins = (0.0, 1e3, 1e6)
     for origin in origins:
         body = block("cube", RUBBER, [origin + 0.4] * 2, [origin + 1.2] * 2)
-        solver = start(scene([body], [16, 16], H, gravity=GRAVITY, origin=origin))
-        dt = solver.stable_step()[0]
+        run = start(scene([body], [16, 16], H, gravity=GRAVITY, origin=origin))
+        dt = run.stable_step()[0]
         for _ in range(300):
-            solver.step(dt)
-        frame, row = look(solver)
+            run.step(dt)
+        frame, row = look(run)
         if not sound(frame, row):
             return Outcome(False, f"not finite at {origin:g} m")
         places[origin] = frame.position.astype(np.float64) - origin
@@ -105,12 +105,12 @@ def fast_spin() -> Outcome:
     disc = {"name": "disc", "material": RUBBER, "shape": {"ball": {"center": [1.0, 1.0], "radius": radius}}}
     asked = scene([disc], [20, 20], H, precision="f64")
     sample = sample_bodies(asked)[0]
-    solver = start(asked)
-    dt = solver.stable_step()[0]
+    run = start(asked)
+    dt = run.stable_step()[0]
     w = turn / dt
     spin = np.array([[0.0, -w], [w, 0.0]])
     offset = sample.position - 1.0
-    solver = start(
+    run = start(
         asked,
         [replace(sample, velocity=offset @ spin.T, affine=np.tile(spin, (sample.count, 1, 1)))],
     )
@@ -118,8 +118,8 @@ def fast_spin() -> Outcome:
     low, high, fine = 1.0, 1.0, True
     for _ in range(steps // 10):
         for _ in range(10):
-            solver.step(dt)
-        frame, row = look(solver)
+            run.step(dt)
+        frame, row = look(run)
         fine = fine and sound(frame, row)
         low, high = min(low, row.volume_ratio_min), max(high, row.volume_ratio_max)
     bound = np.exp(turn**2 * steps)
@@ -135,11 +135,11 @@ def rest(steps: int) -> Outcome:
     water = {"law": "fluid", "density": DENSITY, "bulk_modulus": 1e5}
     bodies = [block("water", water, [0, 0], [0.5, 0.5]), block("rubber", RUBBER, [0.5, 0.0], [1.2, 0.7])]
     fields = ["velocity", "affine", "volume_ratio", "deformation_gradient"]
-    solver = start(scene(bodies, [16, 16], H, fields=fields))
-    before, _ = look(solver)
+    run = start(scene(bodies, [16, 16], H, fields=fields))
+    before, _ = look(run)
     for _ in range(steps):
-        solver.step(solver.stable_step()[0])
-    after, row = look(solver)
+        run.step(run.stable_step()[0])
+    after, row = look(run)
     same = np.array_equal(before.position, after.position) and np.array_equal(before.velocity, after.velocity)
     same = same and all(np.array_equal(before.fields[name], after.fields[name]) for name in before.fields)
     sliver = {"polygon": {"vertices": [[0.5, 0.5], [0.9, 0.6], [0.9, 0.599]]}}

@@ -7,7 +7,7 @@ import numpy as np
 from hard_cases.case import HardCase, Outcome
 from hard_cases.running import GRAVITY, block, look, scene, sound, start
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.run import Run
 
 DENSITY = 1000.0
 
@@ -22,7 +22,7 @@ def stretch_under(weight: np.ndarray, law: str, modulus: float) -> np.ndarray:
     return -weight / modulus + np.sqrt((weight / modulus) ** 2 + 1)
 
 
-def column(law: str, precision: str) -> Solver:
+def column(law: str, precision: str) -> Run:
     """Return a column of 1 m between slip walls that starts with the stress and the places of rest."""
     h, height, width = 1 / 32, 1.0, 8
     modulus = 1.962e6
@@ -44,13 +44,13 @@ def column(law: str, precision: str) -> Solver:
     middle = (fine[1:] + fine[:-1]) / 2
     stretch = stretch_under(DENSITY * GRAVITY * (height - middle), law, modulus)
     y = np.interp(Y, fine, np.concatenate([[0.0], np.cumsum(stretch * np.diff(fine))]))
-    solver = start(asked, [replace(sample, position=np.stack([sample.position[:, 0], y], 1))])
+    run = start(asked, [replace(sample, position=np.stack([sample.position[:, 0], y], 1))])
     there = stretch_under(DENSITY * GRAVITY * (height - Y), law, modulus)
     F = np.tile(np.eye(2), (sample.count, 1, 1))
     F[:, 1, 1] = there
-    solver.groups[0].set_deformation(there if law == "fluid" else F)
-    solver.state_was_replaced()
-    return solver
+    run.groups[0].replace(deformation=there if law == "fluid" else F)
+    run.state_was_replaced()
+    return run
 
 
 def jitter(precision: str) -> Outcome:
@@ -58,14 +58,14 @@ def jitter(precision: str) -> Outcome:
     found, details, fine = {}, [], True
     scale = np.sqrt(GRAVITY * 1.0)
     for law in ("fluid", "neo_hookean"):
-        solver = column(law, precision)
+        run = column(law, precision)
         fastest, early = 0.0, 0.0
-        while solver.time < 2.0:
+        while run.time < 2.0:
             for _ in range(20):
-                solver.step(solver.stable_step()[0])
-            frame, row = look(solver)
+                run.step(run.stable_step()[0])
+            frame, row = look(run)
             fine = fine and sound(frame, row)
-            if solver.time > 1.0:
+            if run.time > 1.0:
                 fastest = max(fastest, row.speed_max)
             else:
                 early = max(early, row.speed_max)
@@ -83,13 +83,13 @@ def block_at_rest(steps: int) -> Outcome:
     h, side = 0.1, 0.4
     rubber = {"law": "neo_hookean", "density": DENSITY, "youngs_modulus": 1e5, "poissons_ratio": 0.3}
     body = block("block", rubber, [0.3, 0.0], [0.3 + side, side])
-    solver = start(scene([body], [10, 8], h, gravity=GRAVITY))
+    run = start(scene([body], [10, 8], h, gravity=GRAVITY))
     scale = DENSITY * side**2 * GRAVITY * side
     places, kinetic, fine = [], [], True
     for part in range(1, 21):
-        while solver.step_count < part * steps // 20:
-            solver.step(solver.stable_step()[0])
-        frame, row = look(solver)
+        while run.step_count < part * steps // 20:
+            run.step(run.stable_step()[0])
+        frame, row = look(run)
         fine = fine and sound(frame, row)
         places.append(frame.position.astype(np.float64))
         kinetic.append(row.kinetic / scale)
@@ -116,16 +116,16 @@ def slosh(periods: int) -> Outcome:
     x, y = sample.position.T
     scale = rise * w / np.sinh(k * depth)
     velocity = scale * np.stack([np.sin(k * x) * np.cosh(k * y), -np.cos(k * x) * np.sinh(k * y)], 1)
-    solver = start(asked, [replace(sample, velocity=velocity)])
+    run = start(asked, [replace(sample, velocity=velocity)])
     modulus = asked.bodies[0].material.bulk_modulus
-    solver.groups[0].set_deformation(1 / (1 + DENSITY * GRAVITY * (depth - y) / modulus))
-    solver.state_was_replaced()
+    run.groups[0].replace(deformation=1 / (1 + DENSITY * GRAVITY * (depth - y) / modulus))
+    run.state_was_replaced()
     period, fine = 2 * np.pi / w, True
     centres, kinetic, energy = [], [], []
     for part in range(4 * periods):
-        while solver.time < (part + 1) * period / 4:
-            solver.step(solver.stable_step()[0])
-        frame, row = look(solver)
+        while run.time < (part + 1) * period / 4:
+            run.step(run.stable_step()[0])
+        frame, row = look(run)
         fine = fine and sound(frame, row)
         centres.append(frame.position.astype(np.float64).mean(0))
         kinetic.append(row.kinetic)
@@ -137,7 +137,7 @@ def slosh(periods: int) -> Outcome:
     return Outcome(
         fine and drift < 0.1 and kinetic[-1] < 1e-8 * weight,
         f"slosh: drift {drift:.1e} h, KE {kinetic[-1] / weight:.1e} m g H",
-        f"{periods} periods, {solver.step_count:,} steps; energy rose by {100 * over:.2g} % of what was lost. "
+        f"{periods} periods, {run.step_count:,} steps; energy rose by {100 * over:.2g} % of what was lost. "
         f"The scheme damps the wave: KE {kinetic[len(kinetic) // 5 - 1] / weight:.1e} m g H after a fifth of the time.",
     )
 

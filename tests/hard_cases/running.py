@@ -1,4 +1,4 @@
-"""Set-ups that the hard cases share: scenes in few words, runs of them, and what is read from a solver."""
+"""Set-ups that the hard cases share: scenes in few words, runs of them, and what is read from them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,9 +9,10 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import BodyParticles, Scene, parse_scene
-from mpmcli.solver.backend import start_backend, stop_backend
-from mpmcli.solver.diagnosis import UnstableRunError
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import start_backend, stop_backend
 
 GRAVITY = 9.81
 
@@ -56,15 +57,15 @@ def scene(
     ).scene
 
 
-def start(asked: Scene, particles: list[BodyParticles] | None = None) -> Solver:
-    """Return a solver on a backend of its own, one thread of the CPU; earlier solvers die."""
+def start(asked: Scene, particles: list[BodyParticles] | None = None) -> Run:
+    """Return a run on a backend of its own, one thread of the CPU; earlier runs die."""
     stop_backend()
-    return Solver(asked, start_backend("cpu", 1, asked.solver.precision), particles)
+    return build_run(asked, start_backend("cpu", 1, asked.solver.precision), particles)
 
 
-def look(solver: Solver) -> tuple[Frame, LedgerRow]:
-    """Return the state of a solver at this moment."""
-    return solver.frame()
+def look(run: Run) -> tuple[Frame, LedgerRow]:
+    """Return the state of a run at this moment."""
+    return run.frame()
 
 
 def sound(frame: Frame, row: LedgerRow) -> bool:
@@ -74,7 +75,7 @@ def sound(frame: Frame, row: LedgerRow) -> bool:
 
 
 @dataclass(frozen=True)
-class Run:
+class Record:
     """A run to its end, or to the error that stopped it: all frames, their ledger rows, and whether all are finite."""
 
     frames: list[Frame]
@@ -98,17 +99,17 @@ class Run:
         return self.frames[-1]
 
 
-def run(solver: Solver) -> Run:
-    """Run a solver to its end."""
+def run(run: Run) -> Record:
+    """Let a run go on to its end."""
     frames, rows, fine, stopped = [], [], True, None
     try:
-        for frame, row in solver.frames():
+        for frame, row in run.frames():
             frames.append(frame)
             rows.append(row)
             fine = fine and sound(frame, row)
     except UnstableRunError as error:
         stopped = error
-    return Run(frames, rows, fine, stopped)
+    return Record(frames, rows, fine, stopped)
 
 
 def growth(energy: np.ndarray) -> float:

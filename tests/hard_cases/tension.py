@@ -7,10 +7,10 @@ import numpy as np
 from hard_cases.case import HardCase, Outcome
 from hard_cases.running import block, growth, look, nearest, run, scene, start
 from mpmcli.check.finding import FrameFindings
-from mpmcli.check.result_stretch import StretchCheck
+from mpmcli.check.result_state import StretchCheck
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import BodyParticles, sample_bodies, scene_to_toml
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.run import Run
 
 H, DENSITY = 0.1, 1000.0
 YOUNG, NU = 1e6, 0.3
@@ -32,7 +32,7 @@ def side_stretch(stretch: float) -> float:
     return low
 
 
-def pulled(stretch: float, per_cell: int) -> tuple[Solver, BodyParticles, float]:
+def pulled(stretch: float, per_cell: int) -> tuple[Run, BodyParticles, float]:
     """Return a bar that starts at rest, pulled to a multiple of its length, its particles at rest, and their distance.
 
     Nothing holds it: it snaps back to its length and swings about it. Six of its swings long.
@@ -43,10 +43,10 @@ def pulled(stretch: float, per_cell: int) -> tuple[Solver, BodyParticles, float]
     across = side_stretch(stretch)
     middle = np.array([1.6, 0.8])
     position = (sample.position - sample.position.mean(0)) * [stretch, across] + middle
-    solver = start(asked, [replace(sample, position=position)])
-    solver.groups[0].set_deformation(np.tile(np.diag([stretch, across]), (sample.count, 1, 1)))
-    solver.state_was_replaced()
-    return solver, sample, H / np.sqrt(per_cell)
+    run = start(asked, [replace(sample, position=position)])
+    run.groups[0].replace(deformation=np.tile(np.diag([stretch, across]), (sample.count, 1, 1)))
+    run.state_was_replaced()
+    return run, sample, H / np.sqrt(per_cell)
 
 
 def bar_snaps_back() -> tuple[float, bool, str]:
@@ -141,7 +141,7 @@ def sheets() -> Outcome:
     thick = H / 2
     low = 4 * H
 
-    def pair(gap: float, speed: float) -> tuple[Solver, np.ndarray]:
+    def pair(gap: float, speed: float) -> tuple[Run, np.ndarray]:
         names = (("lower", low, 0.0), ("upper", low + thick + gap, speed))
         bodies = [
             block(name, RUBBER, [0.4, y], [1.2, y + thick], particles_per_cell=4, velocity=[0.0, v])

@@ -8,7 +8,7 @@ from hard_cases.case import HardCase, Outcome
 from hard_cases.running import block, look, scene, sound, start
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
-from mpmcli.solver.solver import Solver
+from mpmcli.solver.engine.run import Run
 
 # The bar of docs/theory.md, 10: fixed at x = 0, free at x = L unless its end is fixed too.
 L, YOUNG, DENSITY = 25.0, 100.0, 1.0
@@ -60,13 +60,13 @@ def ringing(periods: int) -> Outcome:
     """H2: the bar with 16 particles per cell: what of its velocities the grid cannot see."""
     speed = 0.1
     asked, sample, w = bar(speed, 16, free=True)
-    solver = start(asked, [sample])
+    run = start(asked, [sample])
     shape = np.sin(np.pi / (2 * L) * sample.position[:, 0])
     noise, fine, swing = 0.0, True, 0.0
     for period in range(1, periods + 1):
-        while solver.time < period * 2 * np.pi / w:
-            solver.step(solver.stable_step()[0])
-        frame, row = look(solver)
+        while run.time < period * 2 * np.pi / w:
+            run.step(run.stable_step()[0])
+        frame, row = look(run)
         fine = fine and sound(frame, row)
         noise = max(noise, float(np.abs(frame.velocity - filtered(frame)).max()))
         # Kinetic and elastic energy share one amplitude.
@@ -74,32 +74,30 @@ def ringing(periods: int) -> Outcome:
     return Outcome(
         fine and noise < 1e-2 * speed,
         f"noise {noise / speed:.1e} of v0 after {periods} periods",
-        f"{solver.step_count:,} steps; {100 * swing:.1f} % of the amplitude are left.",
+        f"{run.step_count:,} steps; {100 * swing:.1f} % of the amplitude are left.",
     )
 
 
-def loss(solver: Solver, sample: BodyParticles, w: float, courant: float, periods: int) -> tuple[float, int]:
+def loss(run: Run, sample: BodyParticles, w: float, courant: float, periods: int) -> tuple[float, int]:
     """Return the energy lost per period of the first mode of a bar fixed at both ends, and the steps of one."""
     steps = round(2 * np.pi / w / (courant * H / C))
-    solver.groups[0].x.from_numpy(sample.position)
-    solver.groups[0].set_motion(sample.velocity, sample.affine)
-    solver.groups[0].set_deformation(np.tile(np.eye(2), (sample.count, 1, 1)))
-    solver.groups[0].id.from_numpy(np.arange(sample.count, dtype=np.int32))
-    solver.state_was_replaced()
+    at_rest, ids = np.tile(np.eye(2), (sample.count, 1, 1)), np.arange(sample.count)
+    run.groups[0].replace(x=sample.position, v=sample.velocity, C=sample.affine, deformation=at_rest, id=ids)
+    run.state_was_replaced()
     energies = []
     # The first period settles what the start gets wrong at first order.
     for _ in range(periods + 1):
         for _ in range(steps):
-            solver.step(2 * np.pi / w / steps)
-        energies.append(look(solver)[1].energy)
+            run.step(2 * np.pi / w / steps)
+        energies.append(look(run)[1].energy)
     return float(1 - (energies[-1] / energies[0]) ** (1 / periods)), steps
 
 
 def small_steps() -> Outcome:
     """H19: the energy that the bar loses per period at C = 0.5 and at C = 0.05."""
     asked, sample, w = bar(0.01, 4, free=False)
-    solver = start(asked, [sample])
-    (large, few), (small, many) = (loss(solver, sample, w, courant, 4) for courant in (0.5, 0.05))
+    run = start(asked, [sample])
+    (large, few), (small, many) = (loss(run, sample, w, courant, 4) for courant in (0.5, 0.05))
     kh = np.pi / CELLS
     return Outcome(
         9 < small / large < 11,

@@ -16,7 +16,7 @@ from mpmcli.output import open_result
 from mpmcli.simulation.runner import Runner
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.simulate import simulate
-from mpmcli.solver.backend import stop_backend
+from mpmcli.solver.machine.backend import stop_backend
 from soak.laws import broken_laws, digest, energy_growth, resting_speed
 from soak.scenes import SoakScene
 

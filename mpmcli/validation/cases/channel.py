@@ -1,31 +1,47 @@
-"""Flow between two walls that stick, started by a pull: a viscous fluid and a Bingham fluid, in closed form."""
+"""Flow between two walls that stick, started by a pull or by one of the walls, of a viscous and of a Bingham fluid."""
 
 import math
-from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
+from mpmcli.validation.case import Case, Frames, Measure, case_text
+from mpmcli.validation.measuring import field
+from mpmcli.validation.tables import Tables, body, box, fluid, problem
 
-# Distance of the walls, m; density, kg/m^3; kinematic viscosity, m^2/s; and the pull, m/s^2.
-WIDTH, DENSITY, VISCOSITY, PULL = 1.0, 1000.0, 1.0, 0.5
+# Distance of the walls, m; density, kg/m^3; kinematic viscosity, m^2/s; the pull, m/s^2; and the speed of a wall, m/s.
+WIDTH, DENSITY, VISCOSITY, PULL, SPEED = 1.0, 1000.0, 1.0, 0.5, 0.5
+# Sound crosses ten channels in the time in which viscosity crosses one.
+VISCOUS = fluid(DENSITY, DENSITY * (10 * VISCOSITY / WIDTH) ** 2, viscosity=DENSITY * VISCOSITY, tension_cutoff=False)
 # Length of the middle that is looked at, in widths.
 MIDDLE = 1
+# Width of the plug of the Bingham fluid, in that of the channel.
+PLUG = 0.4
 # Terms of the series; the first one left out has 1e-6 of the first.
 TERMS = 50
+# Cells along the channel whose faces are periodic: nothing depends on the place along it.
+PERIODIC = 8
 
 
 def started(y: np.ndarray, time: float) -> np.ndarray:
-    """Return the velocity of a viscous fluid at y, m/s, a time after it was at rest, s.
+    """Return the velocity of a viscous fluid at y, m/s, a time after a pull began, s.
 
     u = g/(2 nu) y (W - y) - sum 4 g W^2/(nu (k pi)^3) sin(k pi y/W) exp(-nu (k pi/W)^2 t) over odd k.
     """
     k = math.pi * (2 * np.arange(TERMS) + 1)
     waves = 4 * PULL * WIDTH**2 / (VISCOSITY * k**3) * np.exp(-VISCOSITY * (k / WIDTH) ** 2 * time)
     return PULL / (2 * VISCOSITY) * y * (WIDTH - y) - np.sin(y[:, None] * k / WIDTH) @ waves
+
+
+def dragged(y: np.ndarray, time: float) -> np.ndarray:
+    """Return the velocity of a viscous fluid at y, m/s, a time after the upper wall began to move, s.
+
+    u = U y/W + sum 2 U/(n pi) (-1)^n sin(n pi y/W) exp(-nu (n pi/W)^2 t).
+    """
+    n = np.arange(1, TERMS + 1)
+    waves = 2 * SPEED / (n * math.pi) * (-1.0) ** n * np.exp(-VISCOSITY * (n * math.pi / WIDTH) ** 2 * time)
+    return SPEED * y / WIDTH + np.sin(y[:, None] * n * math.pi / WIDTH) @ waves
 
 
 def plugged(y: np.ndarray, plug: float) -> np.ndarray:
@@ -44,39 +60,28 @@ class Channel(Case):
     # End of the run, s, and length of the strip in widths: what its ends do has not come to the middle by then.
     end: float
     length: int
+    material: Tables
 
-    @abstractmethod
-    def material(self) -> dict[str, Any]:
-        """Return the table of the material."""
+    # The velocity along the channel at y, m, and at a time, s, in m/s.
+    known: Callable[[np.ndarray, float], np.ndarray]
 
-    @abstractmethod
-    def known(self, y: np.ndarray, time: float) -> np.ndarray:
-        """Return the velocity along the channel at y, m/s."""
-
-    def tables(self, n: int) -> dict[str, Any]:
+    def tables(self, n: int) -> Tables:
         h = WIDTH / n
-        return {
-            "domain": {
+        return problem(
+            {
                 "size": [(self.length + 1) * WIDTH, WIDTH],
                 "cells": [(self.length + 1) * n, n],
                 "gravity": [PULL, 0.0],
                 "walls": {"default": "slip", "y_min": "stick", "y_max": "stick"},
             },
-            "time": {"end": self.end, "frames": 1},
-            "output": {"fields": ["velocity", "initial_position"]},
-            "bodies": [
-                {
-                    "name": "fluid",
-                    "material": self.material(),
-                    "shape": {"box": {"min": [4 * h, 0.0], "max": [4 * h + self.length * WIDTH, WIDTH]}},
-                }
-            ],
-        }
+            (self.end, 1),
+            "velocity initial_position",
+            [body("fluid", self.material, box([4 * h, 0.0], [4 * h + self.length * WIDTH, WIDTH]))],
+        )
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
-        for entry in frames:
-            last, row = entry
-        X = last.fields["initial_position"].astype(np.float64)
+        *_, (last, row) = frames
+        X = field(last, "initial_position")
         start, end = (bound[0] for bound in scene.bodies[0].shape.form.bounds())
         middle = np.abs(X[:, 0] - (start + end) / 2) < MIDDLE * WIDTH / 2
         # Velocities are half a step old.
@@ -93,74 +98,81 @@ def channel_measures(bound: Callable[[int], float], order: float | None = None) 
     """Return the measures with bounds of that of the velocity; the flow is a mean of it."""
     text = "L2 error of the velocity in the middle, over the velocity."
     return (
-        Measure("velocity error", "", text, bound=bound, order=order, expected=2.0),
-        Measure("flow error", "", "Flow through the middle over the exact one, less 1.", bound=bound, expected=2.0),
-        Measure("cross flow", "", "Largest velocity across the channel, over the largest along it.", lambda n: 1e-4),
+        Measure(f"velocity error: {text}", bound, order=order, expected=2.0),
+        Measure("flow error: Flow through the middle over the exact one, less 1.", bound, expected=2.0),
+        Measure("cross flow: Largest velocity across the channel, over the largest along it.", 1e-4),
     )
 
 
 class Poiseuille(Channel):
     """The plane flow of Poiseuille, a fifth of the time after its start in which viscosity crosses the channel."""
 
-    name = "poiseuille"
-    title = "Start of a viscous flow between walls that stick"
-    group = "fluids"
-    source = "Batchelor 1967 (An Introduction to Fluid Dynamics), 4.3"
+    text = case_text("poiseuille")
+    name, title, group = "poiseuille", "Start of a viscous flow between walls that stick", "fluids"
     levels = {"coarse": (8, 16), "default": (8, 16, 32), "fine": (8, 16, 32, 64)}  # noqa: RUF012
     end, length = 0.15 * WIDTH**2 / VISCOSITY, 6
     varies = ("precision", "transfer", "walls")
+    material = VISCOUS
     measures = channel_measures(lambda n: 1.5 * 1.6 / n**2, 1.9)
-    note = (
-        "Most of the error is that particles have the mean of the flow over a kernel, h^2/8 u'' less than the flow: "
-        "1/n^2 of the largest velocity."
-    )
-
-    def material(self) -> dict[str, Any]:
-        # Sound crosses ten channels in the time in which viscosity crosses one.
-        modulus = DENSITY * (10 * VISCOSITY / WIDTH) ** 2
-        return {
-            "law": "fluid",
-            "density": DENSITY,
-            "bulk_modulus": modulus,
-            "viscosity": DENSITY * VISCOSITY,
-            "tension_cutoff": False,
-        }
-
-    def known(self, y: np.ndarray, time: float) -> np.ndarray:
-        return started(y, time)
+    known = staticmethod(started)
 
 
 class Bingham(Channel):
     """The steady flow of a Bingham fluid: a plug, and a parabola on either side."""
 
-    name = "bingham"
-    title = "Bingham fluid between walls that stick"
-    group = "plastic"
-    source = "Bird, Stewart and Lightfoot 1960 (Transport Phenomena), the plug flow of a Bingham fluid, between plates"
+    text = case_text("bingham")
+    name, title, group = "bingham", "Bingham fluid between walls that stick", "plastic"
     levels = {"coarse": (16,), "default": (16, 32), "fine": (16, 32, 64)}  # noqa: RUF012
     end, length = 0.55 * WIDTH**2 / VISCOSITY, 20
     varies = ("precision",)
-    plug = 0.4
+    # Shear waves cross twelve channels in the time in which viscosity crosses one.
+    modulus = DENSITY * (12 * VISCOSITY / WIDTH) ** 2
+    flow = {"yield_stress": DENSITY * PULL * PLUG * WIDTH / 2, "consistency": DENSITY * VISCOSITY}  # noqa: RUF012
+    material = fluid(DENSITY, modulus, shear_modulus=modulus, law="viscoplastic", **flow)
     measures = channel_measures(lambda n: 1.5 * (1.5 / n**2 + 3e-4))
-    note = (
-        "The material gives way elastically before it yields, and what its free ends do runs along the plug at the "
-        "speed of sound: the strip is so long that this has not arrived, and the flow is steady to 1e-3."
+    known = staticmethod(lambda y, time: plugged(y, PLUG))
+
+
+class Couette(Case):
+    """The plane flow of Couette, a tenth of the time after its start in which viscosity crosses the channel."""
+
+    text = case_text("couette")
+    name, title, group = "couette", "Start of a viscous flow by a wall that moves", "fluids"
+    source = Poiseuille.source
+    resolution = Channel.resolution
+    levels = Poiseuille.levels
+    varies = ("precision", "transfer", "walls")
+    measures = (
+        text.measure("velocity error", lambda n: 1.5 * 0.25 / n**2, order=1.9, expected=2.0),
+        text.measure("cross flow", 1e-4),
+        text.measure("unevenness", 1e-9),
     )
 
-    def material(self) -> dict[str, Any]:
-        # Shear waves cross twelve channels in the time in which viscosity crosses one.
-        modulus = DENSITY * (12 * VISCOSITY / WIDTH) ** 2
+    def tables(self, n: int) -> Tables:
+        length = PERIODIC * WIDTH / n
+        return problem(
+            {
+                "size": [length, WIDTH],
+                "cells": [PERIODIC, n],
+                "walls": {"x_min": "periodic", "x_max": "periodic", "y_min": "stick", "y_max": "stick"},
+                "wall_velocity": {"y_max": [SPEED, 0.0]},
+            },
+            (0.1 * WIDTH**2 / VISCOSITY, 1),
+            "velocity initial_position",
+            [body("fluid", VISCOUS, box([0.0, 0.0], [length, WIDTH]))],
+        )
+
+    def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        *_, (last, row) = frames
+        y = field(last, "initial_position")[:, 1]
+        u, v = last.velocity.astype(np.float64).T
+        # Velocities are half a step old.
+        exact = dragged(y, last.time - row.step_max / 2)
         return {
-            "law": "viscoplastic",
-            "density": DENSITY,
-            "yield_stress": DENSITY * PULL * self.plug * WIDTH / 2,
-            "consistency": DENSITY * VISCOSITY,
-            "shear_modulus": modulus,
-            "bulk_modulus": modulus,
+            "velocity error": float(np.sqrt(((u - exact) ** 2).mean())) / SPEED,
+            "cross flow": float(np.abs(v).max()) / SPEED,
+            "unevenness": max(float(np.ptp(u[y == height])) for height in np.unique(y)) / SPEED,
         }
 
-    def known(self, y: np.ndarray, time: float) -> np.ndarray:
-        return plugged(y, self.plug)
 
-
-CASES = (Poiseuille(), Bingham())
+CASES = (Poiseuille(), Bingham(), Couette())

@@ -1,13 +1,13 @@
 """A column on which gravity is switched on at once: it swings to twice its settlement and back (d'Alembert)."""
 
 import math
-from typing import Any
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure, elastic
-from mpmcli.validation.oscillation import fit_oscillation
+from mpmcli.validation.case import Case, Frames, case_text
+from mpmcli.validation.measuring import field, fit_oscillation
+from mpmcli.validation.tables import Tables, body, elastic, problem, shaft
 
 HEIGHT, YOUNG, DENSITY, GRAVITY = 1.0, 1e6, 1000.0, 1.0
 WAVE_SPEED = math.sqrt(YOUNG / DENSITY)
@@ -16,8 +16,6 @@ WEIGHT = DENSITY * GRAVITY * HEIGHT
 # The top sinks by twice its settlement, m.
 PEAK = WEIGHT * HEIGHT / YOUNG
 PERIODS, FRAMES_PER_PERIOD = 3, 48
-# The grid has at least five cells per axis; the column fills them, between slip walls: it stays one-dimensional.
-STRIP, ROOM = 5, 3
 # What sums over particles that are no longer evenly spread, by strains of 1e-3, leave of the error at any spacing.
 FLOOR = 4e-5
 
@@ -48,77 +46,38 @@ def extreme(times: np.ndarray, values: np.ndarray) -> float:
 class ColumnDynamic(Case):
     """u_tt = c^2 u_yy - g from rest: the stress at the base is a triangle wave between 0 and 2 density g height."""
 
-    name = "column_dynamic"
-    title = "Column with gravity switched on"
-    group = "solids"
-    source = "d'Alembert's solution for small strain"
-    resolution = "cells along the column"
+    text = case_text("column_dynamic")
+    name, title, group = "column_dynamic", "Column with gravity switched on", "solids"
     levels = {"coarse": (16, 32), "default": (16, 32, 64, 128), "fine": (16, 32, 64, 128, 256)}  # noqa: RUF012
     measures = (
-        Measure(
-            "base stress error",
-            "",
-            "Mean |sigma_yy - exact| in the lowest cell over three periods, over density g height.",
-            bound=lambda n: 1.25 * 0.32 / n,
-            order=0.9,
-            expected=1.0,
-        ),
-        Measure(
-            "peak error",
-            "",
-            "Deepest place of the top over density g height^2 / E, less 1.",
-            bound=lambda n: 1.5 * (0.052 / n**2 + FLOOR),
-            single=lambda n: 3e-4,
-        ),
-        Measure(
-            "period error",
-            "",
-            "Period of the first mode over 4 height / c, less 1.",
-            bound=lambda n: 1.3 * 0.105 * (math.pi / 2 / n) ** 2 + 1.5 * FLOOR,
-        ),
-    )
-    note = (
-        "Fixed corotated with nu = 0 is linear in the stretch, P = E (F - 1), and the answer for small strain holds "
-        "at any. The stress has corners, which no scheme of the grid follows: its error falls at first order."
+        text.measure("base stress error", lambda n: 1.25 * 0.32 / n, order=0.9, expected=1.0),
+        text.measure("peak error", lambda n: 1.5 * (0.052 / n**2 + FLOOR), rounding=3e-4),
+        text.measure("period error", lambda n: 1.3 * 0.105 * (math.pi / 2 / n) ** 2 + 1.5 * FLOOR),
     )
 
-    def tables(self, n: int) -> dict[str, Any]:
-        h = HEIGHT / n
-        return {
-            "domain": {
-                "size": [STRIP * h, HEIGHT + ROOM * h],
-                "cells": [STRIP, n + ROOM],
-                "gravity": [0.0, -GRAVITY],
-                "walls": "slip",
-            },
-            "time": {"end": PERIODS * PERIOD, "frames": PERIODS * FRAMES_PER_PERIOD},
-            "output": {"fields": ["stress", "initial_position"]},
-            "bodies": [
-                {
-                    "name": "column",
-                    "material": elastic("fixed_corotated", DENSITY, YOUNG, 0.0),
-                    "shape": {"box": {"min": [0.0, 0.0], "max": [STRIP * h, HEIGHT]}},
-                }
-            ],
-        }
+    def tables(self, n: int) -> Tables:
+        domain, shape = shaft(n, HEIGHT, -GRAVITY)
+        column = body("column", elastic("fixed_corotated", DENSITY, YOUNG, 0.0), shape)
+        time = PERIODS * PERIOD, PERIODS * FRAMES_PER_PERIOD
+        return problem(domain, time, "stress initial_position", [column])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
         times, tops, modes, errors = [], [], [], []
         for frame, _ in frames:
-            start = frame.fields["initial_position"][:, 1].astype(np.float64)
+            start = field(frame, "initial_position")[:, 1]
             sunk = start - frame.position[:, 1]
             low = start < scene.domain.spacing
-            stress = frame.fields["stress"].reshape(-1, 3, 3)[low, 1, 1].astype(np.float64)
+            stress = field(frame, "stress").reshape(-1, 3, 3)[low, 1, 1]
             times.append(frame.time)
             tops.append(float(sunk[start == start.max()].mean()))
             modes.append(float(sunk @ np.sin(np.pi * start / (2 * HEIGHT))))
             errors.append(abs(float((stress - exact_stress(start[low], frame.time)).mean())) / WEIGHT)
-        found = fit_oscillation(np.array(times), np.array(modes), 2 * math.pi / PERIOD)
+        wave = fit_oscillation(np.array(times), np.array(modes), 2 * math.pi / PERIOD)
         first = slice(0, FRAMES_PER_PERIOD + 1)
         return {
             "base stress error": float(np.mean(errors)),
             "peak error": extreme(np.array(times[first]), np.array(tops[first])) / PEAK - 1,
-            "period error": 2 * math.pi / found.frequency / PERIOD - 1,
+            "period error": 2 * math.pi / wave.frequency / PERIOD - 1,
         }
 
 

@@ -1,13 +1,13 @@
 """A column that settles under its own weight, brought on slowly: the stress is known for any law."""
 
 import math
-from typing import Any
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure, elastic
-from mpmcli.validation.quasi_static import smooth_ramp, window_weights
+from mpmcli.validation.case import Case, Frames, Measure, case_text
+from mpmcli.validation.measuring import after_ramp, field
+from mpmcli.validation.tables import Tables, body, elastic, problem, shaft, smooth_ramp
 
 HEIGHT, DENSITY, GRAVITY = 50.0, 80.0, 10.0
 WEIGHT = DENSITY * GRAVITY
@@ -15,8 +15,6 @@ WEIGHT = DENSITY * GRAVITY
 FIRM, SOFT = 1e7, 1e6
 # In first periods of the column: how long the load takes to come on, and how long the mean is taken after that.
 RAMP, WINDOW, FRAMES_PER_PERIOD = 10, 2, 24
-# The grid has at least five cells per axis; the column fills them, between slip walls: it stays one-dimensional.
-STRIP, ROOM = 5, 3
 
 
 def stretch(law: str, youngs_modulus: float, Y: np.ndarray) -> np.ndarray:
@@ -56,39 +54,20 @@ class WeightedColumn(Case):
     youngs_modulus: float
     extra: dict[str, float] = {}  # noqa: RUF012
 
-    def tables(self, n: int) -> dict[str, Any]:
-        h = HEIGHT / n
-        periods = RAMP + WINDOW
+    def tables(self, n: int) -> Tables:
         # 4 height / c, s.
         period = 4 * HEIGHT / math.sqrt(self.youngs_modulus / DENSITY)
-        return {
-            "domain": {
-                "size": [STRIP * h, HEIGHT + ROOM * h],
-                "cells": [STRIP, n + ROOM],
-                "gravity": [0.0, f"-{GRAVITY} * {smooth_ramp(RAMP * period)}"],
-                "walls": "slip",
-            },
-            "time": {"end": periods * period, "frames": periods * FRAMES_PER_PERIOD},
-            "output": {"fields": ["stress", "initial_position"]},
-            "bodies": [
-                {
-                    "name": "column",
-                    "material": elastic(self.law, DENSITY, self.youngs_modulus, 0.0, **self.extra),
-                    "shape": {"box": {"min": [0.0, 0.0], "max": [STRIP * h, HEIGHT]}},
-                }
-            ],
-        }
+        domain, shape = shaft(n, HEIGHT, f"-{GRAVITY} * {smooth_ramp(RAMP * period)}")
+        column = body("column", elastic(self.law, DENSITY, self.youngs_modulus, 0.0, **self.extra), shape)
+        time = (RAMP + WINDOW) * period, (RAMP + WINDOW) * FRAMES_PER_PERIOD
+        return problem(domain, time, "stress initial_position", [column])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
-        weights = iter(window_weights(WINDOW * FRAMES_PER_PERIOD + 1))
         stress = height = 0.0
-        for frame, _ in frames:
-            if frame.index < RAMP * FRAMES_PER_PERIOD:
-                continue
-            weight = next(weights)
-            stress = stress + weight * frame.fields["stress"].reshape(-1, 3, 3)[:, 1, 1].astype(np.float64)
+        for weight, frame in after_ramp(frames, RAMP * FRAMES_PER_PERIOD, WINDOW * FRAMES_PER_PERIOD):
+            stress = stress + weight * field(frame, "stress").reshape(-1, 3, 3)[:, 1, 1]
             height = height + weight * frame.position[:, 1].astype(np.float64)
-        Y = frame.fields["initial_position"][:, 1].astype(np.float64)
+        Y = field(frame, "initial_position")[:, 1]
         settled = HEIGHT - float(rest_place(self.law, self.youngs_modulus, np.array(HEIGHT)))
         error = np.abs(height - rest_place(self.law, self.youngs_modulus, Y)).max() / settled
         # Every particle has the same volume.
@@ -105,45 +84,31 @@ SETTLEMENT = "Largest error of the height of a particle, over the settlement of 
 class ColumnStatic(WeightedColumn):
     """The firm column: strains of 0.4 %, so that particles keep their places in their cells."""
 
-    name = "column_static"
-    title = "Column at rest under its own weight"
+    text = case_text("column_static")
+    name, title = "column_static", "Column at rest under its own weight"
     law, youngs_modulus = "neo_hookean", FIRM
     levels = {"coarse": (16, 32), "default": (16, 32, 64), "fine": (16, 32, 64, 128)}  # noqa: RUF012
     measures = (
-        Measure("stress error", "", STRESS, bound=lambda n: 1.1 * 3 / 32 / n, order=1.0, expected=1.0),
+        Measure(f"stress error: {STRESS}", lambda n: 1.1 * 3 / 32 / n, order=1.0, expected=1.0),
         Measure(
-            "settlement error",
-            "",
-            SETTLEMENT,
-            bound=lambda n: 1.3 * (0.132 / n**2 + 1.6e-4),
-            single=lambda n: 0.0046 * n / 64,
+            f"settlement error: {SETTLEMENT}",
+            lambda n: 1.3 * (0.132 / n**2 + 1.6e-4),
+            rounding=lambda n: 0.0046 * n / 64,
         ),
-    )
-    note = (
-        "The error of the stress is 3/32 h of its slope, up and down in turn: in a flow v = a x^2 a particle a quarter "
-        "of a cell off a node takes a velocity gradient that is 3/16 a h off, as the quadratic weights have a third "
-        "moment there. Forces do not feel it, as it cancels between neighbours. In single precision heights are off by "
-        "up to 0.5 % of the settlement at 64 cells: in a step of this slow motion particles move by a dozen units in "
-        "the last digit of their places at most, and where by less than half of one, not at all."
     )
 
 
 class ColumnSettlement(WeightedColumn):
     """The soft column: strains of 4 %, at which each law settles by a length of its own."""
 
+    text = case_text("column_settlement")
     youngs_modulus = SOFT
     # What the knobs do shows in the firm column.
     varies = ("precision",)
     levels = {"coarse": (32,), "default": (16, 32, 64), "fine": (16, 32, 64, 128)}  # noqa: RUF012
     measures = (
-        Measure("settlement error", "", SETTLEMENT, bound=lambda n: 1.3 * 0.021 / n, expected=1.0),
-        Measure("stress error", "", STRESS, bound=lambda n: 1.4 * (0.8 / n**2 + 1.1e-3)),
-    )
-    note = (
-        "Particles that are compressed by a fraction e are no longer evenly spread over the cells, and sums over them "
-        "are no longer exact integrals: the stress swings about its mean by some e/8 of itself, at any spacing of the "
-        "grid, over lengths of h / 2e. That is what remains here of the error of the stress (1.2e-3 with 2 particles "
-        "per cell and axis), and it makes the error of the height one of first order. More particles lessen it."
+        Measure(f"settlement error: {SETTLEMENT}", lambda n: 1.3 * 0.021 / n, expected=1.0),
+        Measure(f"stress error: {STRESS}", lambda n: 1.4 * (0.8 / n**2 + 1.1e-3)),
     )
 
     def __init__(self, name: str, title: str, law: str, **extra: float) -> None:

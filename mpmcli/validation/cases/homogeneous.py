@@ -6,15 +6,16 @@ particles shears against the grid, homogeneous stress makes small forces.
 """
 
 import math
-from typing import Any
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure, elastic
+from mpmcli.validation.case import Case, Frames, case_text
+from mpmcli.validation.measuring import field, in_middle
+from mpmcli.validation.tables import Tables, body, elastic, fluid, free_blocks, lame_moduli, problem
 
 DENSITY, YOUNG, NU = 1000.0, 1e6, 0.3
-MU, LAMBDA = YOUNG / (2 * (1 + NU)), YOUNG * NU / ((1 + NU) * (1 - 2 * NU))
+MU, LAMBDA = lame_moduli(YOUNG, NU)
 SIZE = 0.5
 # t L at the end: a shear and a compression. F <- (I + dt C) F is exact, and so is J <- J det(I + dt C).
 FINAL = np.array([[-0.06, 0.3], [0.0, 0.0]])
@@ -31,21 +32,9 @@ ELASTIC = (DENSITY, YOUNG, NU)
 MATERIALS = {
     "neo-Hookean": elastic("neo_hookean", *ELASTIC),
     "corotated": elastic("fixed_corotated", *ELASTIC),
-    "fluid": {
-        "law": "fluid",
-        "density": DENSITY,
-        "bulk_modulus": BULK,
-        "exponent": EXPONENT,
-        "viscosity": VISCOSITY,
-    },
+    "fluid": fluid(DENSITY, BULK, exponent=EXPONENT, viscosity=VISCOSITY),
     "plastic": elastic("von_mises", *ELASTIC, yield_stress=YIELD, hardening_modulus=0.0),
 }
-
-
-def rotation(F: np.ndarray) -> np.ndarray:
-    """Return the rotation of the polar decomposition."""
-    U, _, V = np.linalg.svd(F)
-    return U @ V
 
 
 def known_stress(name: str, F: np.ndarray) -> np.ndarray:
@@ -55,7 +44,8 @@ def known_stress(name: str, F: np.ndarray) -> np.ndarray:
         case "neo-Hookean":
             tau = MU * (F @ F.T - unit) + LAMBDA * math.log(J) * unit
         case "corotated":
-            tau = 2 * MU * (F - rotation(F)) @ F.T + LAMBDA * (J - 1) * J * unit
+            U, _, V = np.linalg.svd(F)
+            tau = 2 * MU * (F - U @ V) @ F.T + LAMBDA * (J - 1) * J * unit
         case _:
             C = FINAL @ np.linalg.inv(F) / END
             pressure = BULK / EXPONENT * (J**-EXPONENT - 1)
@@ -68,91 +58,49 @@ def known_stress(name: str, F: np.ndarray) -> np.ndarray:
 class Homogeneous(Case):
     """v = L (X - c) in four free blocks."""
 
-    name = "homogeneous"
+    text = case_text("homogeneous")
+    name, title, group = "homogeneous", "Free blocks in homogeneous motion", "invariants"
     varies = ("precision", "kernel", "transfer")
-    title = "Free blocks in homogeneous motion"
-    group = "invariants"
-    source = "Closed forms: F = I + t L, and the laws at that F"
-    resolution = "cells across a block"
     levels = {"coarse": (32,), "default": (32, 64), "fine": (32, 64, 128)}  # noqa: RUF012
     measures = (
-        Measure(
-            "deformation error", "", "Largest |F - (I + t L)| in the middle of the solids.", bound=lambda n: 1.2e-4
-        ),
-        Measure(
-            "neo-Hookean",
-            "",
-            "Stress in the middle less the closed form, over it.",
-            bound=lambda n: 1.2e-4 * (32 / n) ** 1.2,
-        ),
-        Measure("corotated", "", "The same of the fixed corotated solid.", bound=lambda n: 1e-4 * (32 / n) ** 0.8),
-        Measure(
-            "fluid", "", "The same of the fluid of exponent 7, with viscosity.", bound=lambda n: 0.002 * (32 / n) ** 1.3
-        ),
-        Measure(
-            "plastic",
-            "",
-            "Von Mises stress of the metal over its yield stress, less 1.",
-            bound=lambda n: max(5e-6 * (32 / n) ** 2, 6e-7),
-        ),
-        Measure(
-            "plastic pressure",
-            "",
-            "Its pressure over (lambda + 2 mu / 3) ln J / J, less 1.",
-            bound=lambda n: max(9e-5 * (32 / n) ** 2, 1.2e-5),
-        ),
-    )
-    note = (
-        "A check of the laws in the solver at large strain and rotation, with hardly any discretisation in it. The "
-        "viscous stress is first order in the step, as C is that of the step before."
+        text.measure("deformation error", 1.2e-4),
+        text.measure("neo-Hookean", lambda n: 1.2e-4 * (32 / n) ** 1.2),
+        text.measure("corotated", lambda n: 1e-4 * (32 / n) ** 0.8),
+        text.measure("fluid", lambda n: 0.002 * (32 / n) ** 1.3),
+        text.measure("plastic", lambda n: max(5e-6 * (32 / n) ** 2, 6e-7)),
+        text.measure("plastic pressure", lambda n: max(9e-5 * (32 / n) ** 2, 1.2e-5)),
     )
 
-    def tables(self, n: int) -> dict[str, Any]:
-        h = SIZE / n
-        across, up = n + 2 * BESIDE, len(MATERIALS) * (n + ABOVE) + ABOVE
-        bodies = []
-        for k, (name, material) in enumerate(MATERIALS.items()):
-            low = [BESIDE * h, (ABOVE + k * (n + ABOVE)) * h]
-            bodies.append(
-                {
-                    "name": name,
-                    "material": material,
-                    "shape": {"box": {"min": low, "max": [x + SIZE for x in low]}},
-                    "velocity_gradient": (FINAL / END).tolist(),
-                }
-            )
-        return {
-            "domain": {"size": [across * h, up * h], "cells": [across, up], "walls": "separate"},
-            "time": {"end": END, "frames": 1},
-            "output": {"fields": ["velocity", "stress", "deformation_gradient", "initial_position"]},
-            "bodies": bodies,
-        }
+    def tables(self, n: int) -> Tables:
+        domain, shapes = free_blocks(n, SIZE, len(MATERIALS), (BESIDE, ABOVE))
+        bodies = [
+            body(name, material, shape, velocity_gradient=(FINAL / END).tolist())
+            for (name, material), shape in zip(MATERIALS.items(), shapes, strict=True)
+        ]
+        return problem(domain, (END, 1), "velocity stress deformation_gradient initial_position", bodies)
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
-        for frame, _ in frames:
-            last = frame
+        *_, (last, _) = frames
         F = np.eye(2) + FINAL
-        place = last.fields["initial_position"].astype(np.float64)
-        stress = last.fields["stress"].astype(np.float64).reshape(-1, 3, 3)
-        deformation = last.fields["deformation_gradient"].astype(np.float64).reshape(-1, 2, 2)
-        found, errors = {}, []
-        for k, body in enumerate(scene.bodies):
-            centre = np.mean(body.shape.form.bounds(), axis=0)
-            middle = (last.body == k) & (np.abs(place - centre).max(axis=1) < MIDDLE * SIZE / 2)
+        J = float(np.linalg.det(F))
+        stress = field(last, "stress").reshape(-1, 3, 3)
+        deformation = field(last, "deformation_gradient").reshape(-1, 2, 2)
+        values, errors = {}, []
+        for k, solid in enumerate(scene.bodies):
+            middle = in_middle(last, scene, k, MIDDLE * SIZE)
             mean = stress[middle].mean(axis=0)
-            if body.name == "plastic":
+            if solid.name == "plastic":
                 pressure = -np.trace(mean) / 3
                 deviator = mean + pressure * np.eye(3)
-                J = float(np.linalg.det(F))
-                found["plastic"] = float(math.sqrt(1.5) * np.linalg.norm(deviator) * J / YIELD - 1)
+                values["plastic"] = float(math.sqrt(1.5) * np.linalg.norm(deviator) * J / YIELD - 1)
                 known = -(LAMBDA + 2 * MU / 3) * math.log(J) / J
-                found["plastic pressure"] = float(pressure / known - 1)
+                values["plastic pressure"] = float(pressure / known - 1)
                 continue
-            known = known_stress(body.name, F)
-            found[body.name] = float(np.linalg.norm(mean[:2, :2] - known) / np.linalg.norm(known))
-            if body.name != "fluid":
+            known = known_stress(solid.name, F)
+            values[solid.name] = float(np.linalg.norm(mean[:2, :2] - known) / np.linalg.norm(known))
+            if solid.name != "fluid":
                 errors.append(float(np.abs(deformation[middle] - F).max()))
-        return {"deformation error": max(errors), **found}
+        return {"deformation error": max(errors), **values}
 
 
 CASES = (Homogeneous(),)

@@ -2,93 +2,176 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Level, Measure, elastic
-from mpmcli.validation.manufactured import StandingWave
+from mpmcli.validation.case import Case, Frames, Levels, case_text
+from mpmcli.validation.measuring import field
+from mpmcli.validation.tables import Tables, body, box, elastic, lame_moduli, problem
 
 # The grid has at least five cells per axis; in 1D the strip fills them.
 STRIP = 5
 FRAMES = 8
+AXES = ("X", "Y", "Z")
+
+
+@dataclass(frozen=True)
+class StandingWave:
+    """The motion, the force and the stress of a solid of one of two laws; `signs` has s_i, one per axis that moves.
+
+    Along each axis i, with s_i = 1 or -1 (phases 0 and pi of Wallstedt and Guilkey 2008), in a unit square or cube of
+    rest density rho between slip walls:
+        u_i = s_i A sin(k X_i) sin(w t), so that F is diagonal with F_i = 1 + s_i A k cos(k X_i) sin(w t),
+        b_i = d2u_i/dt2 - (dP_ii/dX_i) / rho, with dF_i/dX_i = -k^2 u_i.
+    At t = 0 nothing is displaced. Moduli are in Pa, the density in kg/m^3, the amplitude A in m.
+    """
+
+    law: str
+    signs: tuple[int, ...]
+    # k / pi.
+    half_waves: int
+    young: float
+    poisson: float
+    density: float = 1.0
+    amplitude: float = 0.05
+
+    @property
+    def moduli(self) -> tuple[float, float]:
+        """Return mu and lambda, Pa."""
+        return lame_moduli(self.young, self.poisson)
+
+    @property
+    def frequency(self) -> float:
+        """Return w = pi c with c = sqrt(E / rho), rad/s."""
+        return math.pi * math.sqrt(self.young / self.density)
+
+    def velocity(self) -> list[str]:
+        """Return the initial velocity, m/s, as expressions of a scene, one per axis that moves."""
+        peak = self.amplitude * self.frequency
+        return [f"{sign * peak!r} * sin({self._wave} * {name})" for sign, name in zip(self.signs, AXES, strict=False)]
+
+    def force(self) -> list[str]:
+        """Return b, m/s^2, as expressions of a scene, one per axis that moves."""
+        mu, lam = (modulus / self.density for modulus in self.moduli)
+        k2 = (self.half_waves * math.pi) ** 2
+        stretches = [self._stretch(i) for i in range(len(self.signs))]
+        texts = []
+        for i, F in enumerate(stretches):
+            if self.law == "neo_hookean":
+                # P_ii = mu (F_i - 1/F_i) + lambda ln J / F_i
+                stiffness = f"{mu!r} * (1 + 1 / {F}**2)"
+                if lam:
+                    stiffness += f" + {lam!r} * (1 - log({' * '.join(stretches)})) / {F}**2"
+            else:
+                # P_ii = 2 mu (F_i - 1) + lambda (J - 1) J / F_i, where J / F_i is the product of the others.
+                others = " * ".join(f"{stretch}**2" for j, stretch in enumerate(stretches) if j != i)
+                stiffness = f"{2 * mu!r} + {lam!r} * {others}" if others else f"{2 * mu + lam!r}"
+            texts.append(f"{self._moved(i)} * ({k2!r} * ({stiffness}) - {self.frequency**2!r})")
+        return texts
+
+    def displacement(self, X: np.ndarray, time: float) -> np.ndarray:
+        """Return u, (n, d), m, of particles that began at X, (n, d), m: only the axes that move."""
+        signs = np.array(self.signs)
+        moving = X[:, : len(signs)]
+        return signs * self.amplitude * np.sin(self.half_waves * np.pi * moving) * np.sin(self.frequency * time)
+
+    def stretches(self, X: np.ndarray, time: float) -> np.ndarray:
+        """Return F_i, (n, 3): 1 along axes that do not move."""
+        signs = np.array(self.signs)
+        k = self.half_waves * np.pi
+        F = np.ones((len(X), 3))
+        moving = X[:, : len(signs)]
+        F[:, : len(signs)] += signs * self.amplitude * k * np.cos(k * moving) * np.sin(self.frequency * time)
+        return F
+
+    def piola_stress(self, X: np.ndarray, time: float) -> np.ndarray:
+        """Return the diagonal of the first Piola-Kirchhoff stress, (n, 3), Pa."""
+        F = self.stretches(X, time)
+        J = F.prod(axis=1)[:, None]
+        mu, lam = self.moduli
+        if self.law == "neo_hookean":
+            return mu * (F - 1 / F) + lam * np.log(J) / F
+        return 2 * mu * (F - 1) + lam * (J - 1) * J / F
+
+    def cauchy_stress(self, X: np.ndarray, time: float) -> np.ndarray:
+        """Return the diagonal of the Cauchy stress, (n, 3), Pa."""
+        F = self.stretches(X, time)
+        return self.piola_stress(X, time) * F / F.prod(axis=1)[:, None]
+
+    @property
+    def _wave(self) -> str:
+        return "pi" if self.half_waves == 1 else f"{self.half_waves} * pi"
+
+    @property
+    def _swing(self) -> str:
+        return f"sin({self.frequency!r} * t)"
+
+    def _moved(self, i: int) -> str:
+        return f"{self.signs[i] * self.amplitude!r} * sin({self._wave} * {AXES[i]}) * {self._swing}"
+
+    def _stretch(self, i: int) -> str:
+        sign = "+" if self.signs[i] > 0 else "-"
+        # F_i - 1 = s_i A k cos(k X_i) sin(w t), with A k as a multiple of pi.
+        slope = self.amplitude * self.half_waves
+        return f"(1 {sign} {slope!r} * pi * cos({self._wave} * {AXES[i]}) * {self._swing})"
 
 
 class ManufacturedWave(Case):
     """u_i = s_i A sin(k X_i) sin(w t) for one period, A = 0.05, w = pi sqrt(E / rho)."""
 
+    text = case_text("manufactured_wave")
     group = "solids"
-    resolution = "cells along an edge"
 
     def __init__(
         self,
         name: str,
         title: str,
-        source: str,
         wave: StandingWave,
-        levels: dict[Level, tuple[int, ...]],
         error: tuple[float, float],
         stress: Callable[[int], float],
-        note: str,
+        note: str = "",
         solids: str = "updated",
     ) -> None:
-        """`error` and `stress` are their bounds, that of the error at n = 16 and at most resolutions."""
-        self.name, self.title, self.source, self.wave, self.solids = name, title, source, wave, solids
+        """`error` and `stress` are their bounds, that of the error at n = 16 and at most resolutions.
+
+        `note` is the name of the text with the note, by default that of the case.
+        """
+        self.name, self.title, self.wave, self.solids = name, f"Manufactured wave in a {title}", wave, solids
+        self.source = STEFFEN if len(wave.signs) == 1 else WALLSTEDT
         # What the knobs do shows with the other law.
         self.varies = ("precision",) if wave.law == "fixed_corotated" else Case.varies
-        self.levels = levels
+        self.levels = CUBE_LEVELS if len(wave.signs) == 3 else LEVELS
         total = solids == "total"
-        self.note = note if total else f"{note} {NOTE}"
+        own = case_text(note or name).note
+        self.note = own if total else f"{own} {self.text.note}"
         self.measures = (
-            Measure(
+            self.text.measure(
                 "displacement error",
-                "",
-                "RMS error of the displacement of all particles over a period, in amplitudes.",
-                bound=lambda n: _displacement(n, *error),
+                lambda n: _displacement(n, *error),
                 order=1.9,
                 expected=2.0,
                 order_to=None if total else 16,
             ),
-            Measure(
-                "largest displacement error",
-                "",
-                "The same for the worst particle and frame.",
-                bound=lambda n: 3.6 * _displacement(n, *error),
-                expected=2.0,
-            ),
-            Measure(
-                "stress error",
-                "",
-                "RMS error of the stress over a period, over E A k.",
-                bound=stress,
-                order=1.0 if total else None,
-                expected=2.0,
-            ),
+            self.text.measure("largest displacement error", lambda n: 3.6 * _displacement(n, *error), expected=2.0),
+            self.text.measure("stress error", stress, order=1.0 if total else None, expected=2.0),
         )
 
-    def tables(self, n: int) -> dict[str, Any]:
+    def tables(self, n: int) -> Tables:
         wave = self.wave
         d = len(wave.signs)
-        size, cells = [1.0] * d, [n] * d
-        velocity, force = [*wave.velocity()], [*wave.force()]
+        size, cells, velocity, force = [1.0] * d, [n] * d, wave.velocity(), wave.force()
         if d == 1:
-            size, cells = [1.0, STRIP / n], [n, STRIP]
-            velocity, force = [*velocity, 0.0], [*force, 0.0]
-        return {
-            "domain": {"size": size, "cells": cells, "walls": "slip"},
-            "time": {"end": wave.period, "frames": FRAMES},
-            "output": {"fields": ["velocity", "stress", "initial_position"]},
-            "forces": [{"acceleration": force}],
-            "bodies": [
-                {
-                    "name": "solid",
-                    "material": elastic(wave.law, wave.density, wave.young, wave.poisson),
-                    "shape": {"box": {"min": [0.0] * len(size), "max": size}},
-                    "velocity": velocity,
-                }
-            ],
-        }
+            size, cells, velocity, force = [1.0, STRIP / n], [n, STRIP], [*velocity, 0.0], [*force, 0.0]
+        solid = elastic(wave.law, wave.density, wave.young, wave.poisson)
+        return problem(
+            {"size": size, "cells": cells, "walls": "slip"},
+            (2 * math.pi / wave.frequency, FRAMES),
+            "velocity stress initial_position",
+            [body("solid", solid, box([0.0] * len(size), size), velocity=velocity)],
+            forces=[{"acceleration": force}],
+        )
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
         wave = self.wave
@@ -96,7 +179,7 @@ class ManufacturedWave(Case):
         for frame, _ in frames:
             if frame.index == 0:
                 continue
-            X = frame.fields["initial_position"].astype(np.float64)
+            X = field(frame, "initial_position")
             off = frame.position - X
             off[:, : len(wave.signs)] -= wave.displacement(X, frame.time)
             squares.append((off**2).sum(axis=1).mean())
@@ -120,71 +203,48 @@ def _displacement(n: int, at_16: float, at_32: float) -> float:
     return _second_order(n, at_16, at_32 * max(32 / n, 0.5))
 
 
+COROTATED = StandingWave("fixed_corotated", (1, -1), 1, 1000.0, 0.3)
+LEVELS: Levels = {"coarse": (8, 16), "default": (8, 16, 32, 64), "fine": (8, 16, 32, 64, 128)}
+CUBE_LEVELS: Levels = {"coarse": (12, 16), "default": (12, 16, 32), "fine": (12, 16, 32, 48)}
 STEFFEN = "Steffen, Wallstedt, Guilkey, Kirby and Berzins 2008 (CMES 31:107)"
 WALLSTEDT = "Wallstedt and Guilkey 2008 (JCP 227:9628)"
-NOTE = (
-    "The floor is that of the sums over particles, which stand for integrals: as cells of particles are stretched and "
-    "carried across the grid, their number per cell is no longer whole. It is not the walls, where the error is "
-    "smooth, nor the step, which does not move it; more particles per cell lower it."
-)
-SQUARE = (
-    "Order 2 up to n = 16; from 32 on, where particles cross cells, two particles per cell and axis leave a floor of "
-    "0.0012 of the amplitude and 3 % of the stress. With four the order is 2.0 up to n = 64 (error 0.00056)."
-)
-
 CASES = (
     ManufacturedWave(
         "mms_1d",
-        "Manufactured wave in a bar, neo-Hookean",
-        STEFFEN,
+        "bar, neo-Hookean",
         StandingWave("neo_hookean", (1,), 2, 100.0, 0.0),
-        {"coarse": (8, 16), "default": (8, 16, 32, 64), "fine": (8, 16, 32, 64, 128)},
         error=(0.0053, 0.002),
         stress=lambda n: _second_order(n, 0.0172, 0.0137),
-        note="Order 2 up to n = 16; from 32 on, where particles cross cells, two particles per cell and axis leave a "
-        "floor of 0.0008 of the amplitude and 1 % of the stress. With eight the order is 2.0 up to n = 128.",
     ),
     ManufacturedWave(
         "mms_2d_neo_hookean",
-        "Manufactured wave in a square, neo-Hookean",
-        WALLSTEDT,
+        "square, neo-Hookean",
         StandingWave("neo_hookean", (1, -1), 1, 1000.0, 0.3),
-        {"coarse": (8, 16), "default": (8, 16, 32, 64), "fine": (8, 16, 32, 64, 128)},
         error=(0.0119, 0.004),
         stress=lambda n: _second_order(n, 0.033, 0.042),
-        note=SQUARE,
+        note="mms_square",
     ),
     ManufacturedWave(
         "mms_2d_corotated",
-        "Manufactured wave in a square, fixed corotated",
-        WALLSTEDT,
-        StandingWave("fixed_corotated", (1, -1), 1, 1000.0, 0.3),
-        {"coarse": (8, 16), "default": (8, 16, 32, 64), "fine": (8, 16, 32, 64, 128)},
+        "square, fixed corotated",
+        COROTATED,
         error=(0.0132, 0.004),
         stress=lambda n: _second_order(n, 0.033, 0.042),
-        note=SQUARE,
+        note="mms_square",
     ),
     ManufacturedWave(
         "mms_2d_total",
-        "Manufactured wave in a square, total Lagrangian",
-        WALLSTEDT,
-        StandingWave("fixed_corotated", (1, -1), 1, 1000.0, 0.3),
-        {"coarse": (8, 16), "default": (8, 16, 32, 64), "fine": (8, 16, 32, 64, 128)},
+        "square, total Lagrangian",
+        COROTATED,
         error=(0.0118, 0.0),
         stress=lambda n: max(0.0326 * (16 / n) ** 2, 0.0284 * 16 / n),
-        note="No particle crosses a cell of the grid of the state at rest, and nothing leaves a floor: the error is of "
-        "order 2 up to n = 64, the stress of order 1.5 to 1.1.",
         solids="total",
     ),
     ManufacturedWave(
         "mms_3d",
-        "Manufactured wave in a cube, neo-Hookean",
-        WALLSTEDT,
+        "cube, neo-Hookean",
         StandingWave("neo_hookean", (1, -1, 1), 1, 1000.0, 0.3),
-        {"coarse": (12, 16), "default": (12, 16, 32), "fine": (12, 16, 32, 48)},
         error=(0.015, 0.005),
         stress=lambda n: _second_order(n, 0.043, 0.045),
-        note="Order 1.92 from n = 12 to 16, and 1.87 from 8 to 12, where a run has 36 steps; at 32, where particles "
-        "cross cells, two particles per cell and axis begin to leave a floor.",
     ),
 )

@@ -5,105 +5,223 @@ F = I + t L. Paths are such that principal directions and the ratios of the plas
 stress is a closed form of F at the end, for any number of steps.
 """
 
-from typing import Any
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
-from mpmcli.validation.plastic_paths import (
-    END,
-    FLUID_BLOCKS,
-    METAL_BLOCKS,
-    PASTE_BLOCKS,
-    SAND_BLOCKS,
-    SIZE,
-    SNOW_BLOCKS,
-    SWING,
-    Block,
-)
+from mpmcli.validation.case import Case, Frames, case_text
+from mpmcli.validation.measuring import field, in_middle
+from mpmcli.validation.tables import Tables, body, elastic, fluid, free_blocks, lame_moduli, problem
 
+DENSITY, YOUNG, NU = 1000.0, 1e6, 0.1
+MU, LAMBDA = lame_moduli(YOUNG, NU)
+SIZE = 0.5
 # Width of the middle that is looked at, in parts of the size, and empty cells around a block.
 MIDDLE, GAP = 0.15, 4
+# A wave runs so far until the end, in parts of the size.
+REACH = 0.2
+END = REACH * SIZE / math.sqrt((LAMBDA + 2 * MU) / DENSITY)
+# Least bound on an error: what the tails of waves, which the grid carries ahead, bring to the middle.
+LEAST = 1e-6
+
+YIELD, HARDENING = 0.02 * MU, MU
+FRICTION, COHESION = 30.0, 0.002 * MU
+COMPRESSION, STRETCH, SNOW_HARDENING = 0.025, 0.0075, 10.0
+# The paste forgets its stress 40 times until the end, and half of its stress is viscous.
+PASTE_YIELD = 0.0025 * MU
+CONSISTENCY = MU * END / 40
+BULK, BULK_VISCOSITY, VISCOSITY = MU, 0.1 * MU * END, 0.1 * MU * END
+# So soft that hardly a wave runs in it.
+SOFT = BULK / 20
+# The sand that opens swings as cos wt + s sin wt, and ends pressed by a two-hundredth.
+SWING, CLOSED = 0.5 / END, 0.995
+OPENING = (CLOSED - math.cos(SWING * END)) / math.sin(SWING * END)
+
+METAL = elastic("von_mises", DENSITY, YOUNG, NU, yield_stress=YIELD, hardening_modulus=HARDENING)
+DAMP = elastic("sand", DENSITY, YOUNG, NU, friction_angle=FRICTION, cohesion=COHESION)
+DRY = elastic("sand", DENSITY, YOUNG, NU, friction_angle=FRICTION)
+SNOW = elastic(
+    "snow", DENSITY, YOUNG, NU, critical_compression=COMPRESSION, critical_stretch=STRETCH, hardening=SNOW_HARDENING
+)
+PASTE = fluid(DENSITY, BULK, yield_stress=PASTE_YIELD, consistency=CONSISTENCY, shear_modulus=MU, law="viscoplastic")
+WATER, SOFT_WATER = fluid(DENSITY, BULK), fluid(DENSITY, SOFT)
+OIL = WATER | {"bulk_viscosity": BULK_VISCOSITY, "viscosity": VISCOSITY}
+
+
+@dataclass(frozen=True)
+class Block:
+    """One block, whose measure is the error of its Kirchhoff stress, d x d, Pa, nan where `stress` does not know it.
+
+    `motion` takes d and returns F - I at the end. The error is set over a scale, or the norm of the known stress;
+    at n = 32 it has `noise` of quadrature, which grows as n^2, and the `lag` of the step, which falls as 1/n. Where the
+    block swings, a force that is linear in the place drives it, from `motion` as rate times END.
+    """
+
+    name: str
+    material: Tables
+    motion: Callable[[int], np.ndarray]
+    stress: Callable[[np.ndarray], np.ndarray]
+    scale: float | None = None
+    noise: float = 0.0
+    lag: float = 0.0
+    swings: bool = False
+
+    def bound(self, n: int) -> float:
+        """Return the largest admissible error."""
+        return max(1.5 * (self.noise * (n / 32) ** 2 + self.lag * 32 / n), LEAST)
+
+
+def strained(last: float = 0.0, everywhere: float = 0.0, shear: float = 0.0) -> Callable[[int], np.ndarray]:
+    """Return a stretch along the last axis or all axes, with a shear of the first axis along the last."""
+
+    def motion(d: int) -> np.ndarray:
+        L = everywhere * np.eye(d)
+        L[-1, -1] += last
+        L[0, -1] += shear
+        return L
+
+    return motion
+
+
+def hardened(F: np.ndarray) -> np.ndarray:
+    """Return K ln J I and a deviator of sqrt(3/2) |s| = yield + H a, in uniaxial strain: a by consistency."""
+    strain = math.log(F[-1, -1])
+    plastic = (2 * MU * abs(strain) - YIELD) / (3 * MU + HARDENING)
+    q = math.copysign(YIELD + HARDENING * plastic, strain)
+    d = len(F)
+    return (LAMBDA + 2 / 3 * MU) * strain * np.eye(d) + q * np.diag([-1 / 3] * (d - 1) + [2 / 3])
+
+
+def pressed(F: np.ndarray) -> np.ndarray:
+    """Return the stress of damp sand on the cone, |s| = sqrt(2) (p sin(phi) + c cos(phi)), in uniaxial strain."""
+    d, phi = len(F), math.radians(FRICTION)
+    strain = math.log(F[-1, -1])
+    p = -(LAMBDA + 2 * MU / d) * strain
+    deviator = strain * (np.diag([0.0] * (d - 1) + [1.0]) - np.eye(d) / d)
+    strength = math.sqrt(2) * (p * math.sin(phi) + COHESION * math.cos(phi))
+    return deviator * strength / np.linalg.norm(deviator) - p * np.eye(d)
+
+
+def at_the_tip(F: np.ndarray) -> np.ndarray:
+    """Return the tension that damp sand bears, c cot(phi)."""
+    return COHESION / math.tan(math.radians(FRICTION)) * np.eye(len(F))
+
+
+def reopened(F: np.ndarray) -> np.ndarray:
+    """Return K ln J I: pressure since the volume is less than at the start, not since it began to fall."""
+    d = len(F)
+    return (LAMBDA + 2 * MU / d) * math.log(np.linalg.det(F)) * np.eye(d)
+
+
+def snow(F: np.ndarray) -> np.ndarray:
+    """Return h (2 mu (s - 1) s + lambda (s - 1) s) along the axis, h = exp(xi (1 - J/s)), s within its bounds."""
+    d, J = len(F), F[-1, -1]
+    s = min(max(J, 1 - COMPRESSION), 1 + STRETCH)
+    part = math.exp(SNOW_HARDENING * (1 - J / s)) * (s - 1) * s
+    return part * (LAMBDA * np.eye(d) + np.diag([0.0] * (d - 1) + [2 * MU]))
+
+
+def flowing(F: np.ndarray) -> np.ndarray:
+    """Return a shear stress of the yield stress and consistency times the shear rate; normal stresses are left open."""
+    d = len(F)
+    tau = np.full((d, d), np.nan)
+    tau[0, -1] = tau[-1, 0] = PASTE_YIELD + CONSISTENCY * F[0, -1] / END
+    return tau
+
+
+def resting(F: np.ndarray) -> np.ndarray:
+    """Return K (J - 1) I + G dev(J^(-2/d) F F^T)."""
+    d, J = len(F), np.linalg.det(F)
+    b = F @ F.T * J ** (-2 / d)
+    return BULK * (J - 1) * np.eye(d) + MU * (b - np.trace(b) / d * np.eye(d))
+
+
+def squeezed(F: np.ndarray) -> np.ndarray:
+    """Return (K (J - 1) + (bulk viscosity - 2/3 viscosity) tr C) I + viscosity (C + C^T); C as it is at the end."""
+    d, J = len(F), np.linalg.det(F)
+    C = (F - np.eye(d)) @ np.linalg.inv(F) / END
+    spherical = BULK * (J - 1) + (BULK_VISCOSITY - 2 / 3 * VISCOSITY) * np.trace(C)
+    return spherical * np.eye(d) + VISCOSITY * (C + C.T)
+
+
+def compressed(F: np.ndarray) -> np.ndarray:
+    """Return K (J - 1) I, of the soft fluid."""
+    return SOFT * (np.linalg.det(F) - 1) * np.eye(len(F))
+
+
+BLOCKS = (
+    Block("hardening", METAL, strained(-0.03), hardened, noise=2.9e-4),
+    Block("cohesion", DAMP, strained(-0.01), pressed, noise=1.4e-5),
+    Block("tension", DAMP, strained(everywhere=0.01), at_the_tip),
+    Block("reopened", DRY, strained(everywhere=SWING * END * OPENING), reopened, swings=True),
+    Block("packed snow", SNOW, strained(-0.05), snow, noise=8.2e-4),
+    Block("torn snow", SNOW, strained(0.02), snow, noise=1.5e-5),
+    Block("paste that flows", PASTE, strained(shear=0.1), flowing, lag=1.3e-4),
+    Block("paste at rest", PASTE, strained(-0.001, shear=0.6 * PASTE_YIELD / MU), resting),
+    Block("viscous fluid", OIL, strained(-0.005), squeezed, lag=5.3e-5),
+    Block("soft fluid", SOFT_WATER, strained(-0.05), compressed, noise=4.5e-5),
+    Block("opened fluid", WATER, strained(everywhere=0.01), np.zeros_like, scale=BULK / 100),
+)
 
 
 class PlasticBlocks(Case):
     """v = L (x - c) in free blocks of one law, a path each."""
 
+    text = case_text("plastic_blocks")
     group = "plastic"
-    source = "Closed forms of the law at F = I + t L (docs/theory.md, 5)"
-    resolution = "cells across a block"
     varies = ("precision",)
-    note = (
-        "A check of the law in the solver, with hardly any discretisation in it. As particles come closer to each "
-        "other, sums over them are no longer exact, and homogeneous stress makes small forces, in proportion to 1/h; "
-        "the strain that they cause until the end is in proportion to 1/h^2. Stress that depends on the rate of "
-        "deformation is first order in the step."
-    )
 
-    def __init__(self, law: str, title: str, dimension: int, blocks: tuple[Block, ...]) -> None:
-        self.name = f"{law}_blocks" + ("_3d" if dimension == 3 else "")
+    def __init__(self, name: str, law: str, title: str, dimension: int = 2) -> None:
+        self.name = f"{name}_blocks" + ("_3d" if dimension == 3 else "")
         self.title = title + (" in 3D" if dimension == 3 else "")
-        self.dimension, self.blocks = dimension, blocks
+        self.dimension = dimension
+        self.blocks = tuple(block for block in BLOCKS if block.material["law"] == law)
         coarse, usual, fine = (32, 64, 128) if dimension == 2 else (16, 24, 32)
         self.levels = {"coarse": (coarse,), "default": (coarse, usual), "fine": (coarse, usual, fine)}
-        self.measures = tuple(
-            Measure(block.name, "", block.text, bound=block.bound, single=lambda n: 2e-4) for block in blocks
-        )
+        self.measures = tuple(self.text.measure(block.name, block.bound, rounding=2e-4) for block in self.blocks)
 
-    def tables(self, n: int) -> dict[str, Any]:
-        d, h = self.dimension, SIZE / n
-        cells = [n + 2 * GAP] * (d - 1) + [len(self.blocks) * (n + GAP) + GAP]
+    def tables(self, n: int) -> Tables:
+        d = self.dimension
+        domain, shapes = free_blocks(n, SIZE, len(self.blocks), [GAP] * d)
         bodies, forces = [], []
-        for k, block in enumerate(self.blocks):
-            low = [GAP * h] * (d - 1) + [(GAP + k * (n + GAP)) * h]
-            bodies.append(
-                {
-                    "name": block.name,
-                    "material": block.material,
-                    "shape": {"box": {"min": low, "max": [x + SIZE for x in low]}},
-                    "velocity_gradient": (block.motion(d) / END).tolist(),
-                }
-            )
+        for block, shape in zip(self.blocks, shapes, strict=True):
+            rate = (block.motion(d) / END).tolist()
+            bodies.append(body(block.name, block.material, shape, velocity_gradient=rate))
             if block.swings:
-                pull = [f"{-(SWING**2)!r} * ({axis} - {x + SIZE / 2!r})" for axis, x in zip("xyz", low, strict=False)]
+                places = zip("xyz", shape["box"]["min"], strict=False)
+                pull = [f"{-(SWING**2)!r} * ({axis} - {x + SIZE / 2!r})" for axis, x in places]
                 forces.append({"body": block.name, "acceleration": pull})
-        return {
-            "domain": {"size": [count * h for count in cells], "cells": cells, "walls": "separate"},
-            "time": {"end": END, "frames": 1},
-            "output": {"fields": ["stress", "initial_position"]},
-            "bodies": bodies,
-            "forces": forces,
-        }
+        return problem(domain, (END, 1), "stress initial_position", bodies, forces=forces)
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
-        for frame, _ in frames:
-            last = frame
+        *_, (last, _) = frames
         d = self.dimension
-        place = last.fields["initial_position"].astype(np.float64)
-        stress = last.fields["stress"].astype(np.float64).reshape(-1, 3, 3)[:, :d, :d]
-        found = {}
+        start = field(last, "initial_position")
+        stress = field(last, "stress").reshape(-1, 3, 3)[:, :d, :d]
+        values = {}
         for k, block in enumerate(self.blocks):
-            off = place - np.mean(scene.bodies[k].shape.form.bounds(), axis=0)
-            middle = (last.body == k) & (np.abs(off).max(axis=1) < MIDDLE * SIZE / 2)
+            middle = in_middle(last, scene, k, MIDDLE * SIZE)
             F = np.eye(d) + block.motion(d)
             if block.swings:
                 # As the places have it: the force, step by step, leaves it off by (swing dt)^2.
                 x = last.position[middle, 0].astype(np.float64)
-                F = np.polyfit(place[middle, 0], x, 1)[0] * np.eye(d)
+                F = np.polyfit(start[middle, 0], x, 1)[0] * np.eye(d)
             known = block.stress(F)
             off_by = (np.linalg.det(F) * stress[middle].mean(axis=0) - known)[np.isfinite(known)]
             scale = block.scale or np.linalg.norm(known[np.isfinite(known)])
-            found[block.name] = float(np.linalg.norm(off_by) / scale)
-        return found
+            values[block.name] = float(np.linalg.norm(off_by) / scale)
+        return values
 
 
 CASES = (
-    PlasticBlocks("metal", "Free blocks of a metal that hardens", 2, METAL_BLOCKS),
-    PlasticBlocks("metal", "Free blocks of a metal that hardens", 3, METAL_BLOCKS),
-    PlasticBlocks("sand", "Free blocks of sand", 2, SAND_BLOCKS),
-    PlasticBlocks("sand", "Free blocks of sand", 3, SAND_BLOCKS),
-    PlasticBlocks("snow", "Free blocks of snow", 2, SNOW_BLOCKS),
-    PlasticBlocks("paste", "Free blocks of a Bingham fluid", 2, PASTE_BLOCKS),
-    PlasticBlocks("fluid", "Free blocks of a fluid", 2, FLUID_BLOCKS),
+    PlasticBlocks("metal", "von_mises", "Free blocks of a metal that hardens"),
+    PlasticBlocks("metal", "von_mises", "Free blocks of a metal that hardens", 3),
+    PlasticBlocks("sand", "sand", "Free blocks of sand"),
+    PlasticBlocks("sand", "sand", "Free blocks of sand", 3),
+    PlasticBlocks("snow", "snow", "Free blocks of snow"),
+    PlasticBlocks("paste", "viscoplastic", "Free blocks of a Bingham fluid"),
+    PlasticBlocks("fluid", "fluid", "Free blocks of a fluid"),
 )

@@ -1,12 +1,13 @@
 """An elastic disc that turns, stretched by its own turning: what ten turns take from it."""
 
 import math
-from typing import Any
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure, elastic
+from mpmcli.validation.case import Case, Frames, case_text
+from mpmcli.validation.measuring import field
+from mpmcli.validation.tables import Tables, ball, body, elastic, problem
 
 RADIUS, YOUNG, POISSON, DENSITY, SPIN = 0.5, 1e6, 0.3, 1000.0, 5.0
 TURNS, FRAMES_PER_TURN = 10, 8
@@ -22,65 +23,34 @@ class SpinningDisc(Case):
     F is I plus the gradient of the plane-strain solution, taken where the particles start.
     """
 
-    name = "spinning_disc"
+    text = case_text("spinning_disc")
+    name, title, group = "spinning_disc", "Spinning elastic disc", "invariants"
     varies = ("precision", "kernel", "transfer", "per_axis")
-    title = "Spinning elastic disc"
-    group = "invariants"
-    source = "Timoshenko and Goodier 1970 (rotating disc); Jiang et al. 2017 (conservation)"
-    resolution = "cells along the radius"
     levels = {"coarse": (4, 8), "default": (4, 8, 16), "fine": (4, 8, 16, 32)}  # noqa: RUF012
     measures = (
-        Measure(
-            "energy loss",
-            "",
-            "Kinetic energy lost in ten turns, over what it was.",
-            bound=lambda n: 1.4 * (9e-4 / n + 3e-5),
-        ),
-        Measure(
-            "angle error",
-            "",
-            "Angle turned in ten turns over spin times time, less 1.",
-            bound=lambda n: 1.4 * (7.8e-4 / n + 5e-6),
-        ),
-        Measure(
-            "angular momentum",
-            "",
-            "Change of the angular momentum in ten turns, over what it was.",
-            bound=lambda n: 1e-13,
-        ),
-    )
-    note = (
-        "Angular momentum stays, so energy and angle follow the moment of inertia: what is lost shows in the disc "
-        "growing, by a tenth of its own stretch of 8e-4 at 8 cells, as its outermost particles lose stress (see "
-        "cantilever)."
+        text.measure("energy loss", lambda n: 1.4 * (9e-4 / n + 3e-5)),
+        text.measure("angle error", lambda n: 1.4 * (7.8e-4 / n + 5e-6)),
+        text.measure("angular momentum", 1e-13),
     )
 
-    def tables(self, n: int) -> dict[str, Any]:
+    def tables(self, n: int) -> Tables:
         k, R = STRETCH, RADIUS
         radial = f"1 + {k!r} * ({(3 - 2 * POISSON) * R**2!r} - X**2 - Y**2"
         cross = f"{-2 * k!r} * X * Y"
-        return {
-            "domain": {"origin": [-HALF, -HALF], "size": [2 * HALF, 2 * HALF], "spacing": RADIUS / n},
-            "time": {
-                "end": TURNS * 2 * math.pi / SPIN,
-                "frames": TURNS * FRAMES_PER_TURN,
-            },
-            "output": {"fields": ["initial_position"]},
-            "bodies": [
-                {
-                    "name": "disc",
-                    "material": elastic("neo_hookean", DENSITY, YOUNG, POISSON),
-                    "shape": {"ball": {"center": [0.0, 0.0], "radius": RADIUS}},
-                    "velocity_gradient": [[0.0, -SPIN], [SPIN, 0.0]],
-                    "deformation": [[f"{radial} - 2 * X**2)", cross], [cross, f"{radial} - 2 * Y**2)"]],
-                }
-            ],
-        }
+        disc = body(
+            "disc",
+            elastic("neo_hookean", DENSITY, YOUNG, POISSON),
+            ball([0.0, 0.0], RADIUS),
+            velocity_gradient=[[0.0, -SPIN], [SPIN, 0.0]],
+            deformation=[[f"{radial} - 2 * X**2)", cross], [cross, f"{radial} - 2 * Y**2)"]],
+        )
+        domain = {"origin": [-HALF, -HALF], "size": [2 * HALF, 2 * HALF], "spacing": RADIUS / n}
+        return problem(domain, (TURNS * 2 * math.pi / SPIN, TURNS * FRAMES_PER_TURN), "initial_position", [disc])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
         kinetic, momentum, turned, last = [], [], 0.0, 0.0
         for frame, row in frames:
-            X = frame.fields["initial_position"].astype(np.float64)
+            X = field(frame, "initial_position")
             x = frame.position.astype(np.float64)
             angle = math.atan2(float((X[:, 0] * x[:, 1] - X[:, 1] * x[:, 0]).sum()), float((X * x).sum()))
             turned += (angle - last) % (2 * math.pi) if frame.index else 0.0

@@ -1,19 +1,47 @@
 """A Taylor-Green vortex in a slip box: viscosity, that of the fluid and that of the transfers."""
 
 import math
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure
-from mpmcli.validation.transfer_loss import apic_factor
+from mpmcli.validation.case import Case, Frames, case_text
+from mpmcli.validation.tables import Tables, body, box, fluid, problem
 
 # L = 1 m, U = 1 m/s, density 1 kg/m^3.
 VISCOSITY, SOUND, PRESSURE, END, FRAMES = 0.01, 20.0, 1.0, 1.0, 20
 K = math.pi
+# Nodes of a stencil relative to the central one, in cells.
+NODES = np.arange(-1, 2)
 # Decay rate of kinetic energy, 1/s.
 DECAY = 4 * VISCOSITY * K**2
+
+
+def apic_factor(angles: Sequence[float], places: np.ndarray | None = None) -> float:
+    """Return the amplification factor of a velocity wave exp(i k.x) in a step without forces, with quadratic weights.
+
+    Nodes hold one number per wave, so that a step multiplies it: with the weights w_i and the levers x_i - x_p in
+    cells, by the mean over particles of |sum w_i e_i|^2 + 4 |sum w_i (x_i - x_p) e_i|^2, e_i = exp(i k.x_i). On a
+    lattice it is a product over axes: A A + A B + B A in 2D. Hence 1 - 0.024 (kh)^4 along an axis, and
+    1 - 0.110 (kh)^4 for the wave vector (k, k) (docs/theory.md, 2.4). `angles` are k h along each axis, `places` those
+    of particles along each axis, in cells from the nearest node; uniform by default.
+    """
+    if places is None:
+        # Polynomials of the sixth degree in the place: four points of Gauss are exact.
+        points, parts = np.polynomial.legendre.leggauss(4)
+        places, parts = points / 2, parts / 2
+    else:
+        parts = np.full(len(places), 1 / len(places))
+    x = np.asarray(places)[:, None]
+    weights = np.concatenate([(0.5 - x) ** 2 / 2, 0.75 - x**2, (0.5 + x) ** 2 / 2], axis=1)
+    factor, affine = 1.0, 0.0
+    for angle in angles:
+        waves = weights * np.exp(1j * angle * NODES)
+        A = parts @ np.abs(waves.sum(1)) ** 2
+        B = 4 * parts @ np.abs((waves * (NODES - x)).sum(1)) ** 2
+        factor, affine = factor * A, affine * A + factor * B
+    return float(factor + affine)
 
 
 def predicted_decay(h: float, step: float) -> float:
@@ -29,71 +57,30 @@ def excess(n: int) -> float:
 class TaylorGreen(Case):
     """v = (sin kx cos ky, -cos kx sin ky) exp(-2 nu k^2 t), k = pi, p = p_b + (cos 2kx + cos 2ky)/4 at the start."""
 
-    name = "taylor_green"
-    title = "Taylor-Green vortex"
-    group = "fluids"
-    source = "Taylor and Green 1937 (Proc. R. Soc. A 158:499), a cell of it between slip walls"
-    resolution = "cells along the box"
+    text = case_text("taylor_green")
+    name, title, group = "taylor_green", "Taylor-Green vortex", "fluids"
     levels = {"coarse": (16, 32), "default": (16, 32, 64), "fine": (32, 64, 128)}  # noqa: RUF012
     measures = (
-        Measure(
-            "decay error",
-            "",
-            "Rate at which kinetic energy decays until t = 1 s, over that of viscosity, 4 nu k^2, less 1.",
-            bound=lambda n: 1.05 * excess(n) + 0.014,
-            order=0.9,
-            expected=3.0,
-        ),
-        Measure(
-            "decay unexplained",
-            "",
-            "The same rate over that of viscosity and of the transfers of APIC as predicted, less 1.",
-            bound=lambda n: 0.02 * (16 / n) ** 0.6,
-        ),
-        Measure(
-            "velocity error",
-            "",
-            "Mean of |v - exact| at t = 1 s over the mean of |exact|.",
-            # What the transfers take until then, and the noise of the particles.
-            bound=lambda n: 1.25 * (1 - math.exp(-0.5 * DECAY * END * excess(n))) + 0.25 / n,
-        ),
-    )
-    note = (
-        "APIC damps this wave by 0.110 (kh)^4 in each step, more in all the shorter the steps; the prediction takes "
-        "the factor of the transfers in full. Particles start at random places in their cells. From a lattice the "
-        "decay is right to 1 % until t = 0.3 s, too, but the flow stretches it by exp(pi t) at the corners, and from "
-        "t = ln(3)/pi = 0.35 s on, with rows more than 1.5 h apart there, it is torn into sheets: until t = 1 s the "
-        "rate is then 6 % too high at 32 cells and 12 % at 64; with the cut-off of tension, which books every gap as "
-        "a loss of volume, 38 % and 57 %. From random places the cut-off costs less than 1 %."
+        text.measure("decay error", lambda n: 1.05 * excess(n) + 0.014, order=0.9, expected=3.0),
+        text.measure("decay unexplained", lambda n: 0.02 * (16 / n) ** 0.6),
+        # What the transfers take until then, and the noise of the particles.
+        text.measure("velocity error", lambda n: 1.25 * (1 - math.exp(-0.5 * DECAY * END * excess(n))) + 0.25 / n),
     )
 
-    def tables(self, n: int) -> dict[str, Any]:
+    def tables(self, n: int) -> Tables:
         modulus = SOUND**2
-        return {
-            "domain": {"size": [1.0, 1.0], "cells": [n, n], "gravity": [0.0, 0.0], "walls": "slip"},
-            "time": {"end": END, "frames": FRAMES},
-            "output": {"fields": ["velocity"]},
-            "bodies": [
-                {
-                    "name": "fluid",
-                    "material": {
-                        "law": "fluid",
-                        "density": 1.0,
-                        "bulk_modulus": modulus,
-                        "viscosity": VISCOSITY,
-                        # The flow takes none; the noise of the particles' pressures must not be cut on one side.
-                        "tension_cutoff": False,
-                    },
-                    "shape": {"box": {"min": [0.0, 0.0], "max": [1.0, 1.0]}},
-                    "velocity": ["sin(pi * X) * cos(pi * Y)", "-cos(pi * X) * sin(pi * Y)"],
-                    # p = K (1/J - 1), pressed enough to stay so everywhere.
-                    "deformation": (
-                        f"1 / (1 + ({PRESSURE!r} + 0.25 * (cos(2 * pi * X) + cos(2 * pi * Y))) / {modulus!r})"
-                    ),
-                    "sampling": "jittered",
-                }
-            ],
-        }
+        vortex = body(
+            "fluid",
+            # The flow takes no tension; the noise of the particles' pressures must not be cut on one side.
+            fluid(1.0, modulus, viscosity=VISCOSITY, tension_cutoff=False),
+            box([0.0, 0.0], [1.0, 1.0]),
+            velocity=["sin(pi * X) * cos(pi * Y)", "-cos(pi * X) * sin(pi * Y)"],
+            # p = K (1/J - 1), pressed enough to stay so everywhere.
+            deformation=f"1 / (1 + ({PRESSURE!r} + 0.25 * (cos(2 * pi * X) + cos(2 * pi * Y))) / {modulus!r})",
+            sampling="jittered",
+        )
+        domain = {"size": [1.0, 1.0], "cells": [n, n], "gravity": [0.0, 0.0], "walls": "slip"}
+        return problem(domain, (END, FRAMES), "velocity", [vortex])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
         times, energies, steps = [], [], 0

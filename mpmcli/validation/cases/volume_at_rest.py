@@ -1,12 +1,13 @@
 """Liquids and sand that are thrown, dropped and stirred, and must fill at rest what they filled at first."""
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Level, Measure
+from mpmcli.validation.case import Case, Frames, Levels, case_text
+from mpmcli.validation.tables import Tables, body, box, problem
 
 GRAVITY = 9.81
 WATER = {"law": "fluid", "density": 1000.0}
@@ -18,43 +19,35 @@ TOLERANCE = 0.02
 class VolumeAtRest(Case):
     """The depth of a pool when it is quiet again, over what its volume amounts to between walls.
 
-    Attributes:
-        depth: of the material at rest, m; width: between the walls, m.
-        cells: of the width at resolution 1; up: height of the domain in cells, at resolution 1.
-        start, end: of the time over which the depth is averaged, s.
-        frames: of the whole run.
+    The depth is averaged from `start`, s, to the end. `h` and `cells` are those of the domain at resolution 1, `time`
+    the end and the number of frames; `width`, `height` and `state` describe the body, a box in the lower left corner.
     """
 
-    resolution = "cells per unit of the box"
+    text = case_text("volume_at_rest")
     varies: ClassVar[tuple[str, ...]] = ()
-    measures = (
-        Measure(
-            "volume error",
-            "",
-            "Depth of the pool at rest, twice the mean height less what its motion adds to that, over the depth that "
-            "its volume amounts to, less 1; the mean over the last frames.",
-            bound=lambda n: TOLERANCE,
-        ),
-    )
-    source = "Conservation of volume: a liquid fills at rest what it filled at first"
-    levels: ClassVar[dict[Level, tuple[int, ...]]] = {"coarse": (1,), "default": (1, 2), "fine": (1, 2)}
+    measures = (text.measure("volume error", TOLERANCE),)
+    levels: ClassVar[Levels] = {"coarse": (1,), "default": (1, 2), "fine": (1, 2)}
     depth: ClassVar[float]
     start: ClassVar[float]
+    h: ClassVar[float] = 1 / 32
+    cells: ClassVar[tuple[int, int]]
+    walls: ClassVar[str | Tables] = "separate"
+    time: ClassVar[tuple[float, int]]
+    material: ClassVar[Tables] = WATER
+    width: ClassVar[float]
+    height: ClassVar[float]
+    state: ClassVar[Tables] = {"initial_pressure": "hydrostatic"}
+    forces: ClassVar[tuple[Tables, ...]] = ()
 
-    def pool(self, n: int, h: float, cells: tuple[int, int], end: float, frames: int, **more: Any) -> dict[str, Any]:
-        """Return the tables of a scene of these cells at resolution 1, its spacing there h, m."""
-        size = [count * h for count in cells]
-        return {
-            "domain": {
-                "size": size,
-                "cells": [n * count for count in cells],
-                "gravity": [0.0, -GRAVITY],
-                "walls": more.pop("walls", "slip"),
-            },
-            "time": {"end": end, "frames": frames},
-            "output": {"fields": ["velocity"]},
-            **more,
+    def tables(self, n: int) -> Tables:
+        block = body("material", self.material, box([0.0, 0.0], [self.width, self.height]), **self.state)
+        domain = {
+            "size": [count * self.h for count in self.cells],
+            "cells": [n * count for count in self.cells],
+            "gravity": [0.0, -GRAVITY],
+            "walls": self.walls,
         }
+        return problem(domain, self.time, "velocity", [block], forces=[*self.forces])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
         # A small wave has as much potential energy, above that of the level, as kinetic energy.
@@ -68,79 +61,50 @@ class VolumeAtRest(Case):
         return {"volume error": 2 * float(np.average(heights, weights=window)) / self.depth - 1}
 
 
-def block(material: dict[str, Any], width: float, height: float, **more: Any) -> list[dict[str, Any]]:
-    """Return the only body of a scene: a box in the lower left corner."""
-    box = {"min": [0.0, 0.0], "max": [width, height]}
-    return [{"name": "material", "material": material, "shape": {"box": box}, **more}]
-
-
 class Toss(VolumeAtRest):
     """A pool 0.6 m wide and 0.3 m deep, thrown up by v = 2 Y/0.3 m/s: it opens everywhere, and falls back."""
 
-    name = "toss"
-    title = "Water tossed up"
-    group = "fluids"
+    text = case_text("toss")
+    name, title, group = "toss", "Water tossed up", "fluids"
     varies = ("precision", "per_axis", "safety")
     depth, start = 0.3, 0.6
-    note = (
-        "Where opening is forgotten at the tension cut-off, closing makes pressure at once and nothing ever closes: "
-        "the pool stays 45 % too deep, at any spacing and with any number of particles."
-    )
-
-    def tables(self, n: int) -> dict[str, Any]:
-        bodies = block(WATER, 0.6, self.depth, velocity=["0", "2*Y/0.3"])
-        return self.pool(n, 0.025, (24, 40), 1.0, 40, bodies=bodies)
+    h, cells, walls, time = 0.025, (24, 40), "slip", (1.0, 40)
+    width, height, state = 0.6, 0.3, {"velocity": ["0", "2*Y/0.3"]}
 
 
 class SandToss(VolumeAtRest):
     """A layer of sand 0.4 m wide and 0.2 m deep, thrown up by v = 4 Y/0.2 m/s: its grains part, and rain down."""
 
-    name = "sand_toss"
-    title = "Sand tossed up"
-    group = "plastic"
+    text = case_text("sand_toss")
+    name, title, group = "sand_toss", "Sand tossed up", "plastic"
     varies = ("precision", "per_axis", "safety")
     depth, start = 0.2, 1.1
+    h, cells, walls, time = 0.025, (16, 56), {"default": "slip", "y_min": "stick"}, (1.3, 26)
+    material, width, height, state = SAND, 0.4, 0.2, {"velocity": ["0", "4*Y/0.2"]}
     # Where grains fall among others rounding decides: what comes of it differs by as much as between lattices.
-    measures = tuple(replace(measure, single=lambda n: TOLERANCE) for measure in VolumeAtRest.measures)
-    source = "Conservation of volume: sand that sheared no further fills at rest what it filled at first"
-    note = (
-        "Velocity gradients no longer say how far apart scattered grains are. Where nothing else says when they have "
-        "closed up, they bear pressure up to a cell early, and the layer is a third too deep."
-    )
-
-    def tables(self, n: int) -> dict[str, Any]:
-        bodies = block(SAND, 0.4, self.depth, velocity=["0", "4*Y/0.2"])
-        return self.pool(n, 0.025, (16, 56), 1.3, 26, walls={"default": "slip", "y_min": "stick"}, bodies=bodies)
+    measures = tuple(replace(measure, rounding=TOLERANCE) for measure in VolumeAtRest.measures)
 
 
 class DamAtRest(VolumeAtRest):
     """The dam break of a column 0.25 m wide and 0.5 m high in a tank 1 m long, until it is quiet."""
 
-    name = "dam_at_rest"
-    title = "Dam break, at rest again"
-    group = "fluids"
+    name, title, group = "dam_at_rest", "Dam break, at rest again", "fluids"
     depth, start = 0.125, 8.0
+    cells, time = (32, 32), (12.0, 240)
+    width, height = 0.25, 0.5
     note = "Without relaxation towards the density of the grid a tenth of the volume is gone."
-
-    def tables(self, n: int) -> dict[str, Any]:
-        bodies = block(WATER, 0.25, 0.5, initial_pressure="hydrostatic")
-        return self.pool(n, 1 / 32, (32, 32), 12.0, 240, walls="separate", bodies=bodies)
 
 
 class StirredPool(VolumeAtRest):
     """A pool 1 m wide and six cells deep, rocked for 30 s near its lowest frequency, after 36 s."""
 
-    name = "stirred_pool"
-    title = "Stirred pool"
-    group = "fluids"
+    name, title, group = "stirred_pool", "Stirred pool", "fluids"
     levels = {"coarse": (1,), "default": (1,), "fine": (1, 2)}  # noqa: RUF012
     depth, start = 6 / 32, 31.0
+    cells, time = (32, 16), (36.0, 720)
+    width, height = 1.0, 6 / 32
+    forces = ({"acceleration": ["sin(4.04 * t) if t < 30 else 0", 0.0]},)
     note = "Without relaxation towards the density of the grid a sixth of the volume is gone."
-
-    def tables(self, n: int) -> dict[str, Any]:
-        bodies = block(WATER, 1.0, self.depth, initial_pressure="hydrostatic")
-        forces = [{"acceleration": ["sin(4.04 * t) if t < 30 else 0", 0.0]}]
-        return self.pool(n, 1 / 32, (32, 16), 36.0, 720, walls="separate", bodies=bodies, forces=forces)
 
 
 CASES = (Toss(), SandToss(), DamAtRest(), StirredPool())

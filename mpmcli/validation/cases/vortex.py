@@ -1,12 +1,13 @@
 """The generalized vortex: a ring of a disc is sheared far and back by a body force, with nothing at its surface."""
 
 import math
-from typing import Any
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Level, Measure, elastic
+from mpmcli.validation.case import Case, Frames, Levels, case_text
+from mpmcli.validation.measuring import field
+from mpmcli.validation.tables import Tables, ball, body, elastic, problem
 
 # Inner and outer radius of the ring, m; the outer one is that of the disc.
 INNER, OUTER = 0.75, 1.25
@@ -61,56 +62,32 @@ def body_force() -> list[str]:
 class Vortex(Case):
     """Circles between R = 0.75 and 1.25 m turn by alpha(R, t) and back; what lies inside them stays at rest."""
 
-    name = "vortex"
-    title = "Large shear and back: the generalized vortex"
-    group = "solids"
+    text = case_text("vortex")
+    name, title, group = "vortex", "Large shear and back: the generalized vortex", "solids"
     solids = "total"
     varies = ("precision", "transfer", "per_axis", "safety")
-    resolution = "cells across the ring"
-    levels: dict[Level, tuple[int, ...]] = {"coarse": (4, 8), "default": (4, 8, 16), "fine": (4, 8, 16)}  # noqa: RUF012
+    levels: Levels = {"coarse": (4, 8), "default": (4, 8, 16), "fine": (4, 8, 16)}  # noqa: RUF012
     measures = (
-        Measure(
-            "error at the end",
-            "",
-            "RMS error of the places of all particles when they are back, over the largest displacement.",
-            bound=lambda n: 1.3 * 0.0299 * (8 / n) ** 1.8 if n >= 8 else 0.25,
-            order=1.7,
-            expected=2.0,
+        text.measure(
+            "error at the end", lambda n: 1.3 * 0.0299 * (8 / n) ** 1.8 if n >= 8 else 0.25, order=1.7, expected=2.0
         ),
-        Measure(
-            "displacement error",
-            "",
-            "The same over all frames.",
-            bound=lambda n: 0.036 * (8 / n) ** 1.8 if n >= 8 else 0.15,
-        ),
-    )
-    source = "Kamojjala, Brannon, Sadeghirad and Guilkey 2015 (Eng. with Computers 31:193), the generalized vortex"
-    note = (
-        'With solids = "updated" the error at the end is 19, 3 and 31 % at 4, 8 and 16 cells: it grows once particles '
-        "of the sheared ring stand about a cell apart, which feeds what the grid does not see; with a step eight times "
-        "as short it is 1.2 % at 16 cells."
+        text.measure("displacement error", lambda n: 0.036 * (8 / n) ** 1.8 if n >= 8 else 0.15),
     )
 
-    def tables(self, n: int) -> dict[str, Any]:
+    def tables(self, n: int) -> Tables:
         edge = OUTER + MARGIN
-        return {
-            "domain": {"origin": [-edge, -edge], "size": [2 * edge, 2 * edge], "spacing": 2 * HALF / n},
-            "time": {"end": PERIOD, "frames": FRAMES},
-            "output": {"fields": ["initial_position"]},
-            "forces": [{"acceleration": body_force()}],
-            "bodies": [
-                {
-                    "name": "disc",
-                    "material": elastic("neo_hookean", DENSITY, YOUNG, POISSON),
-                    "shape": {"ball": {"center": [0.0, 0.0], "radius": OUTER}},
-                }
-            ],
-        }
+        return problem(
+            {"origin": [-edge, -edge], "size": [2 * edge, 2 * edge], "spacing": 2 * HALF / n},
+            (PERIOD, FRAMES),
+            "initial_position",
+            [body("disc", elastic("neo_hookean", DENSITY, YOUNG, POISSON), ball([0.0, 0.0], OUTER))],
+            forces=[{"acceleration": body_force()}],
+        )
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
         squares = []
         for frame, _ in frames:
-            X = frame.fields["initial_position"].astype(np.float64)
+            X = field(frame, "initial_position")
             alpha = turn(np.hypot(*X.T), frame.time)
             place = np.stack(
                 [X[:, 0] * np.cos(alpha) - X[:, 1] * np.sin(alpha), X[:, 1] * np.cos(alpha) + X[:, 0] * np.sin(alpha)],

@@ -1,0 +1,271 @@
+"""`mpmcli check`, `mpmcli info`, `mpmcli repair` and `mpmcli doctor`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from mpmcli.cli.options import COUNT, PATH, json_option, plugin_option, set_option
+from mpmcli.cli.streams import print_answer, print_json, print_text
+from mpmcli.errors import InputError
+
+if TYPE_CHECKING:
+    from mpmcli.check.scene_check import SceneCheck
+    from mpmcli.dataset.report import Verification as DatasetVerification
+    from mpmcli.output.verify import Verification
+
+
+@click.command("check")
+@click.argument("path", type=PATH)
+@set_option
+@plugin_option
+@click.option("--no-probe", is_flag=True, help="Skip the run of two seconds that measures the time of a step.")
+@click.option("--strict", is_flag=True, help="Treat warnings as errors.")
+@click.option("--threads", type=COUNT, help="CPU threads; all of them by default.")
+@json_option
+def check_command(path: Path, strict: bool, as_json: bool, **of_scene: object) -> int:
+    """Check a scene (PATH.toml): the stable step and its cause, likely faults, and the cost of the run.
+
+    Or check whether a result is stable and complete: its directory, particles.vtkhdf or particles.pvd. Nothing is
+    written. The exit code is 1 if there is an error, or with --strict a warning.
+    """
+    if path.suffix == ".toml":
+        check = _check_scene(path, **of_scene)
+    else:
+        options = {"overrides": "--set", "plugins": "--plugin", "no_probe": "--no-probe", "threads": "--threads"}
+        given = [option for name, option in options.items() if of_scene[name]]
+        if given:
+            raise InputError(f"{given[0]} is for scenes, and {path} is none; leave it out.")
+        from mpmcli.check.result_check import check_result
+
+        check = check_result(path)
+    if as_json:
+        print_json({**check.as_dict(), "ok": check.passes(strict=strict)})
+    else:
+        print_text(check.text())
+    return 0 if check.passes(strict=strict) else 1
+
+
+def _check_scene(
+    path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], no_probe: bool, threads: int | None
+) -> "SceneCheck":
+    from mpmcli.check.probe import probe_scene
+    from mpmcli.check.scene_check import check_scene
+    from mpmcli.cores import available_cores
+    from mpmcli.materials.registry import load_plugins
+    from mpmcli.scene import load_scene
+    from mpmcli.solver.machine.backend import Backend
+    from mpmcli.solver.machine.plan import make_plan
+
+    loaded = load_scene(path, overrides, laws=load_plugins(plugins))
+    backend = Backend("cpu", threads or available_cores(), loaded.scene.solver.precision, compile_cache=True)
+    check = check_scene(loaded, plan=make_plan(loaded.scene, backend))
+    # A scene that does not fit into memory is not run.
+    if not no_probe and not any(finding.rule == "memory" for finding in check.findings):
+        probe, plan = probe_scene(loaded, check.forecast.steps, threads=threads)
+        check = check_scene(loaded, plan=plan, probe=probe)
+    return check
+
+
+@click.command("info")
+@click.argument("path", type=PATH)
+@set_option
+@plugin_option
+@click.option("--verify", is_flag=True, help="Read all of a result, a dataset or an export, and compare its checksums.")
+@json_option
+def info_command(
+    path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], verify: bool, as_json: bool
+) -> int | None:
+    """Say what PATH holds: a scene (.toml), or a result (its directory, particles.vtkhdf or particles.pvd).
+
+    With --verify the exit code is 1 if anything has changed since it was written, or is missing.
+    """
+    if verify:
+        if path.suffix == ".toml" or overrides or plugins:
+            raise InputError(f"--verify is for results, datasets and exports, and {path} is none; leave it out.")
+        verification = _verified(path)
+        print_answer(verification, as_json)
+        return 1 if verification.faults else 0
+    if path.suffix == ".toml":
+        facts = _scene_facts(path, overrides, plugins)
+    else:
+        if overrides or plugins:
+            option = "--set changes" if overrides else "--plugin is for"
+            raise InputError(f"{option} scenes, and {path} is none; leave it out.")
+        facts = _result_facts(path)
+    if as_json:
+        print_json(facts)
+        return None
+    known = {name: value for name, value in facts.items() if value not in (None, "", [], {})}
+    width = max(len(name) for name in known)
+    print_text("\n".join(f"{name.replace('_', ' '):<{width}}  {_plain(value)}" for name, value in known.items()))
+    return None
+
+
+def _verified(path: Path) -> "Verification | DatasetVerification":
+    from mpmcli.dataset.dataset import is_dataset
+    from mpmcli.dataset.export import is_export, verify_export
+    from mpmcli.dataset.report import verify
+    from mpmcli.output.verify import verify_result
+
+    if is_export(path):
+        return verify_export(path)
+    return verify(path) if is_dataset(path) else verify_result(path)
+
+
+def _scene_facts(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...]) -> dict:
+    from mpmcli.materials.registry import load_plugins
+    from mpmcli.scene import load_scene
+    from mpmcli.solver.machine.backend import Backend
+    from mpmcli.solver.machine.plan import make_plan
+
+    loaded = load_scene(path, overrides, laws=load_plugins(plugins))
+    scene = loaded.scene
+    plan = make_plan(scene, Backend("cpu", 1, scene.solver.precision, True))
+    return {
+        "title": scene.title,
+        "dimension": scene.dimension,
+        "size_m": list(scene.domain.size),
+        "spacing_m": scene.domain.spacing,
+        "cells": list(scene.domain.cells),
+        "end_s": scene.time.end,
+        "frames": scene.time.frames + 1,
+        "bodies": [
+            f"{body.name}: {body.material.law}, {type(body.shape.form).__name__.lower()}" for body in scene.bodies
+        ],
+        "colliders": [
+            f"{collider.name}: {type(collider.form).__name__.lower()}{', moving' if collider.motion.moves else ''}"
+            for collider in scene.colliders
+        ],
+        "particles": plan.particles,
+        "bytes_per_particle": plan.bytes_per_particle,
+        "device_bytes": plan.device_bytes,
+        "fields": list(scene.output.fields),
+        "notes": list(loaded.notes),
+    }
+
+
+def _result_facts(path: Path) -> dict:
+    from mpmcli.output import open_result
+
+    result = open_result(path)
+    header, record, ledger = result.header, result.record or {}, result.ledger
+    return {
+        "title": header.title,
+        "kind": result.kind,
+        "status": result.status,
+        "frames": result.frame_count,
+        "frames_expected": record.get("frames_expected"),
+        "time_s": [float(result.times[0]), float(result.times[-1])],
+        "particles": int(result.particle_counts[-1]),
+        "dimension": result.dimension,
+        "bodies": list(header.body_names),
+        "colliders": list(header.collider_names),
+        "materials": [law.name for law in header.laws],
+        "fields": ["velocity", *result.field_names],
+        "precision": header.precision,
+        "backend": record.get("backend") or dict(header.backend) or None,
+        "steps": record.get("steps"),
+        "step_s": [
+            min((row.step_min for row in ledger[1:]), default=0.0),
+            max((row.step_max for row in ledger[1:]), default=0.0),
+        ],
+        "limits": record.get("limits", {}),
+        "energy_J": [ledger[0].energy, ledger[-1].energy],
+        "mass_kg": ledger[-1].mass,
+        "volume_ratio": [min(row.volume_ratio_min for row in ledger), max(row.volume_ratio_max for row in ledger)],
+        "timings_s": record.get("timings", {}),
+        "failure": (record.get("failure") or {}).get("message"),
+        "version": header.version,
+    }
+
+
+def _plain(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_plain(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(_plain(item) for item in value)
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+@click.command("repair")
+@click.argument("directory", type=PATH)
+@json_option
+def repair_command(directory: Path, as_json: bool) -> int:
+    """Make one readable file of the frames of a run in DIRECTORY that died, or whose files have been damaged.
+
+    The frames up to the first one that is damaged or missing are packed. What is damaged or lies beyond stays, and is
+    named. A sound result is left alone. The exit code is 1 if anything is lost.
+    """
+    from mpmcli.output.repair import repair
+
+    done = repair(directory)
+    print_answer(done, as_json)
+    return 1 if done.lost else 0
+
+
+@click.command("doctor")
+@click.option(
+    "--kernels",
+    type=PATH,
+    multiple=True,
+    metavar="SCENE",
+    help="Compare, in place of all that, the stored kernels of a scene with fresh ones. May be repeated.",
+)
+@json_option
+def doctor_command(kernels: tuple[Path, ...], as_json: bool) -> int:
+    """Say whether everything that mpmcli needs works on this machine.
+
+    Python, Taichi and its backends, VTK and its window, libraries, disk and memory are tried, each in a process of
+    its own, and get one line each, with the remedy where something is wrong. The exit code is 1 where something
+    needed is missing or broken; a GPU that is not here is neither.
+    """
+    from mpmcli.doctor.examination import EXAMINATIONS, examine
+
+    if kernels:
+        return _compare_kernels(kernels, as_json)
+    width = max(len(each.name) for each in EXAMINATIONS)
+    checks, faults = [], []
+    for name, result in examine(EXAMINATIONS):
+        checks.append({"name": name, "status": result.status, "detail": result.detail, "remedy": result.remedy})
+        faults += [name] if result.is_fault else []
+        if not as_json:
+            remedy = f"; {result.remedy}" if result.remedy else ""
+            print_text(f"{result.status:<11}  {name:<{width}}  {result.detail}{remedy}")
+    if as_json:
+        print_json({"ok": not faults, "checks": checks})
+    elif faults:
+        print_text(f"\nnot everything that mpmcli needs works: {', '.join(faults)}")
+    else:
+        print_text("\neverything that mpmcli needs works")
+    return 1 if faults else 0
+
+
+def _compare_kernels(scenes: tuple[Path, ...], as_json: bool) -> int:
+    """Run scenes with stored kernels, which are made before where there are none, and with fresh ones."""
+    from mpmcli.cli.interrupt import interrupt_came
+    from mpmcli.materials.registry import parameter_models
+    from mpmcli.scene import load_scene
+    from mpmcli.simulation.warm import STEPS, Warmed, warm
+
+    def outcome(path: Path, steps: int = 0, *, fresh: bool = False) -> Warmed:
+        return next(iter(warm([path], 1, "cpu", steps=steps, fresh=fresh, stop=interrupt_came)))
+
+    for path in scenes:
+        load_scene(path, laws=parameter_models())
+    checks = []
+    for path in scenes:
+        made, stored, fresh = outcome(path), outcome(path, STEPS), outcome(path, STEPS, fresh=True)
+        detail = next((one.fault for one in (made, stored, fresh) if one.fault), "")
+        if not detail and not stored.stored:
+            detail = "no kernel is stored, as of a law of a plugin, or where the folder cannot be written"
+        same = stored.digest == fresh.digest
+        status = "broken" if (detail and not stored.digest) or not same else "information" if detail else "ok"
+        detail = detail or f"{STEPS} steps of the stored kernel have {'the' if same else 'other'} bytes of a fresh one"
+        checks.append({"name": str(path), "status": status, "detail": detail})
+        if not as_json:
+            print_text(f"{status:<11}  {path}  {detail}")
+    broken = any(check["status"] == "broken" for check in checks)
+    if as_json:
+        print_json({"ok": not broken, "checks": checks})
+    return 1 if broken else 0

@@ -1,0 +1,152 @@
+"""`mpmcli render` and `mpmcli plot`."""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import click
+
+from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
+from mpmcli.cli.options import COUNT, PATH, choice_option, json_option, output_option, quiet_option
+from mpmcli.cli.streams import print_json, print_note, print_text
+from mpmcli.errors import InputError
+from mpmcli.render.settings import COLLIDERS, MODES, THEMES, parse_size
+
+# Of plot: the file by default, and the prefix of the digest in a picture of this command.
+LEDGER = "ledger.png"
+MARK = "plot "
+# Of plot: pixels along each side, as smaller text is illegible and larger pictures are taken for a typing error; and
+# the largest width over the height.
+SIZE_MIN, SIZE_MAX = 300, 8_000
+WIDEST = 3
+
+
+@click.command("render")
+@click.argument("result", type=PATH)
+@output_option("A .png for one picture, or a directory; by default the directory render beside the result.", "OUT")
+@choice_option("--mode", MODES, "dots", "How particles are drawn.")
+@click.option(
+    "--frame",
+    "frames",
+    metavar="N|first|last|all|A:B:S",
+    help="Which frames; the last one by default, all of them for a film or a montage.",
+)
+@click.option(
+    "--color-by",
+    "color",
+    metavar="NAME",
+    help="speed, material, body, density, pressure, J, stress, id or a stored field, stress.xy for a component.",
+)
+@click.option("--clim", metavar="LOW,HIGH", help="Limits of the colours; those of the whole result by default.")
+@click.option("--cmap", metavar="NAME", help="A colour map of matplotlib.")
+@click.option("--size", metavar="WxH", help="Pixels; 1280x720 by default.")
+@click.option(
+    "--camera",
+    default="iso",
+    show_default=True,
+    metavar="iso|front|side|top|x,y,z,x,y,z",
+    help="Of 3D scenes: by name, or where it stands and what it looks at, m.",
+)
+@choice_option("--theme", list(THEMES), "light", "Colours around the particles.")
+@choice_option(
+    "--colliders", COLLIDERS, "solid", "How colliders are drawn; clear: in 3D their far sides only, which hide nothing."
+)
+@click.option("--movie", type=PATH, metavar="FILE", help="Make a film: .mp4 or .gif.")
+@click.option("--fps", type=float, help="Frames of the film per second, 30 by default.")
+@click.option("--montage", metavar="CxR", help="One picture of evenly spaced frames, in C columns and R rows.")
+@click.option(
+    "--save-surface",
+    type=PATH,
+    metavar="DIR",
+    help="With --mode surface: write the surfaces for other tools, .vtp and .obj.",
+)
+@click.option("--workers", type=COUNT, help="Processes that render; as many as cores by default.")
+@click.option("--overwrite", is_flag=True, help="Render again what is there, and replace files that others made.")
+@quiet_option
+@json_option
+def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool, **asked: Any) -> int:
+    """Draw frames of a RESULT without a screen: pictures, a film (--movie) or a montage.
+
+    RESULT may be a dataset: its montage shows evenly spaced trajectories at one frame, the middle one or --frame, and
+    goes to montage.png in the dataset.
+
+    RESULT is a directory, particles.vtkhdf or particles.pvd, of a run that has ended or goes on. A picture that is
+    there and still right is not made again. The path of each picture, or that of the film, and the directory of the
+    surfaces are printed on stdout.
+    """
+    from mpmcli.cli.progress import ProgressBar
+    from mpmcli.dataset.dataset import is_dataset
+    from mpmcli.dataset.montage import plan_montage
+    from mpmcli.output import open_result
+    from mpmcli.plain_text import counted
+    from mpmcli.render.request import Request, plan_render
+
+    # Without a home directory it warns about its cache.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    request = Request(**asked)
+    plan = plan_montage(result, request) if is_dataset(result) else plan_render(open_result(result), request)
+    with ProgressBar(plan.due, "frames", quiet=quiet) as bar, interrupts_wait():
+        done = plan.carry_out(workers, watch=bar.show, stop=interrupt_came)
+    for warning in done.warnings:
+        print_note(f"warning: {warning}")
+    if as_json:
+        print_json(done.as_dict())
+    elif not quiet:
+        kept = len(done.pictures) - done.made
+        there = f", {kept} {'was' if kept == 1 else 'were'} there already" if kept else ""
+        print_note(f"{counted(done.made, 'picture')} made{there}")
+        print_text("\n".join(map(str, done.paths)))
+    return 0
+
+
+@click.command("plot")
+@click.argument("result", type=PATH)
+@output_option(f"The picture; {LEDGER} in the directory of the result by default.", "OUT.png")
+@choice_option("--theme", ["light", "dark"], "light", "Colours.")
+@click.option("--size", default="1200x900", show_default=True, metavar="WxH", help="Pixels; text grows with them.")
+@click.option("--overwrite", is_flag=True, help="Replace a file that this command did not make.")
+@quiet_option
+@json_option
+def plot_command(
+    result: Path, output: Path | None, theme: str, size: str, overwrite: bool, quiet: bool, as_json: bool
+) -> None:
+    """Draw the ledger of RESULT: its directory, particles.vtkhdf or particles.pvd, also while it is being written.
+
+    Energies, the momentum that walls and forces gave, the time step and what bounds it, Courant number, volumes, the
+    largest speed, and how far the particles reach.
+    """
+    from mpmcli.output import open_result
+    from mpmcli.plot.history import read_history
+    from mpmcli.plot.ledger_figure import ledger_picture
+    from mpmcli.render.picture_file import digest_of, settings_digest, write_picture
+
+    # Without a home directory it warns about its cache.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    width, height = parse_size(size)
+    if height is None or min(width, height) < SIZE_MIN or max(width, height) > SIZE_MAX:
+        raise InputError(
+            f"--size {size} is not possible: each side of this picture has {SIZE_MIN} to {SIZE_MAX} pixels."
+        )
+    if not height <= width <= WIDEST * height:
+        raise InputError(
+            f"--size {size} leaves no room for the panels: give a width of one to {WIDEST} times the height."
+        )
+    opened = open_result(result)
+    path = output or (opened.path if opened.path.is_dir() else opened.path.parent) / LEDGER
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path} would be no picture of this command: give a name that ends in .png.")
+    digest = digest_of(path)
+    if digest is not None and not digest.startswith(MARK) and not overwrite:
+        raise InputError(f"{path} is there and was not made by mpmcli plot: give another name, or --overwrite.")
+    history = read_history(opened)
+    for note in history.notes:
+        if not quiet:
+            print_note(note)
+    picture, panels = ledger_picture(history, (width, height), theme)  # type: ignore[arg-type]
+    settings = {"theme": theme, "size": (width, height)}
+    write_picture(path, picture, MARK + settings_digest(settings))
+    if as_json:
+        facts = {"path": str(path), "size": (width, height), "theme": theme, "frames": opened.frame_count}
+        print_json({**facts, "panels": panels, "notes": history.notes})
+    elif not quiet:
+        print_text(str(path))

@@ -1,0 +1,321 @@
+"""The formats of an export: LagrangeBench and GNS for learners, npz for numpy, vtkhdf for ParaView."""
+
+import math
+import zipfile
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import h5py
+import numpy as np
+
+from mpmcli.dataset.metadata import LEAST_FRAMES, learning_facts, require_alike
+from mpmcli.dataset.shard import LABELS, MOVING, SPLITS, group_name
+from mpmcli.dataset.thinned import ThinnedTrajectory
+from mpmcli.errors import InputError
+from mpmcli.output.durable import ask_for
+from mpmcli.output.layout import POSITION
+from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
+
+# What a format says in metadata.json, and notes for the user.
+Written = tuple[dict[str, Any], list[str]]
+
+
+class Format(ABC):
+    """Trajectories of the same dimension as files of a format."""
+
+    def __init__(self, trajectories: Sequence[ThinnedTrajectory]) -> None:
+        self.trajectories = trajectories
+
+    def check(self) -> None:  # noqa: B027
+        """Refuse with an InputError what the format cannot hold."""
+
+    @abstractmethod
+    def size(self) -> int:
+        """Return the bytes of the files before compression."""
+
+    @abstractmethod
+    def write(self, directory: Path, tick: Callable[[], None]) -> Written:
+        """Write the files, and call `tick` after each trajectory."""
+
+
+class LearnerFormat(Format):
+    """A file for each split; laws have particle types from `usual`, then `free`; walls have `wall` or `moving_wall`."""
+
+    name: ClassVar[str]
+    suffix: ClassVar[str]
+    usual: ClassVar[Mapping[str, int]]
+    free: ClassVar[Sequence[int]]
+    wall: ClassVar[int]
+    moving_wall: ClassVar[int]
+    parameters: Sequence[str] = ()
+
+    @abstractmethod
+    def facts(self) -> Written:
+        """Return what no other format says."""
+
+    @abstractmethod
+    def write_split(self, path: Path, chosen: Sequence[ThinnedTrajectory], tick: Callable[[], None]) -> None:
+        """Write the file of a split."""
+
+    def size(self) -> int:
+        return sum(map(self._bytes, self.trajectories))
+
+    def _bytes(self, trajectory: ThinnedTrajectory) -> int:
+        position = 4 * trajectory.layout.dimension * trajectory.frame_count
+        return trajectory.whole_count * (position + 8 + 8 * len(self.parameters))
+
+    def check(self) -> None:
+        require_alike(self.trajectories, self.name)
+        _ = self.types
+
+    def write(self, directory: Path, tick: Callable[[], None]) -> Written:
+        statistics, notes = learning_facts(self.trajectories)
+        facts, more = self.facts()
+        notes += more
+        for split in SPLITS:
+            file = f"{split}{self.suffix}"
+            if chosen := [each for each in self.trajectories if each.source.split == split]:
+                self.write_split(directory / file, chosen, tick)
+            else:
+                notes.append(f"No trajectory is of the split {split}: {file} is left out, as loaders need one.")
+        # Metadata has one entry for all domains.
+        headers = [each.source.header for each in self.trajectories]
+        if len({(tuple(header.origin), tuple(header.upper)) for header in headers}) > 1:
+            notes.append("The domains of the trajectories differ: bounds is the box around all of them.")
+        if len({tuple(header.periodic) for header in headers}) > 1:
+            notes.append("The trajectories differ in periodic faces: metadata has those of the first.")
+        return facts | {"particle_types": self.types | self._wall_types(), **statistics}, notes
+
+    @cached_property
+    def types(self) -> dict[str, int]:
+        """The particle type of each law; an InputError says that there are more laws than types."""
+        laws = sorted({law.name for each in self.trajectories for law in each.source.header.laws})
+        types = {name: self.usual[name] for name in laws if name in self.usual}
+        others = [name for name in laws if name not in types]
+        left = [number for number in self.free if number not in types.values()]
+        if others[len(left) :]:
+            law = others[len(left)]
+            raise InputError(f"{self.name} has no particle type left for {law}, the law of some of the particles.")
+        return types | dict(zip(others, left, strict=False))
+
+    def _wall_types(self) -> dict[str, int]:
+        moving = {bool(moves) for each in self.trajectories for moves in np.unique(each.walls.moving)}
+        if self.wall == self.moving_wall:
+            return {"wall": self.wall} if moving else {}
+        known = {"wall": (False, self.wall), "moving_wall": (True, self.moving_wall)}
+        return {name: number for name, (moves, number) in known.items() if moves in moving}
+
+    def particle_types(self, trajectory: ThinnedTrajectory) -> np.ndarray:
+        """Return the type of each particle, and then of each on walls, (N + W,) int64."""
+        laws = np.array([self.types[law.name] for law in trajectory.source.header.laws], np.int64)
+        walls = np.where(trajectory.walls.moving, self.moving_wall, self.wall).astype(np.int64)
+        return np.concatenate([laws[trajectory.label("material")], walls])
+
+
+class LagrangeBench(LearnerFormat):
+    """train.h5, valid.h5 and test.h5, as the class H5Dataset of LagrangeBench reads them.
+
+    Source: github.com/tumaer/lagrangebench, lagrangebench/data/data.py, utils.py (NodeType) and
+    data_gen/lagrangebench_data/gen_dataset.py. Trajectory k of a split is the group f"{k:05d}" with `position`,
+    (T, N, d) float32, and `particle_type`, (N,) int64; all have the same T.
+    """
+
+    name, suffix = "LagrangeBench", ".h5"
+    # Its own types are 0 fluid, 1 solid wall, 2 moving wall, 3 rigid body, -1 padding, out of 9.
+    usual: ClassVar = {"fluid": 0, "sand": 4, "viscoplastic": 5, "snow": 6, "von_mises": 7, "fixed_corotated": 8}
+    free = (8, 7, 6, 5, 4)
+    wall, moving_wall = 1, 2
+
+    def facts(self) -> Written:
+        first = self.trajectories[0]
+        # As there, the frame that only serves as the last target does not count.
+        length = first.frame_count - 1
+        lengths = {"sequence_length_train": length, "sequence_length_test": length}
+        return {"solver": "MPM", "case": first.source.header.title, **lengths}, []
+
+    def write_split(self, path: Path, chosen: Sequence[ThinnedTrajectory], tick: Callable[[], None]) -> None:
+        ask_for(path, sum(map(self._bytes, chosen)))
+        with h5py.File(path, "w") as file:
+            for k, each in enumerate(chosen):
+                self._write_trajectory(file.create_group(f"{k:05d}"), each)
+                tick()
+
+    def _write_trajectory(self, group: h5py.Group, trajectory: ThinnedTrajectory) -> None:
+        # The layout of the file depends on when its objects are closed: here, before the next group is made.
+        shape = (trajectory.frame_count, trajectory.whole_count, trajectory.layout.dimension)
+        # Loaders read windows of some frames: a chunk is one.
+        position = group.create_dataset("position", shape, np.float32, chunks=(1, *shape[1:]), compression="gzip")
+        first = 0
+        for block in trajectory.whole_blocks():
+            position[first : first + len(block)] = block
+            first += len(block)
+        group.create_dataset("particle_type", data=self.particle_types(trajectory))
+
+
+class Gns(LearnerFormat):
+    """train.npz, valid.npz and test.npz, as the particle data loader of GNS reads them.
+
+    Source: github.com/geoelements/gns, gns/data_loader.py, gns/train.py and docs/gns_data.md. Each entry is an object
+    array of (positions (T, N, d) float32, particle type (N,) int64), and, where parameters of the materials differ,
+    (N,) or (N, m) float64 with those.
+    """
+
+    name, suffix = "GNS", ".npz"
+    # As in the data of DeepMind's "Learning to simulate": 5 water, 6 sand, 7 goop; 3 stands for particles whose motion
+    # is given, here those on walls.
+    usual: ClassVar = dict(fluid=5, sand=6, viscoplastic=7, fixed_corotated=0, neo_hookean=1, snow=2, von_mises=4)
+    free = (8, 4, 2, 1, 0, 7)
+    wall = moving_wall = 3
+
+    @cached_property
+    def parameters(self) -> list[str]:
+        """Names of numeric parameters of materials whose values differ between bodies of any trajectories."""
+        values: dict[str, set[float]] = {}
+        for each in self.trajectories:
+            for body in each.source.header.bodies:
+                for name, value in body.material.items():
+                    if isinstance(value, int | float) and math.isfinite(value):
+                        values.setdefault(name, set()).add(float(value))
+        return sorted(name for name, different in values.items() if len(different) > 1)
+
+    def facts(self) -> Written:
+        names, d = self.parameters, self.trajectories[0].layout.dimension
+        notes = [
+            f"Each particle has {len(names)} parameters of its material ({', '.join(names)}): the loader of GNS takes "
+            "one, unless np.full in it is given the shape (N, m)."
+        ]
+        values = np.concatenate([self._parameters_of_bodies(each) for each in self.trajectories])
+        return {
+            # Every frame counts: a rollout is compared with all that follow the first six.
+            "sequence_length": self.trajectories[0].frame_count,
+            # Of a particle: the last 5 velocities, the distances to 2 d walls, and 16 numbers that stand for its type.
+            "nnode_in": 5 * d + 2 * d + 16 + len(names),
+            "nedge_in": d + 1,
+            "material_feature_len": len(names),
+            "material_feature_names": names,
+            "material_feature_min": np.min(values, axis=0).tolist(),
+            "material_feature_max": np.max(values, axis=0).tolist(),
+        }, notes if len(names) > 1 else []
+
+    def _parameters_of_bodies(self, trajectory: ThinnedTrajectory) -> np.ndarray:
+        """Return the parameters of each body, (bodies, m), in the units of scenes; 0 where a law has no such one."""
+        bodies = trajectory.source.header.bodies
+        rows = [[body.material.get(name, 0.0) for name in self.parameters] for body in bodies]
+        numbers = [[float(value) if isinstance(value, int | float) else 0.0 for value in row] for row in rows]
+        return np.array(numbers).reshape(len(bodies), len(self.parameters))
+
+    def write_split(self, path: Path, chosen: Sequence[ThinnedTrajectory], tick: Callable[[], None]) -> None:
+        def entries() -> Iterable[tuple[str, np.ndarray]]:
+            for each in chosen:
+                yield f"trajectory_{each.source.number:06d}", self._entry(each)
+                tick()
+
+        write_npz(path, entries())
+
+    def _entry(self, trajectory: ThinnedTrajectory) -> np.ndarray:
+        positions = np.concatenate([block.astype(np.float32) for block in trajectory.whole_blocks()])
+        parts = [positions, self.particle_types(trajectory)]
+        m = len(self.parameters)
+        if m:
+            # The loader broadcasts a single one to (N,), which it could not do with (N, 1).
+            properties = self._parameters_of_bodies(trajectory)[trajectory.label("body")]
+            properties = np.concatenate([properties, np.zeros((trajectory.walls.count, m))])
+            parts.append(properties[:, 0] if m == 1 else properties)
+        # From a tuple of arrays numpy would try to make one array of numbers, and fail.
+        entry = np.empty(len(parts), object)
+        for k, part in enumerate(parts):
+            entry[k] = part
+        return entry
+
+
+class Npz(Format):
+    """One compressed .npz for each trajectory, which numpy reads without pickles; they may differ in all but d."""
+
+    def size(self) -> int:
+        particles = sum(e.particle_count * e.layout.bytes_per_particle * e.frame_count for e in self.trajectories)
+        walls = sum(e.walls.count * (8 * e.layout.dimension * e.frame_count + 4) for e in self.trajectories)
+        return particles + walls
+
+    def write(self, directory: Path, tick: Callable[[], None]) -> Written:
+        facts: dict[str, Any] = {"laws": {}, "bodies": {}, "colliders": {}, "draws": {}}
+        for each in self.trajectories:
+            name, header = group_name(each.source.number), each.source.header
+            write_npz(directory / f"{name}.npz", self._arrays(each))
+            facts["laws"][name] = [law.name for law in header.laws]
+            facts["bodies"][name] = list(header.body_names)
+            facts["colliders"][name] = list(header.collider_names)
+            facts["draws"][name] = each.source.draws
+            tick()
+        if min(each.frame_count for each in self.trajectories) < LEAST_FRAMES:
+            return facts, ["Some trajectories have fewer than three frames: metadata.json has no statistics of motion."]
+        statistics, notes = learning_facts(self.trajectories)
+        return facts | statistics, notes
+
+    @staticmethod
+    def _arrays(trajectory: ThinnedTrajectory) -> Iterable[tuple[str, np.ndarray]]:
+        for name in (*MOVING, *trajectory.source.field_names):
+            yield name, trajectory.read(name)
+        for name in LABELS:
+            yield name, trajectory.label(name)
+        yield "time", trajectory.times
+        yield "step", np.asarray(trajectory.steps, np.int64)
+        yield "frame", np.asarray(trajectory.frames, np.int64)
+        if trajectory.walls.count:
+            dtype = trajectory.layout.arrays["Points"].dtype
+            yield "wall_position", trajectory.walls.positions(trajectory.times).astype(dtype)
+            yield "wall_collider", trajectory.walls.numbers
+
+
+class Vtkhdf(Format):
+    """One temporal VTKHDF file for each trajectory, as `mpmcli simulate` packs it."""
+
+    def check(self) -> None:
+        if any(each.walls.walls != "none" for each in self.trajectories):
+            raise InputError("--walls is for learners and numpy: mpmcli render draws the colliders of a vtkhdf itself.")
+
+    def size(self) -> int:
+        return sum(file_size(each.layout, [each.particle_count] * each.frame_count) for each in self.trajectories)
+
+    def write(self, directory: Path, tick: Callable[[], None]) -> Written:
+        for each in self.trajectories:
+            _write_vtkhdf(directory / f"{group_name(each.source.number)}.vtkhdf", each)
+            tick()
+        whole = all(
+            (each.particle_count, each.frame_count) == (each.source.particle_count, each.source.frame_count)
+            for each in self.trajectories
+        )
+        note = "The headers and ledgers stay those of the whole runs: mpmcli check finds frames or particles missing."
+        return {}, [] if whole else [note]
+
+
+def _write_vtkhdf(path: Path, trajectory: ThinnedTrajectory) -> None:
+    n, frames, layout = trajectory.particle_count, trajectory.frame_count, trajectory.layout
+    # The same for all frames.
+    fixed = {name: trajectory.label(name) for name in LABELS} | {"id": np.arange(n, dtype=layout.arrays["id"].dtype)}
+    ask_for(path, file_size(layout, [n] * frames))
+    with VtkhdfWriter(path, layout, [n] * frames) as writer:
+        for name, array in layout.arrays.items():
+            if name in fixed:
+                for _ in range(frames):
+                    writer.append(name, array.pad(fixed[name]))
+                continue
+            for block in trajectory.blocks("position" if name == POSITION else name):
+                joined = block.reshape(len(block) * n, *block.shape[2:])
+                writer.append(name, array.pad(joined))
+        header = trajectory.source.header.stored
+        writer.finish(trajectory.times, trajectory.frames, trajectory.steps, trajectory.ledger(), header)
+
+
+def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
+    """Write a compressed .npz as numpy does, but with one array in memory at a time, and no time of writing."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, array in arrays:
+            # Entries that are opened by name have the date 1980-01-01.
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=array.dtype == object)
+
+
+FORMATS: dict[str, type[Format]] = {"lagrangebench": LagrangeBench, "gns": Gns, "npz": Npz, "vtkhdf": Vtkhdf}

@@ -1,0 +1,187 @@
+"""What metadata.json says of an export, whatever its format; with the statistics of motion for learners."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mpmcli import __version__
+from mpmcli.dataset.shard import SPLITS
+from mpmcli.dataset.thinned import ThinnedTrajectory
+from mpmcli.errors import InputError
+
+# Neighbours of a particle on the lattice of the start lie at 1 and sqrt(2) spacings, 8 in 2D and 18 in 3D, and the next
+# ones at 2 (2D) and sqrt(3) (3D). LagrangeBench takes about the same (1.45, data_gen/.../gen_dataset.py).
+RADIUS_IN_SPACINGS = 1.5
+EXPORTED_BY = "exported_by"
+# Exports without it have no checksums.
+FORMAT_KEY, FORMAT = "export_format", 2
+# Of the time between frames: they are landed on exactly, up to the rounding of sums.
+UNEVEN = 1e-6
+LEAST_FRAMES = 3
+# Standard deviations below it become 1, as in LagrangeBench (data_gen/lagrangebench_data/gen_dataset.py): a
+# direction in which nothing moves is not to be divided by.
+STD_LEAST = 1e-7
+
+
+def common_facts(trajectories: Sequence[ThinnedTrajectory], stride: int) -> dict[str, Any]:
+    """Return what every format says, lengths in m and times in s; an InputError says that dimensions differ."""
+    headers = [each.source.header for each in trajectories]
+    first = headers[0]
+    for each, header in zip(trajectories, headers, strict=True):
+        if header.dimension != first.dimension:
+            both = f"trajectory {each.source.number} is {header.dimension}D and the first one {first.dimension}D"
+            raise InputError(f"{both}: an export holds trajectories of one dimension.")
+    placed = all(header.origin is not None for header in headers)
+    bounds = [np.min([h.origin for h in headers], axis=0), np.max([h.upper for h in headers], axis=0)] if placed else []
+    spacings = [each.spacing for each in trajectories]
+    dx = None if None in spacings else max(spacings)
+    cells = [header.spacing for header in headers]
+    # Which trajectory of the dataset is which one of the export.
+    numbers = {split: [e.source.number for e in trajectories if e.source.split == split] for split in SPLITS}
+    lengths = {each.frame_count for each in trajectories}
+    return {
+        EXPORTED_BY: f"mpmcli {__version__}",
+        FORMAT_KEY: FORMAT,
+        "title": first.title,
+        "dim": first.dimension,
+        # Three entries in 2D too, as LagrangeBench has it.
+        "periodic_boundary_conditions": [*map(bool, first.periodic), False][:3],
+        "bounds": np.transpose(bounds).tolist() if placed else None,
+        "dt": time_between(trajectories[0]),
+        "write_every": 1,
+        "stride": stride,
+        "t_end": float(max(each.times[-1] for each in trajectories)),
+        "dx": dx,
+        "cell_size": None if None in cells else max(cells),
+        "default_connectivity_radius": None if dx is None else RADIUS_IN_SPACINGS * dx,
+        "connectivity_radius_in_dx": RADIUS_IN_SPACINGS,
+        "num_particles_max": max(each.whole_count for each in trajectories),
+        "num_frames": lengths.pop() if len(lengths) == 1 else None,
+        **{f"num_trajs_{split}": len(numbers[split]) for split in SPLITS},
+        "trajectories": numbers,
+    }
+
+
+def learning_facts(trajectories: Sequence[ThinnedTrajectory]) -> tuple[dict[str, list[float]], list[str]]:
+    """Return the statistics of motion of the training split, or of all where it is empty, and a note if so."""
+    train = [each for each in trajectories if each.source.split == "train"]
+    notes = [] if train else ["No trajectory is of the training split: the statistics are those of all trajectories."]
+    chosen = train or trajectories
+    headers = [each.source.header for each in chosen]
+    # After what way, m, the domain repeats along each axis, infinite where it does not.
+    periods = [np.where(header.periodic, header.upper - header.origin, np.inf) for header in headers]
+    known = periods if np.isfinite(periods).any() else None
+    statistics = motion_statistics((each.blocks("position") for each in chosen), known)
+    return {name: vector.tolist() for name, vector in statistics.items()}, notes
+
+
+def require_alike(trajectories: Sequence[ThinnedTrajectory], form: str) -> None:
+    """Refuse with an InputError trajectories of which a learner's loader cannot, or should not, make one set."""
+    first, remedy = trajectories[0], "--to npz takes trajectories that differ."
+    dt = time_between(first)
+    if first.frame_count < LEAST_FRAMES:
+        raise InputError(
+            f"trajectory {first.source.number} has {first.frame_count} of the {LEAST_FRAMES} or more frames that "
+            f"accelerations in {form} need: take a smaller --stride, or store more frames."
+        )
+    for each in trajectories:
+        number, header = each.source.number, each.source.header
+        if header.comes_and_goes:
+            raise InputError(
+                f"trajectory {number} has particles that come or go, and {form} cannot say which are there: --to npz "
+                'and --to vtkhdf keep their field "status".'
+            )
+        if each.frame_count != first.frame_count:
+            raise InputError(
+                f"trajectory {number} has {each.frame_count} frames and trajectory {first.source.number} "
+                f"{first.frame_count}: {form} needs the same number in all; {remedy}"
+            )
+        if (np.abs(np.diff(each.times) - dt) > UNEVEN * dt).any():
+            raise InputError(
+                f"trajectory {number} has frames that are not {dt:.6g} s apart, as those of trajectory "
+                f"{first.source.number} are at first: {form} has one time between frames; {remedy}"
+            )
+        if header.origin is None or each.spacing is None:
+            raise InputError(f"trajectory {number} does not say its domain and bodies, which {form} needs; {remedy}")
+
+
+def time_between(trajectory: ThinnedTrajectory) -> float | None:
+    """Return the mean time between frames, s; None of a single frame."""
+    times = trajectory.times
+    return float((times[-1] - times[0]) / (len(times) - 1)) if len(times) > 1 else None
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Count, mean and squared deviations of vectors, (d,), which merge without loss (Chan, Golub and LeVeque 1979)."""
+
+    count: int
+    mean: np.ndarray
+    square: np.ndarray
+
+    @classmethod
+    def of(cls, vectors: np.ndarray) -> "Moments":
+        """Return the moments of (..., d) vectors, of which there is at least one."""
+        rows = vectors.reshape(-1, vectors.shape[-1]).astype(np.float64)
+        mean = rows.mean(axis=0)
+        return cls(len(rows), mean, np.square(rows - mean).sum(axis=0))
+
+    def merged(self, other: "Moments") -> "Moments":
+        """Return the moments of the vectors of both."""
+        count, apart = self.count + other.count, other.mean - self.mean
+        mean = self.mean + apart * (other.count / count)
+        return Moments(count, mean, self.square + other.square + apart**2 * (self.count * other.count / count))
+
+    @property
+    def variance(self) -> np.ndarray:
+        """(d,), of the population."""
+        return self.square / self.count
+
+
+def motion_statistics(
+    trajectories: Iterable[Iterable[np.ndarray]], periods: Sequence[np.ndarray] | None = None
+) -> dict[str, np.ndarray]:
+    """Return mean and deviation, (d,), m, of x[t+1] - x[t] and of its differences; trajectories count the same."""
+    moments = [_of_trajectory(blocks, None if periods is None else periods[k]) for k, blocks in enumerate(trajectories)]
+    if not moments:
+        raise ValueError("statistics need a trajectory")
+    velocity, acceleration = map(_over_trajectories, zip(*moments, strict=True))
+    return dict(zip(("vel_mean", "vel_std", "acc_mean", "acc_std"), velocity + acceleration, strict=True))
+
+
+def _of_trajectory(blocks: Iterable[np.ndarray], period: np.ndarray | None) -> tuple[Moments, Moments]:
+    """Return the moments of displacements, across periodic faces the shorter ones, and of their differences."""
+    velocity = acceleration = None
+    before: np.ndarray | None = None
+    for block in blocks:
+        positions = block.astype(np.float64)
+        joined = positions if before is None else np.concatenate([before, positions])
+        v = np.diff(joined, axis=0)
+        if period is not None:
+            for a in np.flatnonzero(np.isfinite(period)):
+                v[..., a] -= period[a] * np.round(v[..., a] / period[a])
+        a = np.diff(v, axis=0)
+        # Of the two frames that are carried over, the displacement was counted already.
+        new = v if before is None else v[len(before) - 1 :]
+        velocity, acceleration = _with(velocity, new), _with(acceleration, a)
+        before = joined[-2:]
+    if velocity is None or acceleration is None:
+        raise ValueError("statistics need three frames of each trajectory")
+    return velocity, acceleration
+
+
+def _with(moments: Moments | None, vectors: np.ndarray) -> Moments | None:
+    if vectors.size == 0:
+        return moments
+    return Moments.of(vectors) if moments is None else moments.merged(Moments.of(vectors))
+
+
+def _over_trajectories(moments: Iterable[Moments]) -> tuple[np.ndarray, np.ndarray]:
+    means = np.array([each.mean for each in moments])
+    mean = means.mean(axis=0)
+    # The mean squared distance from the overall mean, without a second reading.
+    variance = (np.array([each.variance for each in moments]) + np.square(means - mean)).mean(axis=0)
+    std = np.sqrt(variance)
+    return mean, np.where(std < STD_LEAST, 1.0, std)

@@ -1,0 +1,275 @@
+"""Colliders in pictures: flat in the plane, meshes in space, and the mirror images of particles behind them."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mpmcli.frames.frame import Frame
+from mpmcli.render.offscreen import OffscreenRenderer
+from mpmcli.render.render_scene import RenderScene
+from mpmcli.render.settings import Theme, rgb
+from mpmcli.render.view import Slice, View
+from mpmcli.scene.colliders import Collider, Plane
+from mpmcli.scene.surface import Surface, collider_surface, poly_data, surface_of, without_doubles
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+RIM, DARKER = 2.0, 0.35  # pixels of a dark rim, at a picture 720 pixels high, and by which share it is darker
+FILLED = 0.55  # share of the colour of colliders that their inside has, the rest being the ground
+SHARP = 30.0  # angle between triangles, degrees, from which on an edge is sharp
+FINE = 1 / 60  # edges of triangles that carry light, as a share of the longest side of the domain
+THICK = 1 / 88  # thickness of the layer under a surface that takes light, in the same measure
+LINE, DARK = 1.5, 0.55  # pixels, at a picture 720 pixels high, and brightness of the lines along edges
+NEAR = 2.0  # distance from a collider within which a particle has an image, in distances between particles
+# Most by which the mirror is before the collider, in the same measure: bodies are kept about a distance from it.
+BEFORE = 0.75
+# Depth behind an image that is inside of the collider too, in the same measure: no image is seen beyond a thin one.
+BEHIND = 2.0
+STEP = 1e-3  # step of differences, in the same measure
+
+
+class FlatColliders:
+    """Covers the pixels of a view of a plane by the signed distances of colliders, within the domain."""
+
+    def __init__(self, scene: RenderScene, view: View, theme: Theme, plane: Slice) -> None:
+        self._scene, self._colliders, self._across = scene, scene.colliders, list(plane.across)
+        corners = plane.corners(scene)
+        pixels = view.pixels(corners)[:, :2]
+        # The axes of the plane may run to the left or down in the picture.
+        backwards = (pixels[1] - pixels[0]) * (1, -1) < 0
+        self._signs, self._start = np.where(backwards, -1.0, 1.0), corners[0].copy()
+        self._start[self._across] = np.where(backwards, *corners[::-1, self._across])
+        (left, top), (right, bottom) = pixels.min(axis=0).tolist(), pixels.max(axis=0).tolist()
+        self._edge = 1.0 / view.pixels_per_metre
+        self._rim = RIM * view.size[1] / 720.0
+        self._color, self._ground = np.array(rgb(theme.solid)), np.array(rgb(theme.ground))
+        width, height = view.size
+        self._rows = slice(max(math.floor(top), 0), min(math.ceil(bottom), height))
+        self._columns = slice(max(math.floor(left), 0), min(math.ceil(right), width))
+        x = np.arange(self._columns.start, self._columns.stop) + 0.5
+        y = np.arange(self._rows.start, self._rows.stop) + 0.5
+        self._right, self._up = (x - left) * self._edge, (bottom - y) * self._edge
+        inside = [
+            np.clip(np.minimum(a - lo, hi - a) + 0.5, 0.0, 1.0) for a, lo, hi in ((x, left, right), (y, top, bottom))
+        ]
+        self._inside = (inside[1][:, None] * inside[0]).astype(np.float32)
+        self._kept: dict[int, np.ndarray] = {}
+
+    def draw(self, picture: np.ndarray, frame: Frame, free: np.ndarray | None = None) -> None:
+        """Draw the colliders of a frame over a picture (h, w, 3) from 0 to 1, in the `free` share (h, w) of pixels."""
+        if not self._colliders or not self._inside.size:
+            return
+        depth = np.full(self._inside.shape, -np.inf, np.float32)
+        for number, collider in enumerate(self._colliders):
+            if self._scene.shows(number, frame):
+                np.maximum(depth, self._depth(number, collider, frame.time), out=depth)
+        cover = np.clip(depth + 0.5, 0.0, 1.0) * self._inside
+        if free is not None:
+            cover = cover * free[self._rows, self._columns]
+        rim = np.clip(self._rim + 0.5 - depth, 0.0, 1.0)[..., None]
+        fill = self._ground + FILLED * (self._color - self._ground)
+        color = fill + rim * ((1.0 - DARKER) * self._color - fill)
+        shown = picture[self._rows, self._columns]
+        shown += cover[..., None] * (color - shown)
+
+    def _place(self, places: np.ndarray) -> np.ndarray:
+        """Return the points (n, d) at places (n, 2), m, from the domain's lower left corner in the picture."""
+        points = np.tile(self._start, (len(places), 1))
+        points[:, self._across] += self._signs * places
+        return points[:, : self._scene.dimension]
+
+    def _depth(self, number: int, collider: Collider, time: float) -> np.ndarray:
+        """Return how many pixels (h, w) each pixel of the domain lies inside a collider, negative outside."""
+        if number in self._kept:
+            return self._kept[number]
+        rows, columns = self._near(collider, time)
+        right, up = np.meshgrid(self._right[columns], self._up[rows])
+        depth = np.full(self._inside.shape, -np.inf, np.float32)
+        if right.size:
+            points = self._place(np.stack([right.ravel(), up.ravel()], axis=1))
+            depth[rows, columns] = -collider.signed_distance(points, time).reshape(right.shape) / self._edge
+        if not collider.motion.moves:
+            self._kept[number] = depth
+        return depth
+
+    def _near(self, collider: Collider, time: float) -> tuple[slice, slice]:
+        if isinstance(collider.form, Plane) or collider.side == "inside":
+            return slice(None), slice(None)
+        lower, upper = collider.form.bounds()
+        d = len(lower)
+        corners = np.array([[upper[a] if k >> a & 1 else lower[a] for a in range(d)] for k in range(2**d)])
+        ends = collider.motion.placed(corners, time)
+        origin, reach = self._place(np.zeros((1, 2)))[0], 2.0 * self._edge
+
+        def seen(axis: tuple[float, float], steps: np.ndarray) -> slice:
+            along = (ends - origin) @ (self._place(np.array([axis]))[0] - origin)
+            hit = np.flatnonzero((steps >= along.min() - reach) & (steps <= along.max() + reach))
+            return slice(hit[0], hit[-1] + 1) if len(hit) else slice(0, 0)
+
+        return seen((0.0, 1.0), self._up), seen((1.0, 0.0), self._right)
+
+
+@dataclass(frozen=True, eq=False)
+class ColliderMesh:
+    """The surface of one collider where its shape stands, as triangles fine enough for light and shadow."""
+
+    collider: Collider
+    number: int  # of the collider in the scene
+    surface: Surface  # triangles with the material before them
+    side: float  # longest side of the domain, m
+
+    @property
+    def casts(self) -> bool:
+        """Whether it throws shadows: the ground and containers do not."""
+        return self.collider.side == "outside" and not isinstance(self.collider.form, Plane)
+
+    def transform(self, time: float) -> np.ndarray:
+        """Return the matrix (4, 4) that takes points, counted from the pivot, to where they are at a time, s."""
+        matrix = np.eye(4)
+        matrix[:3, 3], matrix[:3, :3] = self.collider.motion.pose(time)
+        return matrix
+
+    def shown(self, *, fine: bool = False) -> Any:
+        """Return PyVista's mesh, counted from the pivot, normals parted by sharp edges, long edges divided if fine."""
+        return self._from_pivot(self._fine if fine else self.surface).compute_normals(
+            cell_normals=False,
+            split_vertices=True,
+            feature_angle=SHARP,
+            consistent_normals=False,
+            auto_orient_normals=False,
+        )
+
+    def edges(self) -> Any:
+        """Return its sharp edges and its rims as PyVista's lines, counted from the pivot."""
+        return self._from_pivot(self.surface).extract_feature_edges(
+            SHARP, boundary_edges=True, non_manifold_edges=False, feature_edges=True, manifold_edges=False
+        )
+
+    def _from_pivot(self, surface: Surface) -> Any:
+        import pyvista as pv
+
+        return pv.PolyData(poly_data(Surface(surface.points - np.array(self.collider.motion.pivot), surface.cells)))
+
+    def shade(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return places (n, 3) under its surface that take light at a time, s, and their volumes (n,), m^3."""
+        places, volumes = self._lit
+        return self.collider.motion.placed(places, time), volumes
+
+    @cached_property
+    def _lit(self) -> tuple[np.ndarray, np.ndarray]:
+        surface, thick = self._fine, THICK * self.side
+        places = surface.points[surface.cells].mean(axis=1) - 0.5 * thick * surface.normals
+        return places, thick * surface.sizes
+
+    @cached_property
+    def _fine(self) -> Surface:
+        from vtkmodules.vtkFiltersModeling import vtkAdaptiveSubdivisionFilter
+
+        if len(self.surface.cells) == 0:
+            return self.surface
+        divide = vtkAdaptiveSubdivisionFilter()
+        divide.SetInputData(poly_data(self.surface))
+        divide.SetMaximumEdgeLength(FINE * self.side)
+        divide.SetMaximumTriangleArea((FINE * self.side) ** 2)
+        divide.SetMaximumNumberOfPasses(12)
+        divide.Update()
+        return without_doubles(surface_of(divide.GetOutput()))
+
+
+def collider_meshes(scene: RenderScene) -> tuple[ColliderMesh, ...]:
+    """Return the surfaces of the colliders of a 3D scene that have any extent in it."""
+    lower, upper = np.array(scene.lower), np.array(scene.upper)
+    side = float(np.max(upper - lower))
+    surfaces = [collider_surface(collider, lower, upper) for collider in scene.colliders]
+    return tuple(
+        ColliderMesh(collider, number, without_doubles(surface), side)
+        for number, (collider, surface) in enumerate(zip(scene.colliders, surfaces, strict=True))
+        if len(surface.cells)
+    )
+
+
+class ColliderActors:
+    """Shaded surfaces in a window, seen from the side that faces the material: so a container hides nothing in it."""
+
+    def __init__(self, scene: RenderScene, theme: Theme, window: OffscreenRenderer) -> None:
+        self._scene = scene
+        self._actors: list[tuple[ColliderMesh, list[pv.Actor]]] = []
+        self._shown = self._actors
+        self.meshes = collider_meshes(scene)
+        for mesh in self.meshes:
+            surface = window.plotter.add_mesh(
+                mesh.shown(),
+                color=theme.solid,
+                smooth_shading=True,
+                culling="front" if scene.clear and mesh.casts else "back",
+                ambient=0.45,
+                diffuse=0.65,
+                specular=0.0,
+                reset_camera=False,
+            )
+            # A line on the surface is in front of it.
+            surface.mapper.SetResolveCoincidentTopologyToPolygonOffset()
+            surface.mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(1.0, 1.0)
+            self._actors.append((mesh, [surface, *edge_actors(mesh, theme, window)]))
+
+    def pose(self, frame: Frame) -> None:
+        """Put those of a frame where they are."""
+        self._shown = [(mesh, actors) for mesh, actors in self._actors if self._scene.shows(mesh.number, frame)]
+        for mesh, actors in self._actors:
+            shown, matrix = self._scene.shows(mesh.number, frame), mesh.transform(frame.time)
+            for actor in actors:
+                actor.visibility, actor.user_matrix = shown, matrix
+
+    def shades(self, time: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return what they take of the light at a time, s; see `ColliderMesh.shade`."""
+        return [mesh.shade(time) for mesh, _ in self._shown if mesh.casts]
+
+    def depth_without(self, window: OffscreenRenderer) -> np.ndarray:
+        """Return the depth of a picture of everything else, as `OffscreenRenderer.depth`; the window shows it then."""
+        for show in (False, True):
+            for _, actors in self._shown:
+                for actor in actors:
+                    actor.visibility = show
+            if not show:
+                window.render()
+                depth = window.depth()
+        return depth
+
+
+def edge_actors(mesh: ColliderMesh, theme: Theme, window: OffscreenRenderer) -> "list[pv.Actor]":
+    """Draw the sharp edges of a collider, if it has any, in a window."""
+    edges = mesh.edges()
+    if not edges.n_points:
+        return []
+    shade = tuple(DARK * part for part in rgb(theme.solid))
+    width = max(LINE * window.plotter.window_size[1] / 720.0, window.samples)
+    return [window.plotter.add_mesh(edges, color=shade, line_width=width, lighting=False, reset_camera=False)]
+
+
+def with_collider_images(position: np.ndarray, distance: float, scene: RenderScene, frame: Frame) -> np.ndarray:
+    """Return particles (n, d) of one distance between neighbours, m, and their images in the colliders of a frame."""
+    shown = [collider for number, collider in enumerate(scene.colliders) if scene.shows(number, frame)]
+    return np.concatenate([position, *(_images(position, distance, collider, frame.time) for collider in shown)])
+
+
+def _images(position: np.ndarray, distance: float, collider: Collider, time: float) -> np.ndarray:
+    away = collider.signed_distance(position, time)
+    near = (away > 0) & (away < NEAR * distance)
+    points, away = position[near], away[near, None]
+    step = STEP * distance
+    normal = np.stack(
+        [
+            collider.signed_distance(points + shift, time) - collider.signed_distance(points - shift, time)
+            for shift in step * np.eye(position.shape[1])
+        ],
+        axis=1,
+    ) / (2 * step)
+    # As far from its image as from another particle, where the mirror may be as far before the collider.
+    mirror = np.clip(away - 0.5 * distance, 0.0, BEFORE * distance)
+    images = points - 2 * (away - mirror) * normal
+    thick = collider.signed_distance(images - BEHIND * distance * normal, time) < 0
+    return images[thick]

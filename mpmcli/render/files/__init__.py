@@ -1,1 +1,0 @@
-"""Pictures and films as files: whole or absent, the same bytes for the same pixels."""

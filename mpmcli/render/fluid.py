@@ -1,0 +1,369 @@
+"""Liquids as bodies with a surface, drawn from the picture of their particles; everything else as dots.
+
+Screen-space fluid rendering: W. J. van der Laan, S. Green and M. Sainz, "Screen space fluid rendering with curvature
+flow", Proc. I3D 2009, 91-98, with another smoothing, see `liquid_surface.smoothed`.
+"""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mpmcli.frames.frame import Frame
+from mpmcli.render.colliders import ColliderActors
+from mpmcli.render.dots import OVERLAP, SMALLEST, depth_shaded
+from mpmcli.render.lighting import lights_of
+from mpmcli.render.liquid_surface import NOTHING, Liquid, Surface, layers_of, surface_of, window_of
+from mpmcli.render.occlusion import Background, occlusion_by
+from mpmcli.render.offscreen import OffscreenRenderer
+from mpmcli.render.particle_grid import sampled
+from mpmcli.render.render_scene import Appearance, Finish, Group, RenderScene, groups_of
+from mpmcli.render.settings import Theme, rgb, rgb_bytes
+from mpmcli.render.view import View
+
+if TYPE_CHECKING:
+    import pyvista as pv
+
+TONE = 0.05  # largest deviation of the brightness of a dot, up or down, which makes neighbours distinguishable
+# What is behind a surface by less than this, in distances between particles, lies on it, as the edges of the domain do.
+LIES_ON = 0.3
+FALLS_THROUGH = 0.5  # share of the shadow on the floor that is not seen through a liquid
+LEAVES_TRACES = 4.0  # distance from a particle to which it changes the picture, in distances between particles
+BENDS = 0.3  # the most of a liquid that bends what lies behind it, in lengths of the scene
+SAMPLES = 2  # samples along each axis of a pixel in what VTK draws
+HEAD_ON = 0.02  # reflectance of water at normal incidence: ((n - 1) / (n + 1))^2, n = 1.33
+SKIN = 0.05  # a skin of this thickness, in lengths of the scene, is added to every liquid: a film of it is seen
+RIM = 0.35  # light that comes from behind is lost at the rim, where it would leave at a grazing angle
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What one sample of each pixel shows, of the m pixels in which it shows a dot or a line."""
+
+    row: np.ndarray  # (m,); `column` alike
+    column: np.ndarray
+    light: np.ndarray  # (m, 3)
+    distance: np.ndarray  # (m,), m
+
+    def where(self, chosen: np.ndarray) -> "Sample":
+        """Return what it shows in the chosen of its pixels, (m,) bool."""
+        return Sample(self.row[chosen], self.column[chosen], self.light[chosen], self.distance[chosen])
+
+
+class FluidPainter:
+    """Draws the frames of one run in 3D."""
+
+    fields: tuple[str, ...] = ()
+
+    def __init__(self, scene: RenderScene, view: View, theme: Theme) -> None:
+        self._scene, self._view = scene, view
+        extent = np.subtract(scene.upper, scene.lower)
+        # Absorption scales with the size of the scene: a beaker and a reservoir look alike.
+        self._length = float(np.cbrt(np.prod(np.maximum(extent, 1e-3 * extent.max()))))
+        self._lamp = lights_of(scene, view, theme).lamp
+        self._lights = fluid_lights(theme, view.axes @ self._lamp, view.axes @ np.array(scene.up))
+        self._background = Background(scene, view, theme)
+        # The background without shadows (h, w, 3), in amounts of light.
+        self._bare = linear(self._background.image(None) / np.float32(255))
+        # One window for lines, colliders and dots.
+        self._offscreen = OffscreenRenderer(replace(view, size=(view.size[0] * SAMPLES, view.size[1] * SAMPLES)), theme)
+        self._offscreen.add_box(scene.lower, scene.upper, theme.wall, width=1.6 * SAMPLES)
+        self._colliders = ColliderActors(scene, theme, self._offscreen)
+        if scene.colliders:
+            self._offscreen.add_light()
+        self._actors: dict[tuple[int, int], pv.Actor] = {}
+        self._lines: tuple[np.ndarray, ...] | None = None
+
+    def draw(self, frame: Frame) -> np.ndarray:
+        """Return the picture of a frame, (h, w, 3) uint8; particles without a place (NaN) are left out."""
+        groups = groups_of(self._scene, frame)
+        solids = [group for group in groups if not group.appearance.liquid]
+        picture, depth, dots = self._things(solids, frame)
+        occlusion = occlusion_by(self._scene, groups, self._lamp, self._colliders.shades(frame.time))
+        image = linear(self._background.image(occlusion) / np.float32(255))
+        samples = self._samples(picture, depth, dots, max((group.distance for group in solids), default=None))
+        liquids = [self._liquid(group, frame) for group in groups if group.appearance.liquid]
+        liquids = [liquid for liquid in liquids if len(liquid.pixels)]
+        window = window_of(liquids, self._view)
+        if window is None:
+            _add(image, samples)
+        else:
+            surface = surface_of(liquids, window, self._view, self._scene)
+            layers = layers_of(liquids, window, depth, SAMPLES)
+            self._pour(image, samples, surface, list(zip(liquids, layers, strict=True)))
+        return (displayed(image) * 255 + 0.5).astype(np.uint8)
+
+    def _things(self, groups: list[Group], frame: Frame) -> tuple[np.ndarray, ...]:
+        """Draw lines, colliders and the groups as dots.
+
+        Returned are the picture (2h, 2w, 3) uint8, the depth, inf where there is nothing, and that without colliders.
+        """
+        if not groups and self._lines is not None:
+            return self._lines
+        for actor in self._actors.values():
+            actor.SetVisibility(False)
+        for group in groups:
+            self._show(group)
+        self._colliders.pose(frame)
+        self._offscreen.render()
+        seen = self._offscreen.picture(), *[self._offscreen.depth()] * 2
+        if groups and self._colliders.meshes:
+            seen = *seen[:2], self._colliders.depth_without(self._offscreen)
+        if not groups and not self._scene.colliders:
+            self._lines = seen
+        return seen
+
+    def _show(self, group: Group) -> None:
+        """Let the next picture show the dots of a group, each a little lighter or darker."""
+        import pyvista as pv
+
+        cloud = pv.PolyData(group.position.astype(np.float32))
+        tone = 1 + TONE * group.hashes[:, :1]
+        colors = np.array(rgb_bytes(group.appearance.color)) * tone
+        cloud["rgb"] = np.clip(colors + 0.5, 0, 255).astype(np.uint8)
+        if group.key not in self._actors:
+            if not self._actors and not self._scene.colliders:
+                self._offscreen.add_light()
+            self._actors[group.key] = self._offscreen.add_dots(cloud)
+        actor = self._actors[group.key]
+        actor.mapper.dataset = cloud
+        actor.SetVisibility(True)
+        # Dots of one group have one size, that of those in the middle.
+        distance = max(float(np.median(self._view.pixels(group.position)[:, 2])), self._view.near)
+        scale = self._view.pixels_per_metre * (1.0 if self._view.parallel else self._view.distance / distance)
+        actor.prop.point_size = max(OVERLAP * group.distance * scale, SMALLEST) * SAMPLES
+
+    def _liquid(self, group: Group, frame: Frame) -> Liquid:
+        """Return those particles of a liquid that may be seen."""
+        view = self._view
+        pixels = view.pixels(group.position)
+        seen = np.flatnonzero(pixels[:, 2] > max(view.near, 2 * group.distance))
+        scale = view.scale_at(pixels[seen, 2])
+        reach = (LEAVES_TRACES * group.distance * scale)[:, None]
+        inside = (pixels[seen, :2] > -reach).all(axis=1) & (pixels[seen, :2] < np.array(view.size) + reach).all(axis=1)
+        seen, scale = seen[inside], scale[inside]
+        body = np.clip(frame.body[group.rows[seen]], 0, len(self._scene.bodies) - 1)
+        volume = np.array(self._scene.distances)[body] ** 3
+        return Liquid(group.appearance, group.distance, group.position[seen], pixels[seen], scale, volume)
+
+    def _samples(
+        self, picture: np.ndarray, depth: np.ndarray, dots: np.ndarray, distance: float | None
+    ) -> list[Sample]:
+        """Part a picture with several samples to a pixel, leaving out what shows nothing.
+
+        `dots` is the depth without colliders, `distance` that between the dots, m; None where there are none.
+        """
+        width, height = self._view.size
+        shade = None
+        if distance is not None:
+            white = np.full((height, width, 3), 255, np.uint8)
+            shade = depth_shaded(white, depth, OVERLAP * distance, self._view, SAMPLES, dots)[..., 0] / np.float32(255)
+        samples = []
+        for i, j in np.ndindex(SAMPLES, SAMPLES):
+            far = depth[i::SAMPLES, j::SAMPLES]
+            row, column = np.nonzero(np.isfinite(far))
+            color = picture[i::SAMPLES, j::SAMPLES][row, column] / np.float32(255)
+            if shade is not None:
+                color *= shade[row, column, None]
+            samples.append(Sample(row, column, linear(color), far[row, column]))
+        return samples
+
+    def _pour(
+        self, image: np.ndarray, samples: list[Sample], surface: Surface, layers: list[tuple[Liquid, np.ndarray]]
+    ) -> None:
+        """Draw the liquids, and the samples before and behind them, into an image, in amounts of light."""
+        picture, part = surface.window.inner(self._view.size)
+        depth = np.full(image.shape[:2], NOTHING, np.float32)
+        depth[picture] = np.where(surface.alpha > 0, surface.depth, NOTHING)[part]
+        depth += np.float32(LIES_ON * min(liquid.distance for liquid, _ in layers))
+        before = [sample.distance < depth[sample.row, sample.column] for sample in samples]
+        # Part of the light that a liquid takes from the floor beside it falls through it on the floor under it.
+        behind = image + np.float32(FALLS_THROUGH) * (self._bare - image)
+        _add(behind, [sample.where(~front) for sample, front in zip(samples, before, strict=True)])
+        alpha = np.zeros((*image.shape[:2], 1), np.float32)
+        alpha[picture] = surface.alpha[part][..., None]
+        wet = np.zeros_like(image)
+        wet[picture] = self._lit(surface, layers, behind)[part]
+        image += alpha * (wet - image)
+        shown = []
+        for sample, front in zip(samples, before, strict=True):
+            place = sample.row, sample.column
+            cover = np.where(front[:, None], 0, alpha[place])
+            light = sample.light + cover * (wet[place] - sample.light)
+            shown.append(Sample(*place, light, sample.distance))
+        _add(image, shown)
+
+    def _lit(self, surface: Surface, layers: list[tuple[Liquid, np.ndarray]], behind: np.ndarray) -> np.ndarray:
+        """Return the light (h, w, 3) of the pixels of the window that the liquids cover."""
+        window, view = surface.window, self._view
+        height, width = behind.shape[:2]
+        row, column = np.nonzero(surface.alpha > 0)
+        normal, depth, owner = surface.normal[row, column], surface.depth[row, column], surface.owner[row, column]
+        across, up = view.plane(*window.middles)
+        towards = np.tile(np.array([0, 0, 1], np.float32), (len(row), 1))
+        if not view.parallel:
+            towards[:, 0], towards[:, 1] = -across[0, column], -up[row, 0]
+            towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        through = np.ones((len(row), 3), np.float32)
+        thickness = np.zeros(len(row), np.float32)
+        for liquid, layer in layers:
+            here = layer[row, column]
+            thickness += here
+            through *= transmitted(liquid.appearance, here, self._length)
+        bend = np.minimum(thickness, BENDS * self._length) * view.scale_at(depth)
+        light = np.zeros((*window.shape, 3), np.float32)
+        for k, (liquid, _) in enumerate(layers):
+            mine = np.flatnonzero(owner == k)
+            if len(mine) == 0:
+                continue
+            shift = optics_of(liquid.appearance).bend * bend[mine, None] * normal[mine, :2]
+            x = np.clip(column[mine] + window.left + 0.5 - shift[:, 0], 0, width)
+            y = np.clip(row[mine] + window.top + 0.5 + shift[:, 1], 0, height)
+            here = row[mine], column[mine]
+            points = normal[mine], towards[mine], through[mine], sampled(behind, y, x), surface.hollow[here]
+            light[here] = shaded(liquid.appearance, *points, self._lights)
+        return light
+
+
+def _add(image: np.ndarray, samples: list[Sample]) -> None:
+    """Average the samples of each pixel."""
+    bare = image.copy()
+    for sample in samples:
+        place = sample.row, sample.column
+        image[place] += (sample.light - bare[place]) / len(samples)
+
+
+@dataclass(frozen=True)
+class Optics:
+    """Optical properties of a liquid."""
+
+    depths: float  # optical depths (natural logarithms) that the deepest colour loses over the length of the scene
+    milk: float  # optical depths that it scatters back, in all colours alike
+    body: float  # share of the light that what is scattered gives back
+    deepening: float  # power of the share let through by which what is scattered deepens, its way being as coloured
+    gloss: float  # how strong highlights are
+    sharpness: float  # exponent of the highlight
+    reflection: float  # share of the mirror image that is kept; 0 is dull
+    bend: float  # how far what lies behind is shifted, in parts of the thickness
+    glow: float = 0.0  # light of its own, in parts of full white
+
+
+# Depths, milk, body, deepening, gloss, sharpness, reflection, bend, glow.
+FINISHES: dict[Finish, Optics] = {
+    "water": Optics(6.0, 0.4, 0.6, 0.12, 1.6, 260.0, 1.0, 0.06),
+    "syrup": Optics(32.0, 1.0, 0.88, 0.2, 1.0, 160.0, 0.9, 0.06),
+    "matte": Optics(200.0, 400.0, 0.9, 0.0, 0.10, 18.0, 0.15, 0.0),
+}
+LAVA = Optics(200.0, 400.0, 0.35, 0.0, 0.15, 30.0, 0.2, 0.0, 1.0)
+
+
+def optics_of(appearance: Appearance) -> Optics:
+    """Return the optical properties of a material."""
+    if appearance.name.startswith("lava"):
+        return LAVA
+    return FINISHES.get(appearance.finish, FINISHES["matte"])
+
+
+def linear(color: np.ndarray) -> np.ndarray:
+    """Return displayed values from 0 to 1 as amounts of light."""
+    return np.asarray(color, np.float32) ** np.float32(2.2)
+
+
+def displayed(light: np.ndarray) -> np.ndarray:
+    """Return amounts of light as displayed values from 0 to 1."""
+    return np.clip(light, 0, 1) ** np.float32(1 / 2.2)
+
+
+@dataclass(frozen=True)
+class FluidLights:
+    """What lights a scene: a lamp, a sky and the floor, in amounts of light; directions (3,) are in camera axes."""
+
+    lamp: np.ndarray  # direction to it, a unit vector
+    up: np.ndarray  # direction
+    zenith: np.ndarray  # colour (3,); `horizon` and `floor` alike
+    horizon: np.ndarray
+    floor: np.ndarray
+    strength: float  # of the lamp
+    ambient: float  # strength of what comes from all sides
+
+    def around(self, direction: np.ndarray) -> np.ndarray:
+        """Return what is seen in directions (..., 3): floor, horizon, sky, and the lamp as a large soft box."""
+        rise = (direction @ self.up)[..., None]
+        high = np.clip(rise, 0, 1) ** np.float32(0.6)
+        low = _step(rise, -0.35, 0.02)
+        sky = self.horizon + (self.zenith - self.horizon) * high
+        box = _step((direction @ self.lamp)[..., None], 0.72, 0.97)
+        return self.floor + (sky - self.floor) * low + np.float32(0.9 * self.strength) * box
+
+
+def fluid_lights(theme: Theme, lamp: np.ndarray, up: np.ndarray) -> FluidLights:
+    """Return the lights of a theme, for a lamp in a direction."""
+    floor = linear(np.array(rgb(theme.floor)))
+    if theme.name == "dark":
+        around, strengths = ([0.10, 0.15, 0.24], [0.30, 0.36, 0.46], 0.6 * floor), (0.95, 0.36)
+    else:
+        around, strengths = ([0.25, 0.47, 0.85], [0.93, 0.96, 1.0], 0.8 * floor), (0.75, 0.45)
+    return FluidLights(*(np.asarray(vector, np.float32) for vector in (lamp, up, *around)), *strengths)
+
+
+def transmitted(appearance: Appearance, thickness: np.ndarray, length: float) -> np.ndarray:
+    """Return the share of light (..., 3) that is left behind a thickness (...), m, by the law of Beer and Lambert.
+
+    The liquid takes what its optics say over the `length` of the scene, m: so a beaker and a reservoir look alike.
+    """
+    optics = optics_of(appearance)
+    loss = -np.log(np.clip(linear(np.array(rgb(appearance.color))), 1e-3, 0.98))
+    loss = loss / loss.max() * optics.depths + optics.milk
+    return np.exp(-(thickness[..., None] + np.float32(SKIN * length)) * (loss / length).astype(np.float32))
+
+
+def shaded(
+    appearance: Appearance,
+    normal: np.ndarray,
+    towards: np.ndarray,
+    through: np.ndarray,
+    behind: np.ndarray,
+    hollow: np.ndarray,
+    lights: FluidLights,
+) -> np.ndarray:
+    """Return the light (n, 3) that comes from n points of a surface.
+
+    The directions `normal`, outwards, and `towards` the eye are (n, 3), of length one; `through` is the share (n, 3) of
+    `transmitted`, `behind` the light (n, 3) from what lies behind, and `hollow` (n,) as of `liquid_surface.Surface`.
+    """
+    optics = optics_of(appearance)
+    color = linear(np.array(rgb(appearance.color)))
+    facing = np.clip(np.einsum("ij,ij->i", normal, towards), 0, 1)[:, None]
+    lit = normal @ lights.lamp
+    # Light that has been scattered inside wraps around the edges of its shadow.
+    wrap = np.float32(0.45 if optics.milk < 100 else 0.1)
+    diffuse = lights.strength * np.clip((lit + wrap) / (1 + wrap), 0, 1)
+    ambient = lights.ambient * (0.62 + 0.38 * (normal @ lights.up)) * (1 - 0.35 * np.clip(hollow, -1, 1))
+    body = np.float32(optics.body) * color * (diffuse + ambient)[:, None]
+    if optics.deepening:
+        body = body * through ** np.float32(optics.deepening)
+    scattered = 1 - through.mean(axis=1, keepdims=True)
+    rim = 1 - np.float32(RIM) * (1 - facing) ** 3
+    rim *= np.float32(0.92) + np.float32(0.10) * (normal @ lights.up)[:, None]
+    inside = behind * through * rim + body * scattered
+    if optics.glow:
+        inside = inside + np.float32(optics.glow) * glow(facing[:, 0], hollow)
+    mirrored = 2 * facing * normal - towards
+    fresnel = HEAD_ON + (1 - HEAD_ON) * (1 - facing) ** 5
+    fresnel = np.float32(optics.reflection) * np.minimum(fresnel, np.float32(0.5))
+    half = lights.lamp + towards
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    highlight = np.clip(np.einsum("ij,ij->i", normal, half), 0, 1) ** np.float32(optics.sharpness)
+    spark = np.float32(optics.gloss * lights.strength) * highlight[:, None]
+    return inside * (1 - fresnel) + lights.around(mirrored) * fresnel + spark
+
+
+def glow(facing: np.ndarray, hollow: np.ndarray) -> np.ndarray:
+    """Return the light (n, 3) of molten rock: yellow in its creases, red where it faces away and has cooled."""
+    heat = np.clip(0.24 + 0.30 * facing**2 + 0.9 * hollow, 0, 1)[:, None]
+    return np.concatenate([1.1 * heat, 0.62 * heat**2.4, 0.16 * heat**5], axis=1).astype(np.float32)
+
+
+def _step(value: np.ndarray, low: float, high: float) -> np.ndarray:
+    share = np.clip((value - np.float32(low)) / np.float32(high - low), 0, 1)
+    return share * share * (3 - 2 * share)

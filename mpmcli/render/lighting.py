@@ -1,0 +1,123 @@
+"""Lamps, and how each finish meets their light: the shader that colours every point of a surface.
+
+The light is a formula of the direction (sky, ground, a lamp with a soft edge, a strip behind): it lights
+what is dull and is mirrored in what is glossy. What is clear shows the picture behind it, bent by its normals and
+dimmed by its thickness, after the law of Beer and Lambert, with Schlick's approximation of Fresnel's mirror.
+"""
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+
+from mpmcli.render.render_scene import Appearance, RenderScene
+from mpmcli.render.settings import Theme, rgb
+from mpmcli.render.view import View
+
+CLEAR = ("water", "syrup", "translucent")  # finishes that show what is behind them
+# Names of what each vertex carries to the shader: lamp, sky, thickness; colour; roughness of the normal; normal.
+LIGHT, TINT, ROUGH, OUTWARDS = "lightMC", "tintMC", "roughMC", "outwardsMC"
+CARRIED = (LIGHT, TINT, ROUGH, OUTWARDS)
+BEHIND = "behindTexture"  # name of the picture behind clear things
+# How far what lies behind a clear finish is shifted, as a share of its thickness.
+BENT = {"translucent": "0.16", "water": "0.22", "syrup": "0.2"}
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Directions (3,) towards three lights, in the scene, and colours (3,), in linear light."""
+
+    lamp: np.ndarray
+    rim: np.ndarray
+    fill: np.ndarray
+    lamp_color: np.ndarray
+    sky: np.ndarray
+    horizon: np.ndarray
+    ground: np.ndarray
+
+
+def lights_of(scene: RenderScene, view: View, theme: Theme) -> Lights:
+    """Set up the lamps about a camera: one over the left shoulder, one behind, one from the side."""
+    right, up, back = view.axes
+    above = np.array(scene.up)
+    dark = theme.name == "dark"
+    return Lights(
+        lamp=_unit(-0.42 * right + 1.0 * above + 0.40 * back - 0.1 * up),
+        rim=_unit(0.55 * right + 0.55 * above - 0.75 * back),
+        fill=_unit(0.8 * right + 0.25 * above + 0.6 * back),
+        lamp_color=np.array([1.50, 1.56, 1.66]) * 0.72 if dark else np.array([1.62, 1.55, 1.42]) * 0.66,
+        sky=np.array([0.30, 0.38, 0.52]) * (0.72 if dark else 1.25),
+        horizon=np.array([0.22, 0.26, 0.33]) if dark else np.array([0.86, 0.90, 0.95]),
+        ground=linear(theme.floor) * (1.0 if dark else 0.42) + (0.03 if dark else 0.0),
+    )
+
+
+def linear(color: str) -> np.ndarray:
+    """Return "#rrggbb" in linear light, (3,): the inverse of a display's gamma of 2.2."""
+    return np.array(rgb(color)) ** 2.2
+
+
+def vertex_code() -> tuple[str, str]:
+    """Return what the vertex shader declares and does to hand over what the vertices carry."""
+    declared = f"in vec4 {LIGHT};\n" + "".join(f"in vec3 {name};\n" for name in CARRIED[1:])
+    done = f"carriedLight = {LIGHT}; carriedTint = {TINT}; carriedRough = {ROUGH};\n"
+    return declared + _carried("out"), done + f"worldPoint = vertexMC.xyz; worldNormal = {OUTWARDS};"
+
+
+def fragment_code(
+    scene: RenderScene, view: View, lights: Lights, appearance: Appearance, finer: int, *, by_field: bool, walled: bool
+) -> tuple[str, str]:
+    """Return what the fragment shader declares and does for one material.
+
+    The window has `finer` pixels to one of the view, along each axis. Tints `by_field` mean something, so that light
+    must not change them much. What is `walled` leans on the walls of the domain that it lies at, and is flat there.
+    """
+    extent = np.subtract(scene.upper, scene.lower)
+    volume_length = float(np.prod(np.maximum(extent, 1e-12))) ** (1 / 3)
+    right, up, back = view.axes
+    vectors = {
+        **{"lowerWall": scene.lower, "upperWall": scene.upper, "upwards": scene.up},
+        **{"lampTo": lights.lamp, "rimTo": lights.rim, "fillTo": lights.fill},
+        **{"lampColor": lights.lamp_color, "skyColor": lights.sky},
+        **{"horizonColor": lights.horizon, "groundColor": lights.ground},
+        **{"cameraAt": view.position, "toCamera": back, "cameraRight": right, "cameraUp": up},
+    }
+    declared = _carried("in")
+    declared += "".join(f"const vec3 {name} = {_vec(values)};\n" for name, values in vectors.items())
+    declared += f"const float grainSize = {max(scene.distances):.9g};\n"
+    declared += f"const float wallGap = {1e-5 * max(extent):.9g};\n"
+    declared += f"const float thickUnit = {0.3 * volume_length:.9g};\n"
+    declared += f"const vec2 pictureSize = vec2({finer * view.size[0]}.0, {finer * view.size[1]}.0);\n"
+    declared += f"const float pixelsToMetre = {finer * view.pixels_per_metre:.9g};\n"
+    parts = shader_parts()
+    declared += parts["room"]
+    kind: str = "field" if by_field else appearance.finish
+    if appearance.name.startswith("lava") and kind == "syrup":
+        kind = "lava"
+    towards = "toCamera" if view.parallel else "normalize(cameraAt - worldPoint)"
+    common = parts["common"].replace("TOWARDS", towards).replace("WALLED", "true" if walled else "false")
+    behind = parts["behind"].replace("BENT", BENT[kind]) if kind in BENT else ""
+    return declared, common + behind + parts.get(kind, parts["matte"]) + parts["tone"]
+
+
+@cache
+def shader_parts() -> dict[str, str]:
+    """Return the parts of `lighting.glsl` by name."""
+    text = files("mpmcli.render").joinpath("lighting.glsl").read_text(encoding="utf-8")
+    return dict(re.findall(r"^//// (\w+)(\n.*?)(?=^////|\Z)", text, re.MULTILINE | re.DOTALL))
+
+
+def _carried(direction: str) -> str:
+    """Return the declarations of the varyings, sampled at the centroid of the covered part of the pixel."""
+    names = ("carriedTint", "carriedRough", "worldPoint", "worldNormal")
+    return f"centroid {direction} vec4 carriedLight;\n" + "".join(f"centroid {direction} vec3 {n};\n" for n in names)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
+
+
+def _vec(values: tuple[float, ...] | np.ndarray) -> str:
+    return "vec3(" + ", ".join(f"{float(value):.9g}" if value % 1 else f"{float(value):.1f}" for value in values) + ")"

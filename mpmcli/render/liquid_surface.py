@@ -1,0 +1,443 @@
+"""The surface of the liquids in a picture: where it is seen, how far away, which way it faces, and what is under it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from mpmcli.render.dots import hidden
+from mpmcli.render.particle_grid import deposited, gaussian
+from mpmcli.render.render_scene import Appearance, RenderScene
+from mpmcli.render.view import View
+
+RADIUS = 0.9  # radius of the spheres of particles, in distances between particles: they overlap
+CORE = 0.5  # what is within this of a particle is liquid, however far it is from the next: a drop
+MIRRORED = 1.2  # particles within this of a wall are mirrored in it
+# Standard deviations, in distances between particles: of the smoothing of the depth, the outline, the thickness and
+# the normals.
+SMOOTHING, OUTLINE, SPREAD, SOFTNESS = 2.2, 1.1, 1.2, 0.4
+WIDEST = 60.0  # the widest that any of them may be, pixels
+# The largest sphere that is drawn as it is, pixels; larger ones, which are smoothed over as much, are drawn coarsely.
+LARGEST = 24.0
+NOTHING = np.float32(1e9)  # depth, m, of a pixel that no liquid covers
+BLOCK = 24  # rows that are smoothed together: few enough to stay in the cache
+CUT = 2.0  # standard deviations at which a Gaussian is cut off
+BOXES_FROM = 8.0  # pixels of deviation from which a Gaussian is made of boxes
+MOST_TAPS = 16  # taps to one side of a pixel; a wider filter takes wider steps instead
+
+
+@dataclass(frozen=True)
+class Liquid:
+    """The particles of one liquid."""
+
+    appearance: Appearance
+    distance: float  # between neighbours at the start, m
+    position: np.ndarray  # (n, 3), m
+    pixels: np.ndarray  # (n, 3), from the left and from the top, and the distance from the camera, m
+    scale: np.ndarray  # (n,) pixels to the metre
+    volume: np.ndarray  # (n,) of each particle at rest, m^3
+
+    @property
+    def size(self) -> float:
+        """Pixels from one particle to the next, in the middle of them."""
+        return self.distance * float(np.median(self.scale))
+
+    @property
+    def reach(self) -> float:
+        """Pixels around a particle in which it leaves a trace."""
+        return min((RADIUS + 2) * self.distance * float(self.scale.max()) + 3, 2 * WIDEST)
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of the picture that the liquids are in; it may stand out over the edges of the picture."""
+
+    left: int
+    top: int
+    columns: int
+    rows: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.rows, self.columns
+
+    @property
+    def middles(self) -> tuple[np.ndarray, np.ndarray]:
+        """Middles of its pixels, from the left (1, columns) and from the top (rows, 1) of the picture."""
+        x = np.arange(self.left, self.left + self.columns) + 0.5
+        y = np.arange(self.top, self.top + self.rows) + 0.5
+        return x[None, :], y[:, None]
+
+    def inner(self, size: tuple[int, int]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+        """Return where it lies in a picture of a size (width, height), and which part of it does."""
+        low = max(self.top, 0), max(self.left, 0)
+        high = min(self.top + self.rows, size[1]), min(self.left + self.columns, size[0])
+        part = slice(low[0] - self.top, high[0] - self.top), slice(low[1] - self.left, high[1] - self.left)
+        return (slice(low[0], high[0]), slice(low[1], high[1])), part
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What is seen of the liquids in a window; directions are those of the camera: right, up, towards the viewer."""
+
+    window: Window
+    alpha: np.ndarray  # (h, w) share of each pixel that they cover
+    depth: np.ndarray  # (h, w) distance, m; it means something where `alpha` is above 0
+    owner: np.ndarray  # (h, w) which liquid it is
+    normal: np.ndarray  # (h, w, 3)
+    hollow: np.ndarray  # (h, w) from -1 of a ridge to 1 of a crease, about
+
+
+def window_of(liquids: Sequence[Liquid], view: View) -> Window | None:
+    """Return the box around what can be seen of the liquids; None when nothing can."""
+    if not liquids:
+        return None
+    margin = int(np.ceil(max(liquid.reach for liquid in liquids)))
+    low = np.min([liquid.pixels[:, :2].min(axis=0) - liquid.reach for liquid in liquids], 0)
+    high = np.max([liquid.pixels[:, :2].max(axis=0) + liquid.reach for liquid in liquids], 0)
+    low = np.maximum(np.floor(low), -margin)
+    high = np.minimum(np.ceil(high), np.array(view.size) + margin)
+    if (high <= 0).any() or (low >= view.size).any():
+        return None
+    left, top, right, bottom = (int(number) for number in (*low, *high))
+    return Window(left, top, right - left, bottom - top)
+
+
+def surface_of(liquids: Sequence[Liquid], window: Window, view: View, scene: RenderScene) -> Surface:
+    """Find the surface of the liquids, all of them as one body."""
+    low, high = np.array(scene.lower), np.array(scene.upper)
+    slack = [(liquid.position, 0.3 * liquid.distance) for liquid in liquids]
+    inside = all(((x >= low - more) & (x <= high + more)).all() for x, more in slack)
+    whole = [_mirrored(liquid, view, scene) if inside else liquid for liquid in liquids]
+    depth, owner, core = _nearest([_moved(liquid, window) for liquid in whole], window)
+    if inside:
+        entry, exit_ = _passage(window, view, scene)
+        beyond = depth > exit_
+        depth[beyond] = NOTHING
+        core &= ~beyond
+    known = depth < NOTHING
+    distance = max(liquid.distance for liquid in liquids)
+    scale = view.scale_at(np.where(known, depth, view.distance))
+    depth = smoothed(depth, np.minimum(SMOOTHING * distance * scale, WIDEST), RADIUS * distance)
+    if inside:
+        # The walls hold the liquid: its spheres do not stand out of the domain.
+        depth = np.where(known & (entry < NOTHING), np.maximum(depth, entry), depth)
+    size = min(max(liquid.size for liquid in liquids), WIDEST)
+    soft = max(OUTLINE * size, 0.4)
+    cover = blurred(known.astype(np.float32), soft)
+    # A straight edge, blurred, falls by 1 / (sqrt(2 pi) soft) to the pixel: this makes it one pixel wide again.
+    alpha = np.clip((cover - 0.5) * np.float32(2.5 * soft) + 0.5, 0, 1)
+    alpha = np.maximum(alpha, blurred(core.astype(np.float32), 0.5))
+    if inside:
+        alpha *= blurred((entry < NOTHING).astype(np.float32), 0.5)
+    gap = (alpha > 0) & ~known
+    if gap.any():
+        filled = blurred(np.where(known, depth, 0), soft) / np.maximum(cover, 1e-6)
+        depth = np.where(gap, filled, depth)
+    across, up = view.plane(*window.middles)
+    ahead = 1.0 if view.parallel else depth
+    points = np.stack(np.broadcast_arrays(across * ahead, up * ahead, -depth), axis=-1).astype(np.float32)
+    normal = _softened(normals(points, known), known, max(SOFTNESS * size, 0.5))
+    return Surface(window, alpha, depth, owner, normal, _hollow(normal, alpha > 0, size))
+
+
+def layers_of(liquids: Sequence[Liquid], window: Window, wall: np.ndarray, samples: int) -> list[np.ndarray]:
+    """Return how thick each liquid is along each pixel of the window, (h, w), m, up to what is solid.
+
+    The `wall` is the distance of what is solid, m, in `samples` by `samples` points to each pixel of the picture.
+    """
+    rows, columns = wall.shape
+    layers = []
+    for liquid in liquids:
+        column, row = np.floor(liquid.pixels[:, :2] * samples).astype(np.int64).T
+        before = liquid.pixels[:, 2] < wall[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
+        spread = min(max(SPREAD * liquid.size, 0.5), WIDEST)
+        local = _moved(liquid, window)
+        layers.append(thickness(local.pixels, np.where(before, liquid.volume, 0), liquid.scale, spread, window.shape))
+    return layers
+
+
+def _moved(liquid: Liquid, window: Window) -> Liquid:
+    return replace(liquid, pixels=liquid.pixels - np.array([window.left, window.top, 0.0]))
+
+
+def _nearest(liquids: Sequence[Liquid], window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the depth of the nearest sphere, m, which liquid it is of, and where the cores are."""
+    depth = np.full(window.shape, NOTHING, np.float32)
+    owner = np.zeros(window.shape, np.int8)
+    core = np.zeros(window.shape, bool)
+    for k, liquid in enumerate(liquids):
+        radius = RADIUS * liquid.distance
+        seen = ~hidden(liquid.pixels, max(liquid.size, 2.0), 2 * radius)
+        pixels, scale = liquid.pixels[seen], liquid.scale[seen]
+        near = _spheres(pixels, scale, radius, window.shape)
+        core |= _spheres(pixels, scale, CORE * liquid.distance, window.shape) < NOTHING
+        owner[near < depth] = k
+        depth = np.minimum(depth, near)
+    return depth, owner, core
+
+
+def _spheres(pixels: np.ndarray, scale: np.ndarray, radius: float, shape: tuple[int, int]) -> np.ndarray:
+    """Return `sphere_depths`, worked out for squares of pixels where the spheres are large."""
+    side = int(np.ceil(radius * float(scale.max()) / LARGEST)) if len(scale) else 1
+    if side <= 1:
+        return sphere_depths(pixels, scale, radius, shape)
+    rows, columns = shape
+    coarse = sphere_depths(pixels / (side, side, 1), scale / side, radius, (-(-rows // side), -(-columns // side)))
+    return np.repeat(np.repeat(coarse, side, axis=0), side, axis=1)[:rows, :columns]
+
+
+def _mirrored(liquid: Liquid, view: View, scene: RenderScene) -> Liquid:
+    """Add the mirror images of the particles at the walls: the surface then meets a wall without a gap or a dent."""
+    images = []
+    for axis in range(3):
+        for wall in (scene.lower[axis], scene.upper[axis]):
+            near = np.abs(liquid.position[:, axis] - wall) < MIRRORED * liquid.distance
+            image = liquid.position[near]
+            image[:, axis] = 2 * wall - image[:, axis]
+            images.append(image)
+    added = np.concatenate(images)
+    pixels = view.pixels(added)
+    front = pixels[:, 2] > max(view.near, liquid.distance)
+    added, pixels = added[front], pixels[front]
+    return replace(
+        liquid,
+        position=np.concatenate([liquid.position, added]),
+        pixels=np.concatenate([liquid.pixels, pixels]),
+        scale=np.concatenate([liquid.scale, view.scale_at(pixels[:, 2])]),
+    )
+
+
+def _passage(window: Window, view: View, scene: RenderScene) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the rays of pixels enter the domain and where they leave it, m; `NOTHING` twice where they miss."""
+    start, direction = view.rays(*window.middles)
+    ends = np.array([scene.lower, scene.upper])[:, None, None] - start
+    ends /= np.where(np.abs(direction) < 1e-12, 1e-12, direction)
+    first, last = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
+    hit = first <= last
+    return tuple(np.where(hit, distance, NOTHING).astype(np.float32) for distance in (first, last))
+
+
+def _softened(normal: np.ndarray, known: np.ndarray, deviation: float) -> np.ndarray:
+    """Return normals averaged over their surroundings, and continued a little over the edges."""
+    mean = np.stack([blurred(normal[..., k] * known, deviation) for k in range(3)], axis=-1)
+    length = np.sqrt(np.einsum("ijk,ijk->ij", mean, mean))[..., None]
+    return np.where(length > 1e-6, mean / np.maximum(length, 1e-6), normal)
+
+
+def _hollow(normal: np.ndarray, covered: np.ndarray, size: float) -> np.ndarray:
+    """Return minus the divergence of the normals, times a few particles' size."""
+    spread = np.zeros(covered.shape, np.float32)
+    spread[:, 1:-1] += 0.5 * (normal[:, 2:, 0] - normal[:, :-2, 0])
+    spread[1:-1] -= 0.5 * (normal[2:, :, 1] - normal[:-2, :, 1])
+    spread = np.where(covered, np.clip(spread * np.float32(size), -1, 1), 0)
+    return -2.5 * blurred(spread, max(0.9 * size, 0.5))
+
+
+def sphere_depths(pixels: np.ndarray, scale: np.ndarray, radius: float, shape: tuple[int, int]) -> np.ndarray:
+    """Return the distance of the nearest sphere in every pixel, (h, w) float32, m; `NOTHING` where there is none.
+
+    The centres (n, 3) are pixels from the left and from the top, and the distance, m; `scale` is the pixels to the
+    metre there. Each sphere is seen as from afar: a disc, whose depth is that of the half sphere.
+    """
+    rows, columns = shape
+    reach = radius * scale
+    span = int(np.ceil(reach.max())) if len(reach) else 0
+    # A sphere whose middle is outside by its radius may reach out as far again.
+    border = 2 * span + 1
+    width = columns + 2 * border
+    buffer = np.full((rows + 2 * border) * width, NOTHING, dtype=np.float32)
+    column, row = np.floor(pixels[:, 0]).astype(np.int64), np.floor(pixels[:, 1]).astype(np.int64)
+    inside = (column >= -span) & (column < columns + span) & (row >= -span) & (row < rows + span)
+    column, row, pixels, reach = column[inside], row[inside], pixels[inside], reach[inside]
+    home = (row + border) * width + column + border
+    # A sphere smaller than a pixel still shows, in the pixel of its centre.
+    flat = (1.0 / np.maximum(reach, 0.75) ** 2).astype(np.float32)
+    right, down = (pixels[:, 0] - column).astype(np.float32), (pixels[:, 1] - row).astype(np.float32)
+    depth, radius = pixels[:, 2].astype(np.float32), np.float32(radius)
+    across = [(np.float32(k + 0.5) - right) ** 2 * flat for k in range(-span, span + 1)]
+    for drop in range(-span, span + 1):
+        rest = 1 - (np.float32(drop + 0.5) - down) ** 2 * flat
+        for shift in range(-span, span + 1):
+            if np.hypot(max(abs(drop) - 1, 0), max(abs(shift) - 1, 0)) > span:
+                continue
+            bulge = rest - across[shift + span]
+            hit = np.flatnonzero(bulge > 0)
+            np.minimum.at(buffer, home[hit] + (drop * width + shift), depth[hit] - radius * np.sqrt(bulge[hit]))
+    return buffer.reshape(-1, width)[border : border + rows, border : border + columns].copy()
+
+
+def smoothed(depth: np.ndarray, deviation: np.ndarray, radius: float) -> np.ndarray:
+    """Return a depth image (h, w), m, without the bumps of single particles, and with its edges where they were.
+
+    The narrow-range filter, along the rows and the columns in turn: a Gaussian, of a deviation in pixels, in which a
+    neighbour counts as it is when its depth is within a range of the pixel's own, a range that grows with what it takes
+    in; as lying `radius` behind when it is farther back; and not at all, nor its mirror image, when it is in front.
+
+    Source: N. Truong and C. Yuksel, "A narrow-range filter for screen-space fluid rendering", Proc. ACM Comput.
+    Graph. Interact. Tech. 1 (2018), 17, section 4.
+    """
+    decay = (0.5 / np.maximum(deviation, 0.3) ** 2).astype(np.float32)
+    covered = depth < NOTHING
+    widest = float(deviation[covered].max()) if covered.any() else 0.0
+    reach = int(np.ceil(CUT * widest))
+    stride = max(1, int(np.ceil(reach / MOST_TAPS)))
+    for step in (stride, stride, 1) if stride > 1 else (1, 1):
+        taps = min(reach // step, MOST_TAPS)
+        for _ in range(2):
+            # Along the rows, then along the columns.
+            depth = np.ascontiguousarray(_along_rows(depth, decay, radius, taps, step).T)
+            decay = np.ascontiguousarray(decay.T)
+    return _cleaned(depth, radius) if widest > 1 else depth
+
+
+def _cleaned(depth: np.ndarray, radius: float) -> np.ndarray:
+    """Wipe out the streaks that rows and columns leave: a filter of five by five pixels, in both directions at once."""
+    covered = depth < NOTHING
+    used_rows, used_columns = np.flatnonzero(covered.any(axis=1)), np.flatnonzero(covered.any(axis=0))
+    if len(used_rows) == 0:
+        return depth
+    place = slice(used_rows[0], used_rows[-1] + 1), slice(used_columns[0], used_columns[-1] + 1)
+    centre, mask = depth[place], covered[place]
+    rows, columns = centre.shape
+    padded = np.pad(centre, 2, constant_values=NOTHING)
+    total, weight = np.zeros_like(centre), np.ones_like(centre)
+    for i, j in product(range(-2, 3), repeat=2):
+        if i == j == 0:
+            continue
+        difference = padded[2 + i : 2 + i + rows, 2 + j : 2 + j + columns] - centre
+        share = np.float32(np.exp(-(i * i + j * j) / 6)) * (np.abs(difference) < np.float32(2 * radius))
+        total += share * np.where(share > 0, difference, 0)
+        weight += share
+    result = depth.copy()
+    result[place] = np.where(mask, centre + total / weight, centre)
+    return result
+
+
+def _along_rows(depth: np.ndarray, decay: np.ndarray, radius: float, taps: int, step: int) -> np.ndarray:
+    """Filter along the rows, only where there is something."""
+    rows = len(depth)
+    reach = taps * step
+    result = depth.copy()
+    padded = np.pad(depth, ((0, 0), (reach, reach)), constant_values=NOTHING)
+    covered = depth < NOTHING
+    for top in range(0, rows, BLOCK):
+        here = slice(top, min(top + BLOCK, rows))
+        used = np.flatnonzero(covered[here].any(axis=0))
+        if len(used) == 0:
+            continue
+        left, right = int(used[0]), int(used[-1]) + 1
+        part = padded[here, left : right + 2 * reach]
+        moved = _narrow_range(part, decay[here, left:right], np.float32(radius), taps, step)
+        mask = covered[here, left:right]
+        result[here, left:right][mask] = moved[mask]
+    return result
+
+
+def _narrow_range(part: np.ndarray, decay: np.ndarray, radius: np.float32, taps: int, step: int) -> np.ndarray:
+    reach, columns = taps * step, decay.shape[1]
+    centre = part[:, reach : reach + columns]
+    range_ = 4 * radius
+    nearest, farthest = centre - range_, centre + range_
+    behind = centre + radius
+    total, weight = np.zeros_like(centre), np.ones_like(centre)
+    # exp(-k^2 a) by recurrence: the ratio of neighbouring values is exp(-(2 k + 1) a), itself a geometric sequence.
+    ratio = np.exp(-decay * np.float32(step * step))
+    square = ratio * ratio
+    gauss = np.ones_like(centre)
+    for tap in range(1, taps + 1):
+        gauss *= ratio
+        ratio *= square
+        shift = tap * step
+        before = part[:, reach - shift : reach - shift + columns]
+        after = part[:, reach + shift : reach + shift + columns]
+        low, high = np.minimum(before, after), np.maximum(before, after)
+        fits = low > nearest
+        share = gauss * fits
+        low_seen, high_seen = low < farthest, high < farthest
+        low, high = np.where(low_seen, low, behind), np.where(high_seen, high, behind)
+        total += share * ((low - centre) + (high - centre))
+        weight += 2 * share
+        np.minimum(nearest, low - range_, out=nearest, where=fits)
+        np.maximum(farthest, high + range_, out=farthest, where=fits & high_seen)
+        np.maximum(farthest, low + range_, out=farthest, where=fits & low_seen)
+    return centre + total / weight
+
+
+def blurred(image: np.ndarray, deviation: float) -> np.ndarray:
+    """Return an image (h, w) under a Gaussian, pixels; its sum is kept but for what runs over the edges."""
+    if deviation > BOXES_FROM:
+        return _boxed(image, deviation)
+    reach = int(np.ceil(3 * deviation))
+    # Along the rows first.
+    return np.ascontiguousarray(gaussian(image.T, deviation, reach).T)
+
+
+def _boxed(image: np.ndarray, deviation: float) -> np.ndarray:
+    """Return an image under three boxes, which are as good as a wide Gaussian and cost the same at every width.
+
+    A box of w pixels has the variance (w^2 - 1) / 12; the widths are the odd ones whose sum is nearest.
+    """
+    low = 2 * int((np.sqrt(4 * deviation**2 + 1) - 1) / 2) + 1
+    # With m boxes of `low` and the rest two wider: 12 deviation^2 = 3 (low + 2)^2 - 3 - m (4 low + 4).
+    count = round((3 * (low + 2) ** 2 - 3 - 12 * deviation**2) / (4 * low + 4))
+    result = image.astype(np.float64)
+    for _ in range(2):
+        for k in range(3):
+            half = (low if k < count else low + 2) // 2
+            total = np.cumsum(np.pad(result, ((half + 1, half), (0, 0))), axis=0)
+            result = (total[2 * half + 1 :] - total[: -2 * half - 1]) / (2 * half + 1)
+        result = np.ascontiguousarray(result.T)
+    return result.astype(image.dtype)
+
+
+def thickness(
+    pixels: np.ndarray, volumes: np.ndarray, scale: np.ndarray, deviation: float, shape: tuple[int, int]
+) -> np.ndarray:
+    """Return (h, w) float32, m: the volume of the particles in every pixel over the area that it sees of them.
+
+    Times the area of a pixel, its sum over a picture in parallel projection is the volume of the particles. Each is
+    spread by a Gaussian of a deviation in pixels.
+    """
+    return blurred(deposited(pixels[:, :2] - 0.5, volumes * scale**2, shape).astype(np.float32), deviation)
+
+
+def normals(points: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """Return unit normals (h, w, 3) of a surface, towards the viewer, who looks along minus the third axis.
+
+    In each direction the step to the neighbour is taken whose depth jumps less, so that edges stay sharp. Points
+    (h, w, 3) are in camera axes: to the right, up and towards the viewer, m; there is a surface where it is `covered`.
+    """
+    across, down = (_smaller_step(points, covered, axis) for axis in (1, 0))
+    normal = np.empty_like(points)
+    # up x right turned round: rows run downwards.
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        normal[..., k] = down[..., i] * across[..., j] - down[..., j] * across[..., i]
+    length = np.sqrt(np.einsum("ijk,ijk->ij", normal, normal))
+    flat = ~(length > 0)
+    normal /= np.where(flat, 1, length)[..., None]
+    normal[flat] = (0.0, 0.0, 1.0)
+    return normal
+
+
+def _smaller_step(points: np.ndarray, covered: np.ndarray, axis: int) -> np.ndarray:
+    step = np.diff(points, axis=axis)
+    pixel = float(np.median(np.abs(step[..., 1 - axis][step[..., 1 - axis] != 0]))) if step.any() else 0.0
+    size = np.abs(step[..., 2])
+    pair = covered[1:] & covered[:-1] if axis == 0 else covered[:, 1:] & covered[:, :-1]
+    size = np.where(pair, size, np.inf)
+    step = np.where(pair[..., None], step, 0)
+    edge = [(0, 0)] * 3
+    ahead, back = edge.copy(), edge.copy()
+    ahead[axis], back[axis] = (0, 1), (1, 0)
+    forward, backward = np.pad(step, ahead), np.pad(step, back)
+    size_forward = np.pad(size, ahead[:2], constant_values=np.inf)
+    size_backward = np.pad(size, back[:2], constant_values=np.inf)
+    smaller = np.where((size_forward < size_backward)[..., None], forward, backward)
+    # Where neither is an edge their mean is one order more exact.
+    low, high = np.minimum(size_forward, size_backward), np.maximum(size_forward, size_backward)
+    alike = np.isfinite(high) & (high <= 2 * low + np.float32(0.5) * pixel)
+    return np.where(alike[..., None], np.float32(0.5) * (forward + backward), smaller)

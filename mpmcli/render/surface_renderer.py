@@ -1,0 +1,262 @@
+"""Draws 3D surfaces in one off-screen window, its meshes replaced with every frame."""
+
+import math
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from mpmcli.frames.frame import Frame
+from mpmcli.render import lighting
+from mpmcli.render.colliders import ColliderMesh, collider_meshes, edge_actors
+from mpmcli.render.coloring import Coloring
+from mpmcli.render.lighting import Lights
+from mpmcli.render.occlusion import Background, Occlusion, occlusion_by
+from mpmcli.render.offscreen import OffscreenRenderer
+from mpmcli.render.particle_grid import blurred_along, deposited, sampled
+from mpmcli.render.reconstruction import reconstruct
+from mpmcli.render.render_scene import Appearance, Group, RenderScene, groups_of
+from mpmcli.render.settings import Theme, rgb
+from mpmcli.render.view import View
+
+# Pixels of the window to one of the picture, along each axis, and the longest side of a window.
+FINER, LONGEST = 2, 8192
+# Edge of the cells in which the thickness of a body is found, in distances between particles, and the least, pixels.
+COARSENESS, FINEST = 1.4, 3.0
+# Radius of the ball of a grain, in distances between particles: a little more than half, so that a heap has no holes.
+RADIUS = 0.6
+VARIETY = 0.26  # by how much grains differ in brightness, as a share
+JITTER = 0.3  # by how much a grain is moved, in distances between particles: heaps are no lattices
+
+
+class SurfaceRenderer:
+    """Draws the materials of a 3D run as bodies against a lit background."""
+
+    def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> None:
+        self.scene, self.view, self.theme, self.colors = scene, view, theme, colors
+        self.fields = () if colors is None else colors.fields
+        self.background = Background(scene, view, theme)
+        self.lights = lighting.lights_of(scene, view, theme)
+        self.window = OffscreenRenderer(view, theme, samples=FINER if FINER * max(view.size) <= LONGEST else 1)
+        self.window.add_box(scene.lower, scene.upper, theme.wall, width=1.3)
+        self.renderer = self.window.plotter.renderer
+        self.behind, self.background_texture = _texture(), _texture()
+        for texture in (self.behind, self.background_texture):
+            _put(texture, self.background.image(None))
+        self.renderer.SetBackgroundTexture(self.background_texture)
+        self.renderer.TexturedBackgroundOn()
+        self.actors: dict[Any, Any] = {}
+        self.rims: dict[int, list[Any]] = {}
+        self.solids = [(mesh, mesh.shown(fine=True)) for mesh in collider_meshes(scene)]
+
+    def draw(self, frame: Frame) -> np.ndarray:
+        """Return the picture of a frame, (h, w, 3) uint8."""
+        groups = groups_of(self.scene, frame)
+        solids = [(mesh, shown) for mesh, shown in self.solids if self.scene.shows(mesh.number, frame)]
+        shades = [mesh.shade(frame.time) for mesh, _ in solids if mesh.casts]
+        occlusion = occlusion_by(self.scene, groups, self.lights.lamp, shades)
+        clear = []
+        for actor in (*self.actors.values(), *chain(*self.rims.values())):
+            actor.SetVisibility(False)
+        for group in groups:
+            actor = self._posed(group, frame, occlusion)
+            if group.appearance.finish in lighting.CLEAR and self.colors is None:
+                clear.append(actor)
+        for mesh, shown in solids:
+            self._pose_solid(mesh, shown, frame.time, occlusion)
+        _put(self.background_texture, self.background.image(occlusion))
+        if clear:
+            # What is clear shows the picture of all the rest.
+            for actor in clear:
+                actor.SetVisibility(False)
+            self.window.render()
+            _put(self.behind, self.window.pixels())
+            for actor in clear:
+                actor.SetVisibility(True)
+        self.window.render()
+        return self.window.picture()
+
+    def _posed(self, group: Group, frame: Frame, occlusion: Occlusion | None) -> Any:
+        """Return the actor of a group, with the mesh of this frame."""
+        finish = group.appearance.finish
+        if finish == "grains":
+            return self._posed_grains(group, frame, occlusion)
+        attributes = {"rough": group.hashes} if finish == "crumbly" or group.appearance.name == "lava" else {}
+        if self.colors is not None:
+            values = np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows]
+            known = np.isfinite(values)
+            attributes |= {"value": np.where(known, values, 0.0), "known": known.astype(np.float32)}
+        domain = self.scene.lower, self.scene.upper
+        mesh = reconstruct(group.position, group.distance, *domain, attributes, close=finish == "crumbly")
+        if group.key not in self.actors:
+            self.actors[group.key] = self._new_actor(group.appearance, by_field=self.colors is not None)
+        actor = self.actors[group.key]
+        count = len(mesh.points)
+        light = np.ones((count, 4), dtype=np.float32)
+        if occlusion is not None and count:
+            light[:, 0], light[:, 1] = occlusion.at(mesh.points, mesh.normals)
+            if finish in lighting.CLEAR:
+                light[:, 2] = _thickness_at(self.view, group.position, group.distance, mesh.points)
+        tint = np.broadcast_to(lighting.linear(group.appearance.color), (count, 3))
+        if self.colors is not None:
+            value, known = (mesh.attributes[name].astype(np.float64) for name in ("value", "known"))
+            # The mean over those particles that have a number, where they are the majority.
+            mean = np.divide(value, known, out=np.full_like(value, np.nan), where=known > 0.5)
+            tint = self.colors.shades(mean) ** np.float32(2.2)
+        rough = mesh.attributes.get("rough", np.zeros((count, 3), dtype=np.float32))
+        _carry(actor, mesh.points, mesh.triangles, (light, tint, rough, mesh.normals))
+        actor.SetVisibility(bool(len(mesh.triangles)))
+        return actor
+
+    def _posed_grains(self, group: Group, frame: Frame, occlusion: Occlusion | None) -> Any:
+        """Return the actor of a group of loose grains: balls for particles, each a little lighter or darker."""
+        import pyvista as pv
+
+        if group.key not in self.actors:
+            self.actors[group.key] = _new_grains(self.view, self.lights, group.distance)
+            self.renderer.AddActor(self.actors[group.key])
+        actor = self.actors[group.key]
+        color, hashes = np.array(rgb(group.appearance.color)), group.hashes
+        if self.colors is not None:
+            color = self.colors.shades(np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows])
+            # A colour that means something is not varied.
+            hashes = np.zeros_like(hashes)
+        lamp, sky = np.ones((2, len(hashes)))
+        if occlusion is not None:
+            lamp, sky = occlusion.at(group.position, np.broadcast_to(self.scene.up, group.position.shape))
+        light = 0.42 + 0.34 * lamp + 0.30 * sky
+        light = light * (1.0 + VARIETY * hashes[:, 0] * np.abs(hashes[:, 0]) + 0.08 * hashes[:, 1])
+        shown = np.clip(np.broadcast_to(color, hashes.shape) * light[:, None], 0.0, 1.0)
+        moved = group.position + JITTER * group.distance * group.hashes[:, ::-1]
+        cloud = pv.PolyData(np.clip(moved, self.scene.lower, self.scene.upper).astype(np.float32))
+        cloud.point_data["colors"] = (255.0 * shown + 0.5).astype(np.uint8)
+        mapper = actor.GetMapper()
+        mapper.SetInputData(cloud)
+        mapper.SetScalarModeToUsePointFieldData()
+        mapper.SelectColorArray("colors")
+        mapper.SetColorModeToDirectScalars()
+        actor.SetVisibility(True)
+        return actor
+
+    def _pose_solid(self, mesh: ColliderMesh, shown: Any, time: float, occlusion: Occlusion | None) -> None:
+        """Put a collider where it is at a time, s, in the light there."""
+        color, key, matrix = self.theme.solid, ("collider", mesh.number), mesh.transform(time)
+        if key not in self.actors:
+            look = Appearance("collider", color, color, "matte")
+            self.actors[key] = self._new_actor(look, by_field=False, walled=False)
+            if self.scene.clear and mesh.casts:
+                self.actors[key].GetProperty().BackfaceCullingOff()
+                self.actors[key].GetProperty().FrontfaceCullingOn()
+            # The rims of a container stand for its near side, which is not seen.
+            inside = mesh.collider.side == "inside"
+            self.rims[mesh.number] = edge_actors(mesh, self.theme, self.window) if inside else []
+        actor = self.actors[key]
+        for rim in self.rims[mesh.number]:
+            rim.user_matrix = matrix
+            rim.SetVisibility(True)
+        normals = shown.point_data["Normals"] @ matrix[:3, :3].T
+        points = shown.points @ matrix[:3, :3].T + matrix[:3, 3]
+        light = np.ones((len(points), 4), dtype=np.float32)
+        if occlusion is not None:
+            light[:, 0], light[:, 1] = occlusion.at(points, normals)
+        tint = np.broadcast_to(lighting.linear(color), points.shape)
+        _carry(actor, points, shown.regular_faces, (light, tint, np.zeros_like(points), normals))
+        actor.SetVisibility(True)
+
+    def _new_actor(self, appearance: Appearance, *, by_field: bool, walled: bool = True) -> Any:
+        import vtk
+
+        mapper = vtk.vtkPolyDataMapper()
+        mapper.ScalarVisibilityOff()
+        # The shader uses metres.
+        mapper.SetVBOShiftScaleMethod(0)
+        for name in lighting.CARRIED:
+            mapper.MapDataArrayToVertexAttribute(name, name, 0, -1)
+        actor = vtk.vtkActor()
+        actor.SetMapper(mapper)
+        actor.GetProperty().BackfaceCullingOn()
+        actor.GetProperty().SetTexture(lighting.BEHIND, self.behind)
+        shader = actor.GetShaderProperty()
+        declared, done = lighting.vertex_code()
+        shader.AddVertexShaderReplacement("//VTK::Normal::Dec", True, f"//VTK::Normal::Dec\n{declared}", False)
+        shader.AddVertexShaderReplacement("//VTK::Normal::Impl", True, f"//VTK::Normal::Impl\n{done}", False)
+        declared, done = lighting.fragment_code(
+            self.scene, self.view, self.lights, appearance, self.window.samples, by_field=by_field, walled=walled
+        )
+        # After all that the window does itself; its own lights and textures are left out.
+        shader.AddFragmentShaderReplacement("//VTK::TCoord::Dec", True, f"//VTK::TCoord::Dec\n{declared}", False)
+        shader.AddFragmentShaderReplacement("//VTK::Light::Impl", True, "", False)
+        shader.AddFragmentShaderReplacement("//VTK::TCoord::Impl", True, done, False)
+        self.renderer.AddActor(actor)
+        return actor
+
+
+def _carry(actor: Any, points: np.ndarray, triangles: np.ndarray, carried: tuple[np.ndarray, ...]) -> None:
+    """Give an actor a mesh whose vertices hand the values of `lighting.CARRIED` to the shader."""
+    import pyvista as pv
+
+    data = pv.PolyData.from_regular_faces(points, triangles) if len(points) else pv.PolyData()
+    for name, values in zip(lighting.CARRIED, carried, strict=True):
+        data.point_data[name] = np.ascontiguousarray(values, dtype=np.float32)
+    # Only because the window declares textures of meshes that have these.
+    data.point_data["places"] = np.zeros((len(points), 2), dtype=np.float32)
+    data.GetPointData().SetActiveTCoords("places")
+    actor.GetMapper().SetInputData(data)
+
+
+def _thickness_at(view: View, position: np.ndarray, distance: float, points: np.ndarray) -> np.ndarray:
+    """Return the length (v,) of body that a ray through each of the points (v, 3) meets, m.
+
+    Particles (n, 3) are counted in coarse cells of the picture: their volume over the area of a cell at their depth.
+    """
+    seen, wanted = view.pixels(position), view.pixels(points)
+    near = max(float(seen[:, 2].mean()), 1e-12)
+    scale = view.pixels_per_metre * (1.0 if view.parallel else view.distance / near)
+    edge = max(FINEST, COARSENESS * distance * scale)
+    shape = (math.ceil(view.size[1] / edge) + 2, math.ceil(view.size[0] / edge) + 2)
+    area = (edge / view.pixels_per_metre) ** 2
+    if not view.parallel:
+        area = area * (seen[:, 2] / view.distance) ** 2
+    total = deposited(seen[:, :2] / edge + 0.5, np.broadcast_to(distance**3 / area, len(seen)), shape)
+    total = blurred_along(blurred_along(total, 0), 1)
+    return sampled(total, wanted[:, 1] / edge + 1.0, wanted[:, 0] / edge + 1.0)[:, 0]
+
+
+def _texture() -> Any:
+    import vtk
+
+    texture = vtk.vtkTexture()
+    texture.SetInputData(vtk.vtkImageData())
+    texture.SetColorModeToDirectScalars()
+    texture.InterpolateOn()
+    texture.MipmapOff()
+    texture.RepeatOff()
+    texture.EdgeClampOn()
+    return texture
+
+
+def _put(texture: Any, picture: np.ndarray) -> None:
+    import vtk
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+
+    image = vtk.vtkImageData()
+    height, width = picture.shape[:2]
+    image.SetDimensions(width, height, 1)
+    image.GetPointData().SetScalars(numpy_to_vtk(picture[::-1].reshape(-1, 3), deep=True))
+    texture.SetInputData(image)
+
+
+def _new_grains(view: View, lights: Lights, distance: float) -> Any:
+    """Return an actor without grains, whose balls are lit from the side of the lamp."""
+    import vtk
+
+    mapper = vtk.vtkPointGaussianMapper()
+    mapper.SetInputData(vtk.vtkPolyData())
+    mapper.EmissiveOff()
+    mapper.SetScaleFactor(RADIUS * distance)
+    right, up, back = (float(lights.lamp @ axis) for axis in view.axes)
+    lamp = f"vec3({right:.6f}, {up:.6f}, {back:.6f})"
+    mapper.SetSplatShaderCode(lighting.shader_parts()["grain"].replace("LAMP", lamp))
+    actor = vtk.vtkActor()
+    actor.SetMapper(mapper)
+    return actor

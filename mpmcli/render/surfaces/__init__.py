@@ -1,1 +1,0 @@
-"""`--mode surface`: materials as bodies with a surface, in space and in the plane."""

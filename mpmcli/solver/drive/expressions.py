@@ -1,0 +1,436 @@
+"""Numbers that expressions in kernels read of a run: constants, and means over the kick of what depends on time alone.
+
+Means are differences of integrals in tables. The host fills the table of a run with the windows that come next
+(`scene.quadrature.Mean`); the kernel stops where a kick would end beyond them. As constants are no part of kernels,
+runs share them.
+
+Each node of a tree is an object whose `evaluate` is inlined where it is called. Conditions are integers, 0 or 1, or for
+a condition of time the share of the kick for which it holds. Both branches of `a if c else b` are computed. KERNELS has
+the names of `scene.functions`, and agrees with numpy to rounding.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial, reduce
+
+import numpy as np
+from taichi.lang import ops
+
+from mpmcli.boundaries.doubles import double_field
+from mpmcli.quick_taichi import ti
+from mpmcli.scene.expression import INITIAL, POSITION, Apply, Name, Number, Tree, names_in
+from mpmcli.scene.quadrature import BOUND, COEFFICIENTS, COLUMNS, HALF, LOW, MIDDLE, WINDOWS, Mean, telling_times
+
+# Whole exponents up to this one are products: a power of a negative number is undefined on some devices.
+LARGEST_PRODUCT = 64
+
+
+@dataclass(frozen=True)
+class Place:
+    """A leaf of a tree for kernels: a number that they read, by its index among those of the run."""
+
+    index: int
+
+
+class Entries:
+    """The numbers of a run in the order of their places, `found`: constants, and trees of t, whose means count."""
+
+    def __init__(self, origin: Sequence[float]) -> None:
+        """Begin without any; coordinates of expressions are relative to `origin`, (d,), m."""
+        self.found: list[float | Tree] = []
+        self._origin = tuple(origin)
+
+    @property
+    def timed(self) -> tuple[bool, ...]:
+        return tuple(not isinstance(entry, float) for entry in self.found)
+
+    def number(self, value: float) -> Place:
+        self.found.append(float(value))
+        return Place(len(self.found) - 1)
+
+    def placed(self, tree: Tree) -> "Tree | Place":
+        """Return a tree for `node_of`: what depends on time alone is a place, and so are constants."""
+        names = names_in(tree)
+        if names == {"t"}:
+            if tree not in self.found:
+                self.found.append(tree)
+            return Place(self.found.index(tree))
+        if isinstance(tree, Number):
+            return self.number(tree.value)
+        if isinstance(tree, Name):
+            return self._coordinate(tree)
+        function, arguments = tree.function, tree.arguments
+        if whole_power(tree) is not None:
+            return Apply(function, (self.placed(arguments[0]), arguments[1]))
+        # A condition of time may hold for a part of the kick.
+        if function == "if" and "t" in names_in(arguments[0]):
+            function = "blend"
+        return Apply(function, tuple(self.placed(argument) for argument in arguments))
+
+    def _coordinate(self, name: Name) -> Tree:
+        names = INITIAL if name.name in INITIAL else POSITION
+        return Apply("+", (name, self.number(self._origin[names.index(name.name)])))
+
+
+def whole_power(tree: Apply) -> int | None:
+    """Return the exponent of a power that is a product, None of anything else."""
+    if tree.function in ("**", "pow") and isinstance(tree.arguments[1], Number):
+        exponent = tree.arguments[1].value
+        if exponent == int(exponent) and abs(exponent) <= LARGEST_PRODUCT:
+            return int(exponent)
+    return None
+
+
+@ti.data_oriented
+class DeviceValues:
+    """The numbers of some runs on the device: `field`, (runs, k)."""
+
+    def __init__(self, runs: int, width: int) -> None:
+        self.field = ti.field(float, shape=(runs, max(1, width)))
+        self.real = np.float64 if self.field.dtype == ti.f64 else np.float32
+
+    @ti.kernel
+    def write(self, run: int, values: ti.types.ndarray(ndim=1)):
+        for k in range(values.shape[0]):
+            self.field[run, k] = values[k]
+
+
+class RunValues:
+    """The numbers of one run, as the host sets them; timed: whether any of them depends on time."""
+
+    def __init__(self, values: DeviceValues, run: int, entries: Sequence[float | Tree], end: float) -> None:
+        """Set them as of time 0, of a run of `end` seconds."""
+        self._values, self._run, self.entries = values, run, tuple(entries)
+        self._constants = np.array([entry if isinstance(entry, float) else 0.0 for entry in entries])
+        self.means = {k: Mean(entry, end) for k, entry in enumerate(entries) if not isinstance(entry, float)}
+        self._trees = [entry for entry in entries if not isinstance(entry, float)]
+        self.timed = bool(self.means)
+        if len(entries):
+            self.write(0.0, 0.0)
+
+    def write(self, start: float, end: float) -> None:
+        numbers = self._constants.copy()
+        for k, mean in self.means.items():
+            numbers[k] = mean(start, end)
+        self._values.write(self._run, numbers.astype(self._values.real))
+
+    def telling_times(self, start: float, end: float) -> list[float]:
+        """Return the times between two (s) at which any of the values is smallest or largest."""
+        return [time for tree in self._trees for time in telling_times(tree, start, end)]
+
+
+# Rows for each number of a run, and windows that are filled at once.
+ROOM, AHEAD = 4096, 8
+
+
+@ti.data_oriented
+class TimeTables:
+    """Tables of the numbers of some runs that depend on time: `rows`, (runs * numbers, ROOM), some `used`."""
+
+    def __init__(self, runs: int, numbers: int) -> None:
+        self._numbers = numbers
+        self.rows = double_field(runs * numbers, ROOM, width=COLUMNS)
+        self.used = ti.field(int, shape=runs * numbers)
+
+    def fill(self, run: int, means: Sequence[Mean], since: float, *, coarse: bool) -> float:
+        """Fill the tables of a run with the windows from a time, s, on; return that up to which kernels may take means.
+
+        coarse: whether room must be found for as many windows as a run has, with fewer rows for each.
+        """
+        ahead = 2 * WINDOWS if coarse else AHEAD
+        horizon = math.inf
+        for i, mean in enumerate(means):
+            first = k = mean.window_at(since)
+            rows: list[np.ndarray] = []
+            count, before = 0, 0.0
+            while k < first + ahead:
+                own = thinned(mean.rows(k), ROOM // (ahead if coarse else 2))
+                count += len(own)
+                if count > ROOM:
+                    break
+                rows.append(own.copy())
+                rows[-1][:, -1] += before
+                before += _integral(own[-1])
+                k += 1
+            self._write(run * self._numbers + i, np.concatenate(rows))
+            horizon = min(horizon, mean.start_of(k))
+        return horizon
+
+    @ti.kernel
+    def _write(self, table: int, rows: ti.types.ndarray(ti.f64, 2)):
+        self.used[table] = rows.shape[0]
+        for q in range(rows.shape[0]):
+            for k in ti.static(range(COLUMNS)):
+                self.rows[table, q][k] = rows[q, k]
+
+    @ti.func
+    def part(self, table: int, time: ti.f64):
+        low = 0
+        high = self.used[table] - 1
+        while low < high:
+            middle = (low + high + 1) // 2
+            if self.rows[table, middle][LOW] <= time:
+                low = middle
+            else:
+                high = middle - 1
+        return low
+
+    @ti.func
+    def integral(self, table: int, time: ti.f64):
+        """Return the integral from the start of the table to a time, s."""
+        q = self.part(table, time)
+        place = (time - self.rows[table, q][MIDDLE]) / self.rows[table, q][HALF]
+        result = self.rows[table, q][COEFFICIENTS]
+        for k in ti.static(range(COEFFICIENTS + 1, COLUMNS)):
+            result = result * place + self.rows[table, q][k]
+        return result
+
+    @ti.func
+    def mean(self, table: int, start: ti.f64, end: ti.f64):
+        return (self.integral(table, end) - self.integral(table, start)) / (end - start)
+
+    @ti.func
+    def largest(self, table: int, start: ti.f64, end: ti.f64):
+        """Return a bound on |value| between two times, s; what lies beyond the table does not count."""
+        q = self.part(table, start)
+        result = self.rows[table, q][BOUND]
+        for k in range(q + 1, self.part(table, end) + 1):
+            result = ti.max(result, self.rows[table, k][BOUND])
+        return result
+
+
+def _integral(row: np.ndarray) -> float:
+    """Return the integral to the end of a row, from the start of its window."""
+    return float(row[COEFFICIENTS:].sum())
+
+
+def thinned(rows: np.ndarray, most: int) -> np.ndarray:
+    """Return at most so many rows for those of a window: neighbours are joined, and the integral is linear in each."""
+    if len(rows) <= most:
+        return rows
+    first = np.arange(0, len(rows), -(-len(rows) // most))
+    end = rows[-1, MIDDLE] + rows[-1, HALF]
+    low = rows[first, LOW]
+    high = np.append(low[1:], end)
+    # The integral at the start of each, by its polynomial at -1.
+    signs = (-1.0) ** np.arange(COLUMNS - COEFFICIENTS)[::-1]
+    before = rows[first, COEFFICIENTS:] @ signs
+    after = np.append(before[1:], _integral(rows[-1]))
+    joined = np.zeros((len(first), COLUMNS))
+    joined[:, LOW], joined[:, MIDDLE], joined[:, HALF] = low, 0.5 * (low + high), 0.5 * (high - low)
+    joined[:, BOUND] = np.maximum.reduceat(rows[:, BOUND], first)
+    joined[:, -2], joined[:, -1] = 0.5 * (after - before), 0.5 * (after + before)
+    return joined
+
+
+@ti.func
+def _modulo(a, b):
+    return a - b * ti.floor(a / b)
+
+
+@ti.func
+def _power(a, b):
+    size = ti.pow(ti.abs(a), b)
+    odd = b - 2.0 * ti.floor(0.5 * b) == 1.0
+    whole = ti.select(odd, -size, size)
+    # The root of a negative number is not a number.
+    negative = ti.select(ti.floor(b) == b, whole, ti.sqrt(a))
+    return ti.select(a < 0.0, negative, size)
+
+
+def _holds(compare: Callable) -> Callable:
+    @ti.func
+    def holds(a, b):
+        return ti.select(compare(a, b), 1, 0)
+
+    return holds
+
+
+@ti.func
+def _not(a):
+    return 1 - a
+
+
+@ti.func
+def _choose(condition, a, b):
+    return ti.select(condition != 0, a, b)
+
+
+@ti.func
+def _blend(share, a, b):
+    """Return a, b, or their mean where a condition holds for a share of the kick between 0 and 1."""
+    # A branch that does not count may be infinite.
+    return ti.select(share >= 1, a, ti.select(share <= 0, b, share * a + (1 - share) * b))
+
+
+# By atan2: a device's own asin and acos may be no better than 1e-4.
+@ti.func
+def _asin(a):
+    return ti.atan2(a, ti.sqrt((1.0 - a) * (1.0 + a)))
+
+
+@ti.func
+def _acos(a):
+    return ti.atan2(ti.sqrt((1.0 - a) * (1.0 + a)), a)
+
+
+@ti.func
+def _atan(a):
+    return ti.atan2(a, ti.cast(1.0, float))
+
+
+@ti.func
+def _sinh(a):
+    grown = ti.exp(ti.abs(a))
+    size = 0.5 * (grown - 1.0 / grown)
+    if ti.abs(a) < 0.1:
+        # The first terms of its series: the difference above cancels.
+        square = a * a
+        size = ti.abs(a) * (1.0 + square / 6.0 * (1.0 + square / 20.0 * (1.0 + square / 42.0 * (1.0 + square / 72.0))))
+    return ti.select(a < 0.0, -size, size)
+
+
+@ti.func
+def _cosh(a):
+    grown = ti.exp(ti.abs(a))
+    return 0.5 * (grown + 1.0 / grown)
+
+
+@ti.func
+def _log10(a):
+    return ti.log(a) / ti.cast(2.302585092994046, float)
+
+
+@ti.func
+def _sign(a):
+    return ti.select(a > 0.0, ti.cast(1.0, float), ti.select(a < 0.0, ti.cast(-1.0, float), ti.cast(0.0, float)))
+
+
+@ti.func
+def _step(a):
+    return ti.select(a >= 0.0, ti.cast(1.0, float), ti.cast(0.0, float))
+
+
+@ti.func
+def _clamp(a, low, high):
+    return ti.min(ti.max(a, low), high)
+
+
+@ti.func
+def _hypot(a, b):
+    return ti.sqrt(a * a + b * b)
+
+
+KERNELS: dict[str, Callable] = {
+    "+": ops.add,
+    "-": ops.sub,
+    "*": ops.mul,
+    "/": ops.truediv,
+    "%": _modulo,
+    "**": _power,
+    "negative": ops.neg,
+    "<": _holds(ops.cmp_lt),
+    "<=": _holds(ops.cmp_le),
+    ">": _holds(ops.cmp_gt),
+    ">=": _holds(ops.cmp_ge),
+    "==": _holds(ops.cmp_eq),
+    "!=": _holds(ops.cmp_ne),
+    "and": ops.mul,
+    "or": ops.max,
+    "not": _not,
+    "if": _choose,
+    # A condition of time.
+    "blend": _blend,
+    "clamp": _clamp,
+    "hypot": _hypot,
+    "pow": _power,
+    "step": _step,
+    "sign": _sign,
+    "log10": _log10,
+    "sinh": _sinh,
+    "cosh": _cosh,
+    "asin": _asin,
+    "acos": _acos,
+    "atan": _atan,
+}
+KERNELS |= {
+    name: getattr(ti, name)
+    for name in ("sin", "cos", "tan", "atan2", "tanh", "exp", "log", "sqrt", "abs", "floor", "ceil", "min", "max")
+}
+
+
+@ti.data_oriented
+class Coordinate:
+    """A coordinate of the position, or of the initial one."""
+
+    def __init__(self, axis: int, *, initial: bool) -> None:
+        self.axis, self.initial = axis, initial
+
+    @ti.func
+    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
+        value = x[self.axis]
+        if ti.static(self.initial):
+            value = X[self.axis]
+        return value
+
+
+@ti.data_oriented
+class Reading:
+    """A number of the run; of a condition of time the share of the kick for which it is true."""
+
+    def __init__(self, values: DeviceValues, index: int) -> None:
+        self.values, self.index = values, index
+
+    @ti.func
+    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
+        return self.values.field[run, self.index]
+
+
+@ti.data_oriented
+class Power:
+    """A whole power, by squaring."""
+
+    def __init__(self, base: object, exponent: int) -> None:
+        self.base, self.inverse = base, exponent < 0
+        self.bits = tuple(bit == "1" for bit in bin(abs(exponent))[2:])
+
+    @ti.func
+    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
+        base = self.base.evaluate(x, X, run)
+        result = ti.cast(1.0, float)
+        for bit in ti.static(self.bits):
+            result *= result
+            if ti.static(bit):
+                result *= base
+        if ti.static(self.inverse):
+            result = 1.0 / result
+        return result
+
+
+@ti.data_oriented
+class Application:
+    """A function of the values of other nodes."""
+
+    def __init__(self, function: Callable, *arguments: object) -> None:
+        self.function, self.arguments = function, arguments
+
+    @ti.func
+    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
+        return self.function(*[node.evaluate(x, X, run) for node in ti.static(self.arguments)])
+
+
+def node_of(tree: "Tree | Place", values: DeviceValues) -> object:
+    """Return the node that evaluates a tree of `Entries` at x and X, (d,), m, with the numbers of a run."""
+    if isinstance(tree, Place):
+        return Reading(values, tree.index)
+    if isinstance(tree, Name):
+        names = INITIAL if tree.name in INITIAL else POSITION
+        return Coordinate(names.index(tree.name), initial=names is INITIAL)
+    exponent = whole_power(tree)
+    if exponent is not None:
+        return Power(node_of(tree.arguments[0], values), exponent)
+    function, nodes = KERNELS[tree.function], [node_of(argument, values) for argument in tree.arguments]
+    if tree.function in ("min", "max"):
+        return reduce(partial(Application, function), nodes)
+    return Application(function, *nodes)

@@ -1,0 +1,369 @@
+"""Gravity, which may depend on time, and external forces, which are expressions; and bounds on them for the step.
+
+They advance the velocity from the middle of the last step to that of this one, which moves particles to x_(n+1)
+(docs/theory.md, 6.5 and 7.1). Leapfrog evaluates a force at x_n; what depends on time alone is its mean over that time.
+Gravity acts on the nodes; a force acts on its particles, before their momentum is scattered.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.quick_taichi import ti
+from mpmcli.scene import Scene
+from mpmcli.scene.entry import tree_of
+from mpmcli.scene.expression import INITIAL, POSITION, Number, Tree, names_in
+from mpmcli.scene.quadrature import largest_of
+from mpmcli.scene.schema import Force
+from mpmcli.solver.drive.expressions import DeviceValues, Entries, Place, RunValues, TimeTables, node_of
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.particles.arrays import ParticleArrays
+from mpmcli.solver.particles.state_bounds import build_maxima
+
+# Half of the distance of the differences for the slope of a force, cells.
+REACH = 0.5
+# A slope beyond this counts as zero, as does NaN where a force is undefined next to a particle.
+STEEPEST = 1e30
+# Forces are measured with the state, for the steps up to the next measurement: at INSTANTS times where they depend on
+# time, and where what depends on time alone is smallest and largest. MARGIN allows for the motion of the particles in
+# between.
+INSTANTS = 5
+MARGIN = 1.5
+
+# Measurement of the force on particles, from the first one, their number, and that of the run; see `build_push`.
+Push = Callable[[int, int, int], tuple[float, float]]
+
+
+def forces_on(scene: Scene, members: Sequence[int]) -> tuple[Force, ...]:
+    names = {scene.sources[i].name for i in members}
+    return tuple(force for force in scene.pushes if force.body is None or force.body in names)
+
+
+def needs_initial(scene: Scene, members: Sequence[int]) -> bool:
+    """Return whether any force on these bodies depends on the initial position."""
+    trees = [tree_of(entry) for force in forces_on(scene, members) for entry in force.acceleration]
+    return any(names_in(tree) & set(INITIAL) for tree in trees)
+
+
+@dataclass(frozen=True)
+class Term:
+    """A force on the body at a place in its group, -1 for all of them: each axis along which it acts, with its tree."""
+
+    place: int
+    axes: tuple[tuple[int, Tree | Place], ...]
+
+
+@dataclass(frozen=True)
+class ForceTerms:
+    """Forces on particles of one law, as a kernel computes them; runs for which they are equal share kernels.
+
+    Attributes:
+        moves, initial: whether any of them depends on the position, and on the initial position.
+        reach, slope: half of the distance of differences, m, and the inverse of the distance; None without forces.
+    """
+
+    terms: tuple[Term, ...] = ()
+    moves: bool = False
+    initial: bool = False
+    reach: Place | None = None
+    slope: Place | None = None
+
+    @staticmethod
+    def of(scene: Scene, members: Sequence[int], entries: Entries) -> "ForceTerms":
+        """Return the forces on some bodies, given by their indices, with the numbers that they add to `entries`."""
+        forces = forces_on(scene, members)
+        if not forces:
+            return ForceTerms()
+        names = [scene.sources[i].name for i in members]
+        terms, found = [], set()
+        for force in forces:
+            trees = [tree_of(entry) for entry in force.acceleration]
+            axes = tuple((axis, entries.placed(tree)) for axis, tree in enumerate(trees) if tree != Number(0.0))
+            terms.append(Term(-1 if force.body is None else names.index(force.body), axes))
+            found.update(*map(names_in, trees))
+        reach = REACH * scene.domain.spacing
+        return ForceTerms(
+            tuple(terms),
+            not found.isdisjoint(POSITION),
+            not found.isdisjoint(INITIAL),
+            entries.number(reach),
+            entries.number(0.5 / reach),
+        )
+
+
+@dataclass(frozen=True)
+class Drives:
+    """Gravity and forces as the kernels of a batch compute them; runs for which they are equal share kernels.
+
+    Attributes:
+        gravity: along each axis, of the numbers of a run; nothing where it is steady. forces: on each law.
+        motions: of each collider that moves, for velocity and spin the place of what depends on time, None of others.
+        timed: of each number of a run whether it depends on time.
+    """
+
+    gravity: tuple[Place, ...]
+    forces: tuple[ForceTerms, ...]
+    motions: tuple[tuple[Place | None, ...], ...]
+    timed: tuple[bool, ...]
+
+    @staticmethod
+    def of(scene: Scene, members: Sequence[Sequence[int]]) -> "tuple[Drives, list[float | Tree]]":
+        """Return those of a scene, and its numbers; `members` are the indices of the bodies of each law."""
+        entries = Entries(scene.domain.origin)
+        steady = scene.domain.steady
+        gravity = () if steady else tuple(entries.placed(tree_of(entry)) for entry in scene.domain.gravity)
+        forces = tuple(ForceTerms.of(scene, own, entries) for own in members)
+        moving = [collider.motion.rates for collider in scene.colliders if collider.motion.moves]
+        motions = tuple(tuple(entries.placed(tree) if names_in(tree) else None for tree in rates) for rates in moving)
+        return Drives(gravity, forces, motions, entries.timed), entries.found
+
+
+@ti.data_oriented
+class DriveValues:
+    """The numbers of all runs on the device, and what depends on time in tables.
+
+    device: the numbers; tables: of those that depend on time, None where none does, or without double precision;
+    of_runs: the same on the host; gravity_varies: whether gravity is among them.
+    """
+
+    def __init__(self, drives: Drives, runs: int, *, doubles: bool = True) -> None:
+        timed = [k for k, depends in enumerate(drives.timed) if depends]
+        self.device = DeviceValues(runs, len(drives.timed))
+        # Each number that depends on time, with its table.
+        self.timed = tuple(enumerate(timed))
+        self.tables = TimeTables(runs, len(timed)) if timed and doubles else None
+        self.of_runs: list[RunValues | None] = [None] * runs
+        # Of the colliders that move: (which, of velocity and spin which, table).
+        self.motions = tuple(
+            (m, a, timed.index(leaf.index))
+            for m, places in enumerate(drives.motions)
+            for a, leaf in enumerate(places)
+            if leaf is not None
+        )
+        self.gravity_varies = bool(drives.gravity)
+        self.gravity = tuple(
+            (leaf.index, timed.index(leaf.index) if leaf.index in timed else -1) for leaf in drives.gravity
+        )
+
+    @ti.func
+    def set_means(self, w: int, start: ti.f64, end: ti.f64):
+        """Set what depends on time in a run to its means over a kick."""
+        for table, k in ti.static(self.timed):
+            row = w * ti.static(len(self.timed)) + table
+            self.device.field[w, k] = ti.cast(self.tables.mean(row, start, end), float)
+
+    @ti.func
+    def set_motions(self, w: int, motion: ti.template(), start: ti.f64, end: ti.f64):
+        for m, a, table in ti.static(self.motions):
+            row = w * ti.static(len(self.timed)) + table
+            motion.rates[w * ti.static(len(motion.moving)) + m, a] = self.tables.mean(row, start, end)
+
+    @ti.func
+    def largest_gravity(self, w: int, start: ti.f64, end: ti.f64):
+        """Return a bound on gravity between two times, m/s^2."""
+        square = 0.0 * start
+        for k, table in ti.static(self.gravity):
+            if ti.static(table < 0):
+                value = ti.cast(self.device.field[w, k], ti.f64)
+                square += value * value
+            else:
+                value = self.tables.largest(w * ti.static(len(self.timed)) + table, start, end)
+                square += value * value
+        return ti.sqrt(square)
+
+
+class HostValues:
+    """What `DriveValues` computes in kernels, on the host: for devices without double precision."""
+
+    motions = ()
+
+    def __init__(self, values: DriveValues) -> None:
+        self._values, self.gravity_varies = values, values.gravity_varies
+
+    def set_means(self, w: int, start: float, end: float) -> None:
+        """Set what depends on time in a run to its means over a kick."""
+        if self._values.timed:
+            self._values.of_runs[w].write(start, end)
+
+    def largest_gravity(self, w: int, start: float, end: float) -> float:
+        """Return a bound on gravity between two times, m/s^2."""
+        entries = [self._values.of_runs[w].entries[k] for k, _ in self._values.gravity]
+        return math.hypot(*(e if isinstance(e, float) else largest_of(e, start, end) for e in entries))
+
+
+@ti.data_oriented
+class Gravity:
+    """Gravity where it varies: numbers of the run."""
+
+    def __init__(self, places: Sequence[Place], zero: Sequence[float], values: DeviceValues) -> None:
+        self.dimension, self.values = len(zero), values
+        self.numbers = tuple(place.index for place in places)
+
+    @ti.func
+    def in_step(self, kick: float, run: int):
+        result = ti.Vector.zero(float, self.dimension)
+        for a, k in ti.static(enumerate(self.numbers)):
+            result[a] = kick * self.values.field[run, k]
+        return result
+
+
+@ti.data_oriented
+class GroupForce:
+    """All forces on one group of particles.
+
+    spreads: whether their slope is known: they depend on the position, and none on the initial position, whose own
+    slope is that of the motion so far.
+    """
+
+    def __init__(self, dimension: int, forces: ForceTerms, values: DeviceValues, room: int) -> None:
+        """Build the nodes; `room` is the number of bodies that each run may have in the group."""
+        self.dimension = dimension
+        self.terms = tuple(
+            (term.place, tuple((axis, node_of(tree, values)) for axis, tree in term.axes)) for term in forces.terms
+        )
+        self.moves, self.spreads = forces.moves, forces.moves and not forces.initial
+        self.reach, self.slope = node_of(forces.reach, values), node_of(forces.slope, values)
+        self.room = room
+
+    @ti.func
+    def at(self, group: ti.template(), p: int, x: ti.template(), X: ti.template()):
+        result = ti.Vector.zero(float, self.dimension)
+        for place, axes in ti.static(self.terms):
+            if ti.static(place < 0):
+                for axis, node in ti.static(axes):
+                    result[axis] += node.evaluate(x, X, group.run)
+            else:
+                if group.body[p] - group.run * self.room == ti.static(place):
+                    for axis, node in ti.static(axes):
+                        result[axis] += node.evaluate(x, X, group.run)
+        return result
+
+    @ti.func
+    def acceleration(self, group: ti.template(), p: int, with_slope: ti.template()):
+        """Return the acceleration a of particle p, and its slope da/dx, d x d, at fixed X: zeros without `with_slope`.
+
+        Central differences at the scale of the grid are exact where a is quadratic in x: a force that is linear in x
+        drives a body affinely up to its surface.
+        """
+        d = ti.static(self.dimension)
+        x, X, a = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
+        slope = ti.Matrix.zero(float, d, d)
+        here = group.place(p)
+        for c in ti.static(range(d)):
+            x[c] = here[c]
+            if ti.static(group.keeps_initial):
+                X[c] = group.initial[p][c]
+        if ti.static(self.moves and with_slope):
+            reach, inverse = self.reach.evaluate(x, X, group.run), self.slope.evaluate(x, X, group.run)
+            # In a loop, so that the expressions are compiled once: up and down along each axis, then in place.
+            for k in range(2 * d + 1):
+                place = x
+                for b in ti.static(range(d)):
+                    if k == 2 * b:
+                        place[b] += reach
+                    if k == 2 * b + 1:
+                        place[b] -= reach
+                value = self.at(group, p, place, X)
+                for b, c in ti.static(ti.ndrange(d, d)):
+                    if k == 2 * b:
+                        slope[c, b] += value[c] * inverse
+                    if k == 2 * b + 1:
+                        slope[c, b] -= value[c] * inverse
+                if k == 2 * d:
+                    a = value
+            for b, c in ti.static(ti.ndrange(d, d)):
+                slope[c, b] = ti.select(ti.abs(slope[c, b]) < STEEPEST, slope[c, b], 0.0)
+        else:
+            a = self.at(group, p, x, X)
+        return a, slope
+
+
+def build_push(group: ParticleArrays, backend: Backend) -> Push:
+    """Return a measurement of the force on particles of a run: largest |a|, m/s^2, and row sum of |da/dx|, 1/s^2."""
+
+    @ti.func
+    def widen_one(own: ti.template(), view: ti.template(), p: int):
+        a, slope = view.force.acceleration(view, p, True)
+        own[0] = ti.max(own[0], a.norm_sqr())
+        for c in ti.static(range(view.dimension)):
+            row = 0.0
+            for b in ti.static(range(view.dimension)):
+                row += ti.abs(slope[c, b])
+            own[1] = ti.max(own[1], row)
+
+    @ti.func
+    def widen(own: ti.template(), p: int, run: int):
+        for view in ti.static((group.seen_from(run),)):
+            widen_one(own, view, p)
+
+    measure = build_maxima(2, widen, backend)
+
+    def largest(first: int, count: int, run: int) -> tuple[float, float]:
+        square, slope = measure(first, count, run)
+        return float(square**0.5), slope
+
+    return largest
+
+
+def push_on(
+    group: ParticleArrays, forces: ForceTerms, room: int, values: DeviceValues, backend: Backend
+) -> Push | None:
+    """Let forces act on a group, before kernels are built; return their measurement, see `build_push`."""
+    if not forces.terms:
+        return None
+    group.push_by(GroupForce(group.dimension, forces, values, room))
+    return build_push(group, backend)
+
+
+class ExternalForces:
+    """Bounds on gravity and forces of a scene, by measurements of the force on each group that one acts on.
+
+    slope: largest row sum of |da/dx| of the forces, 1/s^2, as last measured, margin included.
+    """
+
+    def __init__(self, scene: Scene, values: RunValues, measures: Sequence[Callable[[], tuple[float, float]]]) -> None:
+        self._domain = scene.domain
+        self._gravity_pull = float(np.linalg.norm(scene.domain.gravity_at(0.0)))
+        self._values, self._measures = values, measures
+        self._push = 0.0
+        self.slope = 0.0
+
+    @property
+    def pushes(self) -> bool:
+        return bool(self._measures)
+
+    @property
+    def steady_pull(self) -> float:
+        """A bound on the acceleration, m/s^2, by gravity, if it is steady, and by forces as measured."""
+        return (self._gravity_pull if self._domain.steady else 0.0) + self._push
+
+    def save(self) -> dict[str, float]:
+        return {"push": self._push, "slope": self.slope}
+
+    def load(self, saved: dict[str, float]) -> None:
+        self._push, self.slope = saved["push"], saved["slope"]
+
+    def pull(self, start: float, end: float) -> float:
+        """Return a bound on the acceleration between two times (s): gravity by its bounds, forces as measured."""
+        if self._domain.steady:
+            return self.steady_pull
+        return float(np.linalg.norm([largest_of(tree_of(g), start, end) for g in self._domain.gravity])) + self._push
+
+    def measure(self, time: float, ahead: float) -> None:
+        """Measure the forces where the particles are, from a time on up to the next measurement, `ahead` s later."""
+        if not self._measures:
+            return
+        times = [time]
+        if self._values.timed and ahead > 0:
+            times = [*np.linspace(time, time + ahead, INSTANTS), *self._values.telling_times(time, time + ahead)]
+        found = []
+        for instant in times:
+            if self._values.timed:
+                self._values.write(float(instant), float(instant))
+            found += [measure() for measure in self._measures]
+        self._push, self.slope = (
+            MARGIN * max((value for value in values if math.isfinite(value)), default=0.0)
+            for values in zip(*found, strict=True)
+        )

@@ -1,0 +1,273 @@
+"""One run or many in one process: what they share on the device."""
+
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
+
+import numpy as np
+
+from mpmcli.boundaries.colliders import ColliderMotion, Colliders
+from mpmcli.boundaries.mirror_images import build_walls
+from mpmcli.boundaries.walls import MovingFaces, RoughFaces
+from mpmcli.errors import InputError, RunError
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.drive.forces import DriveValues, Gravity, push_on
+from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.cpu_launch import CpuLaunch
+from mpmcli.solver.engine.device import Device
+from mpmcli.solver.engine.gpu_launch import GpuLaunch
+from mpmcli.solver.engine.kernel_store import StoredLaunch
+from mpmcli.solver.engine.run_numbers import MOST_FRAMES, NOTES, Layout
+from mpmcli.solver.engine.step_control import HOLD, RISE
+from mpmcli.solver.frames.reader import sum_entries
+from mpmcli.solver.grid.fixed_point import FixedPoint
+from mpmcli.solver.grid.grid import Grid, drift_allowed, node_width, tile_edge
+from mpmcli.solver.grid.period import Period
+from mpmcli.solver.grid.sparse_grid import (
+    BlockOrder,
+    SparseGrid,
+    most_blocks,
+    require_cpu_if_sparse,
+    room_for_blocks,
+    tiles_reached,
+)
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.particles.arrays import CONSTANTS, ParticleArrays
+from mpmcli.solver.particles.inflow import Emission
+from mpmcli.solver.particles.sort import SortBuffers, TileOrder
+from mpmcli.solver.solids.contact import DRIFT, contact_between
+from mpmcli.solver.solids.reference_grid import slips_in
+from mpmcli.solver.transfer.node_update import NodeUpdate
+from mpmcli.solver.transfer.particle_update import BEYOND, ParticleUpdate
+from mpmcli.solver.transfer.splines import PAD, scheme_of
+from mpmcli.solver.transfer.volume_average import averages_volume
+
+# Room for blocks of a sparse grid, of those that particles reach, when there are more of them than fit.
+GROWTH = 2
+# Taichi inlines functions, and trees of expressions, recursively, about 20 calls deep for each level.
+RECURSION = 4000
+
+
+class Batch:
+    """Room on the device for some runs of one kind, and the kernels that advance them.
+
+    Attributes:
+        kind: what was compiled, with the room for each run.
+        runs: number of runs.
+        device: all of it.
+        layout: columns of `numbers`, (runs, k) float64, and `counts`, (runs, l) int32, which the kernel reads and
+            changes.
+        shown: what particles show at the frames that the last launch recorded, on the CPU: (rows, k), as many rows for
+            each run; notes: on each of these frames, (runs, MOST_FRAMES, NOTES and sums of each law), float64.
+        values: numbers that expressions read.
+        cpu, gpu: what launches steps, there or there; launch_cpu: the kernel of the one, compiled or stored.
+        profile: where a Counter is put here, phases of the only run are launched one by one on the CPU, and their wall
+            time is added by their names, s.
+        pushes: measurements of the forces on each law, None where there are none.
+        seconds: wall time of all launches; first_seconds: of the first, which compiles the kernel.
+    """
+
+    def __init__(self, kind: CompiledKind, backend: Backend, runs: int = 1) -> None:
+        sys.setrecursionlimit(max(sys.getrecursionlimit(), RECURSION))
+        d = kind.dimension
+        self.kind, self.runs, self.backend = kind, runs, backend
+        on_cpu = backend.on_cpu
+        require_cpu_if_sparse(kind.settings, backend)
+        if kind.colliders.moving and not backend.doubles:
+            raise InputError(
+                f"colliders that move need double precision, which --arch {backend.arch} lacks; give --arch cpu"
+            )
+        # Many small runs on a GPU are in its cache, and use all nodes of their domains.
+        sorts = on_cpu or runs == 1 or kind.inflow.any
+        scheme = scheme_of(kind.settings)
+        averaged = [averages_volume(kind.settings, law) for law in kind.members]
+        period = Period(kind.faces, runs, at_once=not on_cpu)
+        deterministic = kind.settings.deterministic and not on_cpu
+        grid = self._make_grid(period, room_for_blocks(sum(kind.particles)), deterministic=deterministic)
+        groups = [
+            ParticleArrays(
+                law,
+                d,
+                runs * room,
+                (runs * bodies, CONSTANTS + len(law.constants(law.members[0]))),
+                # Forces of a batch select the particles of their body.
+                several=runs > 1 or bodies > 1 or bool(forces.terms),
+                serial=on_cpu and backend.threads == 1,
+                keeps_initial=forces.initial,
+                total=kind.settings.solids == "total",
+                averaged=shares,
+                slips=slips_in(kind.settings, kind.rough),
+                comes_and_goes=kind.inflow.any,
+            )
+            for law, shares, room, bodies, forces in zip(
+                kind.members, averaged, kind.particles, kind.bodies, kind.drives.forces, strict=True
+            )
+        ]
+        self.values = DriveValues(kind.drives, runs, doubles=backend.doubles)
+        self.pushes = [
+            push_on(group, forces, bodies, self.values.device, backend)
+            for group, bodies, forces in zip(groups, kind.bodies, kind.drives.forces, strict=True)
+        ]
+        for group in groups:
+            group.repeat(period)
+        friction, moving = RoughFaces(kind.rough, runs), MovingFaces(kind.moving, d, runs)
+        walls, images = build_walls(
+            kind.faces,
+            kind.settings,
+            PAD,
+            grid.cells,
+            grid.shape,
+            scheme.spline.on_node,
+            friction,
+            moving,
+            runs,
+            on_cpu=on_cpu,
+        )
+        if deterministic:
+            grid.fixed = FixedPoint(grid, groups, backend.arch)
+        self._buffers = SortBuffers(groups, runs) if sorts else None
+        orders = self._make_orders(groups, grid) if sorts else []
+        contact = contact_between(groups, kind.bodies, grid, backend, runs)
+        colliders = motion = None
+        if kind.colliders.count:
+            colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, on_cpu=on_cpu, deterministic=deterministic)
+            motion = ColliderMotion(colliders, runs) if kind.colliders.moving else None
+        self.device = Device(
+            runs,
+            kind.particles,
+            backend.threads,
+            grid,
+            groups,
+            orders,
+            walls,
+            friction,
+            moving,
+            NodeUpdate(grid, images, [walls], colliders),
+            ParticleUpdate(
+                grid, kind.faces, runs * len(groups), contact, friction, moving, watches_box=sorts and not on_cpu
+            ),
+            self.values,
+            Gravity(kind.drives.gravity, [0.0] * d, self.values.device),
+            colliders,
+            motion,
+            Emission(kind.inflow, d, runs) if kind.inflow.groups else None,
+            ti.field(int, shape=(2 * runs, d)) if on_cpu else None,
+            sorts,
+        )
+        self.layout = Layout(d, [len(law.internal) for law in kind.members], len(kind.inflow.groups))
+        self.numbers = np.zeros((runs, self.layout.reals))
+        self.counts = np.zeros((runs, self.layout.counts), np.int32)
+        constants = {"drift_allowed": self._drift_allowed(grid, contact is not None)}
+        constants |= {"hold": HOLD, "rise": RISE, "slack": 1e-6, "infinity": math.inf}
+        for name, value in constants.items():
+            self.numbers[:, getattr(self.layout.real, name)] = value
+        self.seconds = self.first_seconds = 0.0
+        self.profile: Counter | None = None
+        self.shown = self._room = np.zeros((runs, 1), groups[0].real)
+        if on_cpu:
+            loads = kind.colliders.count * colliders.loads if colliders else 0
+            self.notes = np.zeros((runs, MOST_FRAMES, len(NOTES) + len(groups) * sum_entries(d) + loads))
+            self._build_cpu()
+        else:
+            self.gpu = GpuLaunch(self.device, self.layout, doubles=backend.doubles)
+
+    def _drift_allowed(self, grid: Grid, touches: bool) -> float:
+        """Return the cells that particles may drift before they are sorted."""
+        if touches:
+            return DRIFT
+        if self.backend.on_cpu:
+            return drift_allowed(grid.tile, grid.scheme.spline.nodes)
+        # The nodes in use are those that a drift of a tile reaches. One cell is for the last step before a sort; what
+        # passes an open face is retired before it leaves the grid.
+        return BEYOND - 1 if grid.opens else grid.tile - 1.0
+
+    def _make_grid(self, period: Period, blocks: int, *, deterministic: bool = False) -> Grid:
+        """Return the grid; on a sparse one there is room for so many blocks."""
+        kind, on_cpu = self.kind, self.backend.on_cpu
+        scheme = scheme_of(kind.settings)
+        tile = tile_edge(scheme.spline.nodes, kind.dimension, on_cpu=on_cpu)
+        sparse = {"blocks": blocks, "threads": self.backend.threads} if kind.sparse and on_cpu else {}
+        return (SparseGrid if sparse else Grid)(
+            kind.dimension,
+            1.0,
+            kind.cells,
+            node_width(kind.dimension, on_cpu=on_cpu),
+            scheme,
+            self.runs,
+            tile=tile,
+            keeps_filling=kind.keeps_filling,
+            averaged=[averages_volume(kind.settings, law) for law in kind.members],
+            period=period,
+            walls_move=len(kind.moving) > 0,
+            opens=kind.inflow.opens,
+            deterministic=deterministic,
+            **sparse,
+        )
+
+    def _make_orders(self, groups: Sequence[ParticleArrays], grid: Grid) -> list[TileOrder]:
+        """Return the tile order of each group."""
+        kind = BlockOrder if grid.sparse else TileOrder
+        sharing = self.backend.threads if self.runs == 1 else 1
+        return [kind(group, grid, self._buffers, sharing, self.runs) for group in groups]
+
+    def occupy(self, first_nodes: np.ndarray) -> None:
+        """Let a sparse grid have the nodes that particles reach whose stencils begin at these, (n, d) int."""
+        grid = self.device.grid
+        tiles = tiles_reached(first_nodes, grid.tile, grid.reach)
+        if len(tiles) >= grid.tile_count:
+            self.grow(len(tiles) + 1)
+        self.device.grid.occupy(tiles)
+
+    def grow(self, blocks: int) -> None:
+        """Make room for GROWTH times so many blocks of a sparse grid. Their numbers are lost: a sort must follow.
+
+        What the grid had stays allocated until the backend stops.
+        """
+        device = self.device
+        room = most_blocks(device.grid)
+        if blocks > room:
+            raise RunError(
+                f"the material has spread over {blocks:,} blocks of the sparse grid, and there is memory for {room:,}; "
+                "a larger domain.spacing needs fewer."
+            )
+        grid = self._make_grid(device.grid.period, min(GROWTH * blocks, room))
+        nodes, particles = copy(device.nodes), copy(device.particles)
+        nodes.grid = particles.grid = particles.near = grid
+        orders = self._make_orders(device.groups, grid)
+        self.device = replace(device, grid=grid, orders=orders, nodes=nodes, particles=particles)
+        self._build_cpu()
+
+    def _build_cpu(self) -> None:
+        self.cpu = CpuLaunch(self.device, self.layout)
+        self.launch_cpu = StoredLaunch(self.cpu, self.kind, self.backend)
+
+    def make_room(self, rows: int, columns: int) -> None:
+        """Let each run have so many rows of `shown` from the next launch on."""
+        shape = max(rows * self.runs, len(self._room)), max(columns, self._room.shape[1])
+        if shape != self._room.shape:
+            self._room = np.empty(shape, self._room.dtype)
+
+    def first_row(self, slot: int) -> int:
+        """Return the first row of a run in `shown`."""
+        return slot * (len(self.shown) // self.runs)
+
+    def launch(self) -> None:
+        """Advance every run until its host has to attend to it, or its budget of steps is spent."""
+        began = time.perf_counter()
+        if self.backend.on_cpu:
+            self.shown = self._room
+            self.counts[:, self.layout.count.recorded] = 0
+            self.counts[:, self.layout.count.row] = [self.first_row(slot) for slot in range(self.runs)]
+            arrays = self.numbers, self.counts, self.shown, self.notes
+            if self.profile is None:
+                self.launch_cpu(*arrays)
+            else:
+                self.cpu.launch_by_phase(*arrays, self.profile)
+        else:
+            self.gpu(self.numbers, self.counts)
+        self.seconds += time.perf_counter() - began
+        self.first_seconds = self.first_seconds or self.seconds

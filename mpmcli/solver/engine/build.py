@@ -1,0 +1,70 @@
+"""Chooses the backend of a scene, and puts the scene on it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from mpmcli.scene import BodyParticles, Scene, estimate_particles, sample_bodies
+from mpmcli.solver.engine.batch import Batch
+from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.run import Run
+from mpmcli.solver.machine.backend import Arch, Backend, choose_backend
+
+# Particles that are worth a thread.
+WORTH_A_THREAD = 2_500
+# On a GPU, where runs advance at once.
+FEW_ON_GPU = 100_000
+# Particle-steps below which the time to optimise kernels exceeds what faster steps save, about a tenth: of one law. The
+# time grows faster than the number of laws, which share one kernel.
+LITTLE_WORK = 8e8
+
+
+def backend_for(
+    scene: Scene,
+    expected_steps: Callable[[], int],
+    arch: Arch = "auto",
+    threads: int | None = None,
+    *,
+    compile_cache: bool = True,
+) -> Backend:
+    """Return the backend for a scene, not started.
+
+    Args:
+        expected_steps: their number; called on the CPU only.
+        threads: CPU threads; None for as many as the scene has use for.
+
+    Raises:
+        InputError: the backend cannot be used.
+    """
+    backend = choose_backend(arch, threads, scene.solver.precision, compile_cache=compile_cache)
+    if not backend.on_cpu:
+        return backend
+    particles = estimate_particles(scene)
+    little = LITTLE_WORK * len({body.material.law for body in scene.sources}) ** 2
+    optimisation = "few" if particles * expected_steps() < little else "most"
+    return replace(backend, threads=threads or useful_threads(particles, backend.threads), optimisation=optimisation)
+
+
+def useful_threads(particles: int, threads: int) -> int:
+    """Return how many of these threads a run of so many particles has use for."""
+    return min(threads, max(1, particles // WORTH_A_THREAD))
+
+
+def suits_batch(particles: int, backend: Backend) -> bool:
+    """Return whether many runs of so many particles are faster in one batch than one by one."""
+    return backend.on_cpu or particles < FEW_ON_GPU
+
+
+def build_run(
+    scene: Scene, backend: Backend, particles: list[BodyParticles] | None = None, *, force: bool = False
+) -> Run:
+    """Put a scene on the device of a started backend, alone.
+
+    Args:
+        particles: one entry per body, in place of the scene's own sampling.
+        force: take time.step as it is, above the stable step too.
+
+    Raises:
+        InputError: a particle is not in the domain, or the backend cannot compute the scene.
+    """
+    particles = particles or sample_bodies(scene)
+    return Run(Batch(CompiledKind.of(scene, particles).roomy(), backend), 0, scene, particles, force=force)

@@ -1,0 +1,107 @@
+"""What kinds of runs may share kernels and the device."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from mpmcli.boundaries.colliders import ColliderKind
+from mpmcli.boundaries.walls import moving_faces, rough_faces
+from mpmcli.materials.law import Law
+from mpmcli.materials.registry import laws
+from mpmcli.scene import BodyParticles, Scene
+from mpmcli.scene.schema import SolverSettings
+from mpmcli.solver.drive.forces import Drives
+from mpmcli.solver.grid.sparse_grid import wants_sparse
+from mpmcli.solver.machine.plan import members_of
+from mpmcli.solver.machine.room import in_steps, power_of_two, roomy_cells, roomy_colliders
+from mpmcli.solver.particles.inflow import Inflow
+from mpmcli.solver.transfer.volume_relaxation import needs_filling
+
+
+@dataclass(frozen=True)
+class CompiledKind:
+    """What is compiled for a run. Everything else is data, and runs of one kind share kernels and the device.
+
+    Attributes:
+        dimension: 2 or 3; precision: "f32" or "f64".
+        settings: of the solver.
+        faces: words of the walls, per axis; rough, moving: (axis, side) of those with friction, and that move.
+        flags: of each law in the order of their names, the name and the terms that it has.
+        cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
+        keeps_filling: whether nodes keep the volume scattered to them.
+        sparse: whether nodes are there where particles are alone, on the CPU, where such runs share nothing.
+        colliders: their forms, and which of them move.
+        drives: gravity that varies, forces, and motions of colliders.
+        inflow: what lets particles come and go.
+        members: the laws.
+    """
+
+    dimension: int
+    precision: str
+    settings: SolverSettings
+    faces: tuple[tuple[str, str], ...]
+    rough: tuple[tuple[int, int], ...]
+    moving: tuple[tuple[int, int], ...]
+    flags: tuple[tuple, ...]
+    cells: tuple[int, ...]
+    particles: tuple[int, ...]
+    bodies: tuple[int, ...]
+    keeps_filling: bool
+    sparse: bool
+    colliders: ColliderKind
+    drives: Drives
+    inflow: Inflow
+    members: tuple[Law, ...] = field(compare=False, repr=False)
+
+    @staticmethod
+    def of(scene: Scene, particles: Sequence[BodyParticles]) -> "CompiledKind":
+        """Return the kind of a scene with these particles, one entry per body."""
+        names = sorted({body.material.law for body in scene.sources})
+        places = [members_of(scene, name) for name in names]
+        members = tuple(
+            laws()[name]([scene.sources[i].material for i in own], scene.dimension)
+            for name, own in zip(names, places, strict=True)
+        )
+        return CompiledKind(
+            scene.dimension,
+            scene.solver.precision,
+            scene.solver,
+            tuple(tuple(pair) for pair in scene.domain.walls.faces(scene.dimension)),
+            rough_faces(scene),
+            moving_faces(scene),
+            tuple((law.name, law.terms) for law in members),
+            tuple(scene.domain.cells),
+            tuple(sum(len(particles[i].position) for i in own) for own in places),
+            tuple(len(own) for own in places),
+            needs_filling(scene, members),
+            wants_sparse(scene),
+            ColliderKind.of(scene),
+            Drives.of(scene, places)[0],
+            Inflow.of(scene, names),
+            members,
+        )
+
+    def roomy(self) -> "CompiledKind":
+        """Return the kind with some room to spare, so that few sizes occur and compiled kernels are found again."""
+        return replace(
+            self,
+            cells=self.cells if self.sparse else roomy_cells(self.cells),
+            particles=tuple(map(in_steps, self.particles)),
+            bodies=tuple(map(power_of_two, self.bodies)),
+            colliders=roomy_colliders(self.colliders),
+            inflow=replace(self.inflow, cells=power_of_two(self.inflow.cells) if self.inflow.cells else 0),
+        )
+
+    def joined(self, other: "CompiledKind") -> "CompiledKind | None":
+        """Return the kind that has room for both, None where they need other kernels."""
+        if (self.dimension, self.flags) != (other.dimension, other.flags) or self.sparse != other.sparse:
+            return None
+        room = {
+            name: tuple(map(max, getattr(self, name), getattr(other, name)))
+            for name in ("cells", "particles", "bodies")
+        }
+        room["colliders"] = self.colliders.joined(other.colliders)
+        if room["colliders"] is None:
+            return None
+        cells = max(self.inflow.cells, other.inflow.cells)
+        wide, fits = (replace(one, inflow=replace(one.inflow, cells=cells), **room) for one in (self, other))
+        return wide if fits == wide else None

@@ -1,0 +1,218 @@
+"""Finds the compiled kernel of a batch without Taichi's front end, which is a third of a warm start and more.
+
+Taichi keeps compiled kernels in files, by a key of their intermediate form, which its front end has to make first. The
+store has a key of all that a kernel is made from. A stub, a kernel of a few lines that Taichi finds in a millisecond,
+holds that key in its source; the file that Taichi keeps for the stub is replaced, once both have been written, by that
+of the kernel, and from then on the stub is the kernel. Taichi compares the checksum of a file: where it is damaged or
+gone, the stub is compiled as what it is, and leaves a mark; then the kernel itself is launched. A process beside that
+makes machine code of the text of LLVM in the stub's file.
+"""
+
+import contextlib
+import hashlib
+import os
+import platform
+import sys
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.cpu_launch import CpuLaunch, Notes
+from mpmcli.solver.engine.cpu_phases import RunInts, RunReals, Shown
+from mpmcli.solver.machine.backend import Backend, after_stop
+from mpmcli.solver.machine.machine_code import can_be_made, is_sound, make_in_background, write
+
+# Versions of Taichi whose files test_kernel_store.py has been run with.
+KNOWN_VERSIONS = ((1, 7, 4),)
+PACKAGE = Path(__file__).resolve().parents[2]
+# Parts of the package that kernels are made from: what they import is among them, or a module beside them.
+SOURCES = ("scene", "frames", "stability", "materials", "boundaries", "solver")
+# Clocks of a file system and of this machine differ by less, s.
+CLOCKS = 2.0
+# What the stub leaves in notes[0, 0, 0], which is never negative otherwise.
+MARK = -(2**30)
+# Where this variable is "off", kernels are neither stored nor found: for who changes modules while they run.
+SWITCH = "MPMCLI_KERNEL_STORE"
+# Keys of kernels that this process has compiled; of each the file, among Taichi's own, that counts its losses.
+_compiled: dict[str, Path] = {}
+# Processes that make machine code.
+_processes: list[int] = []
+
+
+class StoredLaunch:
+    """Launches the kernel of a batch on the CPU: the stored one, or the one of `CpuLaunch`.
+
+    stored: whether the last launch was that of a stored kernel.
+    """
+
+    def __init__(self, launch: CpuLaunch, kind: CompiledKind, backend: Backend) -> None:
+        self._launch, self._kind, self._backend = launch, kind, backend
+        self._kernel: Callable[..., None] | None = None
+        self.stored = False
+
+    def __call__(self, numbers: np.ndarray, counts: np.ndarray, shown: np.ndarray, notes: np.ndarray) -> None:
+        if self._kernel is None:
+            self._first(numbers, counts, shown, notes)
+        else:
+            self._kernel(numbers, counts, shown, notes)
+
+    def _first(self, numbers: np.ndarray, counts: np.ndarray, shown: np.ndarray, notes: np.ndarray) -> None:
+        key = ""
+        if self._may_store():
+            key, losses = kernel_key(self._kind, self._backend, self._launch.device.runs)
+            stub, noted = stub_kernel(key), notes[0, 0, 0]
+            stub(numbers, counts, shown, notes)
+            if notes[0, 0, 0] != MARK:
+                self._kernel, self.stored = stub, True
+                return
+            notes[0, 0, 0] = noted
+            self._launch.token = words_of(key)
+            _compiled[key] = losses
+            after_stop(store_compiled)
+        with _named(CpuLaunch.launch._primal.func, f"launch_{key}" if key else "launch"):
+            self._launch.launch(numbers, counts, shown, notes)
+        self._kernel = self._launch.launch
+
+    def _may_store(self) -> bool:
+        """Return whether all that the kernel is made from is known: laws of plugins may import anything."""
+        own = all(type(law).__module__.startswith("mpmcli.") for law in self._kind.members)
+        known = own and ti.__version__ in KNOWN_VERSIONS and _unchanged_since(psutil.Process().create_time())
+        return known and self._backend.compile_cache and os.environ.get(SWITCH) != "off"
+
+
+@contextlib.contextmanager
+def _named(function: Callable, name: str) -> Iterator[None]:
+    """Give a function another name, by which Taichi calls what it compiles."""
+    usual, function.__name__ = function.__name__, name
+    try:
+        yield
+    finally:
+        function.__name__ = usual
+
+
+def words_of(key: str) -> tuple[int, ...]:
+    """Return a key in numbers of 28 bits."""
+    return tuple(int(key[i : i + 7], 16) for i in range(0, len(key), 7))
+
+
+def stub_kernel(key: str) -> Callable[..., None]:
+    """Return the stub of a key; each key makes another kernel for Taichi."""
+    words = words_of(key)
+
+    def stub(numbers: RunReals, counts: RunInts, shown: Shown, notes: Notes):
+        for word in ti.static(words):
+            notes[0, 0, 0] = word
+        notes[0, 0, 0] = MARK
+
+    stub.__name__ = f"stub_{key}"
+    return ti.kernel(stub)
+
+
+def kernel_key(kind: CompiledKind, backend: Backend, runs: int) -> tuple[str, Path]:
+    """Return a key of all that the kernel of a batch is made from, with its fields in their places, and a file.
+
+    Taichi does not write a file again that is lost: the file that is returned counts such losses, and the key changes
+    with it.
+    """
+    ti.lang.impl.get_runtime().materialize()
+    config = ti.lang.impl.current_cfg()
+    # Those that no code depends on, of which Taichi leaves one as memory was.
+    beside = ("_", "print_", "offline_cache")
+    settings = [(name, str(getattr(config, name))) for name in dir(config) if not name.startswith(beside)]
+    base = _digest(repr((kind, backend, runs, settings, _layout(), _machine(), _sources())))
+    losses = Path(config.offline_cache_file_path) / f"mpmcli-{base}"
+    return _digest(f"{base} {_text(losses)}"), losses
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _layout() -> list[tuple]:
+    """Return where all fields are: of each node of Taichi's trees what it is, its size, and its place in its parent."""
+    program = ti.lang.impl.get_runtime().prog
+    found = []
+    waiting = [program.get_snode_root(tree) for tree in range(program.get_snode_tree_size())]
+    while waiting:
+        node = waiting.pop()
+        children = [node.get_ch(k) for k in range(node.get_num_ch())]
+        kind = str(node.data_type()) if node.is_place() else str(node.type)
+        found.append((kind, len(children), node.cell_size_bytes, node.offset_bytes_in_parent_cell))
+        waiting += children
+    return found
+
+
+@cache
+def _machine() -> tuple:
+    """Return the versions, and the features of the processor, that kernels depend on."""
+    features = platform.processor()
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        features = next((line for line in lines if line.startswith(("flags", "Features"))), features)
+    return platform.system(), platform.machine(), features, sys.version_info[:3], ti.__version__, np.__version__
+
+
+def _files() -> list[Path]:
+    """Return the modules that kernels are made from."""
+    return sorted([*PACKAGE.glob("*.py"), *(path for part in SOURCES for path in (PACKAGE / part).rglob("*.py"))])
+
+
+def _unchanged_since(began: float) -> bool:
+    """Return whether they are files that are older than this process, s, and so what it has imported."""
+    found = [os.stat(path) for path in _files()]
+    return bool(found) and all(max(one.st_mtime, one.st_ctime) < began - CLOCKS for one in found)
+
+
+@cache
+def _sources() -> str:
+    """Return a digest of the modules that kernels are made from."""
+    digest = hashlib.sha256()
+    for path in _files():
+        digest.update(f"{path.relative_to(PACKAGE)}\0".encode() + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
+def store_compiled() -> None:
+    """Let stubs be the kernels that this process has compiled; Taichi has written the files of both."""
+    while _compiled:
+        key, losses = _compiled.popitem()
+        with contextlib.suppress(OSError):
+            _store(key, losses)
+
+
+def _store(key: str, losses: Path) -> None:
+    folder = losses.parent
+    stub_name, kernel_name = f"stub_{key}".encode(), f"launch_{key}".encode()
+    places, kernels = [], []
+    for path in folder.glob("*.tic"):
+        content = path.read_bytes()
+        if kernel_name in content and is_sound(content):
+            kernels.append(content)
+        elif kernel_name in content or stub_name in content:
+            places.append(path)
+    # Two are a kernel and its stub, which another process has replaced.
+    if len(kernels) == 1 and places:
+        write(places[0], kernels[0])
+        if can_be_made():
+            _processes.append(make_in_background(places[0], f"launch_{key}"))
+    elif len(kernels) < 2:
+        write(losses, f"{_text(losses)}+".encode())
+
+
+def finish() -> None:
+    """Wait until machine code has been made of what was stored."""
+    while _processes:
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(_processes.pop(), 0)

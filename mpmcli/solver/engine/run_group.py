@@ -1,0 +1,160 @@
+"""The particles of one law of one run: what its bodies begin with, and what can be read and replaced."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from mpmcli.errors import InputError
+from mpmcli.materials.law import Law
+from mpmcli.quick_taichi import ti
+from mpmcli.scene import BodyParticles, Scene
+from mpmcli.solver.engine.batch import Batch
+from mpmcli.solver.machine.plan import members_of
+from mpmcli.solver.particles.state_bounds import floor_of
+from mpmcli.solver.transfer.particle_update import NOT_LOST
+
+# Particles that the device takes at once.
+PART = 2**15
+
+
+def table_of(law: Law, particles: Sequence[BodyParticles]) -> np.ndarray:
+    """Return the rows of `ParticleArrays.table` for the members of a law, (bodies, columns)."""
+    return np.array([(b.mass, b.volume, *law.constants(p)) for b, p in zip(particles, law.members, strict=True)])
+
+
+def initial_states(
+    law: Law, particles: Sequence[BodyParticles], first_ids: Sequence[int], origin: np.ndarray
+) -> Iterator[tuple[int, dict[str, np.ndarray], np.ndarray]]:
+    """Yield the particles of some bodies, PART at a time, which bounds the memory.
+
+    first_ids: id of the first particle of each body; origin: of the domain, (d,), m. Yields the number of those before,
+    and what `ParticleArrays.write` takes; its rows count from the first body.
+    """
+    rest = np.ones(1) if law.deformation == "J" else np.eye(len(origin))[None]
+    at_rest = [float(variable.at_rest) for variable in law.internal]
+    before = 0
+    for place, (body, first_id) in enumerate(zip(particles, first_ids, strict=True)):
+        count = len(body.position)
+        for first in range(0, count, PART):
+            own = slice(first, min(first + PART, count))
+            n = own.stop - first
+            position = body.position[own] - origin
+            found = {
+                "x": position,
+                "initial": position if body.initial is None else body.initial[own] - origin,
+                "v": body.velocity[own],
+                "C": body.affine[own],
+                "deformation": np.repeat(rest, n, 0) if body.deformation is None else body.deformation[own],
+                "internal": np.tile(at_rest, (n, 1)),
+                "id": first_id + np.arange(first, own.stop),
+                "activity": 0 if body.waits else 1,
+            }
+            yield before + first, found, np.full(n, place)
+        before += count
+
+
+class RunGroup:
+    """The particles of one law of one run, a range of `ParticleArrays`.
+
+    Attributes:
+        law: with the parameters of this run; bodies: index in the scene of each body of the group.
+        arrays: the fields; first: its first particle there; count: particles n; row: its first row of `table`.
+        rows: host copy of its rows of `table`.
+        floor: the least maxima of a measurement, where particles may come in; None elsewhere.
+        total, dimension, real, internal: of the arrays.
+    """
+
+    def __init__(self, batch: Batch, g: int, slot: int, law: Law, bodies: list[int], rows: np.ndarray, count: int):
+        self.law, self.bodies, self.count = law, tuple(bodies), count
+        self.arrays = batch.device.groups[g]
+        self.total = self.arrays.total
+        self.dimension, self.real, self.internal = self.arrays.dimension, self.arrays.real, self.arrays.internal
+        self.rows = rows.astype(self.real)
+        self.first = slot * batch.kind.particles[g]
+        self.row = slot * batch.kind.bodies[g]
+        self.floor: np.ndarray | None = None
+        self._counts, self._column = batch.counts[slot], batch.layout.count.particles[g]
+
+    @property
+    def active(self) -> int:
+        """Particles that take part, which come first."""
+        return int(self._counts[self._column])
+
+    def read(self) -> dict[str, np.ndarray]:
+        """Return x, v, C, deformation, internal, (n, k), id and body, (n), in the solver's order."""
+        return self.arrays.read(self.first, self.count, self.bodies, self.row)
+
+    def replace(self, **state: np.ndarray) -> None:
+        """Replace some of what `read` returns of all particles: x, v, C, deformation, internal or id.
+
+        `Run.state_was_replaced`, or `Run.restart`, follows.
+        """
+        arrays, d = self.arrays, self.dimension
+        if "x" in state:
+            self._assign(arrays.x, np.asarray(state["x"]))
+        if "v" in state:
+            self._assign(arrays.v, np.asarray(state["v"]))
+        if "C" in state:
+            # What rounding took from places is forgotten.
+            gradient = np.zeros((self.count, d, arrays.gradient.m))
+            gradient[:, :, :d] = np.asarray(state["C"]).transpose(0, 2, 1)
+            self._assign(arrays.gradient, gradient)
+        if "deformation" in state:
+            deformation = np.asarray(state["deformation"])
+            if arrays.displacement_gradient is None:
+                self._assign(arrays.J_minus_1, deformation - 1)
+            else:
+                self._assign(arrays.displacement_gradient, deformation - np.eye(d))
+        for i, field in enumerate(arrays.internal if "internal" in state else ()):
+            self._assign(field, np.asarray(state["internal"])[:, i])
+        if "id" in state:
+            self._assign(arrays.id, np.asarray(state["id"]))
+
+    def _assign(self, field: ti.Field, values: np.ndarray) -> None:
+        """Set the range of the group in a field."""
+        whole = field.to_numpy()
+        whole[self.first : self.first + self.count] = values
+        field.from_numpy(whole)
+
+    def fill(self, states: Iterable[tuple[int, Mapping[str, np.ndarray], np.ndarray]]) -> None:
+        """Fill the device with particles, see `initial_states`."""
+        for first, found, row in states:
+            self.arrays.write(self.first + first, found, self.row + row)
+        for i, row in enumerate(self.rows):
+            self.arrays.table[self.row + i] = row.tolist()
+
+
+def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyParticles]) -> list[RunGroup]:
+    """Put the particles of a run, one entry per source, on the device; return its groups, one for each law."""
+    first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
+    lost, groups = batch.device.particles.lost, []
+    counts, count_of = batch.counts[slot], batch.layout.count
+    for g, shared in enumerate(batch.kind.members):
+        bodies = members_of(scene, shared.name)
+        own = [particles[i] for i in bodies]
+        law = type(shared)([scene.sources[i].material for i in bodies], scene.dimension)
+        group = RunGroup(batch, g, slot, law, bodies, table_of(law, own), sum(len(b.position) for b in own))
+        counts[count_of.particles[g]] = sum(len(b.position) for b in own if not b.waits)
+        counts[count_of.capacity[g]] = group.count
+        group.floor = floor_of(scene, law, bodies)
+        group.fill(initial_states(law, own, [int(first_ids[i]) for i in bodies], np.array(scene.domain.origin)))
+        groups.append(group)
+        if lost[slot * len(batch.kind.members) + g] != NOT_LOST:
+            lost[slot * len(batch.kind.members) + g] = NOT_LOST
+    if batch.device.grid.deterministic:
+        batch.device.grid.fixed.write(slot, groups, scene.domain.spacing)
+    return groups
+
+
+def require_inside(scene: Scene, particles: Sequence[BodyParticles]) -> None:
+    """Refuse particles beyond the domain, or nowhere: the sort would count them in a tile that does not exist."""
+    lower, upper = np.array(scene.domain.origin), np.array(scene.domain.upper)
+    for sample in particles:
+        inside = ((sample.position >= lower) & (sample.position <= upper)).all(axis=1)
+        if not inside.all():
+            p = int(np.argmin(inside))
+            place, low, high = (", ".join(f"{x:.6g}" for x in point) for point in (sample.position[p], lower, upper))
+            raise InputError(
+                f'particle {p} of body "{sample.name}" lies at ({place}) m, outside the domain from ({low}) to '
+                f"({high}) m; every particle must begin inside it."
+            )

@@ -1,0 +1,215 @@
+"""The state of a run, everything that its next step depends on, saved and loaded as one."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from mpmcli.errors import InputError
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.drive.forces import ExternalForces
+from mpmcli.solver.engine.batch import Batch
+from mpmcli.solver.engine.run_numbers import Row
+from mpmcli.solver.engine.step_control import StepControl
+
+# Bytes of a number on the device.
+SIZES = {ti.f32: 4, ti.f64: 8, ti.i32: 4}
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """A state on the host, as a file can hold it.
+
+    Attributes:
+        numbers: plain numbers, lists and dictionaries of them, by name; infinity occurs.
+        arrays: of the particles in the order of the device, the tables of the sort and the box of the grid, by name.
+    """
+
+    numbers: dict[str, object]
+    arrays: Mapping[str, np.ndarray]
+
+    def copied(self) -> "SavedState":
+        """Return it with all arrays copied from the device, which outlives the next step."""
+        return SavedState(self.numbers, dict(self.arrays))
+
+
+class ArraysOnDevice(Mapping[str, np.ndarray]):
+    """Arrays of a state that are copied one by one, as they are asked for, before the next step.
+
+    nbytes: of all of them.
+    """
+
+    def __init__(self, fields: Mapping[str, ti.Field], others: Mapping[str, np.ndarray] = MappingProxyType({})) -> None:
+        """Name the arrays: those of fields, and others, which are on the host."""
+        self._fields, self._others = fields, others
+        entries = sum(math.prod(shape_of(field)) * SIZES[field.dtype] for field in fields.values())
+        self.nbytes = entries + sum(array.nbytes for array in others.values())
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self._others[name].copy() if name in self._others else self._fields[name].to_numpy()
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self._fields
+        yield from self._others
+
+    def __len__(self) -> int:
+        return len(self._fields) + len(self._others)
+
+
+class Progress:
+    """What changes in a run beside its particles.
+
+    Attributes:
+        time: s, in double precision; step_count: steps taken; last_step: size of the last one, s, 0 before the first.
+        speed: bound on the speed of every particle, m/s; courant: cells that the fastest one moved in the last step.
+        drift: cells that a particle may have moved since particles were sorted; infinite before the first sort.
+        first_stable_step: s, at the start of the run.
+        owed: time by which velocities lag behind the middle of the last step, s, after a step that fell steeply.
+        unrelaxed: s since volumes were last relaxed, in unrelaxed_steps steps.
+        step_control, external_forces: what is known of the bounds on the next step.
+    """
+
+    NUMBERS = (
+        *("time", "step_count", "last_step", "speed", "courant", "drift", "first_stable_step"),
+        *("owed", "unrelaxed", "unrelaxed_steps"),
+    )
+
+    def __init__(self, step_control: StepControl, external_forces: ExternalForces) -> None:
+        self.step_control = step_control
+        self.external_forces = external_forces
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a run with the particles that are on the device."""
+        self.time = 0.0
+        self.step_count = 0
+        self.last_step = 0.0
+        self.speed = self.step_control.speed
+        self.courant = 0.0
+        self.drift = math.inf
+        self.first_stable_step = 0.0
+        self.owed = 0.0
+        self.unrelaxed = 0.0
+        self.unrelaxed_steps = 0
+        self.step_control.begin()
+
+    @property
+    def velocity_time(self) -> float:
+        """Time to which velocities have advanced, s: the middle of the last step, less what is owed."""
+        return self.time - 0.5 * self.last_step - self.owed
+
+
+def shape_of(field: ti.Field) -> tuple[int, ...]:
+    """Return the shape of a field as a numpy array."""
+    if isinstance(field, ti.lang.matrix.MatrixField):
+        return (*field.shape, field.n) if field.m == 1 else (*field.shape, field.n, field.m)
+    return tuple(field.shape)
+
+
+# The tiles of a sparse grid that have numbers; of the table of a sort what concerns these.
+BLOCKS, START = "grid.blocks", "{}.block_start"
+# Columns that the scene sets, and that one which goes on for longer sets otherwise.
+OF_SCENE = ("end", "until"), ("frames", "sheets")
+
+
+def read_batch(batch: Batch) -> ArraysOnDevice:
+    """Return what a batch of one run has on the device and tells its kernel, by name, until the next launch."""
+    return ArraysOnDevice(_fields(batch), {"numbers": batch.numbers[0], "counts": batch.counts[0]} | _blocks(batch))
+
+
+def write_batch(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
+    """Replace what a batch of one run has by what was read of one of the same scene, or of one that ended earlier."""
+    if batch.device.grid.sparse:
+        _make_room(batch, arrays)
+    fields = _fields(batch)
+    expected = {name: shape_of(field) for name, field in fields.items()}
+    expected |= {"numbers": batch.numbers[0].shape, "counts": batch.counts[0].shape}
+    found = {name: array.shape for name, array in arrays.items()}
+    if batch.device.grid.sparse:
+        expected |= _block_shapes(batch, arrays)
+    if expected != found:
+        raise InputError("the saved state belongs to another scene or to another kind of backend.")
+    for name, field in fields.items():
+        field.from_numpy(arrays[name])
+    if batch.device.grid.sparse:
+        _write_blocks(batch, arrays)
+    for row, name, layout, kept in (
+        (batch.numbers[0], "numbers", batch.layout.real, OF_SCENE[0]),
+        (batch.counts[0], "counts", batch.layout.count, OF_SCENE[1]),
+    ):
+        columns = np.hstack([getattr(layout, column) for column in kept]).astype(int)
+        own = row[columns].copy()
+        row[:] = arrays[name]
+        row[columns] = own
+    if batch.backend.on_cpu:
+        batch.cpu.share_work(batch.counts)
+
+
+def aim_on(row: Row) -> None:
+    """Let a run that has reached its last frame go on to the next one, as the kernel does after every other frame."""
+    frames = row.count("frames")
+    if row.count("arrived") == 1 and row.count("frame") < frames:
+        row.set_counts(frame=row.count("frame") + 1, limit=0, arrived=0)
+        row.set(smallest=math.inf, largest=0.0, largest_courant=0.0)
+    row.set(target=row.number("end") * row.count("frame") / frames)
+
+
+def _fields(batch: Batch) -> dict[str, ti.Field]:
+    """Return every field of the device that outlives a step, by name."""
+    device = batch.device
+    found: dict[str, ti.Field] = {}
+    if batch.backend.on_cpu:
+        found = {"grid.box": device.grid.box, "stencils": device.stencils}
+        if not device.grid.sparse:
+            pairs = zip(device.groups, device.orders, strict=True)
+            found |= {f"{group.law.name}.tile_start": order.start for group, order in pairs}
+    for group in device.groups:
+        found |= {f"{group.law.name}.{name}": field for name, field in group.fields().items()}
+    if device.colliders is not None:
+        found["colliders.taken"] = device.colliders.taken
+    if device.motion is not None:
+        found["colliders.pose"] = device.motion.pose
+    return found | ({} if device.particles.contact is None else device.particles.contact.fields())
+
+
+def _blocks(batch: Batch) -> dict[str, np.ndarray]:
+    """Return what a sparse grid numbers, and the tables of its sorts, by name; nothing of a dense one."""
+    device, grid = batch.device, batch.device.grid
+    if not grid.sparse:
+        return {}
+    found = {BLOCKS: grid.occupied()}
+    for group, order in zip(device.groups, device.orders, strict=True):
+        start = order.start.to_numpy()
+        # Behind the blocks in use all tiles are empty.
+        found[START.format(group.law.name)] = np.concatenate([start[: len(found[BLOCKS]) + 2], start[order.tiles :]])
+    return found
+
+
+def _block_shapes(batch: Batch, arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of `_blocks`, as many as there are in `arrays`."""
+    count, order = len(arrays[BLOCKS]), batch.device.orders[0]
+    starts = {START.format(group.law.name): (count + 3 + order.bins - order.tiles,) for group in batch.device.groups}
+    return {BLOCKS: (count,)} | starts
+
+
+def _make_room(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
+    """Let a sparse grid have room for saved blocks."""
+    tiles, grid = arrays.get(BLOCKS, np.empty((0, 0))), batch.device.grid
+    sound = tiles.ndim == 1 and (np.diff(tiles) > 0).all() and (tiles >= 0).all() and (tiles < grid.all_tiles).all()
+    if not sound:
+        raise InputError("the saved state belongs to another scene or to another kind of backend.")
+    if len(tiles) >= grid.tile_count:
+        batch.grow(len(tiles) + 1)
+
+
+def _write_blocks(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
+    """Replace what `_blocks` returns."""
+    batch.device.grid.occupy(arrays[BLOCKS])
+    used = len(arrays[BLOCKS]) + 1
+    for group, order in zip(batch.device.groups, batch.device.orders, strict=True):
+        saved = arrays[START.format(group.law.name)]
+        start = np.full(order.bins + 1, saved[used], np.int32)
+        start[: used + 1], start[order.tiles :] = saved[: used + 1], saved[used + 1 :]
+        order.start.from_numpy(start)

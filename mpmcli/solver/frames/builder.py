@@ -1,0 +1,268 @@
+"""Builds frames and rows of the ledger from what a device has shown."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mpmcli.frames.frame import STATUS, Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.scene import BodyParticles, Scene
+from mpmcli.solver.frames.columns import FrameArrays, FrameColumns, ParticleConstants, RunConstants, parts_of
+from mpmcli.solver.frames.ledger_sums import StepsTaken, Sums, ledger_rows, ledger_sums
+from mpmcli.solver.particles.sort import ACTIVE, RETIRED, WAITING
+from mpmcli.stability.transfer_factors import affine_moment
+
+# Fewest cells inside the material that say anything: the edge of what is inside is sharp to a particle or so.
+FEWEST = 64
+# Cells that are looked at at once. Of a larger domain only those that particles occupy are.
+WHOLE = 2**16
+
+
+class FilledCells:
+    """The cells that particles fill at T times; particles are added a part after another.
+
+    A cell is inside where it and all of its neighbours, corners included, hold particles of materials that flow and of
+    no others; beyond a wall there is nothing to ask for, beyond a periodic face is the other one.
+    """
+
+    def __init__(self, x: np.ndarray, spacing: float, cells: Sequence[int], periodic: Sequence[bool]) -> None:
+        """Choose the cells to look at from the places of all particles that may be added, (T, n, d), m."""
+        self._spacing, self._cells, self._periodic = spacing, tuple(cells), periodic
+        self._low, self._high = [0] * len(cells), [n - 1 for n in cells]
+        if math.prod(cells) > WHOLE:
+            lower, upper = _bounds(x)
+            for a in range(len(cells)):
+                self._low[a], self._high[a] = (max(0, int(self._cell(bound[a], a))) for bound in (lower, upper))
+        # One cell more on each side: a wall asks for nothing, the void is empty.
+        self._shape = [len(x)] + [last - first + 3 for first, last in zip(self._low, self._high, strict=True)]
+        self._held = np.zeros(math.prod(self._shape))
+        self._others: np.ndarray | None = None
+
+    def _cell(self, x: np.ndarray, a: int) -> np.ndarray:
+        return np.minimum((x * (1 / self._spacing)).astype(np.intp), self._cells[a] - 1)
+
+    def add(self, x: np.ndarray, volume: np.ndarray, flows: np.ndarray) -> None:
+        """Add particles, in whatever parts: x, (T, k, d), m, volume as it is, (T, k), and whether each flows, (k,)."""
+        index = np.arange(len(x))[:, None]
+        for a, (first, count) in enumerate(zip(self._low, self._shape[1:], strict=True)):
+            index = index * count
+            index = index + (self._cell(x[:, :, a], a) + (1 - first))
+        if not flows.all():
+            if self._others is None:
+                self._others = np.zeros(len(self._held), bool)
+            self._others[index[:, ~flows].ravel()] = True
+            index, volume = index[:, flows], volume[:, flows]
+        np.add.at(self._held, index.ravel(), volume.ravel())
+
+    def errors(self) -> np.ndarray:
+        """Return the volume of the cells inside over that of the particles in them, less 1, (T,); 0 with few cells."""
+        held = self._held.reshape(self._shape)
+        inside = held > 0
+        if self._others is not None:
+            inside &= ~self._others.reshape(self._shape)
+        for axis, count in enumerate(self._cells):
+            planes = inside.swapaxes(0, 1 + axis)
+            whole = self._low[axis] == 0, self._high[axis] == count - 1
+            planes[0], planes[-1] = whole
+            if self._periodic[axis]:
+                # Cells that are not looked at are empty.
+                planes[0], planes[-1] = (planes[-2], planes[1]) if all(whole) else (False, False)
+        for axis in range(len(self._cells)):
+            planes = inside.swapaxes(0, 1 + axis)
+            inside = (planes[:-2] & planes[1:-1] & planes[2:]).swapaxes(0, 1 + axis)
+        inside = inside.reshape(len(held), -1)
+        within = held[(slice(None), *(slice(1, -1),) * len(self._cells))].reshape(len(held), -1)
+        counts = np.count_nonzero(inside, axis=1)
+        enough = counts >= FEWEST
+        # In one order, whatever the number of times.
+        filled = np.where(inside, within, 0.0).sum(axis=1)
+        return np.where(enough, counts * self._spacing ** len(self._cells) / np.where(enough, filled, 1.0) - 1, 0.0)
+
+
+def _bounds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the largest coordinate along each axis, (d,), of places (T, n, d)."""
+    found = [[(x[:, rows, a].min(), x[:, rows, a].max()) for a in range(x.shape[2])] for rows in parts_of(x.shape[1])]
+    bounds = np.array(found, x.dtype)
+    return bounds[:, :, 0].min(axis=0), bounds[:, :, 1].max(axis=0)
+
+
+def times_at_once(cells: Sequence[int]) -> int:
+    """Return how many times one `FilledCells` may look at: only one where it depends on the particles which cells."""
+    return max(1, WHOLE // math.prod(cells))
+
+
+# Largest rounding of a stored position, in cells.
+POSITION_ERROR = 1e-3
+
+
+class Moment(NamedTuple):
+    """When a frame is, and what happened since the one before.
+
+    Attributes:
+        index: its number; time: s; step: steps so far; last_step: the last of them, s.
+        taken: the steps since the frame before.
+        loads: impulses, N s, and angular impulses, N m s, that colliders took since then, (colliders, k), or None.
+        blocked: particles of emitters that found no room so far.
+    """
+
+    index: int
+    time: float
+    step: int
+    last_step: float
+    taken: StepsTaken
+    loads: np.ndarray | None = None
+    blocked: int = 0
+
+
+class FrameBuilder:
+    """Builds the frames of a run, with the columns that they need; before: time of the last frame, s."""
+
+    def __init__(
+        self, scene: Scene, particles: Sequence[BodyParticles], groups: Sequence, columns: Sequence[str] = ()
+    ) -> None:
+        """Keep what never changes of the `RunGroup`s; `columns` are further ones, by fields that need them."""
+        self._scene = scene
+        self.constants = RunConstants(groups, [len(b.position) for b in particles])
+        self._flows = any(group.law.flows for group in groups)
+        self._names = [name for name in scene.output.fields if name not in ("velocity", "initial_position")]
+        internal = max(len(group.law.internal) for group in groups)
+        shown = [*self._names, *columns]
+        self.columns = FrameColumns(scene.dimension, internal, shown, comes_and_goes=scene.comes_and_goes)
+        self._waits = np.array([b.waits for b in particles])
+        self._origin = np.array(scene.domain.origin)
+        # Far from zero single precision cannot tell neighbours apart, though the solver, which counts from the
+        # origin of the domain, can.
+        farthest = float(np.abs([self._origin, scene.domain.upper]).max())
+        coarse = farthest * np.finfo(np.float32).eps > POSITION_ERROR * scene.domain.spacing
+        self._position_type = np.float64 if coarse or groups[0].real == np.float64 else np.float32
+        self.before = 0.0
+        self._initial = None
+        if "initial_position" in scene.output.fields:
+            initial = [b.position if b.initial is None else b.initial for b in particles]
+            self._initial = np.concatenate(initial).astype(self._position_type)
+
+    def build(
+        self, moments: Sequence[Moment], arrays: FrameArrays, sums: Sequence[Sums]
+    ) -> list[tuple[Frame, LedgerRow]]:
+        """Return frames with their rows, from the particles and the sums of each law at T moments."""
+        scene, constants = self._scene, self.constants
+        (times, n), d = arrays.reals.shape[:2], scene.dimension
+        position = np.empty((times, n, d), self._position_type)
+        velocity = np.empty((times, n, d), arrays.reals.dtype)
+        status = np.empty((times, n), np.int8) if scene.comes_and_goes else None
+        fields: dict[str, np.ndarray] = {}
+        totals = _Totals(scene, arrays["x"], times, self._waits, flows=self._flows)
+        for rows in parts_of(n):
+            own, same = arrays.of_rows(rows), constants.of_rows(rows)
+            ratios = same.volume_ratios(own)
+            position[:, rows], velocity[:, rows] = own["x"] + self._origin, own["v"]
+            for name, values in same.fields(own, ratios, self._names).items():
+                if name not in fields:
+                    fields[name] = np.empty((times, n, *values.shape[2:]), values.dtype)
+                fields[name][:, rows] = values
+            if status is not None:
+                status[:, rows] = own["activity"]
+            totals.add(own["x"], ratios, same, constants.body[rows], None if status is None else status[:, rows])
+        if self._initial is not None:
+            fields["initial_position"] = np.broadcast_to(self._initial, position.shape)
+        frames = [
+            Frame(
+                index=moment.index,
+                time=moment.time,
+                step=moment.step,
+                position=position[t],
+                velocity=velocity[t],
+                body=constants.body,
+                material=constants.material,
+                fields={name: fields[name][t] for name in scene.output.fields if name != "velocity"}
+                | ({} if status is None else {STATUS: status[t]}),
+            )
+            for t, moment in enumerate(moments)
+        ]
+        if scene.output.drop_retired:
+            frames = [frame.of_present for frame in frames]
+        gravity = np.array([scene.domain.gravity_at(moment.time) for moment in moments])
+        last_steps = np.array([moment.last_step for moment in moments])
+        spacing = scene.domain.spacing
+        conserved = ledger_sums(sums, gravity, spacing, last_steps, affine_moment(scene.solver))
+        conserved |= totals.entries(constants.masses)
+        if status is not None:
+            conserved["blocked"] = np.array([moment.blocked for moment in moments])
+        if scene.colliders:
+            conserved["collider_force"], conserved["collider_torque"] = self._collider_loads(moments)
+        times, taken = [moment.time for moment in moments], [moment.taken for moment in moments]
+        return list(zip(frames, ledger_rows(conserved, times, taken), strict=True))
+
+    def _collider_loads(self, moments: Sequence[Moment]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean force, N, and torque, N m, on each collider since the frame before, (T, colliders, k)."""
+        d = self._scene.dimension
+        found = []
+        for moment in moments:
+            duration, self.before = moment.time - self.before, moment.time
+            found.append(moment.loads / duration if duration > 0 else np.zeros_like(moment.loads))
+        loads = np.array(found)
+        return loads[..., :d], loads[..., d:]
+
+
+class _Totals:
+    """Entries of the ledger over all particles at T times, which are added a part after another.
+
+    x: of all particles, (T, n, d), m; waits: whether the particles of each body belong to an emitter; flows: whether
+    any material does.
+    """
+
+    def __init__(self, scene: Scene, x: np.ndarray, times: int, waits: np.ndarray, *, flows: bool) -> None:
+        domain = scene.domain
+        self._extent, self._waits = np.array(domain.size), waits
+        self._low, self._high = np.full(times, np.inf), np.full(times, -np.inf)
+        # Particles of each body that have been let in, and that have left.
+        self._entered, self._retired = (np.zeros((times, len(waits)), np.int64) for _ in range(2))
+        self._comes_and_goes = scene.comes_and_goes
+        at_once = 1 if scene.comes_and_goes else times_at_once(domain.cells)
+        self._filled = [
+            (own, FilledCells(x[own], domain.spacing, domain.cells, domain.periodic))
+            for own in (slice(t, t + at_once) for t in range(0, times, at_once) if flows)
+        ]
+
+    def add(
+        self, x: np.ndarray, ratios: np.ndarray, same: ParticleConstants, body: np.ndarray, status: np.ndarray | None
+    ) -> None:
+        """Add particles: x, (T, k, d), m, ratios and status, (T, k), body, (k,)."""
+        if status is not None:
+            self._add_active(x, ratios, same, body, status)
+            return
+        self._low = np.minimum(self._low, ratios.min(axis=1))
+        self._high = np.maximum(self._high, ratios.max(axis=1))
+        for own, filled in self._filled:
+            filled.add(x[own], ratios[own] * same.volume, same.flows)
+
+    def _add_active(
+        self, x: np.ndarray, ratios: np.ndarray, constants: ParticleConstants, body: np.ndarray, status: np.ndarray
+    ) -> None:
+        for t, (place, J, state) in enumerate(zip(x, ratios, status, strict=True)):
+            active = state == ACTIVE
+            self._low[t] = J[active].min(initial=self._low[t])
+            self._high[t] = J[active].max(initial=self._high[t])
+            # Beyond an open face there are no cells to look at.
+            seen = active & ((place >= 0) & (place <= self._extent)).all(axis=1)
+            for _, filled in self._filled[t : t + 1]:
+                filled.add(place[None, seen], (J * constants.volume)[None, seen], constants.flows[seen])
+            for counts, own in ((self._entered, state != WAITING), (self._retired, state == RETIRED)):
+                counts[t] += np.bincount(body[own], minlength=len(self._waits))
+
+    def entries(self, masses: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the entries of `LedgerRow` by name, (T,); `masses` of a particle of each body, kg."""
+        # Where no particle takes part, none has changed its volume.
+        none = self._low > self._high
+        errors = [filled.errors() for _, filled in self._filled]
+        found = {
+            "volume_ratio_min": np.where(none, 1.0, self._low),
+            "volume_ratio_max": np.where(none, 1.0, self._high),
+            "volume_error": np.concatenate(errors) if errors else np.zeros(len(none)),
+        }
+        if self._comes_and_goes:
+            for name, counts in (("emitted", self._entered * self._waits), ("retired", self._retired)):
+                found[name], found[f"{name}_mass"] = counts.sum(axis=1), counts @ masses
+        return found

@@ -1,0 +1,176 @@
+"""Describes why a run stopped: which particle, where, what happened to it, and which limit was nearest."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from mpmcli.errors import RunError
+from mpmcli.materials.tensors import determinant
+from mpmcli.scene import Domain, Scene
+from mpmcli.solver.transfer.particle_update import SMALLEST_J
+from mpmcli.stability.limits import Limit
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Host copies of one group's state, in the solver's order.
+
+    Attributes:
+        x: (n, d) relative to the origin of the domain, m; v: (n, d); C: (n, d, d); deformation: (n) or (n, d, d).
+        internal: (n, k), the internal variables of the law; id, body: (n) int.
+        activity: (n) int, see `particles.sort`; None where all particles take part.
+    """
+
+    group: object
+    x: np.ndarray
+    v: np.ndarray
+    C: np.ndarray
+    deformation: np.ndarray
+    internal: np.ndarray
+    id: np.ndarray
+    body: np.ndarray
+    activity: np.ndarray | None = None
+
+    @cached_property
+    def volume_ratio(self) -> np.ndarray:
+        """J of each particle as stored, (n,)."""
+        return self.deformation if self.deformation.ndim == 1 else determinant(self.deformation)
+
+
+def read_group(group: object) -> Snapshot:
+    return Snapshot(group, **group.read())
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Where and why a run stopped.
+
+    Attributes:
+        step: number of the step after which it was seen; time: s.
+        particle: row of the particle in every frame; body: name of its body; position: last one inside the domain, m.
+        cause: what happened to it; suggestion: what may help.
+        limit: name of the bound on the step that was nearest; step_size: of that step, s.
+    """
+
+    step: int
+    time: float
+    particle: int
+    body: str
+    position: tuple[float, ...]
+    cause: str
+    limit: str
+    step_size: float
+    suggestion: str
+
+    def sentence(self) -> str:
+        place = ", ".join(f"{x:.4g}" for x in self.position)
+        return (
+            f"the run became unstable at step {self.step}, t = {self.time:.6g} s: particle {self.particle} of body "
+            f'"{self.body}" at ({place}) m {self.cause}; the step was {self.step_size:.3g} s, its nearest limit '
+            f'"{self.limit}"; {self.suggestion}.'
+        )
+
+
+class UnstableRunError(RunError):
+    """The state of a run is no longer physical; frames already written stay."""
+
+    def __init__(self, diagnosis: Diagnosis) -> None:
+        super().__init__(diagnosis.sentence())
+        self.diagnosis = diagnosis
+
+
+# Causes, and what may help.
+NOT_FINITE = "has a state that is not finite"
+INVERTED = "was turned inside out"
+CRUSHED = "was crushed to nothing"
+LEFT = "left the domain"
+OUTRAN = "outran the nodes prepared for it"
+FASTER = "got more momentum in a step than the sums of solver.deterministic have room for"
+DENSER = "lies where more mass meets than the sums of solver.deterministic have room for"
+STIFFER = "a stiffer material, a finer domain.spacing or a lower time.safety may keep it from that"
+SUGGESTIONS = {
+    NOT_FINITE: "lower time.safety, or look for a number in the scene that is far from what you mean",
+    INVERTED: STIFFER,
+    CRUSHED: STIFFER,
+    LEFT: "check the speeds and forces of the scene, or lower time.safety or time.step",
+    FASTER: "check the speeds, forces and materials of the scene, or lower time.safety",
+    DENSER: "look for particles that lie on each other, or leave solver.deterministic out",
+    OUTRAN: "lower time.step, so that speeds are measured more often",
+}
+FORCED = 'time.step = "auto" would have taken steps that are stable'
+OTHERWISE = "check the speeds, forces and materials of the scene"
+
+
+def first_unsound(snapshot: Snapshot) -> int | None:
+    """Return the particle (in solver order) with the smallest id that is crushed, inverted or not finite, or None."""
+    sound = snapshot.volume_ratio > SMALLEST_J
+    for values in (snapshot.x, snapshot.v, snapshot.C):
+        sound &= np.isfinite(values).reshape(len(sound), -1).all(1)
+    unsound = np.flatnonzero(~sound)
+    return int(unsound[snapshot.id[unsound].argmin()]) if len(unsound) else None
+
+
+def first_beyond(snapshots: Sequence[Snapshot], particle: int | None, place: np.ndarray | None) -> tuple[Snapshot, int]:
+    """Return group and number, in solver order, of the particle with an id, or of the one nearest to a place, m."""
+    if particle is not None:
+        found = [(snapshot, np.flatnonzero(snapshot.id == particle)) for snapshot in snapshots]
+        return next((snapshot, int(rows[0])) for snapshot, rows in found if len(rows))
+    nearest = []
+    for g, snapshot in enumerate(snapshots):
+        away = ((snapshot.x - place) ** 2).sum(1)
+        p = int(np.lexsort((snapshot.id, away))[0])
+        nearest.append((float(away[p]), g, p))
+    _, g, p = min(nearest)
+    return snapshots[g], p
+
+
+def rate_of_change(snapshot: Snapshot, spacing: float) -> np.ndarray:
+    """Return how fast each particle moves through cells or deforms, (n,), 1/s."""
+    speed = np.linalg.norm(snapshot.v.astype(np.float64), axis=1)
+    return speed / spacing + np.abs(snapshot.C.astype(np.float64)).sum((1, 2))
+
+
+def cause_of(snapshot: Snapshot, p: int, dt: float, domain: Domain) -> str:
+    """Return what happened to particle p (in solver order) in a step of dt (s) in a domain."""
+    values = (snapshot.x[p], snapshot.v[p], snapshot.C[p], snapshot.deformation[p])
+    if not all(np.isfinite(value).all() for value in values):
+        return NOT_FINITE
+    J = float(snapshot.volume_ratio[p])
+    if not J > 0:
+        return f"{INVERTED} (J = {J:.3g})"
+    if J <= SMALLEST_J:
+        return f"{CRUSHED} (J = {J:.3g})"
+    speed = float(np.linalg.norm(snapshot.v[p].astype(np.float64)))
+    going = snapshot.x[p].astype(np.float64) + dt * snapshot.v[p]
+    if (((going < 0) | (going > np.array(domain.size))) & ~np.array(domain.periodic)).any():
+        return f"{LEFT} at {speed:.4g} m/s"
+    return f"{OUTRAN} at {speed:.4g} m/s"
+
+
+def diagnose(
+    snapshot: Snapshot,
+    p: int,
+    cause: str,
+    scene: Scene,
+    step: int,
+    time: float,
+    step_size: float,
+    limit: Limit,
+    *,
+    forced: bool,
+) -> Diagnosis:
+    """Describe particle p (in solver order) of a group, which stopped the run for this cause."""
+    advice = next((advice for start, advice in SUGGESTIONS.items() if cause.startswith(start)), OTHERWISE)
+    return Diagnosis(
+        step,
+        time,
+        int(snapshot.id[p]),
+        scene.sources[int(snapshot.body[p])].name,
+        tuple((snapshot.x[p].astype(np.float64) + scene.domain.origin).tolist()),
+        cause,
+        limit.name,
+        step_size,
+        FORCED if forced else advice,
+    )

@@ -1,0 +1,228 @@
+"""The background grid: nodes of mass and momentum, and the box of them that is in use."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from mpmcli.boundaries.walls import REACH
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.grid.period import Period
+from mpmcli.solver.transfer.splines import PAD, TransferScheme
+
+# What is left of the cells that a particle may drift, for the rounding of positions.
+ROUNDING = 0.02
+
+
+def tile_edge(stencil: int, dimension: int, *, on_cpu: bool) -> int:
+    """Return the edge of a tile, cells, for a spline whose stencil has this many nodes per axis.
+
+    In larger tiles particles are sorted more rarely; in 3D the nodes must fit into the fastest cache.
+    """
+    return stencil + (3 if on_cpu and dimension == 2 else 1)
+
+
+def drift_allowed(tile: int, stencil: int) -> float:
+    """Return the cells that a particle may drift out of its tile as long as same-coloured tiles write disjoint nodes.
+
+    Tiles of one colour lie two edges of t cells apart. With a drift of up to c cells one writes t + 2 c nodes and the
+    rest of the last stencil, which must be fewer: 2 c < t - stencil + 2.
+    """
+    return (tile - stencil + 1) // 2 - ROUNDING
+
+
+def node_width(dimension: int, *, on_cpu: bool) -> int:
+    """Return the numbers per node: momentum and mass, and on the CPU padding to a vector register."""
+    return 4 if on_cpu else dimension + 1
+
+
+@ti.data_oriented
+class LinearNodes:
+    """Nodes of a box addressed by one linear index, with `strides` per axis; `first_node` is that of node 0."""
+
+    dimension: int
+    strides: tuple[int, ...]
+    first_node: int
+
+    def line_node(self, plane: int, line: int) -> int:
+        """Return the linear offset of the first node of a line along the last axis in a plane of a stencil."""
+        return line * self.strides[-2] + (plane * self.strides[0] if self.dimension == 3 else 0)
+
+    @ti.func
+    def linear_index(self, base: ti.template()):
+        index = self.first_node
+        for a in ti.static(range(self.dimension)):
+            index += base[a] * self.strides[a]
+        return index
+
+
+@ti.data_oriented
+class Grid(LinearNodes):
+    """A dense grid of nodes over the domain and its ghost margin, addressed by one linear index.
+
+    Node index n along an axis lies at (n - PAD) h from the lower wall.
+
+    Attributes:
+        spacing: h, m; inverse_spacing: 1/h; gradient_scale: h / D, the factor of a velocity gradient.
+        cells: of the domain per axis; scheme: constants of the transfers; period: axes along which the domain repeats.
+        tile: edge of a tile, cells; tiles: per axis; tile_count: of all of them.
+        shape: nodes per axis, margins included, a multiple of `tile`.
+        planes: of a stencil, normal to the first axis, 1 in 2D; runs: whose nodes it has, one after the other.
+        width: numbers per node, at least d + 1.
+        nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update.
+        before: Vector(width) field: momentum, later velocity, without stress and forces of this step; None in schemes
+            that do not keep it.
+        filling: Vector(width) field: where the mass is in `nodes` it has the volume of particles at rest, m^3, in the
+            steps that relax volumes; None where the mass says as much. keeps_filling: whether it is there.
+        holding: `filling`, or else `nodes`.
+        means: Vector(2) field per group: of the particles in the cell behind a node the volume at rest times ln J, and
+            the volume at rest, m^3; None of groups that do not average them (`volume_average`). kept_means: the others.
+        weighs_before: whether `before` holds masses too, of which walls that move ask for.
+        opens: (axis, side) of every face that material may leave through: nodes beyond it are like all others.
+        fixed: sums in fixed point, from which `FixedPoint.settle` sets the fields; None where P2G adds to these itself.
+            deterministic: whether there are such sums; then there are no `means`.
+        box: (2, d) ints: first node in use and number of nodes in use, per axis.
+    """
+
+    sparse = False
+
+    def __init__(
+        self,
+        dimension: int,
+        spacing: float,
+        cells: tuple[int, ...],
+        width: int,
+        scheme: TransferScheme,
+        runs: int,
+        *,
+        tile: int,
+        keeps_filling: bool,
+        averaged: Sequence[bool],
+        period: Period,
+        walls_move: bool,
+        opens: Sequence[tuple[int, int]],
+        deterministic: bool,
+    ) -> None:
+        """Allocate nodes for a number of runs; `averaged` says of each group whether it averages volumes over cells."""
+        self.dimension, self.width = dimension, width
+        self.spacing, self.inverse_spacing = spacing, 1 / spacing
+        self.gradient_scale = scheme.spline.inverse_moment / spacing
+        self.cells, self.scheme, self.tile = tuple(cells), scheme, tile
+        self.tiles = self.tile_counts(cells, tile)
+        self.tile_count = math.prod(self.tiles)
+        self.shape = tuple(self.tile * n for n in self.tiles)
+        self.strides = tuple(int(np.prod(self.shape[a + 1 :])) for a in range(dimension))
+        self.planes = scheme.spline.nodes if dimension == 3 else 1
+        self.runs, self.opens, self.first_node = runs, tuple(opens), 0
+        self.node_count = self.stored_nodes()
+        count = runs * self.node_count
+        self.nodes = ti.Vector.field(width, float, shape=count)
+        self.before = ti.Vector.field(width, float, shape=count) if scheme.keeps_before else None
+        self.keeps_filling = keeps_filling
+        self.filling = ti.Vector.field(width, float, shape=count) if keeps_filling else None
+        self.holding = self.filling if keeps_filling else self.nodes
+        self.means = tuple(
+            ti.Vector.field(2, float, shape=count) if wanted and not deterministic else None for wanted in averaged
+        )
+        self.kept_means = tuple(means for means in self.means if means is not None)
+        self.period, self.weighs_before = period, walls_move and scheme.keeps_before
+        self.deterministic, self.fixed = deterministic, None
+        self.box = ti.field(int, shape=(2 * runs, dimension))
+
+    def stored_nodes(self) -> int:
+        """Return the number of nodes of a run that memory is allocated for."""
+        return math.prod(self.shape)
+
+    @staticmethod
+    def tile_counts(cells: Sequence[int], tile: int) -> tuple[int, ...]:
+        """Return the tiles per axis of a grid over these cells, for tiles with this edge."""
+        return tuple(-(-(n + 1 + 2 * PAD) // tile) for n in cells)
+
+    @staticmethod
+    def nodes_needed(cells: Sequence[int], tile: int) -> int:
+        return math.prod(tile * n for n in Grid.tile_counts(cells, tile))
+
+    @ti.func
+    def clear(self, node: int):
+        if ti.static(self.deterministic):
+            self.fixed.clear(node)
+        else:
+            self.nodes[node] = ti.Vector.zero(float, self.width)
+            if ti.static(self.scheme.keeps_before):
+                self.before[node] = ti.Vector.zero(float, self.width)
+            if ti.static(self.keeps_filling):
+                self.filling[node] = ti.Vector.zero(float, self.width)
+            for means in ti.static(self.kept_means):
+                means[node] = ti.Vector.zero(float, 2)
+
+    @ti.func
+    def tile_number(self, node: ti.template()):
+        tile = 0
+        for a in ti.static(range(self.dimension)):
+            tile = tile * ti.static(self.tiles[a]) + ti.raw_div(node[a], ti.static(self.tile))
+        return tile
+
+    @ti.func
+    def place_of(self, index: int):
+        place = ti.Vector.zero(int, self.dimension)
+        rest = index - self.first_node
+        for a in ti.static(range(self.dimension)):
+            place[a] = rest // ti.static(self.strides[a])
+            rest = rest % ti.static(self.strides[a])
+        return place
+
+    @ti.func
+    def row_count(self):
+        """Return the number of rows of nodes, along the last axis, in the box in use."""
+        count = 1
+        for a in ti.static(range(self.dimension - 1)):
+            count *= self.box[1, a]
+        return count
+
+    @ti.func
+    def row_start(self, row: int):
+        """Return the integer coordinates of the first node of a row of the box."""
+        start, rest = ti.Vector.zero(int, self.dimension), row
+        for b in ti.static(range(self.dimension - 1)):
+            a = ti.static(self.dimension - 2 - b)
+            start[a] = self.box[0, a] + rest % self.box[1, a]
+            rest = rest // self.box[1, a]
+        start[ti.static(self.dimension - 1)] = self.box[0, ti.static(self.dimension - 1)]
+        return start
+
+    @ti.func
+    def box_nodes(self):
+        return self.row_count() * self.box[1, ti.static(self.dimension - 1)]
+
+    @ti.func
+    def box_node(self, q: int):
+        """Return the integer coordinates of the q-th node of the box."""
+        last = ti.static(self.dimension - 1)
+        node = self.row_start(q // self.box[1, last])
+        node[last] += q % self.box[1, last]
+        return node
+
+
+@ti.func
+def box_of(grid: ti.template(), axis: ti.template(), low: int, high: int, drift: int, last_wall: int):
+    """Return the first and the last node in use along an axis, from those where stencils began at the last sort.
+
+    drift: cells that a particle may have moved since; last_wall: node of the upper wall.
+    """
+    first = low - drift
+    last = high + drift + ti.static(grid.scheme.spline.nodes - 1)
+    # A box that comes near a wall holds the images beyond it too: they are read and written.
+    if ti.static(axis in grid.period.axes):
+        if first <= PAD + PAD or last >= last_wall - PAD:
+            first = 0
+            last = last_wall + PAD
+    else:
+        if ti.static((axis, 0) in grid.opens):
+            first = ti.max(first, 0)
+        elif first <= PAD + REACH:
+            first = PAD - REACH
+        if ti.static((axis, 1) in grid.opens):
+            last = ti.min(last, last_wall + PAD)
+        elif last >= last_wall - REACH:
+            last = last_wall + REACH
+    return first, last

@@ -1,0 +1,131 @@
+"""The axes along which a scene repeats: beyond one face lies what is as far inside of the other (docs/theory.md, 3.6).
+
+On the CPU particles are put back into the domain when they are sorted. Until then they, and what they scatter, go on
+beyond the face, so that pencils of one colour write disjoint nodes there as everywhere. On a GPU every step puts them
+back. Nodes beyond a face hold the sums of their images as soon as `MirrorImages` has folded them.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+
+from mpmcli.quick_taichi import ti
+from mpmcli.scene import Scene
+from mpmcli.scene.domain import PERIODIC
+from mpmcli.solver.transfer.splines import PAD
+
+
+@ti.func
+def opaque(x: float):
+    """Return a number of single precision that is not negative, as no compiler can tell.
+
+    Those of Vulkan and Metal reorder sums, and would find that a rounded sum less its first term is the second.
+    """
+    return ti.bit_cast(ti.max(ti.bit_cast(x, ti.i32), 0), ti.f32)
+
+
+@ti.func
+def opaque_signed(x: float):
+    size = opaque(ti.abs(x))
+    return ti.select(x < 0.0, -size, size)
+
+
+@ti.data_oriented
+class Period:
+    """The periodic axes of all runs, and of each run the extent of the domain, m, and its cells.
+
+    at_once: whether every step puts particles back into the domain; run: number of the run that a view is for.
+    """
+
+    def __init__(self, faces: Sequence[tuple[str, str]], runs: int = 1, *, at_once: bool) -> None:
+        self.dimension = len(faces)
+        self.axes = tuple(a for a, pair in enumerate(faces) if PERIODIC in pair)
+        self.at_once = at_once
+        self.run = 0
+        if self.axes:
+            self.extent = ti.Vector.field(self.dimension, float, shape=runs)
+            self.cells = ti.Vector.field(self.dimension, int, shape=runs)
+
+    def write(self, scene: Scene, run: int = 0) -> None:
+        if self.axes:
+            self.extent[run] = [n * scene.domain.spacing for n in scene.domain.cells]
+            self.cells[run] = scene.domain.cells
+
+    def seen_from(self, run: object) -> "Period":
+        view = copy(self)
+        view.run = run
+        return view
+
+    @ti.func
+    def inside(self, x: ti.template()):
+        """Return where the image of a point lies that is inside the domain, m."""
+        result = x
+        for a in ti.static(self.axes):
+            extent = self.extent[self.run][a]
+            if x[a] < 0.0:
+                result[a] = x[a] + extent
+            elif x[a] >= extent:
+                result[a] = x[a] - extent
+        return result
+
+    @ti.func
+    def settle(self, group: ti.template(), p: int):
+        """Put particle p back into the domain; its remainder takes what rounding would lose (docs/theory.md, 8.3)."""
+        for a in ti.static(self.axes):
+            after, lost = self.wrapped(group, group.x[p][a], a)
+            group.x[p][a] = after
+            if ti.static(group.carries):
+                group.gradient[p][a, ti.static(self.dimension)] += lost
+
+    @ti.func
+    def wrapped(self, group: ti.template(), x: float, axis: ti.template()):
+        """Return a coordinate inside the domain, and what rounding took from it, m: beyond the upper face nothing."""
+        extent = self.extent[self.run][axis]
+        after, lost = x, 0.0
+        if x < 0.0:
+            after = x + extent
+            if ti.static(group.carries):
+                lost = x - (opaque(after) - extent)
+        elif x >= extent:
+            after = x - extent
+        return after, lost
+
+    @ti.func
+    def moved(self, group: ti.template(), x: float, way: float, extent: float, axis: ti.template()):
+        """Return where a particle at x moves by `way`, m, what rounding took, and 1 where it is lost, else 0.
+
+        A sort is due long before it has gone half of the domain.
+        """
+        after, lost = x + way, 0.0
+        if ti.static(group.carries):
+            lost = way - (opaque_signed(after) - x)
+        low = -0.5 * extent
+        if ti.static(self.at_once):
+            inside, taken = self.wrapped(group, after, axis)
+            after = inside
+            lost += taken
+            low = 0.0
+        # Written so that a NaN is out.
+        out = 1.0
+        if after >= low and after <= extent - low:
+            out = 0.0
+        return after, lost, out
+
+    @ti.func
+    def image(self, node: ti.template(), images: int):
+        """Return the image of a node, or of a cell, along the axes of a bit set, and whether there is one on the grid.
+
+        Along a periodic axis there is one at most: the domain is longer than both margins.
+        """
+        place, exists = node, True
+        for a in ti.static(range(self.dimension)):
+            if images >> a & 1 == 1:
+                there = -1
+                if ti.static(a in self.axes):
+                    cells = self.cells[self.run][a]
+                    if node[a] <= 2 * PAD:
+                        there = node[a] + cells
+                    elif node[a] >= cells:
+                        there = node[a] - cells
+                place[a] = there
+                exists = exists and there >= 0
+        return place, exists

@@ -1,0 +1,458 @@
+"""A grid whose nodes are there where particles are alone: blocks of nodes, one for each tile that particles reach.
+
+A sort numbers the tiles that particles reach until the next one, in their order. Nodes are stored tile by tile in that
+order, and a table has the number of every tile of the domain. Number 0 stands for all others: its nodes are zero.
+"""
+
+import math
+from collections.abc import Sequence
+from copy import copy
+
+import numpy as np
+import psutil
+
+from mpmcli.boundaries.walls import REACH
+from mpmcli.errors import InputError
+from mpmcli.quick_taichi import ti
+from mpmcli.scene import Scene
+from mpmcli.scene.sampling import estimate_body
+from mpmcli.scene.schema import SolverSettings
+from mpmcli.scene.sheets import sheets_of
+from mpmcli.solver.grid.grid import Grid, LinearNodes, drift_allowed
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.machine.device_memory import LARGEST_INDEX, MEMORY_SHARE
+from mpmcli.solver.particles.sort import ACTIVE, SPAN, TileOrder
+from mpmcli.solver.transfer.splines import PAD, SPLINES
+
+
+@ti.data_oriented
+class TileWindow(LinearNodes):
+    """Copies, one for each thread, of the nodes that the stencils of a tile's particles reach.
+
+    A stencil is in up to 2^d blocks, but in one window, whose nodes have linear indices as a dense grid's. So P2G and
+    G2P are the same on both; see `Grid` for the attributes that they share. size: nodes of a window; before_tile,
+    behind_tile: of them, those before the tile and behind it, per axis.
+    """
+
+    runs = 1
+
+    def __init__(self, grid: Grid, threads: int) -> None:
+        d = self.dimension = grid.dimension
+        self.before_tile, self.behind_tile = grid.beyond
+        self.tile, self.tiles = grid.tile, grid.tiles
+        edge = self.before_tile + grid.tile + self.behind_tile
+        self.strides = tuple(edge ** (d - 1 - a) for a in range(d))
+        self.size = edge**d
+        self.node_count, self.first_node = threads * self.size, 0
+        for name in ("width", "planes", "scheme", "weighs_before", "deterministic"):
+            setattr(self, name, getattr(grid, name))
+        self.nodes, self.before, self.filling = (
+            None if field is None else ti.Vector.field(grid.width, float, shape=self.node_count)
+            for field in (grid.nodes, grid.before, grid.filling)
+        )
+        # What P2G adds to, with the fields of the grid: in every step, and in those that relax volumes.
+        pairs = ((self.nodes, grid.nodes), (self.before, grid.before), (self.filling, grid.filling))
+        self.summed = tuple(pair for pair in pairs[:2] if pair[0] is not None)
+        self.relaxing = tuple(pair for pair in pairs[2:] if pair[0] is not None)
+
+    def seen_from(self, grid: Grid, first_node: object) -> "TileWindow":
+        """Return the window of a view of the grid, with a linear index of node 0, a variable of the kernel."""
+        result = copy(self)
+        result.first_node = first_node
+        for name in ("spacing", "inverse_spacing", "gradient_scale"):
+            setattr(result, name, getattr(grid, name))
+        return result
+
+    @ti.func
+    def first_of(self, t: int, place: ti.template()):
+        """Return the linear index that node 0 of the grid would have, in the window of thread t at a tile."""
+        first = t * ti.static(self.size)
+        for a in ti.static(range(self.dimension)):
+            first -= (place[a] * ti.static(self.tile) - self.before_tile) * ti.static(self.strides[a])
+        return first
+
+    @ti.func
+    def clear(self, t: int, relaxed: float):
+        """Set what P2G adds to in the window to zero, volumes where they are relaxed."""
+        for field, _ in ti.static(self.summed):
+            self.zero(field, t)
+        for field, _ in ti.static(self.relaxing):
+            if relaxed > 0.0:
+                self.zero(field, t)
+
+    @ti.func
+    def zero(self, field: ti.template(), t: int):
+        for k in range(t * ti.static(self.size), (t + 1) * ti.static(self.size)):
+            field[k] = ti.Vector.zero(float, self.width)
+
+    @ti.func
+    def load(self, grid: ti.template(), t: int, place: ti.template()):
+        """Copy the nodes near a tile into the window."""
+        for pair in ti.static(self.summed):
+            self.exchange(pair, grid, t, place, True)
+
+    @ti.func
+    def add(self, grid: ti.template(), t: int, place: ti.template(), relaxed: float):
+        """Add the window to the nodes near a tile, volumes where they are relaxed."""
+        for pair in ti.static(self.summed):
+            self.exchange(pair, grid, t, place, False)
+        for pair in ti.static(self.relaxing):
+            if relaxed > 0.0:
+                self.exchange(pair, grid, t, place, False)
+
+    @ti.func
+    def exchange(self, pair: ti.template(), grid: ti.template(), t: int, place: ti.template(), loads: ti.template()):
+        """Go through the nodes near a tile, block by block."""
+        d, field, of_grid = ti.static((self.dimension, pair[0], pair[1]))
+        for q in range(ti.static(3**d)):
+            tile, exists = 0, True
+            # First node in the window and in the block, and number of nodes, per axis.
+            here, there, count = ti.Vector.zero(int, d), ti.Vector.zero(int, d), ti.Vector.zero(int, d)
+            for a in ti.static(range(d)):
+                side = q // ti.static(3 ** (d - 1 - a)) % 3
+                along = place[a] + side - 1
+                exists = exists and along >= 0 and along < ti.static(self.tiles[a])
+                tile = tile * ti.static(self.tiles[a]) + along
+                here[a], count[a] = self.before_tile, self.tile
+                if side == 0:
+                    here[a], there[a], count[a] = 0, self.tile - self.before_tile, self.before_tile
+                if side == 2:
+                    here[a], count[a] = self.before_tile + self.tile, self.behind_tile
+            if exists:
+                block = grid.table[tile] * ti.static(grid.block)
+                rows = 1
+                for a in ti.static(range(d - 1)):
+                    rows *= count[a]
+                for r in range(rows):
+                    row, k, n = r, t * ti.static(self.size), block
+                    for b in ti.static(range(d - 1)):
+                        a = ti.static(d - 2 - b)
+                        k += (here[a] + row % count[a]) * ti.static(self.strides[a])
+                        n += (there[a] + row % count[a]) * ti.static(self.tile ** (d - 1 - a))
+                        row = row // count[a]
+                    k += here[d - 1]
+                    n += there[d - 1]
+                    for c in range(count[d - 1]):
+                        if ti.static(loads):
+                            field[k + c] = of_grid[n + c]
+                        else:
+                            of_grid[n + c] = of_grid[n + c] + field[k + c]
+
+
+# Particles for each of which there is room for a block, and blocks beside those.
+SHARED_BY, AT_LEAST = 20, 500
+# What a table has for tiles that are to be numbered: they hold particles, or are reached by some.
+HOLDS, REACHED = -1, -2
+# Places in `sizes`: blocks in use, pencils, blocks that a sort asked for, and of each colour the pencils.
+BLOCKS, PENCILS, WANTED, COLOURS = range(4)
+
+
+def room_for_blocks(particles: int) -> int:
+    """Return the number of blocks that memory is allocated for at first."""
+    return particles // SHARED_BY + AT_LEAST
+
+
+def most_blocks(grid: "SparseGrid") -> int:
+    """Return the number of blocks that a larger grid may have in what memory is free, and indices reach."""
+    fields = [field for field in (grid.nodes, grid.before, grid.filling) if field is not None]
+    numbers = grid.width * len(fields) + 2 * len(grid.kept_means)
+    # And of the tables of a sort on some threads.
+    block = (4 if grid.nodes.dtype == ti.f32 else 8) * numbers * grid.block + 4 * 16
+    return int(min(MEMORY_SHARE * psutil.virtual_memory().available // block, LARGEST_INDEX // grid.block))
+
+
+@ti.data_oriented
+class SparseGrid(Grid):
+    """See `Grid`; of one run, on the CPU.
+
+    Attributes:
+        tile_count: blocks that there is room for, number 0 included.
+        table: (tiles of the domain) int, their numbers; tile_at: (tile_count) int, the tile of each; sizes: see BLOCKS.
+        pencils: (tile_count + 1) int, the first block of each pencil; coloured: (colours, tile_count) int, the numbers
+            of the pencils of each colour.
+        window: of the nodes near a tile, for each thread.
+    """
+
+    sparse = True
+
+    def __init__(self, *args: object, blocks: int, threads: int, **options: object) -> None:
+        """Allocate; `blocks` is the room for blocks, and the rest that of `Grid`."""
+        self._blocks = blocks
+        super().__init__(*args, **options)
+        self.all_tiles = math.prod(self.tiles)
+        self.tile_count = blocks
+        self.block = self.tile**self.dimension
+        # Nodes that stencils of particles reach before their tile and behind it.
+        drift = math.ceil(drift_allowed(self.tile, self.scheme.spline.nodes))
+        self.beyond = drift, drift + self.scheme.spline.nodes - 1
+        repeats = [axis in self.period.axes for axis in range(self.dimension)]
+        self.reach = [
+            reach_along(n, self.tile, self.beyond, repeats=again) for n, again in zip(self.cells, repeats, strict=True)
+        ]
+        self._most = max(table.shape[1] for table in self.reach)
+        self._reach = ti.field(int, shape=(self.dimension, max(self.tiles), self._most))
+        padded = np.full(self._reach.shape, -1, np.int32)
+        for axis, table in enumerate(self.reach):
+            padded[axis, : table.shape[0], : table.shape[1]] = table
+        self._reach.from_numpy(padded)
+        self._spans = -(-self.all_tiles // SPAN)
+        self._marked = ti.field(ti.i8, shape=self._spans)
+        colours = 2 ** (self.dimension - 1)
+        self.table = ti.field(int, shape=self.all_tiles)
+        self.tile_at = ti.field(int, shape=blocks)
+        self.sizes = ti.field(int, shape=COLOURS + colours)
+        self.pencils = ti.field(int, shape=blocks + 1)
+        self.coloured = ti.field(int, shape=(colours, blocks))
+        self.window = TileWindow(self, threads)
+        self.sizes[BLOCKS] = 1
+
+    def stored_nodes(self) -> int:
+        return self._blocks * self.tile**self.dimension
+
+    @staticmethod
+    def table_bytes(tiles: int, blocks: int, dimension: int) -> int:
+        """Return the bytes of the tables, for so many tiles of the domain."""
+        return 4 * tiles + tiles // SPAN + 4 * blocks * (2 + 2 ** (dimension - 1))
+
+    def occupy(self, tiles: np.ndarray) -> None:
+        """Number these tiles, sorted linear indices, and no others."""
+        self._occupy(np.ascontiguousarray(tiles, np.int32))
+
+    @ti.kernel
+    def _occupy(self, tiles: ti.types.ndarray(ti.i32, 1)):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            self.forget(0, self.sizes[BLOCKS])
+            for k in range(tiles.shape[0]):
+                self.tile_at[k + 1] = tiles[k]
+            self.sizes[BLOCKS] = tiles.shape[0] + 1
+            for b in range(1, self.sizes[BLOCKS]):
+                self.table[self.tile_at[b]] = b
+            self.find_pencils()
+
+    def occupied(self) -> np.ndarray:
+        tiles = np.empty(self.sizes[BLOCKS] - 1, np.int32)
+        self._read(tiles)
+        return tiles
+
+    @ti.kernel
+    def _read(self, tiles: ti.types.ndarray(ti.i32, 1)):
+        for k in range(tiles.shape[0]):
+            tiles[k] = self.tile_at[k + 1]
+
+    @ti.func
+    def tile_number(self, node: ti.template()):
+        return self.table[self.tile_index(node)]
+
+    @ti.func
+    def tile_index(self, node: ti.template()):
+        """Return the linear index of the tile that holds the node at these integer coordinates."""
+        index = 0
+        for a in ti.static(range(self.dimension)):
+            index = index * ti.static(self.tiles[a]) + ti.raw_div(node[a], ti.static(self.tile))
+        return index
+
+    @ti.func
+    def tile_place(self, index: int):
+        place, rest = ti.Vector.zero(int, self.dimension), index
+        for b in ti.static(range(self.dimension)):
+            a = ti.static(self.dimension - 1 - b)
+            place[a] = rest % ti.static(self.tiles[a])
+            rest = rest // ti.static(self.tiles[a])
+        return place
+
+    @ti.func
+    def linear_index(self, base: ti.template()):
+        inner = 0
+        for a in ti.static(range(self.dimension)):
+            inner = inner * ti.static(self.tile) + base[a] % ti.static(self.tile)
+        return self.tile_number(base) * ti.static(self.block) + inner
+
+    @ti.func
+    def place_of(self, index: int):
+        place = self.tile_place(self.tile_at[index // ti.static(self.block)])
+        rest = index % ti.static(self.block)
+        for b in ti.static(range(self.dimension)):
+            a = ti.static(self.dimension - 1 - b)
+            place[a] = place[a] * ti.static(self.tile) + rest % ti.static(self.tile)
+            rest = rest // ti.static(self.tile)
+        return place
+
+    @ti.func
+    def forget(self, begin: int, end: int):
+        for b in range(ti.max(begin, 1), end):
+            self.table[self.tile_at[b]] = 0
+
+    @ti.func
+    def mark(self, order: ti.template(), begin: int, end: int):
+        """Mark the tiles of particles `begin` to `end` - 1 that take part."""
+        for p in range(begin, end):
+            order.settle(p)
+            if order.status_of(p) == ACTIVE:
+                tile = self.tile_index(order.first_node_of(p))
+                # Other threads may write the same.
+                if self.table[tile] != HOLDS:
+                    self.table[tile] = HOLDS
+                    self._marked[tile // SPAN] = ti.cast(1, ti.i8)
+
+    @ti.func
+    def number(self):
+        """Number the tiles that marked ones reach; return whether there is room for all of them."""
+        wanted = 1
+        for s in range(self._spans):
+            if self._marked[s] == 1:
+                for tile in range(s * SPAN, ti.min((s + 1) * SPAN, self.all_tiles)):
+                    if self.table[tile] == HOLDS:
+                        self.mark_reached(tile)
+        for s in range(self._spans):
+            if self._marked[s] == 1:
+                for tile in range(s * SPAN, ti.min((s + 1) * SPAN, self.all_tiles)):
+                    if self.table[tile] < 0:
+                        wanted += 1
+        self.sizes[WANTED] = wanted
+        fits = wanted <= self.tile_count
+        b = 1
+        for s in range(self._spans):
+            if self._marked[s] == 1:
+                self._marked[s] = ti.cast(0, ti.i8)
+                for tile in range(s * SPAN, ti.min((s + 1) * SPAN, self.all_tiles)):
+                    if self.table[tile] < 0:
+                        self.table[tile] = 0
+                        if fits:
+                            self.table[tile] = b
+                            self.tile_at[b] = tile
+                            b += 1
+        if fits:
+            self.sizes[BLOCKS] = b
+            self.find_pencils()
+        return fits
+
+    @ti.func
+    def mark_reached(self, tile: int):
+        """Mark the tiles that the particles of a tile reach."""
+        place = self.tile_place(tile)
+        for q in range(ti.static(self._most**self.dimension)):
+            rest, index, exists = q, 0, True
+            for a in ti.static(range(self.dimension)):
+                along = self._reach[a, place[a], rest % ti.static(self._most)]
+                rest = rest // ti.static(self._most)
+                exists = exists and along >= 0
+                index = index * ti.static(self.tiles[a]) + along
+            if exists:
+                if self.table[index] == 0:
+                    self.table[index] = REACHED
+                    self._marked[index // SPAN] = ti.cast(1, ti.i8)
+
+    @ti.func
+    def find_pencils(self):
+        """Find the pencils of the blocks in use, and of each colour."""
+        for colour in range(ti.static(2 ** (self.dimension - 1))):
+            self.sizes[COLOURS + colour] = 0
+        count, before = 0, -1
+        for b in range(1, self.sizes[BLOCKS]):
+            pencil = self.tile_at[b] // ti.static(self.tiles[-1])
+            if pencil != before:
+                before = pencil
+                place, colour = self.tile_place(self.tile_at[b]), 0
+                for a in ti.static(range(self.dimension - 1)):
+                    colour += (place[a] & 1) << a
+                self.pencils[count] = b
+                self.coloured[colour, self.sizes[COLOURS + colour]] = count
+                self.sizes[COLOURS + colour] += 1
+                count += 1
+        self.pencils[count] = self.sizes[BLOCKS]
+        self.sizes[PENCILS] = count
+
+
+@ti.data_oriented
+class BlockOrder(TileOrder):
+    """The tile order of one group on a sparse grid: of the tiles that have numbers."""
+
+    @ti.func
+    def pencil_count(self, colour: int):
+        return self.grid.sizes[COLOURS + colour]
+
+    @ti.func
+    def pencil_of(self, colour: int, q: int):
+        return self.grid.coloured[colour, q]
+
+    @ti.func
+    def pencils(self):
+        return self.grid.sizes[PENCILS]
+
+    @ti.func
+    def first_tile_of(self, pencil: int):
+        return self.grid.pencils[pencil]
+
+
+def reach_along(cells: int, tile: int, beyond: tuple[int, int], *, repeats: bool) -> np.ndarray:
+    """Return per tile of an axis those that its particles reach, images included, (tiles, k), padded with -1.
+
+    cells: of the domain; tile: edge of a tile, cells; beyond: nodes that stencils reach before the tile, and behind it.
+    """
+    tiles, last = -(-(cells + 1 + 2 * PAD) // tile), cells + PAD
+    found = []
+    for t in range(tiles):
+        low, high = t * tile - beyond[0], (t + 1) * tile - 1 + beyond[1]
+        ranges = [(low, high)]
+        if repeats:
+            # Of a node near a face there is an image as far inside of the other one.
+            if low <= 2 * PAD:
+                ranges.append((low + cells, min(high, 2 * PAD) + cells))
+            if high >= last - PAD:
+                ranges.append((max(low, last - PAD) - cells, high - cells))
+        else:
+            if low <= PAD + REACH:
+                ranges.append((0, low))
+            if high >= last - REACH:
+                ranges.append((high, tiles * tile - 1))
+        own = {k for first, after in ranges for k in range(max(first // tile, 0), min(after // tile, tiles - 1) + 1)}
+        found.append(sorted(own))
+    table = np.full((tiles, max(map(len, found))), -1, np.int32)
+    for t, own in enumerate(found):
+        table[t, : len(own)] = own
+    return table
+
+
+def first_nodes_of(position: np.ndarray, scene: Scene) -> np.ndarray:
+    """Return the first nodes of the stencils of points, (n, d) m, as integer coordinates, (n, d)."""
+    scaled = (position - np.array(scene.domain.origin)) / scene.domain.spacing
+    shift = SPLINES[scene.solver.kernel].nodes / 2 - 1
+    return np.clip(np.floor(scaled - shift).astype(np.int64), 0, np.array(scene.domain.cells)) + PAD
+
+
+def tiles_reached(first_nodes: np.ndarray, tile: int, reach: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the tiles that particles may write, sorted, from the first nodes of their stencils, (n, d)."""
+    shape = tuple(len(table) for table in reach)
+    found = np.unique(np.ravel_multi_index(tuple((first_nodes // tile).T), shape))
+    # Along one axis after the other, which keeps few of them twice.
+    for axis, table in enumerate(reach):
+        places = list(np.unravel_index(found, shape))
+        along = table[places[axis]]
+        wide = [np.broadcast_to(place[:, None], along.shape)[along >= 0] for place in places]
+        wide[axis] = along[along >= 0]
+        found = np.unique(np.ravel_multi_index(tuple(wide), shape))
+    return found
+
+
+# Cells from which on a grid may be sparse by itself, and then the share of them that material fills at most.
+MANY_CELLS, FILLED = 8_000_000, 0.05
+
+
+def wants_sparse(scene: Scene) -> bool:
+    """Return whether the grid of a scene is sparse on the CPU, whatever machine that is."""
+    if scene.solver.grid != "auto":
+        return scene.solver.grid == "sparse"
+    cells = math.prod(scene.domain.cells)
+    return cells >= MANY_CELLS and filled_cells(scene) <= FILLED * cells
+
+
+def filled_cells(scene: Scene) -> float:
+    """Return the number of cells that all material of a scene fills at rest."""
+    bodies = sum(estimate_body(body, scene.domain.spacing) / body.particles_per_cell for body in scene.bodies)
+    return bodies + sum(sheets_of(emitter, scene).particles / emitter.particles_per_cell for emitter in scene.emitters)
+
+
+def require_cpu_if_sparse(settings: SolverSettings, backend: Backend) -> None:
+    if settings.grid == "sparse" and not backend.on_cpu:
+        raise InputError('solver.grid = "sparse" is for the CPU; give "auto" or "dense", or --arch cpu.')

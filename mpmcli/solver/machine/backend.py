@@ -1,0 +1,295 @@
+"""Starts Taichi, once per process, on the requested backend, and tries whether one works on this machine."""
+
+import ast
+import atexit
+import contextlib
+import gc
+import inspect
+import io
+import linecache
+import os
+import platform
+import tempfile
+import textwrap
+import time
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from types import CodeType, SimpleNamespace
+from typing import Literal
+
+import numpy as np
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+from taichi.lang.kernel_impl import Kernel
+
+from mpmcli.cores import available_cores
+from mpmcli.errors import InputError, RunError
+from mpmcli.plain_text import counted
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.machine.device_memory import has_cuda_device
+
+# Taichi's optimisations: all, all but those across branches, or few. Those across branches take half to three quarters
+# of the time to compile for a CPU, and save nothing. Few halve the rest, and steps are 7 to 30 % slower.
+Optimisation = Literal["all", "most", "few"]
+OPTIMISATION: dict[str, dict[str, bool]] = {
+    "all": {},
+    "most": {"cfg_optimization": False},
+    "few": {"advanced_optimization": False},
+}
+
+Arch = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
+ARCHES: tuple[str, ...] = ("auto", "cpu", "cuda", "vulkan", "metal")
+
+# Threads that are accepted on any machine; beyond that, twice the number of cores.
+FEW_THREADS = 64
+# What compiled kernels may take on the disk: a kernel of four laws in 3D takes 6 MB, and is there twice.
+CACHE_BYTES = 2**29
+# Age, s, at which a lock on the compiled kernels counts as left behind by a killed process.
+LONGEST_LOCK = 60.0
+
+_started: "Backend | None" = None
+# What is called once after the backend has ended.
+_endings: list[Callable[[], None]] = []
+
+
+@dataclass(frozen=True)
+class Backend:
+    """The backend that runs the kernels: "cpu", "cuda", "vulkan" or "metal".
+
+    Attributes:
+        threads: CPU threads that kernels use (1 on a GPU).
+        precision: "f32" or "f64", the type of every particle and node value.
+        compile_cache: whether compiled kernels are kept for the next start.
+        optimisation: how much of Taichi's optimisation kernels get; results have the same bytes with any.
+    """
+
+    arch: str
+    threads: int
+    precision: str
+    compile_cache: bool
+    optimisation: Optimisation = "all"
+
+    @property
+    def on_cpu(self) -> bool:
+        """Whether kernels run on the CPU, where the scatter needs no atomics."""
+        return self.arch == "cpu"
+
+    @property
+    def doubles(self) -> bool:
+        """Whether the device has double precision, in which a run counts its time."""
+        return self.arch != "metal"
+
+
+def choose_backend(
+    arch: Arch = "auto",
+    threads: int | None = None,
+    precision: str = "f32",
+    *,
+    compile_cache: bool = True,
+    optimisation: Optimisation | None = None,
+) -> Backend:
+    """Return the backend that a name stands for on this machine; it is not started.
+
+    "auto" takes CUDA where a driver and a device are present, Metal on a Mac, and otherwise the CPU. Vulkan is taken
+    only by name, since software Vulkan counts as a device.
+
+    Args:
+        threads: of the CPU; None for one on each core.
+        optimisation: None for most on the CPU, and all on a GPU.
+
+    Raises:
+        InputError: it cannot do this precision, or not with so many threads.
+    """
+    if arch not in ARCHES:
+        raise InputError(f'--arch "{arch}" is not a backend; use one of {", ".join(ARCHES)}.')
+    if precision not in ("f32", "f64"):
+        raise InputError(f'precision "{precision}" is not known; use f32 or f64.')
+    wanted = _best(precision) if arch == "auto" else arch
+    if wanted in ("vulkan", "metal") and precision == "f64":
+        raise InputError(f"precision f64 is not available on {wanted}; use --arch cpu or cuda, or f32.")
+    cores = available_cores()
+    count = (threads or cores) if wanted == "cpu" else 1
+    most = max(FEW_THREADS, 2 * cores)
+    if not 1 <= count <= most:
+        raise InputError(f"--threads {count} is not possible; give 1 to {most}, best {cores} on this machine.")
+    usual: Optimisation = "most" if wanted == "cpu" else "all"
+    return Backend(wanted, count, precision, compile_cache, optimisation or usual)
+
+
+def start(backend: Backend) -> Backend:
+    """Start Taichi and return the backend; a second call must request the same, but for its optimisation.
+
+    Raises:
+        InputError: the backend is not there, or another one is running.
+    """
+    global _started
+    if _started is not None:
+        if replace(_started, optimisation=backend.optimisation) != backend:
+            raise InputError(
+                f"this process already runs on {_started.arch} with {counted(_started.threads, 'thread')} in "
+                f"{_started.precision}; another backend needs a new process."
+            )
+        return _started
+    _initialise(backend)
+    _started = backend
+    return backend
+
+
+def start_backend(
+    arch: Arch = "auto", threads: int | None = None, precision: str = "f32", *, compile_cache: bool = True
+) -> Backend:
+    """Start what `choose_backend` returns; see both for the errors."""
+    return start(choose_backend(arch, threads, precision, compile_cache=compile_cache))
+
+
+def stop_backend() -> None:
+    """End the running backend, and with it every field and kernel; another may start then."""
+    global _started
+    ti.reset()
+    _forget_kernels()
+    _started = None
+    while _endings:
+        _endings.pop()()
+
+
+def after_stop(ending: Callable[[], None]) -> None:
+    """Call a function once after the backend has ended, which it does with the process at the latest."""
+    if ending not in _endings:
+        _endings.append(ending)
+    # Once, however often.
+    atexit.unregister(stop_backend)
+    atexit.register(stop_backend)
+
+
+def _forget_kernels() -> None:
+    """Let go of kernels, of which Taichi keeps a list; those made in a function hold everything they were made for."""
+    runtime = ti.lang.impl.get_runtime()
+    known = [weakref.ref(kernel) for kernel in runtime.kernels]
+    runtime.kernels = []
+    gc.collect()
+    runtime.kernels = [kernel for reference in known if (kernel := reference()) is not None]
+    for kernel in runtime.kernels:
+        # By the fields that it was called with; what was compiled for them is gone.
+        kernel.mapper.mapping.clear()
+
+
+def _settle_cache() -> None:
+    """Set a writable cache directory, without which Taichi crashes at exit, and free the lock of a killed process."""
+    os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+        lock = folder / "ticache" / "ticache.lock"
+        if lock.exists() and time.time() - lock.stat().st_mtime > LONGEST_LOCK:
+            lock.unlink(missing_ok=True)
+    except OSError:
+        os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="mpmcli-cache-")
+
+
+def _best(precision: str) -> str:
+    """Name the fastest backend that this machine has for this precision."""
+    if platform.system() == "Darwin" and precision == "f32" and backend_is_here("metal"):
+        return "metal"
+    return "cuda" if backend_is_here("cuda") else "cpu"
+
+
+def backend_is_here(arch: str) -> bool:
+    """Return whether this machine has a device for a backend; it may still fail to start."""
+    if arch == "cpu":
+        return True
+    # Taichi loads CUDA wherever the driver's library is present, and ends the process without a device.
+    if arch == "cuda" and not has_cuda_device():
+        return False
+    return bool(ti.lang.misc.is_arch_supported(getattr(ti, arch)))
+
+
+def _position(context: ASTTransformerContext, node: ast.AST) -> str:
+    """Return the position of a node of a kernel's source, for Taichi's error messages.
+
+    Taichi's own function, which runs for every node, takes a quarter of the start of a run whose kernels are cached.
+    """
+    line = node.lineno + context.lineno_offset
+    return f'File "{context.file}", line {line}, in {context.func.func.__name__}:\n'
+
+
+@cache
+def _source(code: CodeType) -> tuple[list[str], int]:
+    """Return the lines of a function and the number of the first; a code object keeps no fields alive.
+
+    `inspect.getsourcelines` would look for the module among all that are loaded.
+    """
+    first = code.co_firstlineno
+    return inspect.getblock(linecache.getlines(code.co_filename)[first - 1 :]), first
+
+
+def _builder(kernel: Kernel) -> object:
+    """Return what collects the statements of the function that is being compiled.
+
+    Taichi's own method returns that of the kernel, and a loop in a function that a real function inlines ends the
+    process.
+    """
+    return ti.lang.impl.get_runtime().compiling_callable.ast_builder()
+
+
+def _initialise(backend: Backend) -> None:
+    if not backend_is_here(backend.arch):
+        raise InputError(f"--arch {backend.arch} needs a device that this machine does not have; use --arch cpu.")
+    arch = getattr(ti, backend.arch)
+    # This variable would override `arch`. Taichi prints a line to standard output when it starts.
+    os.environ.pop("TI_ARCH", None)
+    _settle_cache()
+    ASTTransformerContext.get_pos_info = _position
+    Kernel.ast_builder = _builder
+    # Taichi asks for all of this anew each time that it inlines a function, and wraps lines at 9,999 columns: together
+    # a fifth of the work of its front end.
+    ti.lang.kernel_impl.getsourcelines = lambda function: _source(function.__code__)
+    ti.lang.kernel_impl.getsourcefile = lambda function: function.__code__.co_filename
+    ti.lang.kernel_impl.textwrap = SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)
+    # Taichi would warn of each of its variables that `ti.init` overrides, before it reads `log_level`.
+    ti.set_logging_level(ti.ERROR)
+    with contextlib.redirect_stdout(io.StringIO()):
+        ti.init(
+            arch=arch,
+            default_fp=ti.f64 if backend.precision == "f64" else ti.f32,
+            cpu_max_num_threads=backend.threads,
+            offline_cache=backend.compile_cache,
+            offline_cache_max_size_of_files=CACHE_BYTES,
+            # Strict arithmetic is as fast on the CPU, and a NaN stays a NaN in every comparison.
+            fast_math=False,
+            # Real functions may write what a serial loop would keep in variables; steps are as fast without.
+            cache_loop_invariant_global_vars=not backend.on_cpu,
+            log_level=ti.ERROR,
+            **OPTIMISATION[backend.optimisation],
+        )
+    came = ti.lang.impl.current_cfg().arch
+    if came != arch:
+        raise InputError(f"--arch {backend.arch} did not start ({came.name} came instead); use --arch cpu.")
+
+
+COUNT = 1000
+
+
+def try_backend(arch: Arch) -> Backend:
+    """Start a backend in f32, fill a field by a kernel, and return the backend if the numbers are right.
+
+    Raises:
+        InputError: the backend is not there, does not start, or another one is running.
+        RunError: the kernel computed something else.
+    """
+    started = start_backend(arch)
+    squares = ti.field(ti.f32, COUNT)
+
+    @ti.kernel
+    def fill():
+        for i in squares:
+            squares[i] = float(i) * float(i)
+
+    fill()
+    # Squares of whole numbers below 2^12 are exact in f32.
+    if not np.array_equal(squares.to_numpy(), np.arange(COUNT, dtype=np.float32) ** 2):
+        raise RunError(f"the kernel that tried --arch {arch} computed wrong numbers.")
+    return started

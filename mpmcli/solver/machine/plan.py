@@ -1,0 +1,284 @@
+"""Memory and passes that a scene needs, known before anything is allocated."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import psutil
+
+from mpmcli.boundaries.colliders import ColliderKind
+from mpmcli.boundaries.walls import rough_faces
+from mpmcli.errors import InputError
+from mpmcli.materials.law import Law
+from mpmcli.materials.registry import laws
+from mpmcli.plain_text import size_text
+from mpmcli.scene import Scene
+from mpmcli.scene.sampling import estimate_body, has_expressions
+from mpmcli.scene.sheets import sheets_of
+from mpmcli.solver.drive.forces import forces_on, needs_initial
+from mpmcli.solver.engine.phases import step_phases
+from mpmcli.solver.frames.columns import FrameColumns
+from mpmcli.solver.grid.fixed_point import FixedPoint
+from mpmcli.solver.grid.grid import Grid, node_width, tile_edge
+from mpmcli.solver.grid.sparse_grid import SparseGrid, require_cpu_if_sparse, room_for_blocks, wants_sparse
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.machine.device_memory import LARGEST_INDEX, MEMORY_SHARE, free_memory
+from mpmcli.solver.machine.room import in_steps, roomy_cells, roomy_colliders
+from mpmcli.solver.particles.arrays import particle_fields
+from mpmcli.solver.particles.sort import TileOrder
+from mpmcli.solver.solids.contact import ParticleContact, bins_along
+from mpmcli.solver.solids.reference_grid import slips_in
+from mpmcli.solver.transfer.splines import scheme_of
+from mpmcli.solver.transfer.volume_average import averages_volume
+from mpmcli.solver.transfer.volume_relaxation import needs_filling
+
+
+def host_bytes_of(scene: Scene, members: Sequence[Law], particles: int, real: int, *, on_cpu: bool) -> int:
+    """Return the bytes that particles take on the host at most: at the start, or while a frame is built and written.
+
+    Python, Taichi and its compiler take about 200 MB more. real: bytes of a real number on the device.
+    """
+    d = scene.dimension
+    # Double precision: places, and where they vary velocities, their gradients and deformations.
+    start = 8 * (d + any(map(has_expressions, scene.bodies)) * (d + 2 * d * d))
+    internal = max(len(law.internal) for law in members)
+    columns = FrameColumns(d, internal, scene.output.fields, comes_and_goes=scene.comes_and_goes)
+    widths = {"velocity": 0, "initial_position": d, "affine": d * d, "deformation_gradient": d * d, "stress": 9}
+    fields = sum(widths.get(name, 1) for name in scene.output.fields)
+    # Of the frame: positions, velocities and fields.
+    frame = real * (2 * d + fields) + scene.comes_and_goes
+    # The array that is being written: the number of each particle, or in 2D what has the components of 3D.
+    frame += 4 if d == 3 else real * (3 if {"affine", "deformation_gradient"}.isdisjoint(scene.output.fields) else 9)
+    if len(scene.sources) > 1:
+        frame += 2 * np.dtype(np.int32).itemsize
+    if "initial_position" in scene.output.fields:
+        frame += real * d
+    if not on_cpu:
+        # The state as it was copied, and what numpy makes of it.
+        return particles * (start + frame + 2 * 8 * (2 * d + d * d))
+    return particles * max(start, real * columns.count + frame)
+
+
+# Phases of every step as users read them; volumes are relaxed in some only.
+WORDS = {
+    "clear": "clear grid",
+    "average": "average volumes of {}",
+    "scatter": "scatter {}",
+    "settle": "read sums in fixed point",
+    "find_contact": "find contact",
+    "find_friction": "find friction",
+    "book_loads": "add up loads",
+    "advance": "gather {}",
+}
+# A particle has at most 3 x 4 numbers in one field.
+WIDEST_FIELD = 12
+
+
+@dataclass(frozen=True)
+class LawPlan:
+    """Memory of the particles of one law: an estimate of their number, and the bytes of each field of one."""
+
+    law: str
+    particles: int
+    fields: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Memory of a run, and the passes of its time step.
+
+    Attributes:
+        nodes: number of grid nodes, on a sparse grid those that there is memory for at first.
+        tiles: number of tiles of the domain, and of bins of bodies that meet.
+        scratch_bytes: per particle, of the sort buffers.
+        grid_bytes: of all nodes, the tables of the sort, what is found at walls, and what colliders need.
+        host_bytes: see `host_bytes_of`.
+        passes: the loops of a step in order; loops over particles name their law.
+    """
+
+    laws: tuple[LawPlan, ...]
+    nodes: int
+    scratch_bytes: int
+    bytes_per_node: int
+    grid_bytes: int
+    host_bytes: int
+    passes: tuple[str, ...]
+    arch: str = "cpu"
+    sparse: bool = False
+    tiles: int = 0
+
+    @property
+    def particles(self) -> int:
+        return sum(law.particles for law in self.laws)
+
+    @property
+    def bytes_per_particle(self) -> int:
+        """Bytes of a particle of the law that takes most, sort buffers included."""
+        return max(sum(law.fields.values()) for law in self.laws) + self.scratch_bytes
+
+    @property
+    def device_bytes(self) -> int:
+        """Bytes on the device; the sort buffers hold the largest group."""
+        rooms = [in_steps(law.particles) for law in self.laws]
+        state = sum(room * sum(law.fields.values()) for law, room in zip(self.laws, rooms, strict=True))
+        return state + max(rooms) * self.scratch_bytes + self.grid_bytes
+
+    @property
+    def machine_bytes(self) -> int:
+        """Bytes of the machine's own memory: all but those that a CUDA device has itself."""
+        return self.host_bytes + (0 if self.arch == "cuda" else self.device_bytes)
+
+    def as_dict(self) -> dict:
+        return {
+            "particles": self.particles,
+            "laws": {law.law: {"particles": law.particles, "bytes_per_particle": law.fields} for law in self.laws},
+            "scratch_bytes_per_particle": self.scratch_bytes,
+            "nodes": self.nodes,
+            "sparse": self.sparse,
+            "bytes_per_node": self.bytes_per_node,
+            "device_bytes": self.device_bytes,
+            "passes": list(self.passes),
+        }
+
+
+def bytes_of_fields(law: type[Law], dimension: int, precision: str, **asked: bool) -> dict[str, int]:
+    """Return the bytes of each field of one particle of a law, by name; see `particle_fields` for what is asked."""
+    real, internal = 8 if precision == "f64" else 4, law.parameters.internal_in(dimension)
+    fields = particle_fields(law.deformation, [v.name for v in internal], dimension, precision, **asked)
+    return {name: rows * columns * (real if kind is float else 4) for name, (kind, rows, columns) in fields.items()}
+
+
+def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = False) -> tuple[str, ...]:
+    """Return the loops of one step; `deterministic` where P2G is in fixed point."""
+    phases = step_phases(
+        members,
+        [averages_volume(scene.solver, law) for law in members],
+        contact=bool(_separating_axes(scene)),
+        friction=scene.solver.walls != "zeroed" and bool(_rough_axes(scene)),
+        deterministic=deterministic,
+        loads=deterministic and bool(scene.colliders),
+    )
+    forces = [" with forces" * bool(forces_on(scene, members_of(scene, law.name))) for law in members]
+    words = WORDS | {"update": "update grid" + " with colliders" * bool(scene.colliders)}
+    return tuple(
+        words[phase.name].format(members[phase.group].name) + forces[phase.group] * (phase.name == "scatter")
+        for phase in phases
+        if phase.name in words
+    )
+
+
+def members_of(scene: Scene, law: str) -> list[int]:
+    return [i for i, body in enumerate(scene.sources) if body.material.law == law]
+
+
+def make_plan(scene: Scene, backend: Backend) -> Plan:
+    dimension = scene.dimension
+    sparse = wants_sparse(scene) and backend.on_cpu
+    cells = scene.domain.cells if sparse else roomy_cells(scene.domain.cells)
+    real = 8 if backend.precision == "f64" else 4
+    width = node_width(dimension, on_cpu=backend.on_cpu)
+    bodies = Counter(body.material.law for body in scene.sources)
+    counts = Counter[str]()
+    for body in scene.bodies:
+        counts[body.material.law] += estimate_body(body, scene.domain.spacing)
+    for emitter in scene.emitters:
+        counts[emitter.material.law] += sheets_of(emitter, scene).particles
+    members = [
+        laws()[name]([scene.sources[i].material for i in members_of(scene, name)], dimension) for name in sorted(bodies)
+    ]
+    averaged = [averages_volume(scene.solver, law) for law in members]
+    groups = tuple(
+        LawPlan(
+            name,
+            counts[name],
+            bytes_of_fields(
+                laws()[name],
+                dimension,
+                backend.precision,
+                several=bodies[name] > 1,
+                keeps_initial=scene.solver.solids == "total" or needs_initial(scene, members_of(scene, name)),
+                averaged=shares,
+                slips=slips_in(scene.solver, rough_faces(scene)),
+                comes_and_goes=scene.comes_and_goes,
+            ),
+        )
+        for name, shares in zip(sorted(bodies), averaged, strict=True)
+    )
+    # The widest field is a matrix; sources and keys are integers.
+    widest = max(size for group in groups for size in group.fields.values())
+    scheme = scheme_of(scene.solver)
+    tile = tile_edge(scheme.spline.nodes, dimension, on_cpu=backend.on_cpu)
+    all_nodes = nodes = Grid.nodes_needed(cells, tile)
+    require_cpu_if_sparse(scene.solver, backend)
+    if sparse:
+        blocks = room_for_blocks(sum(map(in_steps, counts.values())))
+        nodes = blocks * tile**dimension
+    filling, deterministic = needs_filling(scene, members), scene.solver.deterministic and not backend.on_cpu
+    node_bytes = real * (width * (1 + scheme.keeps_before + filling) + 2 * sum(averaged))
+    if deterministic:
+        shared = sum(averaged)
+        node_bytes += FixedPoint.bytes_needed(width, before=scheme.keeps_before, filling=filling, averaged=shared)
+        # In their place.
+        node_bytes -= real * 2 * shared
+    all_tiles = all_nodes // tile**dimension
+    tables = len(groups) * TileOrder.bytes_needed(blocks if sparse else all_tiles, backend.threads)
+    if sparse:
+        tables += SparseGrid.table_bytes(all_tiles, blocks, dimension)
+    tables += _contact_bytes(scene, all_nodes, tile, Grid.tile_counts(cells, tile), real)
+    if scene.solver.solids == "total" and len(scene.sources) > 1:
+        tables += ParticleContact.bytes_needed(cells, sum(map(in_steps, counts.values())))
+        all_tiles = max(all_tiles, 2 * math.prod(bins_along(cells)))
+    rows = all_nodes // (tile * Grid.tile_counts(cells, tile)[-1])
+    tables += roomy_colliders(ColliderKind.of(scene)).bytes_needed(dimension, rows)
+    if deterministic:
+        tables += nodes * roomy_colliders(ColliderKind.of(scene)).count * dimension * real
+    host_bytes = host_bytes_of(scene, members, sum(counts.values()), real, on_cpu=backend.on_cpu)
+    passes = passes_of(members, scene, deterministic=deterministic)
+    grid_bytes = nodes * node_bytes + tables
+    return Plan(groups, nodes, widest + 8, node_bytes, grid_bytes, host_bytes, passes, backend.arch, sparse, all_tiles)
+
+
+def _separating_axes(scene: Scene) -> list[int]:
+    """Return the axis of every face that needs contact flags: separating ones of the grid, unless walls are zeroed."""
+    if scene.solver.walls == "zeroed" or scene.solver.solids == "total":
+        return []
+    faces = scene.domain.walls.faces(scene.dimension)
+    return [axis for axis, pair in enumerate(faces) for wall in pair if wall == "separate"]
+
+
+def _rough_axes(scene: Scene) -> list[int]:
+    """Return the axis of every face of the grid that has friction, unless walls are zeroed."""
+    if scene.solver.walls == "zeroed":
+        return []
+    total, faces = scene.solver.solids == "total", scene.domain.walls.faces(scene.dimension)
+    return [axis for axis, side in rough_faces(scene) if not (total and faces[axis][side] == "separate")]
+
+
+def _contact_bytes(scene: Scene, nodes: int, tile: int, tiles: Sequence[int], real: int) -> int:
+    """Return the bytes of what is found at walls: for each node of a plane an integer, with friction a vector."""
+    separating, rough = (
+        [nodes // (tile * tiles[axis]) for axis in axes] for axes in (_separating_axes(scene), _rough_axes(scene))
+    )
+    contact = 4 * len(separating) * max(separating, default=0)
+    return contact + real * scene.dimension * len(rough) * max(rough, default=0)
+
+
+def require_room(plan: Plan) -> None:
+    """Refuse, by an InputError, what exceeds the free memory of this machine or its device, or 32-bit indices."""
+    total = plan.machine_bytes
+    free = MEMORY_SHARE * psutil.virtual_memory().available
+    on_device = free_memory(plan.arch)
+    need = f"the scene needs {plan.particles:.3g} particles and {plan.nodes:.3g} grid nodes"
+    cure = "a larger domain.spacing or fewer particles_per_cell needs less"
+    if total > free:
+        raise InputError(f"{need}, {size_text(total)} of memory, and {size_text(free)} may be used here; {cure}.")
+    if on_device is not None and plan.device_bytes > MEMORY_SHARE * on_device:
+        raise InputError(
+            f"{need}, {size_text(plan.device_bytes)} of memory on the {plan.arch} device, and "
+            f"{size_text(MEMORY_SHARE * on_device)} may be used there; {cure}."
+        )
+    # The widest field of the sort is addressed by one index.
+    if max(plan.nodes, plan.particles * WIDEST_FIELD, plan.tiles) > LARGEST_INDEX:
+        raise InputError(f"{need}, more than 32-bit indices can address; {cure}.")

@@ -1,0 +1,374 @@
+"""The fields of particles of one law on the device, what kernels read of them, and copies from and to the host."""
+
+from collections.abc import Sequence
+from copy import copy
+
+import numpy as np
+
+from mpmcli.materials.elementary import exp
+from mpmcli.materials.law import Law
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.grid.period import Period
+
+# Particles of a launch that reads them: with up to 27 numbers each, their entries stay within 32-bit indices, and a GPU
+# needs half a gigabyte for them.
+MOST_READ = 2**22
+
+
+# Entries of the per-body table that come before the constants of the law.
+MASS, VOLUME, CONSTANTS = 0, 1, 2
+# Numbers behind the last field.
+SPARE = 16
+
+
+def particle_fields(
+    deformation: str,
+    internal: Sequence[str],
+    dimension: int,
+    precision: str,
+    *,
+    several: bool,
+    keeps_initial: bool = False,
+    averaged: bool = False,
+    slips: bool = False,
+    comes_and_goes: bool = False,
+) -> dict[str, tuple[type, int, int]]:
+    """Return the fields of particles by name: float or int, rows and columns; options as of `ParticleArrays`."""
+    d = dimension
+    fields = {"position": (float, d, 1), "velocity": (float, d, 1)}
+    # In single precision a column more, see `ParticleArrays.gradient`.
+    fields["velocity_gradient"] = (float, d, d + (precision == "f32"))
+    if deformation == "F":
+        fields["deformation_gradient"] = (float, d, d)
+    else:
+        fields["volume_ratio"] = (float, 1, 1)
+    fields |= {name: (float, 1, 1) for name in internal}
+    fields |= {"initial_position": (float, d, 1)} if keeps_initial else {}
+    fields |= {"volume_to_mean": (float, 1, 1), "cell": (int, 1, 1)} if averaged else {}
+    fields |= {"slip": (float, d, 1)} if slips else {}
+    fields |= {"id": (int, 1, 1)} | ({"body": (int, 1, 1)} if several else {})
+    return fields | ({"activity": (int, 1, 1)} if comes_and_goes else {})
+
+
+def _field(count: int, kind: type, rows: int, columns: int) -> ti.Field:
+    if columns > 1:
+        return ti.Matrix.field(rows, columns, kind, shape=count, layout=ti.Layout.SOA)
+    return ti.field(kind, shape=count) if rows == 1 else ti.Vector.field(rows, kind, shape=count, layout=ti.Layout.SOA)
+
+
+@ti.data_oriented
+class ParticleArrays:
+    """Fields of particles of one law, of one run or of several, each of which has a contiguous range.
+
+    The same entry of neighbouring particles lies together in memory, so that a CPU loads and stores as many at once as
+    a vector register holds, and a GPU those of neighbouring threads. A few places behind the last particle may be read.
+
+    Attributes:
+        law: the constitutive law; capacity: particles n; dimension: d.
+        x: position relative to the origin of the domain, (n) Vector(d), m; v: velocity, (n) Vector(d), m/s.
+        gradient: of the velocity, (n) matrix of d rows, 1/s: row a holds dv/dx_a, the transpose of C, and then the
+            remainder of x along a, m, where the group `carries` one.
+        carries: whether particles carry what rounding takes from x, see `ParticleUpdate.moved`: in single precision.
+        displacement_gradient: F - I, (n) matrix d x d; None where the law keeps J.
+        J_minus_1: J - 1, (n); None where the law keeps F. Both are stored as the difference from rest: a step adds
+            strains of 1e-6 and less, which single precision would round off next to 1.
+        internal: the law's internal variables, (n) each; id: (n) int, row of the particle in every frame.
+        body: (n) int, row of its body in the table; None unless particles may belong to `several` bodies.
+        serial: whether loops that copy particles from and to the host run on one thread, which few particles need.
+        total: whether the body is on the grid of its state at rest, see `reference_grid`.
+        initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force, or
+            since they are `total`.
+        averaged: whether particles of a cell share their change of volume (`volume_average`): then each has its `cell`,
+            (n), and `to_mean`, (n), ln J during P2G, and where a frame is read what it lacks to the mean of its cell.
+        slip: how far a particle has slipped on the wall that pushes it, (n) Vector(d), m, where there is friction
+            (`slips`), see `reference_grid`.
+        activity: (n) int, whether each waits, takes part or has left (`particles.sort`); None where all take part
+            always (`comes_and_goes` is false).
+        force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
+        table: per body a row of particle mass, particle volume and the constants of the law; real: numpy's type.
+    """
+
+    def __init__(
+        self,
+        law: Law,
+        dimension: int,
+        count: int,
+        table: tuple[int, int],
+        *,
+        several: bool,
+        serial: bool,
+        keeps_initial: bool = False,
+        total: bool = False,
+        averaged: bool = False,
+        slips: bool = False,
+        comes_and_goes: bool = False,
+    ) -> None:
+        """Allocate for `count` particles, and a table of these rows and columns."""
+        self.law, self.capacity = law, count
+        self.dimension = d = dimension
+        self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
+        self.carries = self.real == np.float32
+        self.several, self.serial, self.total, self.averaged = several, serial, total, averaged
+        self.keeps_initial = keeps_initial or total
+        self.slips, self.comes_and_goes = slips, comes_and_goes
+        wanted = particle_fields(
+            law.deformation,
+            names := [variable.name for variable in law.internal],
+            d,
+            "f32" if self.carries else "f64",
+            several=several,
+            keeps_initial=self.keeps_initial,
+            averaged=averaged,
+            slips=slips,
+            comes_and_goes=comes_and_goes,
+        )
+        made = {name: _field(count, *shape) for name, shape in wanted.items()}
+        self.x, self.v, self.gradient = made["position"], made["velocity"], made["velocity_gradient"]
+        self.displacement_gradient, self.J_minus_1 = made.get("deformation_gradient"), made.get("volume_ratio")
+        self.internal = tuple(made[name] for name in names)
+        self.initial, self.slip = made.get("initial_position"), made.get("slip")
+        self.cell, self.to_mean = made.get("cell"), made.get("volume_to_mean")
+        self.id, self.body, self.activity = made["id"], made.get("body"), made.get("activity")
+        self.pushed, self.force, self.run = False, None, 0
+        self.repeats = False
+        self.period: Period | None = None
+        self.table = ti.Vector.field(table[1], float, shape=table[0])
+        # Taichi lays fields out one after the other: what is read beyond the last particle lies in the next ones.
+        self.spare = ti.field(float, shape=SPARE)
+
+    def push_by(self, force: object) -> None:
+        self.pushed, self.force = True, force
+
+    def repeat(self, period: Period) -> None:
+        self.period, self.repeats = period, len(period.axes) > 0
+
+    def seen_from(self, run: object) -> "ParticleArrays":
+        """Return the view that a run has: its number, a variable of a kernel, counts where forces are evaluated."""
+        view = copy(self)
+        view.run = run
+        if self.repeats:
+            view.period = self.period.seen_from(run)
+        return view
+
+    @property
+    def state(self) -> tuple[ti.Field, ...]:
+        """Every real field that the sort must move."""
+        initial = () if self.initial is None else (self.initial,)
+        deformation = self.J_minus_1 if self.displacement_gradient is None else self.displacement_gradient
+        slip = (self.slip,) if self.slips else ()
+        return (self.x, self.v, self.gradient, deformation, *self.internal, *initial, *slip)
+
+    @property
+    def labels(self) -> tuple[ti.Field, ...]:
+        """Every integer field that the sort must move."""
+        return tuple(label for label in (self.id, self.body, self.activity) if label is not None)
+
+    @property
+    def moved(self) -> tuple[ti.Field, ...]:
+        """Every field that moves with a particle from place to place."""
+        return (*self.state, *self.labels)
+
+    def fields(self) -> dict[str, ti.Field]:
+        """Return every field of the particles that changes during a run or is sorted, by name."""
+        names = ["position", "velocity", "velocity_gradient", "deformation", *(v.name for v in self.law.internal)]
+        initial = ["initial_position"] * self.keeps_initial + ["slip"] * self.slips
+        labels = ["id"] + ["body"] * (self.body is not None) + ["activity"] * self.comes_and_goes
+        return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
+
+    def read(self, first: int, count: int, bodies: Sequence[int], row: int = 0) -> dict[str, np.ndarray]:
+        """Return x, v, C, deformation, internal, (n, k), id and body, (n), of a range of particles.
+
+        All fields by one launch: one per field would take most of the time of a frame of few particles.
+
+        bodies: index in the scene of each body of the group; row: of the first of them in the table.
+        """
+        d = self.dimension
+        widths = {"x": d, "v": d, "C": d * d, "deformation": self._deformation_width, "internal": len(self.internal)}
+        reals, labels = np.empty((count, sum(widths.values())), self.real), np.empty((count, 3), np.int32)
+        for begin in range(0, count, MOST_READ):
+            rows = slice(begin, begin + MOST_READ)
+            self._read(first + begin, reals[rows], labels[rows])
+        found, end = {}, 0
+        for name, width in widths.items():
+            found[name] = reals[:, end : end + width]
+            end += width
+        found["C"] = found["C"].reshape(count, d, d)
+        if self.J_minus_1 is None:
+            found["deformation"] = np.eye(d, dtype=self.real) + found["deformation"].reshape(count, d, d)
+        else:
+            found["deformation"] = 1 + found["deformation"].reshape(count)
+        found["id"] = labels[:, 0]
+        found["body"] = np.array(bodies, np.int32)[labels[:, 1] - row]
+        if self.comes_and_goes:
+            found["activity"] = labels[:, 2]
+        return found
+
+    def write(self, first: int, found: dict[str, np.ndarray], row: np.ndarray) -> None:
+        """Set a range of particles to what `read` returned, `initial` beside it, and the `row` of each in the table."""
+        count = len(found["x"])
+        rest = np.eye(self.dimension) if self.J_minus_1 is None else 1.0
+        parts = (found["x"], found["v"], found["C"], found["deformation"] - rest, found["internal"])
+        if self.keeps_initial:
+            parts = (*parts, found["initial"])
+        reals = np.concatenate([part.reshape(count, -1).astype(self.real) for part in parts], axis=1)
+        labels = np.stack([found["id"], row, np.broadcast_to(found.get("activity", 1), count)], axis=1).astype(np.int32)
+        self._write(first, np.ascontiguousarray(reals), np.ascontiguousarray(labels))
+
+    @property
+    def _deformation_width(self) -> int:
+        return self.dimension**2 if self.J_minus_1 is None else 1
+
+    @ti.kernel
+    def _read(self, first: int, reals: ti.types.ndarray(), labels: ti.types.ndarray()):
+        ti.loop_config(serialize=self.serial)
+        for q in range(reals.shape[0]):
+            d = ti.static(self.dimension)
+            p = first + q
+            for c in ti.static(range(d)):
+                reals[q, c] = self.x[p][c]
+                reals[q, d + c] = self.v[p][c]
+                for a in ti.static(range(d)):
+                    reals[q, (2 + c) * d + a] = self.gradient[p][a, c]
+            start = ti.static((2 + d) * d)
+            if ti.static(self.law.deformation == "F"):
+                for i, j in ti.static(ti.ndrange(d, d)):
+                    reals[q, start + i * d + j] = self.displacement_gradient[p][i, j]
+            else:
+                reals[q, start] = self.J_minus_1[p]
+            for i in ti.static(range(len(self.internal))):
+                reals[q, start + self._deformation_width + i] = self.internal[i][p]
+            labels[q, 0] = self.id[p]
+            # Every entry is written: a GPU does not get the zeros of the host.
+            if ti.static(self.several):
+                labels[q, 1] = self.body[p]
+            else:
+                labels[q, 1] = 0
+            if ti.static(self.comes_and_goes):
+                labels[q, 2] = self.activity[p]
+
+    @ti.kernel
+    def _write(self, first: int, reals: ti.types.ndarray(), labels: ti.types.ndarray()):
+        ti.loop_config(serialize=self.serial)
+        for q in range(reals.shape[0]):
+            d = ti.static(self.dimension)
+            width = ti.static(self.v.n)
+            p = first + q
+            for c in ti.static(range(d)):
+                self.x[p][c] = reals[q, c]
+            for c in ti.static(range(width)):
+                self.v[p][c] = reals[q, d + c] if ti.static(c < d) else 0.0
+            for a, c in ti.static(ti.ndrange(d, self.gradient.m)):
+                self.gradient[p][a, c] = reals[q, (2 + c) * d + a] if ti.static(c < d) else 0.0
+            start = ti.static((2 + d) * d)
+            if ti.static(self.law.deformation == "F"):
+                for i, j in ti.static(ti.ndrange(d, width)):
+                    if ti.static(j < d):
+                        self.displacement_gradient[p][i, j] = reals[q, start + i * d + j]
+                    else:
+                        self.displacement_gradient[p][i, j] = 0.0
+            else:
+                self.J_minus_1[p] = reals[q, start]
+            for i in ti.static(range(len(self.internal))):
+                self.internal[i][p] = reals[q, start + self._deformation_width + i]
+            if ti.static(self.keeps_initial):
+                for c in ti.static(range(d)):
+                    self.initial[p][c] = reals[q, start + self._deformation_width + ti.static(len(self.internal)) + c]
+            if ti.static(self.slips):
+                for c in ti.static(range(d)):
+                    self.slip[p][c] = 0.0
+            self.id[p] = labels[q, 0]
+            if ti.static(self.several):
+                self.body[p] = labels[q, 1]
+            if ti.static(self.comes_and_goes):
+                self.activity[p] = labels[q, 2]
+
+    @ti.func
+    def stored(self, p: int):
+        """Return J, or F as a d x d matrix, of particle p."""
+        if ti.static(self.law.deformation == "F"):
+            F = ti.Matrix.identity(float, self.dimension)
+            for i, j in ti.static(ti.ndrange(self.dimension, self.dimension)):
+                F[i, j] += self.displacement_gradient[p][i, j]
+            return F
+        else:
+            return 1.0 + self.J_minus_1[p]
+
+    @ti.func
+    def seen(self, p: int):
+        """Return what the law sees of the deformation of particle p, where a frame is read."""
+        if ti.static(self.averaged):
+            return self.stored(p) * exp(self.to_mean[p] * ti.static(1.0 / self.dimension))
+        else:
+            return self.stored(p)
+
+    @ti.func
+    def inner(self, p: int):
+        values = ti.Vector.zero(float, ti.static(max(len(self.internal), 1)))
+        for i in ti.static(range(len(self.internal))):
+            values[i] = self.internal[i][p]
+        return values
+
+    @ti.func
+    def store(self, p: int, deformation: ti.template(), inner: ti.template()):
+        """Replace what particle p stores of its deformation, and its internal variables."""
+        # Adds the difference, so that a deformation that the law did not change keeps every digit.
+        change = deformation - self.stored(p)
+        if ti.static(self.law.deformation == "F"):
+            for i, j in ti.static(ti.ndrange(self.dimension, self.dimension)):
+                self.displacement_gradient[p][i, j] += change[i, j]
+        else:
+            self.J_minus_1[p] += change
+        for i in ti.static(range(len(self.internal))):
+            self.internal[i][p] = inner[i]
+
+    @ti.func
+    def constants(self, p: int):
+        row = self.row(p)
+        return ti.Vector([row[CONSTANTS + c] for c in ti.static(range(row.n - CONSTANTS))])
+
+    @ti.func
+    def motion(self, p: int):
+        """Return the velocity, d, and the affine velocity C, d x d, of particle p."""
+        d = ti.static(self.dimension)
+        v, C = ti.Vector.zero(float, d), ti.Matrix.zero(float, d, d)
+        for c in ti.static(range(d)):
+            v[c] = self.v[p][c]
+            for a in ti.static(range(d)):
+                C[c, a] = self.gradient[p][a, c]
+        return v, C
+
+    @ti.func
+    def place(self, p: int):
+        """Return where particle p is in the domain, m: on the CPU one may have left a periodic one since the sort."""
+        result = self.x[p]
+        if ti.static(self.repeats):
+            inside = self.period.inside(result)
+            for c in ti.static(range(self.dimension)):
+                result[c] = inside[c]
+        return result
+
+    @property
+    def place_on_grid(self) -> ti.Field:
+        return self.initial if self.total else self.x
+
+    @ti.func
+    def on_grid(self, p: int):
+        return self.place_on_grid[p]
+
+    @ti.func
+    def motion_on_grid(self, p: int):
+        """Return the velocity of particle p, and its gradient with respect to places on the grid."""
+        v, C = self.motion(p)
+        if ti.static(self.total):
+            # Entry by entry: Taichi loses matrices that are assigned as a whole here.
+            at_rest = C @ self.stored(p)
+            for i, j in ti.static(ti.ndrange(self.dimension, self.dimension)):
+                C[i, j] = at_rest[i, j]
+        return v, C
+
+    @ti.func
+    def row(self, p: int):
+        row = 0
+        if ti.static(self.several):
+            row = self.body[p]
+        return self.table[row]

@@ -1,0 +1,251 @@
+"""Keeps the particles of a group sorted by tile, so that neighbours in space are neighbours in memory.
+
+On the CPU the tiles also make the scatter safe without atomics: tiles form pencils along the last axis,
+pencils are coloured along the others, and pencils of one colour write disjoint nodes. The sort is a stable counting
+sort, a share of the particles for each thread, so the order, and with it every floating-point sum, is the same for any
+number of threads (docs/theory.md, 8).
+"""
+
+from collections.abc import Sequence
+
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.grid.grid import Grid
+from mpmcli.solver.particles.arrays import ParticleArrays
+
+# Whether a particle waits, takes part, or has left.
+WAITING, ACTIVE, RETIRED = range(3)
+# Taichi gives a CPU thread at least this many iterations of a parallel loop.
+CHUNK = 512
+# Tiles per entry of the two-level prefix sum.
+SPAN = 256
+
+
+@ti.func
+def share_start(count: int, t: int, threads: int):
+    """Return where the t-th of nearly equal shares of `count` items begins; count * t would overflow."""
+    return count // threads * t + ti.min(t, count % threads)
+
+
+def entry_count(field: ti.Field) -> int:
+    return field.n * field.m if hasattr(field, "n") else 1
+
+
+@ti.data_oriented
+class SortBuffers:
+    """Scratch memory of the sort, shared by all groups.
+
+    Attributes:
+        room: particles of the largest group of one run.
+        order: (n) int, where the particle at each new place comes from.
+        key: (n) int, tile of each particle; also the scratch of integer fields.
+        real: (n w) scratch of real fields; widest: w, the largest number of entries of a particle in one of them, or
+            that of groups: between sorts it holds a number of each particle.
+    """
+
+    def __init__(self, groups: Sequence[ParticleArrays], runs: int = 1) -> None:
+        n = max(group.capacity for group in groups)
+        self.room = n // runs
+        self.widest = max(len(groups), *(entry_count(field) for group in groups for field in group.state))
+        self.order = ti.field(int, shape=n)
+        self.key = ti.field(int, shape=n)
+        self.real = ti.field(float, shape=n * self.widest)
+
+
+@ti.func
+def scratch_offset(buffers: ti.template(), g: ti.template(), w: int, room: ti.template()):
+    """Return what to add to the number of a particle for a place in `SortBuffers.real` that no other has.
+
+    g: its group; w: its run; room: particles of a run in the group.
+    """
+    return w * ti.static(buffers.room * buffers.widest - room) + ti.static(g * buffers.room)
+
+
+@ti.data_oriented
+class TileOrder:
+    """The tile order of one group.
+
+    Attributes:
+        start: (bins + 1) int, first particle of each bin: the tiles, and see `bin_of`.
+        first_tile: place in `start` of tile 0.
+        work: (colours, threads + 1) int, first pencil of a colour of each thread.
+    """
+
+    def __init__(self, group: ParticleArrays, grid: Grid, buffers: SortBuffers, threads: int, runs: int = 1) -> None:
+        self.group, self.grid, self.buffers, self.threads = group, grid, buffers, threads
+        self.tiles = grid.tile_count
+        # Behind the tiles, where particles come and go, one bin of those that wait and one of those that left.
+        self.comes_and_goes = group.comes_and_goes
+        self.bins = self.tiles + 2 * self.comes_and_goes
+        self.extent = tuple(n * grid.spacing for n in grid.cells)
+        self.colours = 2 ** (grid.dimension - 1)
+        self.spans = -(-self.bins // SPAN)
+        self.first_tile = 0
+        self.start = ti.field(int, shape=runs * (self.bins + 1))
+        self.cursor = ti.field(int, shape=(runs * self.bins, threads))
+        self.span_sum = ti.field(int, shape=runs * self.spans)
+        self.work = ti.field(int, shape=(self.colours, threads + 1))
+
+    @staticmethod
+    def bytes_needed(tiles: int, threads: int) -> int:
+        """Return the bytes that the tables of one group take for so many tiles."""
+        return 4 * tiles * (threads + 1)
+
+    @ti.func
+    def first_node_of(self, p: int):
+        base, _ = self.grid.scheme.spline.stencil(self.group.on_grid(p), self.grid.inverse_spacing)
+        return base
+
+    @ti.func
+    def settle(self, p: int):
+        """Put particle p back into the domain where that repeats."""
+        if ti.static(len(self.grid.period.axes) > 0):
+            self.grid.period.settle(self.group, p)
+
+    @ti.func
+    def tile_of(self, p: int):
+        return self.grid.tile_number(self.first_node_of(p))
+
+    @ti.func
+    def status_of(self, p: int):
+        """Return the status of particle p; what lies beyond an open face is retired."""
+        status = ACTIVE
+        if ti.static(self.comes_and_goes):
+            status = self.group.activity[p]
+            if status == ACTIVE:
+                for axis, side in ti.static(self.grid.opens):
+                    x = self.group.x[p][axis]
+                    if ti.static(side == 0):
+                        if x < 0.0:
+                            status = RETIRED
+                            self.group.x[p][axis] = 0.0
+                    elif x > self.extent[axis]:
+                        status = RETIRED
+                        self.group.x[p][axis] = self.extent[axis]
+                if status == RETIRED:
+                    self.group.activity[p] = RETIRED
+                    for c in ti.static(range(self.group.v.n)):
+                        self.group.v[p][c] = 0.0
+        return status
+
+    @ti.func
+    def bin_of(self, p: int):
+        """Return the bin of particle p, its tile if it takes part."""
+        place = 0
+        if ti.static(self.comes_and_goes):
+            status = self.status_of(p)
+            if status == ACTIVE:
+                place = self.tile_of(p)
+            else:
+                place = self.tiles + ti.cast(status == RETIRED, int)
+        else:
+            place = self.tile_of(p)
+        return place
+
+    @ti.func
+    def pencils_along(self, colour: int, axis: ti.template()):
+        """Return how many pencils of a colour lie along an axis; bit `axis` of the colour is their parity."""
+        return (self.grid.tiles[axis] - (colour >> axis & 1) + 1) // 2
+
+    @ti.func
+    def pencil_count(self, colour: int):
+        count = 1
+        for a in ti.static(range(self.grid.dimension - 1)):
+            count *= self.pencils_along(colour, a)
+        return count
+
+    @ti.func
+    def pencil_of(self, colour: int, q: int):
+        """Return the number of the q-th pencil of a colour, among all pencils."""
+        place = ti.Vector.zero(int, ti.static(self.grid.dimension - 1))
+        rest = q
+        for b in ti.static(range(self.grid.dimension - 1)):
+            a = ti.static(self.grid.dimension - 2 - b)
+            along = self.pencils_along(colour, a)
+            place[a] = 2 * (rest % along) + (colour >> a & 1)
+            rest = rest // along
+        pencil = 0
+        for a in ti.static(range(self.grid.dimension - 1)):
+            pencil = pencil * ti.static(self.grid.tiles[a]) + place[a]
+        return pencil
+
+    @ti.func
+    def pencils(self):
+        return ti.static(self.tiles // self.grid.tiles[-1])
+
+    @ti.func
+    def first_tile_of(self, pencil: int):
+        """Return the first tile of a pencil, or behind the last pencil the number of tiles."""
+        return pencil * ti.static(self.grid.tiles[-1])
+
+    @ti.func
+    def first_particle_of(self, pencil: int):
+        """Return the first particle of a pencil; behind the last pencil, the one after the last."""
+        return self.start[self.first_tile + self.first_tile_of(pencil)]
+
+
+@ti.func
+def count_tiles(order: ti.template(), run: int, t: int, first: int, begin: int, end: int):
+    """Count the particles of each tile in share t of those of a run, which begin at `first`: from `begin` to `end`."""
+    cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.room)
+    for tile in range(order.bins):
+        order.cursor[cursor + tile, t] = 0
+    for q in range(begin, end):
+        order.settle(first + q)
+        tile = order.bin_of(first + q)
+        order.buffers.key[own + q] = tile
+        order.cursor[cursor + tile, t] = order.cursor[cursor + tile, t] + 1
+
+
+@ti.func
+def find_places(order: ti.template(), run: int, first: int):
+    """Set the first particle of each tile of a run, and where each share places its particles of the tile."""
+    cursor, place = run * ti.static(order.bins), 0
+    for tile in range(order.bins):
+        order.start[order.first_tile + tile] = first + place
+        for t in range(ti.static(order.threads)):
+            size = order.cursor[cursor + tile, t]
+            order.cursor[cursor + tile, t] = place
+            place += size
+    order.start[order.first_tile + order.bins] = first + place
+
+
+@ti.func
+def place_particles(order: ti.template(), run: int, t: int, first: int, begin: int, end: int):
+    """Note, at the place of each particle of a share, where it comes from; see `count_tiles`."""
+    cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.room)
+    for q in range(begin, end):
+        tile = cursor + order.buffers.key[own + q]
+        order.buffers.order[own + order.cursor[tile, t]] = first + q
+        order.cursor[tile, t] = order.cursor[tile, t] + 1
+
+
+def is_label(field: ti.Field) -> bool:
+    return field.dtype == ti.i32
+
+
+@ti.func
+def keep(buffers: ti.template(), field: ti.template(), first: int, q: int, source: int):
+    """Copy the entries of one particle to place q of a buffer; `first` is that of the first particle of its run."""
+    entries = ti.static(entry_count(field))
+    value = field[source]
+    if ti.static(is_label(field)):
+        buffers.key[first + q] = value
+    elif ti.static(entries == 1):
+        buffers.real[first * ti.static(buffers.widest) + q] = value
+    else:
+        for e in ti.static(range(entries)):
+            place = ti.static(e if field.m == 1 else (e // field.m, e % field.m))
+            buffers.real[first * ti.static(buffers.widest) + q * entries + e] = value[place]
+
+
+@ti.func
+def take(buffers: ti.template(), field: ti.template(), first: int, q: int, p: int):
+    entries = ti.static(entry_count(field))
+    if ti.static(is_label(field)):
+        field[p] = buffers.key[first + q]
+    elif ti.static(entries == 1):
+        field[p] = buffers.real[first * ti.static(buffers.widest) + q]
+    else:
+        for e in ti.static(range(entries)):
+            place = ti.static(e if field.m == 1 else (e // field.m, e % field.m))
+            field[p][place] = buffers.real[first * ti.static(buffers.widest) + q * entries + e]

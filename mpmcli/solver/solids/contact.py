@@ -1,0 +1,151 @@
+"""Contact between elastic bodies on the grids of their states at rest: particles of different bodies repel each other.
+
+Particles are in bins, two cells wide, by the places where they were when they were last sorted. Forces act along the
+line between two particles, so that momentum and angular momentum are conserved (docs/theory.md, 2.7).
+"""
+
+import math
+from collections.abc import Sequence
+
+from mpmcli.errors import InputError
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.grid.grid import Grid
+from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays
+
+# Edge of a bin, cells; cells that particles may move until they are put into bins anew.
+BIN, DRIFT = 2, 0.2
+# Distance at which two particles begin to repel each other, in spacings: forces of a row of particles, which sum over
+# some of them, then hardly depend on the place along the row.
+RANGE = 1.5
+EMPTY, SEVERAL = -1, -2
+
+
+def contact_between(
+    groups: Sequence[ParticleArrays], bodies: Sequence[int], grid: Grid, backend: Backend, runs: int = 1
+) -> "ParticleContact | None":
+    """Return the contact of a scene with so many bodies in each group, None where there is none."""
+    if not groups[0].total or max(bodies) < 2:
+        return None
+    if not backend.on_cpu:
+        raise InputError(
+            f'solver.solids = "total" computes several bodies on the CPU only; found {backend.arch}: take --arch cpu'
+        )
+    return ParticleContact(grid, groups[0], runs)
+
+
+def bins_along(cells: Sequence[int]) -> tuple[int, ...]:
+    """Return the bins per axis of a domain, a margin of one on each side included."""
+    return tuple(n // BIN + 3 for n in cells)
+
+
+@ti.data_oriented
+class ParticleContact:
+    """Which particles are where, for the bodies of one law of each run.
+
+    Attributes:
+        first: of each bin, its first particle; following: of each particle, the next one in its bin; EMPTY for none.
+        owner: of each bin, the body that its particles belong to, EMPTY, or SEVERAL.
+        meets: of each particle, whether another body is in its bin or beside it.
+    """
+
+    def __init__(self, grid: Grid, group: ParticleArrays, runs: int) -> None:
+        self.group = group
+        self.dimension = grid.dimension
+        self.bins = bins_along(grid.cells)
+        self.count = math.prod(self.bins)
+        self.first = ti.field(int, shape=runs * self.count)
+        self.owner = ti.field(int, shape=runs * self.count)
+        self.following = ti.field(int, shape=group.x.shape[0])
+        self.meets = ti.field(int, shape=group.x.shape[0])
+
+    @staticmethod
+    def bytes_needed(cells: Sequence[int], particles: int) -> int:
+        return 4 * (2 * math.prod(bins_along(cells)) + 2 * particles)
+
+    def fields(self) -> dict[str, ti.Field]:
+        return {"contact.first": self.first, "contact.following": self.following, "contact.meets": self.meets}
+
+    @ti.func
+    def bin_of(self, x: ti.template(), spacing: float, run: int):
+        """Return the bin at a place, as a linear index."""
+        index = 0
+        for a in ti.static(range(self.dimension)):
+            along = ti.cast(x[a] / (BIN * spacing), int) + 1
+            index = index * ti.static(self.bins[a]) + ti.min(ti.max(along, 1), ti.static(self.bins[a] - 2))
+        return run * ti.static(self.count) + index
+
+    @ti.func
+    def fill(self, run: int, first: int, count: int, spacing: float):
+        """Put the particles of a run into bins, the last one of a bin first; done by one thread."""
+        for k in range(run * ti.static(self.count), (run + 1) * ti.static(self.count)):
+            self.first[k] = EMPTY
+            self.owner[k] = EMPTY
+        for p in range(first, first + count):
+            k = self.bin_of(self.group.x[p], spacing, run)
+            self.following[p] = self.first[k]
+            self.first[k] = p
+            body = self.group.body[p]
+            if self.owner[k] == EMPTY:
+                self.owner[k] = body
+            elif self.owner[k] != body:
+                self.owner[k] = SEVERAL
+        for p in range(first, first + count):
+            k = self.bin_of(self.group.x[p], spacing, run)
+            found = 0
+            for beside in range(ti.static(3**self.dimension)):
+                owner = self.owner[k + self.offset(beside)]
+                if owner != EMPTY and owner != self.group.body[p]:
+                    found = 1
+            self.meets[p] = found
+
+    @ti.func
+    def offset(self, beside: int):
+        """Return the difference of linear indices to the bin beside of that number, below 3^d."""
+        # A loop that is not unrolled: 27 copies of what it does would take a minute to compile.
+        result, rest, stride = 0, beside, 1
+        for b in ti.static(range(self.dimension)):
+            result += (rest % 3 - 1) * stride
+            rest = rest // 3
+            stride *= ti.static(self.bins[self.dimension - 1 - b])
+        return result
+
+    @ti.func
+    def push(self, group: ti.template(), p: int, spacing: float, run: int):
+        """Return the acceleration of particle p by those of other bodies, m/s^2."""
+        d = ti.static(self.dimension)
+        force = ti.Vector.zero(float, d)
+        if self.meets[p] == 1:
+            x, own = group.x[p], self.stiffness(group, p, spacing)
+            # Bins are those of the last sort. Particles have moved by less than DRIFT cells since.
+            k = self.bin_of(x, spacing, run)
+            for beside in range(ti.static(3**self.dimension)):
+                q = self.first[k + self.offset(beside)]
+                while q != EMPTY:
+                    if group.body[q] != group.body[p]:
+                        line = x - group.x[q]
+                        distance = line.norm()
+                        reach = 0.5 * RANGE * (self.spacing_of(group, p) + self.spacing_of(group, q))
+                        if distance < 2.0 * reach and distance > 0.0:
+                            n = line / distance
+                            overlap = 0.5 * RANGE * (self.extent(group, p, n) + self.extent(group, q, n)) - distance
+                            if overlap > 0.0:
+                                other = self.stiffness(group, q, spacing)
+                                force += (own * other / (own + other) * overlap) * n
+                    q = self.following[q]
+        return force / group.row(p)[MASS]
+
+    @ti.func
+    def spacing_of(self, group: ti.template(), p: int):
+        return group.row(p)[VOLUME] ** ti.static(1.0 / self.dimension)
+
+    @ti.func
+    def extent(self, group: ti.template(), p: int, n: ti.template()):
+        """Return the spacing of particle p along n, m: s |F^T n|."""
+        return self.spacing_of(group, p) * (group.stored(p).transpose() @ n).norm()
+
+    @ti.func
+    def stiffness(self, group: ti.template(), p: int, spacing: float):
+        """Return (lambda + 2 mu) V / (s h) of particle p, N/m."""
+        volume = group.row(p)[VOLUME]
+        return group.law.wave_modulus(group.constants(p)) * volume / (self.spacing_of(group, p) * spacing)

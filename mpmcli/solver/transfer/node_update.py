@@ -1,0 +1,147 @@
+"""What a step does at the nodes of the grid between P2G and G2P: fold, velocity, constrain, unfold."""
+
+from collections.abc import Sequence
+
+from mpmcli.boundaries.colliders import Colliders
+from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.walls import REACH
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.grid.grid import Grid
+
+
+@ti.data_oriented
+class NodeUpdate:
+    """Turns momentum into velocity at every node.
+
+    Attributes:
+        images: mirror images behind walls, None where walls do not mirror.
+        boundaries: what constrains the velocity, in turn, by a ti.func `constrain(node, velocity)`: of the integer
+            coordinates of a node, and its velocity, m/s, with the mass in entry d.
+        colliders: what does so after them, None where there are none.
+    """
+
+    def __init__(
+        self, grid: Grid, images: MirrorImages | None, boundaries: Sequence, colliders: Colliders | None = None
+    ) -> None:
+        self.grid, self.dimension = grid, grid.dimension
+        self.images, self.mirrors = images, images is not None
+        self.needs_contact = images is not None and images.needs_contact
+        self.needs_friction = images is not None and images.needs_friction
+        self.boundaries = tuple(boundaries)
+        self.collides, self.colliders = colliders is not None, colliders
+
+    def is_mirror(self, boundary: object) -> bool:
+        return self.mirrors and boundary is self.images.walls
+
+    @ti.func
+    def update(self, node: ti.template(), index: int, gravity_step: ti.template()):
+        """Update a node and its images; return the square of its velocity, 0 at an image and where there is no mass.
+
+        Gravity, gravity_step (m/s), acts on the momentum of every image near a wall, and elsewhere on the velocity.
+        """
+        speed_squared = 0.0
+        # Where an image beyond a wall has mass, so has the node inside: a stencil that reaches the one holds the other.
+        massive = self.grid.nodes[index][ti.static(self.dimension)] > 0
+        if ti.static(len(self.grid.period.axes) > 0):
+            # Not so beyond a periodic face.
+            massive = massive or self.images.walls.near(node)
+        if massive:
+            speed_squared = self.update_massive(node, index, gravity_step)
+        return speed_squared
+
+    @ti.func
+    def update_massive(self, node: ti.template(), index: int, gravity_step: ti.template()):
+        d = ti.static(self.dimension)
+        value = self.grid.nodes[index]
+        pull = gravity_step
+        kind = -1
+        speed_squared = 0.0
+        # Asked for once: what follows from them is most of the code of this loop.
+        depth, mirror, upper = ti.Vector([REACH + 1] * d), node, ti.Vector.zero(int, d)
+        acts, holds = ti.Vector.zero(int, d), ti.Vector.zero(int, d)
+        place = ti.static((depth, mirror, upper, acts, holds))
+
+        # Fold.
+        if ti.static(self.mirrors):
+            kind = self.images.kind(node)
+            for k, images in ti.static(enumerate(self.images.kinds)):
+                if kind == k:
+                    found_depth, found_mirror, found_upper = images.walls.place(node)
+                    found_acts = images.walls.acting(node, found_depth, found_mirror, found_upper)
+                    found_holds = images.walls.holding(node, found_depth, found_upper, True)
+                    for a in ti.static(images.walls.axes):
+                        depth[a], mirror[a], upper[a] = found_depth[a], found_mirror[a], found_upper[a]
+                        acts[a], holds[a] = found_acts[a], found_holds[a]
+                    total = images.fold(self.grid, self.grid.nodes, node, place, gravity_step, True)
+                    # Entry by entry here and below: Taichi loses vectors that are assigned as a whole in static blocks.
+                    for c in ti.static(range(self.grid.width)):
+                        value[c] = total[c]
+                    for a in ti.static(range(d)):
+                        pull[a] = 0.0
+
+        if value[d] > 0:
+            # Velocity.
+            velocity = value
+            for a in ti.static(range(d)):
+                velocity[a] = value[a] / value[d] + pull[a]
+
+            # Constrain.
+            for boundary in ti.static(self.boundaries):
+                if ti.static(self.is_mirror(boundary)):
+                    if kind >= 0:
+                        constrained = boundary.constrained(velocity, depth, upper, acts, holds)
+                        for c in ti.static(range(d)):
+                            velocity[c] = constrained[c]
+                else:
+                    constrained = boundary.constrain(node, velocity)
+                    for c in ti.static(range(d)):
+                        velocity[c] = constrained[c]
+
+            if ti.static(self.collides):
+                met = self.colliders.constrain(node, velocity, value[d])
+                for c in ti.static(range(d)):
+                    velocity[c] = met[c]
+
+            # Unfold.
+            self.write(self.grid.nodes, node, index, kind, place, velocity)
+            if ti.static(self.grid.scheme.keeps_before):
+                self.update_before(node, index, kind, place, value[d])
+            for a in ti.static(range(d)):
+                speed_squared += velocity[a] ** 2
+        return speed_squared
+
+    @ti.func
+    def update_before(self, node: ti.template(), index: int, kind: int, place: ti.template(), mass: float):
+        """Turn the momentum from before stress and forces into velocity: fold and unfold, without any boundary.
+
+        Mirror images have it too, so that a wall changes only what stress does; friction changes a change of velocity.
+        """
+        before = self.grid.before[index]
+        if ti.static(self.mirrors):
+            depth, _mirror, upper, _acts, holds = ti.static(place)
+            for k, images in ti.static(enumerate(self.images.kinds)):
+                if kind == k:
+                    by_word = images.walls.holding(node, depth, upper, False)
+                    for a in ti.static(images.walls.axes):
+                        holds[a] = by_word[a]
+                    pull = ti.Vector.zero(float, ti.static(self.dimension))
+                    total = images.fold(self.grid, self.grid.before, node, place, pull, False)
+                    for c in ti.static(range(self.grid.width)):
+                        before[c] = total[c]
+        for a in ti.static(range(self.dimension)):
+            before[a] /= mass
+        self.write(self.grid.before, node, index, kind, place, before)
+
+    @ti.func
+    def write(
+        self, field: ti.template(), node: ti.template(), index: int, kind: int, place: ti.template(), new: ti.template()
+    ):
+        """Write the velocity of a node, and of its images."""
+        if ti.static(self.mirrors):
+            if kind < 0:
+                field[index] = new
+            for k, images in ti.static(enumerate(self.images.kinds)):
+                if kind == k:
+                    images.unfold(self.grid, field, node, place, new)
+        else:
+            field[index] = new

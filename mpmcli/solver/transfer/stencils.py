@@ -1,0 +1,134 @@
+"""Sums over the stencil of a spline, and their transpose: what varies linearly is added to its nodes, and gathered.
+
+Both walk the stencil axis by axis: planes of lines of three nodes along the last axis. Positions are measured from its
+middle node, so that its nodes lie at -1, 0 and 1: moments are then differences of sums that are at hand. A cubic
+stencil has one node more, at 2. On the CPU every node is four numbers wide, which the compiler turns into vector
+instructions.
+"""
+
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.grid.fixed_point import FixedSums
+from mpmcli.solver.transfer.splines import LOW_BITS, bounded
+
+
+@ti.func
+def add_linear(
+    field: ti.template(),
+    grid: ti.template(),
+    first: int,
+    w: ti.template(),
+    middle: ti.template(),
+    change: ti.template(),
+    atomic: ti.template(),
+):
+    """Add to the nodes of a stencil a quantity that varies linearly over it, weighted by the spline.
+
+    field: of the nodes, or sums in fixed point, to which the rest is scaled; first: linear index of the first node;
+    middle: the quantity at the middle node; change: its change per cell, a row per axis.
+    """
+    d = ti.static(grid.dimension)
+    origin = origin_of(first, grid)
+    for i in ti.static(range(grid.planes)):
+        # At the middle of a plane, weighted along the first axis, and the changes along the others.
+        plane, across, along = middle, ti.Vector.zero(float, grid.width), ti.Vector.zero(float, grid.width)
+        if ti.static(d == 3):
+            add_multiple(plane, ti.static(i - 1), row_of(change, 0, grid.width))
+        for c in ti.static(range(grid.width)):
+            across[c], along[c] = change[d - 2, c], change[d - 1, c]
+            if ti.static(d == 3):
+                plane[c] *= w[i, 0]
+                across[c] *= w[i, 0]
+                along[c] *= w[i, 0]
+        for j in ti.static(range(grid.scheme.spline.nodes)):
+            line = plane
+            add_multiple(line, ti.static(j - 1), across)
+            line *= w[j, d - 2]
+            step = along * w[j, d - 2]
+            node = origin + ti.static(grid.line_node(i, j))
+            add(field, node, (line - step) * w[0, d - 1], atomic)
+            add(field, node + 1, line * w[1, d - 1], atomic)
+            add(field, node + 2, (line + step) * w[2, d - 1], atomic)
+            if ti.static(grid.scheme.spline.nodes == 4):
+                add(field, node + 3, (line + 2.0 * step) * w[3, d - 1], atomic)
+
+
+@ti.func
+def origin_of(first: int, grid: ti.template()):
+    """Return the linear index of the first node of a stencil, `bounded` where the grid has few enough nodes."""
+    if ti.static(grid.runs * grid.node_count <= LOW_BITS):
+        return bounded(first)
+    else:
+        return first
+
+
+@ti.func
+def row_of(matrix: ti.template(), row: ti.template(), width: ti.template()):
+    result = ti.Vector.zero(float, width)
+    for c in ti.static(range(width)):
+        result[c] = matrix[row, c]
+    return result
+
+
+@ti.func
+def add_multiple(result: ti.template(), factor: ti.template(), vector: ti.template()):
+    """Add -1, 0, 1 or 2 times a vector."""
+    for c in ti.static(range(result.n)):
+        if ti.static(factor == -1):
+            result[c] -= vector[c]
+        if ti.static(factor == 1):
+            result[c] += vector[c]
+        if ti.static(factor == 2):
+            result[c] += 2.0 * vector[c]
+
+
+@ti.func
+def add(field: ti.template(), node: int, share: ti.template(), atomic: ti.template()):
+    """Add a share of momentum and mass to a node."""
+    if ti.static(isinstance(field, FixedSums)):
+        field.add(node, share)
+    elif ti.static(atomic):
+        ti.atomic_add(field[node], share)
+    else:
+        field[node] = field[node] + share
+
+
+@ti.func
+def gather_linear(field: ti.template(), grid: ti.template(), first: int, w: ti.template()):
+    """Return the weighted sums over a stencil of what nodes hold, and of that times the cells from the middle node."""
+    d = ti.static(grid.dimension)
+    origin = origin_of(first, grid)
+    velocity = ti.Vector.zero(float, grid.width)
+    moment = ti.Matrix.zero(float, d, grid.width)
+    for i in ti.static(range(grid.planes)):
+        # Sums over a plane, and of these times the cells from its middle along its axes.
+        plane = ti.Vector.zero(float, grid.width)
+        across = ti.Vector.zero(float, grid.width)
+        along = ti.Vector.zero(float, grid.width)
+        for j in ti.static(range(grid.scheme.spline.nodes)):
+            node = origin + ti.static(grid.line_node(i, j))
+            low = field[node] * w[0, d - 1]
+            mid = field[node + 1] * w[1, d - 1]
+            high = field[node + 2] * w[2, d - 1]
+            total, slope = (low + high) + mid, high - low
+            if ti.static(grid.scheme.spline.nodes == 4):
+                far = field[node + 3] * w[3, d - 1]
+                total += far
+                slope += 2.0 * far
+            total *= w[j, d - 2]
+            plane += total
+            add_multiple(across, ti.static(j - 1), total)
+            along += slope * w[j, d - 2]
+        if ti.static(d == 3):
+            plane *= w[i, 0]
+            across *= w[i, 0]
+            along *= w[i, 0]
+        velocity += plane
+        for c in ti.static(range(grid.width)):
+            if ti.static(d == 3):
+                if ti.static(i == 0):
+                    moment[0, c] -= plane[c]
+                if ti.static(i > 1):
+                    moment[0, c] += ti.static(float(i - 1)) * plane[c]
+            moment[d - 2, c] += across[c]
+            moment[d - 1, c] += along[c]
+    return velocity, moment

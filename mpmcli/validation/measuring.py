@@ -1,0 +1,99 @@
+"""What cases measure in frames: fields, the fit of a damped oscillation, a mean over residual oscillations."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.frames.frame import Frame
+from mpmcli.scene import Scene
+from mpmcli.validation.case import Frames
+
+STEPS = 50
+LARGEST_EXPONENT = 200.0
+# Initial frequencies of the fit, over the guess.
+STARTS = np.linspace(0.5, 2.0, 61)
+
+
+def field(frame: Frame, name: str) -> np.ndarray:
+    """Return a field of a frame in double precision."""
+    return frame.fields[name].astype(np.float64)
+
+
+def in_middle(frame: Frame, scene: Scene, number: int, width: float) -> np.ndarray:
+    """Return which particles began in the middle of a body, a box or square of that width, m."""
+    low, high = (np.array(bound) for bound in scene.bodies[number].shape.form.bounds())
+    off = np.abs(field(frame, "initial_position") - (low + high) / 2).max(axis=1)
+    return (frame.body == number) & (off < width / 2)
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """offset + e^(-decay t) (a cos(frequency t) + b sin(frequency t)), frequency in rad/s, decay in 1/s."""
+
+    frequency: float
+    decay: float
+    amplitude: float
+    offset: float
+
+    def energy_loss(self) -> float:
+        """Return the part of the energy that is lost in a period."""
+        return -math.expm1(-2 * self.decay * 2 * math.pi / self.frequency)
+
+
+NOT_FOUND = Oscillation(math.nan, math.nan, math.nan, math.nan)
+
+
+def fit_oscillation(times: np.ndarray, signal: np.ndarray, frequency: float) -> Oscillation:
+    """Fit a damped oscillation to several periods of a signal, (n,), by least squares with the Gauss-Newton method.
+
+    The initial frequency, 0.5 to 2 times the guess in rad/s, is that of the best undamped fit. All is NaN if the fit
+    fails.
+    """
+    if not np.isfinite(signal).all():
+        return NOT_FOUND
+    w, decay = min(STARTS * frequency, key=lambda start: _misfit(times, signal, start)), 0.0
+    scale = np.abs(signal).max()
+    basis = np.empty((len(times), 3))
+    for _ in range(STEPS):
+        envelope = np.exp(-decay * times)
+        cosine, sine = envelope * np.cos(w * times), envelope * np.sin(w * times)
+        basis[:] = np.stack([cosine, sine, np.ones_like(times)], axis=1)
+        (a, b, offset), *_ = np.linalg.lstsq(basis, signal, rcond=None)
+        model = a * cosine + b * sine
+        # Gauss-Newton step: derivatives with respect to w and the decay extend the linear basis.
+        slopes = np.stack([times * (b * cosine - a * sine), -times * model], axis=1)
+        change, *_ = np.linalg.lstsq(np.hstack([basis, slopes]), signal - basis @ [a, b, offset], rcond=None)
+        w, decay = w + change[3], decay + change[4]
+        # The fit has diverged, or the exponential would overflow.
+        if not (0.1 * frequency < w < 10 * frequency and abs(decay) < LARGEST_EXPONENT / np.ptp(times)):
+            return NOT_FOUND
+        if (abs(change[3]) <= 1e-14 * abs(w) and abs(change[4]) <= 1e-14 * abs(w)) or scale == 0:
+            break
+    return Oscillation(float(w), float(decay), math.hypot(a, b), float(offset))
+
+
+def _misfit(times: np.ndarray, signal: np.ndarray, frequency: float) -> float:
+    """Return the residual norm of the best undamped oscillation of that frequency."""
+    basis = np.stack([np.cos(frequency * times), np.sin(frequency * times), np.ones_like(times)], axis=1)
+    parts, *_ = np.linalg.lstsq(basis, signal, rcond=None)
+    return float(np.linalg.norm(signal - basis @ parts))
+
+
+def window_weights(count: int) -> np.ndarray:
+    """Return Hann's weights, (count,), of the frames of a window, first and last included; they sum to 1.
+
+    An oscillation with m periods in the window is reduced by sin(pi m) / (pi m (1 - m^2)): 0 for integers m > 1
+    and less than 0.02 for m > 2.4. The factor of an unweighted mean is sin(pi m) / (pi m).
+    """
+    weights = np.sin(np.pi * np.arange(count) / (count - 1)) ** 2
+    return weights / weights.sum()
+
+
+def after_ramp(frames: Frames, ramp: int, window: int) -> Iterator[tuple[float, Frame]]:
+    """Yield the frames that follow the `ramp` first ones, `window` and one in number, each with its weight."""
+    weights = window_weights(window + 1)
+    for frame, _ in frames:
+        if frame.index >= ramp:
+            yield weights[frame.index - ramp], frame

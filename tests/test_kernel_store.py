@@ -1,0 +1,348 @@
+"""Stored kernels are those that would be compiled, and whatever happens to their files, no other code runs."""
+
+import errno
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+from conftest import ROOT
+from solver_state import scene_of
+
+from mpmcli.scene import Scene, sample_bodies
+from mpmcli.solver.engine import batch, kernel_store
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.machine import machine_code
+from mpmcli.solver.machine.backend import Backend, choose_backend, start, stop_backend
+
+
+def drop(**tables: object) -> Scene:
+    """Return the scene of a block of fluid that falls, 10 x 8 cells."""
+    block = {
+        "name": "block",
+        "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},
+        "shape": {"box": {"min": [0.2, 0.3], "max": [0.5, 0.6]}},
+    }
+    usual = {
+        "domain": {"size": [1.0, 0.8], "spacing": 0.1, "gravity": [0.0, -9.81]},
+        "time": {"end": 0.01, "frames": 1},
+        "bodies": [block],
+    }
+    return scene_of(**{**usual, **tables})
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The bytes of the last frame, and whether a stored kernel computed them."""
+
+    frame: bytes
+    stored: bool
+
+
+def outcome(scene: Scene, threads: int = 1, *, compile_cache: bool = True) -> Outcome:
+    """Run a scene on a backend of its own, whose end is that of its process for the files of kernels."""
+    stop_backend()
+    backend = start(choose_backend("cpu", threads, "f32", compile_cache=compile_cache, optimisation="few"))
+    try:
+        run = build_run(scene, backend)
+        *_, (frame, _row) = run.frames()
+        return Outcome(frame.position.tobytes() + frame.velocity.tobytes(), run.batch.launch_cpu.stored)
+    finally:
+        stop_backend()
+        kernel_store.finish()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder of Taichi's files of its own, with the store."""
+    stop_backend()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv(kernel_store.SWITCH)
+    yield tmp_path / "taichi" / "ticache"
+    stop_backend()
+
+
+def kernels_in(folder: Path) -> list[Path]:
+    """Return the files that hold a kernel of the store."""
+    return [path for path in folder.glob("*.tic") if b"launch_" in path.read_bytes()]
+
+
+def test_a_kernel_is_stored_and_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same bytes from a kernel compiled and stored, for other particles, on one thread and two."""
+    scene = drop()
+    fresh = outcome(scene, compile_cache=False)
+    assert not fresh.stored and not kernels_in(folder)
+    assert outcome(scene) == fresh
+    assert len(kernels_in(folder)) == 2
+    assert outcome(scene) == replace(fresh, stored=True)
+    # Another start, and another number of particles.
+    body = scene.bodies[0].model_copy(update={"velocity": (0.1, 0.0)})
+    assert outcome(scene.model_copy(update={"bodies": (body,)})).stored
+    assert outcome(scene, 2) == fresh
+    assert outcome(scene, 2) == replace(fresh, stored=True)
+    monkeypatch.setenv(kernel_store.SWITCH, "off")
+    assert outcome(scene) == fresh
+
+
+def test_a_sparse_grid_that_grows_has_kernels_of_its_own(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there is room for few blocks, a run goes on with another grid, and so with another kernel."""
+    domain = {"size": [4.0, 4.0], "spacing": 0.1, "gravity": [0.0, -9.81]}
+    scene = drop(domain=domain, solver={"grid": "sparse"})
+    fresh = outcome(scene, compile_cache=False)
+    monkeypatch.setattr(batch, "room_for_blocks", lambda particles: 3)
+    grown: list[int] = []
+    grow = batch.Batch.grow
+    monkeypatch.setattr(batch.Batch, "grow", lambda self, blocks: (grown.append(blocks), grow(self, blocks)))
+    assert outcome(scene) == fresh
+    assert outcome(scene) == replace(fresh, stored=True)
+    assert len(grown) == 2
+
+
+HARMS = {
+    "flip": lambda content: content[: len(content) // 2] + b"~" + content[len(content) // 2 + 1 :],
+    "cut": lambda content: content[:-100],
+    "empty": lambda content: b"",
+    "remove": lambda content: None,
+}
+
+
+@pytest.mark.parametrize(
+    ("harm", "which"),
+    [
+        pytest.param(harm, which, marks=[pytest.mark.slow] * ((harm, which) not in (("flip", "all"), ("cut", "first"))))
+        for harm in HARMS
+        for which in ("first", "second", "all")
+    ],
+)
+def test_a_file_that_is_harmed_is_not_run(folder: Path, harm: str, which: str) -> None:
+    """Of the two files that hold the kernel one is harmed, or both: it is compiled anew, and stored in two runs."""
+    scene = drop()
+    fresh = outcome(scene)
+    for path in kernels_in(folder)[{"first": slice(0, 1), "second": slice(1, 2), "all": slice(None)}[which]]:
+        content = HARMS[harm](path.read_bytes())
+        if content is None:
+            path.unlink()
+        else:
+            path.write_bytes(content)
+    found = [outcome(scene) for _ in range(3)]
+    assert {one.frame for one in found} == {fresh.frame}
+    assert found[-1].stored and (which != "all" or not found[0].stored)
+
+
+def solids() -> Scene:
+    """Return a scene with two laws in 3D and a collider."""
+    balls = {
+        name: {"name": name, "material": material, "shape": {"ball": {"center": [x, 0.5, 0.5], "radius": 0.15}}}
+        for name, x, material in (
+            ("snow", 0.3, {"law": "snow", "density": 400.0, "youngs_modulus": 1e5}),
+            ("sand", 0.7, {"law": "sand", "density": 1600.0, "youngs_modulus": 1e5, "friction_angle": 30.0}),
+        )
+    }
+    return drop(
+        domain={"size": [1.0, 1.0, 1.0], "spacing": 0.1, "gravity": [0.0, -9.81, 0.0], "walls": "slip"},
+        bodies=[*balls.values()],
+        colliders=[{"name": "stone", "shape": {"ball": {"center": [0.5, 0.2, 0.5], "radius": 0.1}}}],
+    )
+
+
+@pytest.mark.skipif(not machine_code.can_be_made(), reason="needs Linux and llvmlite, the extra quick")
+@pytest.mark.parametrize(
+    ("scene", "threads"),
+    [
+        pytest.param(drop, 1, id="fluid-1"),
+        pytest.param(drop, 2, id="fluid-2", marks=pytest.mark.slow),
+        pytest.param(solids, 2, id="solids-2", marks=pytest.mark.slow),
+    ],
+)
+def test_machine_code_has_the_bytes_of_the_kernel(
+    folder: Path, usual_optimisations: None, scene: Callable[[], Scene], threads: int
+) -> None:
+    """One of the two files has machine code, and the other LLVM's text; with either, the bytes are the same."""
+    fresh = outcome(scene(), threads, compile_cache=False)
+    assert outcome(scene(), threads) == fresh
+    text, code = sorted(kernels_in(folder), key=lambda path: b"module asm" in path.read_bytes())
+    assert b"module asm" not in text.read_bytes() and b"module asm" in code.read_bytes()
+    assert code.stat().st_size < text.stat().st_size
+    assert outcome(scene(), threads) == replace(fresh, stored=True)
+    code.write_bytes(text.read_bytes())
+    assert outcome(scene(), threads) == replace(fresh, stored=True)
+
+
+@pytest.mark.skipif(not machine_code.can_be_made(), reason="needs Linux and llvmlite, the extra quick")
+def test_no_machine_code_is_made_of_what_is_not_a_kernel(tmp_path: Path) -> None:
+    """Not of a file that is cut, of text that LLVM does not read, or that may mean another sum; they stay."""
+    name = "launch_0"
+    kernel = f"define void @{name}_a({{ i8* }}* %context) {{\n  ret void\n}}\n"
+    sum_of = f"declare float @llvm.fmuladd.f32(float, float, float)\n{kernel}"
+
+    def file_of(text: str) -> bytes:
+        body = b"{}" + text.encode()
+        digest = hashlib.sha256(body).hexdigest().encode()
+        return machine_code.HEAD.pack(b"0000", 0, 2, len(text)) + body + digest
+
+    path = tmp_path / "a.tic"
+    for content in (file_of(kernel)[:-1], file_of(kernel.replace("ret", "rot")), file_of(sum_of), file_of(""), b""):
+        path.write_bytes(content)
+        _, status = os.waitpid(machine_code.make_in_background(path, name), 0)
+        assert path.read_bytes() == content
+        assert machine_code.is_sound(content) == (status != 0) or content == file_of("")
+    path.write_bytes(file_of(kernel))
+    os.waitpid(machine_code.make_in_background(path, name), 0)
+    assert machine_code.is_sound(path.read_bytes()) and b"module asm" in path.read_bytes()
+
+
+def test_a_file_that_cannot_be_written_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk leaves the file as it was, and no part of another."""
+    path = tmp_path / "a.tic"
+    path.write_bytes(b"whole")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(machine_code.os, "replace", full)
+    with pytest.raises(OSError, match="No space left"):
+        machine_code.write(path, b"other")
+    assert [*tmp_path.iterdir()] == [path] and path.read_bytes() == b"whole"
+
+
+def test_the_key_has_all_that_a_kernel_is_made_from(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another law, wall, precision of the solver, number of threads or runs; processor; source; fields before it."""
+
+    def key(scene: Scene, threads: int = 1, runs: int = 1, before: int = 0) -> str:
+        backend = start(choose_backend("cpu", threads, "f32"))
+        for _ in range(before):
+            build_run(drop(), backend)
+        run = build_run(scene, backend)
+        kind = CompiledKind.of(scene, sample_bodies(scene)).roomy()
+        assert kind == run.batch.kind
+        found, _ = kernel_store.kernel_key(kind, backend, runs)
+        stop_backend()
+        return found
+
+    usual = key(drop())
+    assert key(drop(time={"end": 2.0, "frames": 7})) == usual
+    solid = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5}
+    body = {"name": "block", "material": solid, "shape": {"box": {"min": [0.2, 0.3], "max": [0.5, 0.6]}}}
+    domain = {"size": [1.0, 0.8], "spacing": 0.1, "gravity": [0.0, -9.81]}
+    others = [
+        key(drop(bodies=[body])),
+        key(drop(domain={**domain, "walls": "stick"})),
+        key(drop(domain={**domain, "spacing": 0.05})),
+        key(drop(solver={"transfer": "aflip"})),
+        key(drop(), threads=2),
+        key(drop(), runs=2),
+        key(drop(), before=1),
+    ]
+    for name in ("_machine", "_sources"):
+        with monkeypatch.context() as patch:
+            patch.setattr(kernel_store, name, lambda: "another")
+            others.append(key(drop()))
+    with monkeypatch.context() as patch:
+        patch.setenv("TI_ADVANCED_OPTIMIZATION", "1")
+        others.append(key(drop()))
+    assert len({usual, *others}) == 1 + len(others)
+
+
+def test_sources_are_all_that_kernels_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A changed line of any module that the solver may import changes the digest, and one of a command does not."""
+    for path in (ROOT / "mpmcli").rglob("*.py"):
+        copy = tmp_path / path.relative_to(ROOT / "mpmcli")
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(path.read_bytes())
+    monkeypatch.setattr(kernel_store, "PACKAGE", tmp_path)
+
+    def digest() -> str:
+        kernel_store._sources.cache_clear()
+        return kernel_store._sources()
+
+    try:
+        usual = digest()
+        for name in ("solver/grid/grid.py", "materials/fluid.py", "scene/schema.py", "stability/transfer_factors.py"):
+            path = tmp_path / name
+            text = path.read_text(encoding="utf-8")
+            path.write_text(text + "\n# changed", encoding="utf-8")
+            assert digest() != usual, name
+            path.write_text(text, encoding="utf-8")
+            assert digest() == usual
+        (tmp_path / "cli" / "simulate.py").write_text("", encoding="utf-8")
+        assert digest() == usual
+    finally:
+        kernel_store._sources.cache_clear()
+
+
+def test_what_is_not_known_is_not_stored(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Laws from elsewhere, another version of Taichi, modules that are younger than the process, no cache."""
+    scene = drop()
+    kind = CompiledKind.of(scene, sample_bodies(scene))
+    backend = choose_backend("cpu", 1, "f32")
+
+    def may_store(kind: CompiledKind = kind, backend: Backend = backend) -> bool:
+        return kernel_store.StoredLaunch(None, kind, backend)._may_store()
+
+    monkeypatch.setattr(kernel_store, "_unchanged_since", lambda began: True)
+    assert may_store()
+    foreign = type("Law", (type(kind.members[0]),), {"__module__": "law"})
+    assert not may_store(replace(kind, members=(object.__new__(foreign),)))
+    assert not may_store(backend=replace(backend, compile_cache=False))
+    with monkeypatch.context() as patch:
+        patch.setattr(kernel_store, "KNOWN_VERSIONS", ((1, 7, 3),))
+        assert not may_store()
+    with monkeypatch.context() as patch:
+        patch.setenv(kernel_store.SWITCH, "off")
+        assert not may_store()
+    monkeypatch.undo()
+    monkeypatch.setattr(kernel_store, "PACKAGE", tmp_path)
+    assert not kernel_store._unchanged_since(0.0)
+    (tmp_path / "module.py").write_text("", encoding="utf-8")
+    changed = (tmp_path / "module.py").stat().st_mtime
+    assert not kernel_store._unchanged_since(changed - 10) and not kernel_store._unchanged_since(changed + 1)
+    assert kernel_store._unchanged_since(changed + 10)
+
+
+PROCESS = """
+import sys
+from test_kernel_store import drop, outcome
+found = outcome(drop())
+print(found.stored, found.frame.hex())
+"""
+
+
+def process(folder: Path) -> subprocess.Popen:
+    """Start a process that runs the scene with the files in a folder."""
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests")])
+    environment = {**os.environ, "PYTHONPATH": path, "XDG_CACHE_HOME": str(folder.parent.parent)}
+    return subprocess.Popen([sys.executable, "-c", PROCESS], stdout=subprocess.PIPE, text=True, env=environment)
+
+
+def test_processes_at_once_store_the_same_kernel(folder: Path) -> None:
+    fresh = outcome(drop(), compile_cache=False)
+    found = [one.communicate(timeout=300)[0].split()[-1] for one in [process(folder), process(folder)]]
+    assert set(found) == {fresh.frame.hex()}
+    assert outcome(drop()) == replace(fresh, stored=True)
+
+
+@pytest.mark.parametrize("kills", [1, pytest.param(200, marks=pytest.mark.slow)])
+def test_a_killed_process_leaves_no_other_code(folder: Path, kills: int) -> None:
+    """Killed at any moment of a run and of its end, it leaves files with which the bytes are the same."""
+    fresh = outcome(drop(), compile_cache=False)
+    began = time.monotonic()
+    process(folder).communicate(timeout=300)
+    lasts = time.monotonic() - began
+    for k in range(kills):
+        if k % 10 == 0:
+            for path in [*folder.glob("*")]:
+                path.unlink()
+        one = process(folder)
+        time.sleep(lasts * (0.5 + 0.55 * ((k * 0.618) % 1)))
+        one.send_signal(signal.SIGKILL)
+        one.communicate(timeout=60)
+        if kills < 10 or k % 10 == 9:
+            assert outcome(drop()).frame == fresh.frame
+    assert outcome(drop()).frame == fresh.frame
