@@ -15,6 +15,8 @@ from hypothesis import settings
 if TYPE_CHECKING:
     from mpmcli.solver.machine.backend import Backend
 
+pytest_plugins = ("cost",)
+
 ROOT = Path(__file__).resolve().parent.parent
 
 # Kernels compile inside examples and machines are shared: time says nothing about correctness.

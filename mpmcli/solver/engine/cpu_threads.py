@@ -8,13 +8,13 @@ delays the others by the part at most that it has claimed.
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.engine.cpu_phases import CpuPhases
 
-# Words that threads share, of 4 bytes: what is published, the number of a phase, its kind and its parts; then, each on
+# Words that threads share, of 8 bytes: what is published, the number of a phase, its kind and its parts; then, each on
 # a cache line of its own, the parts done, whether the launch is over with the number of threads that work, and of each
 # region the parts claimed, behind the number of the phase.
-NUMBER, PHASE, PARTS, DONE, OVER, PRESENT, CLAIMED = 0, 1, 2, 16, 32, 33, 48
-LINE = 16
-# Bits of a claim below the number of the phase, which counts up to MOST_NUMBER.
-BITS, MASK, MOST_NUMBER = 16, 0xFFFF, 0x7FFF
+NUMBER, PHASE, PARTS, DONE, OVER, PRESENT, CLAIMED = 0, 1, 2, 8, 16, 17, 24
+LINE = 8
+# Bits of a claim below the number of the phase, which counts up to MOST_NUMBER: more than a phase has parts.
+BITS, MASK, MOST_NUMBER = 31, 0x7FFFFFFF, 0x7FFFFFFF
 # Times that a thread looks in vain for a part in its own region before it takes one of another, whose data then move
 # from cache to cache.
 RESPECT = 150
@@ -33,12 +33,14 @@ class CpuThreads:
     def __init__(self, phases: CpuPhases, runs: int) -> None:
         self.phases, self.regions = phases, phases.regions
         self.stride = CLAIMED + LINE * self.regions
-        self.words = ti.field(int, shape=runs * self.stride)
+        self.words = ti.field(ti.i64, shape=runs * self.stride)
 
     @ti.func
     def open(self, w: int):
-        """Begin a launch, before any thread works."""
+        """Begin a launch, before any thread works: nothing is published, so that no part can be claimed."""
         word = w * self.stride
+        for region in range(self.regions):
+            self.words[word + CLAIMED + LINE * region] = MASK
         self.words[word + PARTS] = 0
         self.words[word + DONE] = 0
         self.words[word + OVER] = 0
@@ -86,9 +88,9 @@ class CpuThreads:
         ti.atomic_max(self.words[w * self.stride + OVER], 1)
 
     @ti.func
-    def is_open(self, word: int, region: int, claimed: int):
+    def is_open(self, word: int, region: int, claimed: ti.i64):
         """Return whether a claim is one of a part that nobody has done, of the phase that is published."""
-        parts = self.phases.parts_of(self.words[word + PHASE], region)
+        parts = self.phases.parts_of(ti.cast(self.words[word + PHASE], int), region)
         return claimed >> BITS == self.words[word + NUMBER] and (claimed & MASK) < parts
 
     @ti.func
@@ -111,10 +113,10 @@ class CpuThreads:
                 # What is published stays as it is as long as a part that was claimed is not done.
                 if self.is_open(word, region, claimed):
                     found = 1
-                    part = claimed & MASK
+                    part = ti.cast(claimed & MASK, int)
             turn += 1
         if found == 1:
-            self.phases.do(0, w, self.words[word + PHASE], region, part, t, numbers, counts, shown)
+            self.phases.do(0, w, ti.cast(self.words[word + PHASE], int), region, part, t, numbers, counts, shown)
             ti.atomic_add(self.words[word + DONE], 1)
         elif ti.atomic_add(self.words[word + OVER], 0) == 1:
             found = -1
