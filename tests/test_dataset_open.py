@@ -12,7 +12,8 @@ from made_dataset import COUNTS, made_dataset, made_trajectory, write_dataset
 from made_result import made_frame, write_made
 
 import mpmcli.dataset
-from mpmcli.dataset.shard import write_trajectory
+from mpmcli.dataset import folder
+from mpmcli.dataset.shard import write_single, write_trajectory
 from mpmcli.errors import InputError
 
 
@@ -153,3 +154,24 @@ def test_an_unfinished_shard_and_the_quarantine_are_left_alone(tmp_path):
     (path / "quarantine").mkdir()
     (path / "quarantine" / "00009.h5").write_bytes(b"bad")
     assert len(mpmcli.dataset.open(path)) == 4
+
+
+def test_a_shard_that_is_sealed_again_asks_for_its_own_size(tmp_path, monkeypatch):
+    """A retried trajectory joins those of the shard, which lie there in one file."""
+    asked = []
+    monkeypatch.setattr(folder, "require_free_space", lambda place, size, *_: asked.append(size))
+    place = folder.Folder(tmp_path, 4, 4, (1, 1))
+    (tmp_path / "pending").mkdir()
+
+    def computed(number: int) -> folder.Row:
+        path = tmp_path / "pending" / f"{number:06d}.h5"
+        known = write_single(path, made_trajectory(number), compress=False)
+        row = folder.Row.failed(number, "train")
+        return replace(row, verdict="stable", accepted=1, file=f"pending/{path.name}", checksum=known)
+
+    rows = {n: computed(n) if n < 3 else folder.Row.failed(n, "train") for n in range(4)}
+    rows |= {row.number: row for row in place.seal(0, rows)}
+    rows[3] = computed(3)
+    sealed = place.seal(0, rows)
+    assert [row.file for row in sealed] == ["shards/00000.h5"] * 4
+    assert asked[1] < 1.5 * asked[0] and 0.9 * asked[1] < (tmp_path / "shards" / "00000.h5").stat().st_size

@@ -221,8 +221,17 @@ def test_the_split_has_its_fractions_of_every_first_trajectories(seed):
     names = [sweep.split_of(n) for n in range(10_000)]
     for name, share in (("train", 0.7), ("valid", 0.2), ("test", 0.1)):
         off = np.abs(np.cumsum([one == name for one in names]) - share * np.arange(1, 10_001))
-        assert off[:1000].max() < 2.5 and off.max() < 4
+        assert off[:1000].max() < 4 and off.max() < 5
     assert draw(sweep, 17).split == names[17]
+
+
+@pytest.mark.parametrize("length", [10, 13, 21, 34, 55])
+def test_every_value_of_a_grid_falls_into_every_split(length):
+    """Trajectory n has value n modulo the length of the grid: a tenth of those of each are in test."""
+    sweep = sweep_of('base = "base.toml"\ncount = 10\nseed = 3')
+    shares = [np.mean([sweep.split_of(n) == "test" for n in range(k, 200 * length, length)]) for k in range(length)]
+    # Three standard deviations, and a little for many values.
+    assert max(abs(share - 0.1) for share in shares) < 4 * (0.1 * 0.9 / 200) ** 0.5
 
 
 def test_a_split_of_one_part_has_no_other():

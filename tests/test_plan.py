@@ -15,7 +15,7 @@ from mpmcli.materials.registry import laws
 from mpmcli.output import SegmentStore
 from mpmcli.scene import Scene
 from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.machine.backend import choose_backend, start, stop_backend
+from mpmcli.solver.machine.backend import Backend, choose_backend, start, stop_backend
 from mpmcli.solver.machine.device_memory import has_cuda_device
 from mpmcli.solver.machine.plan import LawPlan, Plan, make_plan, require_room
 from mpmcli.solver.particles.sort import entry_count
@@ -156,7 +156,7 @@ def test_a_scene_of_fluid_plans_nothing_of_other_laws(backend_of: Callable) -> N
 
 @pytest.mark.filterwarnings("ignore:.*Calling non-taichi function:SyntaxWarning")
 def test_a_law_is_compiled_once_for_all_its_bodies_and_not_at_all_without_one(
-    backend_of: Callable, monkeypatch: pytest.MonkeyPatch
+    backend_of: Callable, monkeypatch: pytest.MonkeyPatch, own_kernels: None
 ) -> None:
     """The times that each law's response is traced into kernels: those of one body of fluid, whatever the bodies."""
     traced = Counter[str]()
@@ -183,11 +183,41 @@ def test_a_law_is_compiled_once_for_all_its_bodies_and_not_at_all_without_one(
     assert together["fluid"] == together["sand"] == alone["fluid"]
 
 
-def test_more_than_an_index_reaches_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """3 x 4 numbers of 2^28 particles are 3 x 2^30 entries of one field."""
+@pytest.mark.parametrize(
+    ("fields", "edge", "cells", "threads", "fits"),
+    [
+        # 1.3e8 particles with 8 numbers each in a frame, and with 32.
+        (["velocity"], 254, 256, 1, True),
+        (["velocity", "affine", "deformation_gradient", "stress"], 254, 256, 1, False),
+        # As many nodes, and counts of the tiles of each thread: 64 nodes each.
+        (["velocity"], 10, 1200, 64, True),
+        (["velocity"], 10, 1200, 128, False),
+    ],
+)
+def test_more_than_an_index_reaches_is_refused(
+    monkeypatch: pytest.MonkeyPatch, fields: list[str], edge: int, cells: int, threads: int, fits: bool
+) -> None:
+    """Whatever array it is; frames and tables of the sort are the longest ones."""
     monkeypatch.setattr("mpmcli.solver.machine.plan.MEMORY_SHARE", 1e6)
-    with pytest.raises(InputError, match="more than 32-bit indices can address"):
-        require_room(Plan((LawPlan("fluid", 2**28, {"position": 140}),), 1000, 0, 16, 16000, 1, ()))
+    scene = scene_of(
+        domain={"size": [float(cells)] * 3, "spacing": 1.0},
+        time={"end": 1.0, "frames": 1},
+        output={"fields": fields},
+        solver={"grid": "dense"},
+        bodies=[
+            {
+                "name": "block",
+                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5},
+                "shape": {"box": {"min": [1.0] * 3, "max": [1.0 + edge] * 3}},
+            }
+        ],
+    )
+    plan = make_plan(scene, Backend("cpu", threads, "f32", False))
+    if fits:
+        require_room(plan)
+    else:
+        with pytest.raises(InputError, match="more than 32-bit indices can address"):
+            require_room(plan)
 
 
 class FakeDriver:

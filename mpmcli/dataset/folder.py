@@ -206,7 +206,8 @@ class Folder:
         if not accepted:
             return []
         files = {row.number: self.path / row.file for row in accepted}
-        size = sum(file.stat().st_size for file in files.values())
+        # Those that were sealed before are in the shard that is replaced.
+        size = sum(file.stat().st_size for file in set(files.values()))
         kept = f"its trajectories are kept in {self.path / PENDING}"
         target.parent.mkdir(exist_ok=True)
         require_free_space(target.parent, size, f"shard {shard}", kept)

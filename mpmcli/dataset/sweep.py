@@ -23,6 +23,8 @@ Accepted = Literal["stable", "suspect"]
 _KINDS = ["uniform", "loguniform", "normal", "integers", "choice", "grid"]
 # 2^64 / golden ratio, made odd.
 GOLDEN = 0x9E3779B97F4A7C15
+# Trajectories among which purposes are divided.
+TOGETHER = 10
 ROUND_OFF = 1e-9
 
 
@@ -416,13 +418,14 @@ class Sweep:
     def split_of(self, number: int) -> str:
         """Return "train", "valid" or "test" for a trajectory.
 
-        A golden-ratio sequence frac(offset + number / golden ratio), with an offset from the seed, falls into
-        consecutive intervals as long as the fractions. So a trajectory keeps its purpose when the count grows,
-        and each purpose has its fraction of the first n trajectories for every n: up to 2 or so too many or too few
-        of a thousand, up to 4 of 200,000.
+        Of each TOGETHER trajectories in a row one falls into each of as many equal parts of [0, 1], in an order of its
+        own that is drawn from the seed, and so into consecutive intervals as long as the fractions. So a trajectory
+        keeps its purpose when the count grows, each purpose has its fraction of the first n trajectories for every n,
+        up to 3 or so too many or too few, and no grid of values, of whatever length, goes with the purposes.
         """
-        offset = int(generator(self.seed, 0, "split").integers(2**64, dtype=np.uint64))
-        place = (offset + number * GOLDEN) % 2**64 / 2**64
+        group, member = divmod(number, TOGETHER)
+        offset, order = _split_order(self.seed, group)
+        place = (order[member] + offset) / TOGETHER
         last, total = "train", 0.0
         for name, share in self.split:
             total += share
@@ -430,6 +433,17 @@ class Sweep:
             if share > 0 and place < total:
                 break
         return last
+
+
+@lru_cache(maxsize=64)
+def _split_order(seed: int, group: int) -> tuple[float, tuple[int, ...]]:
+    """Return where the trajectories of a group are in their parts of [0, 1], see `Sweep.split_of`, and their order.
+
+    The first is a golden-ratio sequence, which is spread evenly however many groups there are.
+    """
+    first = int(generator(seed, 0, "split").integers(2**64, dtype=np.uint64))
+    order = generator(seed, group, "split order").permutation(TOGETHER)
+    return (first + group * GOLDEN) % 2**64 / 2**64, tuple(order.tolist())
 
 
 class TrajectoryValues:

@@ -43,8 +43,7 @@ def host_bytes_of(scene: Scene, members: Sequence[Law], particles: int, real: in
     d = scene.dimension
     # Double precision: places, and where they vary velocities, their gradients and deformations.
     start = 8 * (d + any(map(has_expressions, scene.bodies)) * (d + 2 * d * d))
-    internal = max(len(law.internal) for law in members)
-    columns = FrameColumns(d, internal, scene.output.fields, comes_and_goes=scene.comes_and_goes)
+    columns = frame_columns(scene, members)
     widths = {"velocity": 0, "initial_position": d, "affine": d * d, "deformation_gradient": d * d, "stress": 9}
     fields = sum(widths.get(name, 1) for name in scene.output.fields)
     # Of the frame: positions, velocities and fields.
@@ -58,7 +57,13 @@ def host_bytes_of(scene: Scene, members: Sequence[Law], particles: int, real: in
     if not on_cpu:
         # The state as it was copied, and what numpy makes of it.
         return particles * (start + frame + 2 * 8 * (2 * d + d * d))
-    return particles * max(start, real * columns.count + frame)
+    return particles * max(start, real * columns + frame)
+
+
+def frame_columns(scene: Scene, members: Sequence[Law]) -> int:
+    """Return how many numbers of each particle a frame is built from."""
+    internal = max(len(law.internal) for law in members)
+    return FrameColumns(scene.dimension, internal, scene.output.fields, comes_and_goes=scene.comes_and_goes).count
 
 
 # Phases of every step as users read them; volumes are relaxed in some only.
@@ -72,8 +77,6 @@ WORDS = {
     "book_loads": "add up loads",
     "advance": "gather {}",
 }
-# A particle has at most 3 x 4 numbers in one field.
-WIDEST_FIELD = 12
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,8 @@ class Plan:
 
     Attributes:
         nodes: number of grid nodes, on a sparse grid those that there is memory for at first.
-        tiles: number of tiles of the domain, and of bins of bodies that meet.
+        entries: of the longest array, which is addressed by one index: numbers of particles in a frame or in the sort,
+            counts of the tiles of each thread, nodes, bins of bodies that meet.
         scratch_bytes: per particle, of the sort buffers.
         grid_bytes: of all nodes, the tables of the sort, what is found at walls, and what colliders need.
         host_bytes: see `host_bytes_of`.
@@ -107,7 +111,7 @@ class Plan:
     passes: tuple[str, ...]
     arch: str = "cpu"
     sparse: bool = False
-    tiles: int = 0
+    entries: int = 0
 
     @property
     def particles(self) -> int:
@@ -222,14 +226,14 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         node_bytes += FixedPoint.bytes_needed(width, before=scheme.keeps_before, filling=filling, averaged=shared)
         # In their place.
         node_bytes -= real * 2 * shared
-    all_tiles = all_nodes // tile**dimension
+    all_tiles, bins = all_nodes // tile**dimension, 0
     tables = len(groups) * TileOrder.bytes_needed(blocks if sparse else all_tiles, backend.threads)
     if sparse:
         tables += SparseGrid.table_bytes(all_tiles, blocks, dimension)
     tables += _contact_bytes(scene, all_nodes, tile, Grid.tile_counts(cells, tile), real)
     if scene.solver.solids == "total" and len(scene.sources) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(map(in_steps, counts.values())))
-        all_tiles = max(all_tiles, 2 * math.prod(bins_along(cells)))
+        bins = 2 * math.prod(bins_along(cells))
     rows = all_nodes // (tile * Grid.tile_counts(cells, tile)[-1])
     tables += roomy_colliders(ColliderKind.of(scene)).bytes_needed(dimension, rows)
     if deterministic:
@@ -237,7 +241,11 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     host_bytes = host_bytes_of(scene, members, sum(counts.values()), real, on_cpu=backend.on_cpu)
     passes = passes_of(members, scene, deterministic=deterministic)
     grid_bytes = nodes * node_bytes + tables
-    return Plan(groups, nodes, widest + 8, node_bytes, grid_bytes, host_bytes, passes, backend.arch, sparse, all_tiles)
+    shown = sum(map(in_steps, counts.values())) * frame_columns(scene, members)
+    sorted_entries = max(map(in_steps, counts.values())) * max(len(groups), widest // real)
+    counted = (blocks if sparse else all_tiles) * backend.threads
+    entries = max(nodes, all_tiles, bins, shown, sorted_entries, counted)
+    return Plan(groups, nodes, widest + 8, node_bytes, grid_bytes, host_bytes, passes, backend.arch, sparse, entries)
 
 
 def _separating_axes(scene: Scene) -> list[int]:
@@ -279,6 +287,5 @@ def require_room(plan: Plan) -> None:
             f"{need}, {size_text(plan.device_bytes)} of memory on the {plan.arch} device, and "
             f"{size_text(MEMORY_SHARE * on_device)} may be used there; {cure}."
         )
-    # The widest field of the sort is addressed by one index.
-    if max(plan.nodes, plan.particles * WIDEST_FIELD, plan.tiles) > LARGEST_INDEX:
+    if plan.entries > LARGEST_INDEX:
         raise InputError(f"{need}, more than 32-bit indices can address; {cure}.")
