@@ -16,6 +16,7 @@ from made_result import write_made
 from test_dataset_statistics import agree, plain
 
 import mpmcli.dataset
+from mpmcli.dataset.folder import MANIFEST, Manifest, Row
 from mpmcli.dataset.formats import FORMATS
 from mpmcli.dataset.thinned import chosen_particles, joined_row
 from mpmcli.output import open_result
@@ -398,3 +399,28 @@ def test_too_many_laws_are_refused(tmp_path):
     path = write_dataset(tmp_path / "set", [replace(made, header=header)])
     assert "GNS has no particle type left for law_6" in refused(path, "gns", tmp_path / "out")
     assert "LagrangeBench has no particle type left for law_5" in refused(path, "lagrangebench", tmp_path / "out")
+
+
+def test_an_export_says_what_the_dataset_lacks(tmp_path):
+    """In a note, and in metadata.json; a dataset that has all but what its verdicts exclude has no such note."""
+    path = made_dataset(tmp_path / "set")
+    known = {"key": "", "per_shard": 2, "version": "0.1"}
+    rows = [
+        replace(Row.failed(n, split), verdict="stable", accepted=1, file=f"shards/{n % 2:05d}.h5")
+        for n, split in enumerate(SPLITS)
+    ]
+    rows.append(replace(Row.failed(4, "train"), verdict="unstable"))
+    for count, part, lost, lack in (
+        (5, [1, 1], [], ""),
+        (8, [1, 1], [Row.failed(5, "test")], "4 of 8 trajectories included, 2 not computed, 1 failed"),
+        (10, [1, 2], [], "4 of 6 trajectories included, 1 not computed, this is part 1 of 2 of the sweep"),
+    ):
+        (path / MANIFEST).unlink(missing_ok=True)
+        manifest = Manifest(path)
+        manifest.create(known | {"count": count, "part": part})
+        manifest.put(rows + lost)
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        notes = exported(path, "npz", tmp_path / "out")["notes"]
+        assert [note for note in notes if "complete" in note] == [f"The dataset is not complete: {lack}."] * bool(lack)
+        told = metadata_of(tmp_path / "out")["dataset"]
+        assert (told["part"], told["accepted"], told["done"]) == (part, 4, 5 + len(lost))

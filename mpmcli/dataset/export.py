@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from mpmcli.dataset.dataset import Dataset
+from mpmcli.dataset.folder import MANIFEST
 from mpmcli.dataset.formats import FORMATS
 from mpmcli.dataset.metadata import EXPORTED_BY, FORMAT_KEY, common_facts
+from mpmcli.dataset.report import status_of
 from mpmcli.dataset.shard import SPLITS
 from mpmcli.dataset.thinned import SEED, ThinnedTrajectory, Walls
 from mpmcli.errors import InputError, RunError
@@ -91,6 +93,11 @@ def export(
         if each.particle_count == 0 or each.frame_count == 0:
             raise InputError(f"trajectory {each.source.number} of {dataset.path} is empty: there is nothing to export.")
     metadata = common_facts(chosen, settings.stride)
+    lack = ""
+    if settings.trajectory is None and (dataset.path / MANIFEST).exists():
+        status = status_of(dataset.path)
+        lack, told = status.lack(), status.as_dict()
+        metadata["dataset"] = {name: told[name] for name in ("part", "trajectories", "done", "accepted", "verdicts")}
     if any(each.particle_count < each.source.particle_count for each in chosen):
         metadata["particle_seed"] = SEED
     form = FORMATS[settings.form](chosen)
@@ -121,6 +128,7 @@ def export(
     splits = {split: metadata[f"num_trajs_{split}"] for split in SPLITS}
     frames, particles = max(each.frame_count for each in chosen), metadata["num_particles_max"]
     total = sum(files.values())
+    notes = [f"The dataset is not complete: {lack}."] * bool(lack) + notes
     return ExportSummary(str(directory), settings.form, list(files), splits, frames, particles, total, notes)
 
 

@@ -52,6 +52,15 @@ class Status:
             "excluded": [{name: getattr(row, name) for name in told} for row in self.rows if not row.accepted],
         }
 
+    def lack(self) -> str:
+        """Return what of the sweep is not in the dataset, other than what its verdict excludes, "" if nothing is."""
+        failed, waiting = sum(row.verdict == "failed" for row in self.rows), self.expected - len(self.rows)
+        told = [f"{n} {what}" for n, what in ((waiting, "not computed"), (failed, "failed")) if n]
+        (i, n), of = self.part, counted(self.expected, "trajectory")
+        if n > 1:
+            told.append(f"this is part {i} of {n} of the sweep")
+        return f"{self.accepted} of {of} included, {', '.join(told)}" if told else ""
+
     def text(self) -> str:
         """Return it as text: a line of counts, one for each verdict, and the reasons of the first exclusions."""
         told = self.as_dict()
