@@ -267,3 +267,12 @@ def test_a_law_is_one_file_of_the_package(tmp_path: Path) -> None:
     summary = said("simulate", "scene.toml", "-o", "result", "--json")
     assert (summary["status"], summary["frames"]) == ("finished", 5)
     assert said("check", "result", "--json")["verdict"] == "stable"
+
+
+def test_a_run_is_not_resumed_with_a_law_that_has_changed():
+    run_here("simulate", "scene.toml", "--plugin", "law.py", "-o", "result", "--quiet")
+    again = ("simulate", "scene.toml", "--plugin", "law.py", "-o", "result", "--resume")
+    assert run_here(*again).status == 0
+    law = Path("law.py")
+    law.write_text(law.read_text(encoding="utf-8") + "\n# Another one.\n", encoding="utf-8")
+    assert refused(*again).startswith("the plugin of the law log_fluid has changed since the run in result began")

@@ -26,8 +26,11 @@ from mpmcli.dataset.compute import Task, compute
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import status_of, verify
-from mpmcli.dataset.sweep_run import SweepSettings, SweepState, run_sweep, taken_folder
+from mpmcli.dataset.sweep import Sweep
+from mpmcli.dataset.sweep_file import load_sweep
+from mpmcli.dataset.sweep_run import SweepSettings, SweepState, _tasks, run_sweep, taken_folder
 from mpmcli.errors import InputError
+from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.scene import Time
 from mpmcli.simulation.recording import Recording, record
@@ -347,3 +350,43 @@ def test_a_rehearsal_tells_draws_disk_and_time(truth: Path, tmp_path: Path) -> N
     stored = sum(path.stat().st_size for path in (truth / "shards").iterdir())
     assert report["bytes"] == pytest.approx(stored, rel=0.3)
     assert report["seconds"] > 0 and not (tmp_path / "d").exists()
+
+
+POINTS = BASE.replace("box = { min = [0.2, 0.0], max = [0.5, 0.3] }", 'points = { file = "grains.csv", spacing = 0.02 }')
+OF_POINTS = 'base = "base.toml"\ncount = 2\n[vary]\n"domain.gravity.1" = { uniform = [-9.81, -3.7] }\n'
+
+
+@pytest.fixture
+def of_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Sweep:
+    """A sweep of particles from a file in the present directory, which has a namesake with fewer in `elsewhere`."""
+    (tmp_path / "base.toml").write_text(POINTS.replace('sampling = "jittered"\n', ""), encoding="utf-8")
+    (tmp_path / "sweep.toml").write_text(OF_POINTS, encoding="utf-8")
+    for directory, count in ((tmp_path, 30), (tmp_path / "elsewhere", 20)):
+        directory.mkdir(exist_ok=True)
+        rows = [f"{0.2 + 0.005 * k},0.2" for k in range(count)]
+        (directory / "grains.csv").write_text("\n".join(["x,y", *rows]), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    return load_sweep("sweep.toml", laws=parameter_models())
+
+
+def test_a_worker_reads_the_files_of_the_sweep(of_points: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever it runs; a file that differs there ends the sweep."""
+    task, _ = _tasks(of_points, SweepSettings(Path("dataset")), [0, 1], 1)
+    monkeypatch.chdir("elsewhere")
+    assert [row.particles for row in compute(task)] == [30]
+    Path("../grains.csv").write_text(Path("grains.csv").read_text(encoding="utf-8"), encoding="utf-8")
+    changed = replace(task, sources=(*task.sources, *task.sources))
+    with pytest.raises(InputError, match=r"grains.csv: a worker on .* finds another file there than the sweep has"):
+        compute(changed)
+
+
+def test_a_dataset_is_not_resumed_with_other_files(of_points: Sweep) -> None:
+    settings = SweepSettings(Path("dataset"), workers=1)
+    with taken_folder(of_points, settings):
+        pass
+    with taken_folder(of_points, replace(settings, resume=True)):
+        pass
+    Path("grains.csv").write_text("x,y\n0.3,0.3\n", encoding="utf-8")
+    refused = pytest.raises(InputError, match=r"grains.csv has changed since dataset was begun")
+    with refused, taken_folder(of_points, replace(settings, resume=True)):
+        pass

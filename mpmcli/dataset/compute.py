@@ -22,6 +22,7 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.dataset.draw import Draw, draw
 from mpmcli.dataset.folder import Row
 from mpmcli.dataset.shard import LABELS, MOVING, PENDING, QUARANTINE, TrajectoryData, file_name, write_single
+from mpmcli.dataset.sources import require_same_sources
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.materials.registry import load_plugins
@@ -56,7 +57,10 @@ _SETTINGS = {
 
 @dataclass(frozen=True)
 class Task:
-    """Trajectories of the dataset in a directory, for a worker with this backend and further laws from files."""
+    """Trajectories of the dataset in a directory, for a worker with this backend and further laws from files.
+
+    sources: of each file that scenes read its absolute path and its digest.
+    """
 
     directory: Path
     sweep: Sweep
@@ -64,6 +68,7 @@ class Task:
     arch: Arch = "auto"
     threads: int | None = 1
     plugins: tuple[Path, ...] = ()
+    sources: tuple[tuple[Path, str], ...] = ()
 
 
 def compute(task: Task) -> list[Row]:
@@ -80,8 +85,9 @@ _kept = threading.local()
 
 def _runner(task: Task) -> Runner:
     """Return the runner of this process, whose kernels outlive a task."""
-    known = (task.sweep.key, task.arch, task.threads, task.plugins)
+    known = (task.sweep.key, task.arch, task.threads, task.plugins, task.sources)
     if getattr(_kept, "known", None) != known:
+        require_same_sources(task.sources)
         _kept.laws = load_plugins(task.plugins)
         _kept.runner = Runner(task.arch, task.threads)
         scenes = []

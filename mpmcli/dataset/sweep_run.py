@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from mpmcli.dataset.compute import LOOK_AHEAD, Task, Workers, joined_workers, lo
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.folder import MANIFEST, SHARD_BYTES, VERDICTS, Folder, Manifest, Row, require_empty
 from mpmcli.dataset.shard import BASE, LABELS, SWEEP
+from mpmcli.dataset.sources import source_digests, source_files
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import load_plugins
@@ -141,6 +142,14 @@ def open_folder(
             )
         if (i, n) != settings.part:
             raise InputError(f"{directory} holds part {i}/{n} of the sweep; resume it with --shard {i}/{n}.")
+        now = source_digests(sweep, settings.plugins)
+        # An older version knew none.
+        before = facts.get("files", now)
+        if changed := sorted(name for name in {*before, *now} if before.get(name) != now.get(name)):
+            raise InputError(
+                f"{changed[0]} has changed since {directory} was begun, which cannot be resumed with it: put it back "
+                "as it was, or give another directory with -o."
+            )
         return Folder(directory, sweep.count, facts["per_shard"], settings.part), manifest
     if (directory / MANIFEST).exists():
         raise InputError(f"{directory} holds a dataset: --resume goes on with it, and -o gives another directory.")
@@ -169,6 +178,7 @@ def open_folder(
     write_text(directory / SWEEP, sweep.text)
     write_text(directory / BASE, sweep.base_text)
     facts = {"key": sweep.key, "count": sweep.count, "seed": sweep.seed, "accept": sweep.accept}
+    facts["files"] = source_digests(sweep, settings.plugins)
     manifest.create({**facts, "per_shard": per_shard, "part": list(settings.part), "version": __version__})
     return folder, manifest
 
@@ -302,8 +312,12 @@ def _tasks(sweep: Sweep, settings: SweepSettings, numbers: Sequence[int], worker
     size = max(1, min(most, len(numbers) // (ROUNDS * workers)))
     directory = settings.directory.resolve()
     plugins = tuple(path.resolve() for path in settings.plugins)
+    # A worker may have another working directory, and a namesake there.
+    sweep = replace(sweep, base=sweep.base.absolute())
+    digests = source_digests(sweep, plugins)
+    sources = tuple((path, digests[name]) for name, path in source_files(sweep, plugins).items())
     return [
-        Task(directory, sweep, tuple(numbers[i : i + size]), settings.arch, settings.threads, plugins)
+        Task(directory, sweep, tuple(numbers[i : i + size]), settings.arch, settings.threads, plugins, sources)
         for i in range(0, len(numbers), size)
     ]
 

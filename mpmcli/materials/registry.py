@@ -59,6 +59,11 @@ def load_plugin(path: Path) -> type[Law]:
     return law
 
 
+def plugin_file(name: str) -> Path | None:
+    """Return the file that a law was loaded from, None for a law of mpmcli."""
+    return _plugins[name][1] if name in _plugins else None
+
+
 @cache
 def _own_laws() -> dict[str, type[Law]]:
     modules = (importlib.import_module(f"{room.__name__}.{m.name}") for m in pkgutil.iter_modules(room.__path__))

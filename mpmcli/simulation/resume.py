@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.materials.registry import plugin_file
 from mpmcli.output import read_record
 from mpmcli.output.checkpoints import Checkpoint, read_checkpoints
 from mpmcli.output.directory import SCENE
@@ -137,8 +138,11 @@ def take_over(directory: Path, resumption: Resumption) -> None:
 
 
 def file_digests(loaded: LoadedScene) -> dict[str, str]:
-    """Return SHA-256 of each file that a scene reads, by its name in the scene."""
+    """Return SHA-256 of each file that a scene reads, by its name in the scene, and of plugins that it needs."""
     scene, found = loaded.scene, {}
+    for law in sorted({body.material.law for body in scene.sources}):
+        if plugin := plugin_file(law):
+            found[f"the plugin of the law {law}"] = sha256(plugin.read_bytes()).hexdigest()
     for entry in (*scene.sources, *scene.colliders):
         for name in entry.shape.files:
             with suppress(OSError):
