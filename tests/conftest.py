@@ -122,11 +122,20 @@ def few_optimisations() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def no_kernel_store() -> Iterator[None]:
-    """Let no run take a stored kernel, or store one: tests change what kernels are made from. See test_kernel_store."""
+def stored_as_text() -> Iterator[None]:
+    """Let all commands and processes share compiled kernels, without machine code, which takes longer than it saves.
+
+    A test that changes what kernels are made from, other than in files, asks for `own_kernels`.
+    """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MPMCLI_KERNEL_STORE", "off")
+        patch.setenv("MPMCLI_KERNEL_STORE", "text")
         yield
+
+
+@pytest.fixture
+def own_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let runs of a test neither take stored kernels nor store theirs."""
+    monkeypatch.setenv("MPMCLI_KERNEL_STORE", "off")
 
 
 @pytest.fixture

@@ -41,7 +41,9 @@ class WithPlate(NodeUpdate):
         self._given = given
 
 
-def test_a_boundary_acts_on_nodes_and_on_their_images(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_boundary_acts_on_nodes_and_on_their_images(
+    backend_of: Callable, monkeypatch: pytest.MonkeyPatch, own_kernels: None
+) -> None:
     """Water slides along the floor into a plate: nodes and ghost nodes beyond it rest, and the others move."""
     monkeypatch.setattr("mpmcli.solver.engine.batch.NodeUpdate", WithPlate)
     water = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}

@@ -68,7 +68,7 @@ def fields() -> list[ti.Field]:
 
 def bytes_of(field: ti.Field) -> int:
     """Return the bytes that the entries of a field take; Taichi packs them densely."""
-    return {ti.f32: 4, ti.i32: 4, ti.f64: 8}[field.dtype] * entry_count(field) * math.prod(field.shape)
+    return {ti.f32: 4, ti.i32: 4, ti.f64: 8, ti.i64: 8}[field.dtype] * entry_count(field) * math.prod(field.shape)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from cached_kernel import TOTAL
 
+pytestmark = pytest.mark.usefixtures("own_kernels")
+
 KERNEL = Path(__file__).with_name("cached_kernel.py")
 PROCESSES = 4
 

@@ -48,7 +48,7 @@ def test_nothing_is_to_be_done_before_the_first_phase(backend_of: Callable) -> N
 
 
 def test_a_region_may_have_any_number_of_pencils(backend_of: Callable) -> None:
-    """One thread has all particles, at one end of a long domain, and the other 100,000 pencils of a colour: none moves."""
+    """One thread has all particles, at one end of a long domain, and the other 100,000 pencils of a colour."""
     start = scene((840_000, 7), 1.0, [block("drop", FLUID, (0, 0), (3, 2))], 1.0, gravity=(0.0, 0.0))
     assert start.solver.grid == "auto"
     start = start.model_copy(update={"solver": start.solver.model_copy(update={"grid": "dense"})})

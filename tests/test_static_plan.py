@@ -96,7 +96,7 @@ def among(found: Counter, places: set[str]) -> set[str]:
     return {place for place in places if any(f"{name}.".startswith(f"{place}.") for _, name in found)}
 
 
-def test_a_plain_scene_has_nothing_of_features(backend_of: Callable, given: Counter) -> None:
+def test_a_plain_scene_has_nothing_of_features(backend_of: Callable, given: Counter, own_kernels: None) -> None:
     """No field, function or kernel of theirs; and no more kernels than one, and one that fills the device."""
     plain, backend = scene(with_features=False), backend_of("f32", 1)
     plan = make_plan(plain, backend)

@@ -13,6 +13,7 @@ import hashlib
 import os
 import platform
 import sys
+import time
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -36,10 +37,12 @@ SOURCES = ("scene", "frames", "stability", "materials", "boundaries", "solver")
 CLOCKS = 2.0
 # What the stub leaves in notes[0, 0, 0], which is never negative otherwise.
 MARK = -(2**30)
-# Where this variable is "off", kernels are neither stored nor found: for who changes modules while they run.
+# Where this variable is "off", kernels are neither stored nor found: for who changes modules while they run. Where it
+# is "text", no machine code is made.
 SWITCH = "MPMCLI_KERNEL_STORE"
-# Keys of kernels that this process has compiled; of each the file, among Taichi's own, that counts its losses.
-_compiled: dict[str, Path] = {}
+# Keys of kernels that this process has compiled; of each the file, among Taichi's own, that counts its losses, and when
+# its compilation began, s.
+_compiled: dict[str, tuple[Path, float]] = {}
 # Processes that make machine code.
 _processes: list[int] = []
 
@@ -72,7 +75,7 @@ class StoredLaunch:
                 return
             notes[0, 0, 0] = noted
             self._launch.token = words_of(key)
-            _compiled[key] = losses
+            _compiled[key] = losses, time.time()
             after_stop(store_compiled)
         with _named(CpuLaunch.launch._primal.func, f"launch_{key}" if key else "launch"):
             self._launch.launch(numbers, counts, shown, notes)
@@ -187,28 +190,32 @@ def _text(path: Path) -> str:
 def store_compiled() -> None:
     """Let stubs be the kernels that this process has compiled; Taichi has written the files of both."""
     while _compiled:
-        key, losses = _compiled.popitem()
+        key, (losses, began) = _compiled.popitem()
         with contextlib.suppress(OSError):
-            _store(key, losses)
+            # Their files are new, unless something went wrong earlier.
+            if not (_store(key, losses.parent, began - CLOCKS) or _store(key, losses.parent, 0.0)):
+                write(losses, f"{_text(losses)}+".encode())
 
 
-def _store(key: str, losses: Path) -> None:
-    folder = losses.parent
+def _store(key: str, folder: Path, since: float) -> bool:
+    """Let the stub of a key be its kernel, if both are among the files that were written since then, s."""
     stub_name, kernel_name = f"stub_{key}".encode(), f"launch_{key}".encode()
     places, kernels = [], []
     for path in folder.glob("*.tic"):
+        if path.stat().st_mtime < since:
+            continue
         content = path.read_bytes()
         if kernel_name in content and is_sound(content):
             kernels.append(content)
         elif kernel_name in content or stub_name in content:
             places.append(path)
-    # Two are a kernel and its stub, which another process has replaced.
     if len(kernels) == 1 and places:
         write(places[0], kernels[0])
-        if can_be_made():
+        if can_be_made() and os.environ.get(SWITCH) != "text":
             _processes.append(make_in_background(places[0], f"launch_{key}"))
-    elif len(kernels) < 2:
-        write(losses, f"{_text(losses)}+".encode())
+        return True
+    # Two are a kernel and its stub, which another process has replaced.
+    return len(kernels) > 1
 
 
 def finish() -> None:
