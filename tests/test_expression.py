@@ -1,5 +1,6 @@
 """Expressions: every function against Python's own, derivatives against differences, and a sentence for every fault."""
 
+import ast
 import math
 
 import numpy as np
@@ -212,3 +213,11 @@ def test_any_text_is_an_expression_or_a_sentence(text):
         parse(text, NAMES)
     except ExpressionError as error:
         assert str(error)
+
+
+def test_nesting_has_a_limit_where_constants_are_put_in():
+    """The depth of what Python's parser takes is that of nearly all characters of the longest expression."""
+    depth = ast.parse("2", mode="eval").body
+    for count in (MOST_NESTED + 1, 900, 1900):
+        with pytest.raises(ExpressionError, match=f"is nested more than {MOST_NESTED} deep"):
+            parse("-" * count + "depth", ["t"], {"depth": depth})

@@ -49,6 +49,14 @@ def test_the_record_says_what_was_run(first):
     assert record["backend"]["precision"] == "f32"
 
 
+@pytest.mark.parametrize("sampling", ["jittered", "poisson"])
+def test_the_record_has_the_seeds_of_what_is_random(tmp_path, sampling):
+    random = SCENE.replace("[[bodies]]", f'[[bodies]]\nsampling = "{sampling}"\nseed = 5', 1)
+    (tmp_path / "drop.toml").write_text(random, encoding="utf-8")
+    assert run_here("simulate", tmp_path / "drop.toml", "-o", tmp_path / "out", "--quiet").status == 0
+    assert list(json.loads((tmp_path / "out" / "run.json").read_text(encoding="utf-8"))["seeds"].values()) == [5]
+
+
 def test_the_stored_scene_gives_the_same_bytes_again(first, tmp_path):
     """The effective scene is complete: no default and no "auto" is chosen differently the second time."""
     outcome = run_here("simulate", first / "scene.toml", "-o", tmp_path / "again", "--quiet")

@@ -81,6 +81,7 @@ def test_the_effective_scene_is_the_same_scene() -> None:
         ("depth = 0.3", "depth = 0.3\npi = 3", "constants.pi: has a meaning in every expression already"),
         ("depth = 0.3", "depth = 0.3\nmin = 3", "constants.min: has a meaning in every expression already"),
         ("depth = 0.3", "depth = 0.3\nt = 3", "constants.t: has a meaning in every expression already"),
+        ("depth = 0.3", "depth = 0.3\nlambda = 3", "constants.lambda: has a meaning in every expression already"),
         ("depth = 0.3", "depth = true", "constants.depth: must be a number up to 1e+15, or an expression in quotes"),
         ("depth = 0.3", "depth = nan", "constants.depth: must be a number up to 1e+15, or an expression in quotes"),
         ("depth = 0.3", 'depth = "0.3 +"', "constants.depth: is no expression"),

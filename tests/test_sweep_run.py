@@ -352,7 +352,9 @@ def test_a_rehearsal_tells_draws_disk_and_time(truth: Path, tmp_path: Path) -> N
     assert report["seconds"] > 0 and not (tmp_path / "d").exists()
 
 
-POINTS = BASE.replace("box = { min = [0.2, 0.0], max = [0.5, 0.3] }", 'points = { file = "grains.csv", spacing = 0.02 }')
+POINTS = BASE.replace(
+    "box = { min = [0.2, 0.0], max = [0.5, 0.3] }", 'points = { file = "grains.csv", spacing = 0.02 }'
+)
 OF_POINTS = 'base = "base.toml"\ncount = 2\n[vary]\n"domain.gravity.1" = { uniform = [-9.81, -3.7] }\n'
 
 

@@ -16,6 +16,7 @@ from mpmcli.dataset.folder import VERDICTS, Manifest, Row
 from mpmcli.dataset.report import MOST_NAMED
 from mpmcli.dataset.shard import BASE, LABELS, LEDGER, SPLITS, SWEEP, TABLES, group_name, open_shard
 from mpmcli.errors import RunError
+from mpmcli.output.checksums import NAME as CHECKSUMS
 from mpmcli.output.durable import write_text
 from mpmcli.plain_text import counted, one_line, size_text
 
@@ -97,7 +98,7 @@ class _Heads:
         if len(times) > 1:
             self.intervals |= {_rounded(apart) for apart in (np.diff(times).min(), np.diff(times).max())}
         self.durations.add(_rounded(times[-1]))
-        moving = [name for name in group if name not in (*LABELS, *TABLES, LEDGER)]
+        moving = [name for name in group if name not in (*LABELS, *TABLES, LEDGER, CHECKSUMS)]
         self.arrays |= {name: group[name].shape[2:] for name in moving}
 
 

@@ -4,6 +4,7 @@ import ast
 import math
 import re
 from collections.abc import Iterator, Mapping
+from keyword import iskeyword
 from typing import Annotated, Any
 
 import numpy as np
@@ -150,7 +151,7 @@ def definitions(table: object, dimension: int | None) -> tuple[dict[str, ast.exp
     for name, value in table.items() if isinstance(table, Mapping) else ():
         if not _NAME.fullmatch(name):
             faults[name] = "is no name for an expression; use letters, digits and _, and begin with a letter"
-        elif name in QUANTITIES or name in CONSTANTS or name in FUNCTIONS:
+        elif name in QUANTITIES or name in CONSTANTS or name in FUNCTIONS or iskeyword(name):
             faults[name] = "has a meaning in every expression already; take another name"
         else:
             # What uses a constant that is wrong has no fault of its own.

@@ -34,6 +34,7 @@ from mpmcli.scene.problem import listed
 # An expression of a scene is a formula that a person has written; kernels hold all of it.
 MOST_CHARACTERS = 2000
 MOST_NESTED = 60
+TOO_DEEP = f"is nested more than {MOST_NESTED} deep, each term of a sum counted; write it shorter"
 MOST_EXPANDED = 20_000
 
 _BINARY = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Mod: "%", ast.Pow: "**"}
@@ -83,7 +84,10 @@ def parse(
             raise ExpressionError(
                 f"is too long with its constants put in: {length} characters, {MOST_EXPANDED} at most"
             )
-        expanded = source = ast.unparse(_PutIn(constants).visit(parsed))
+        try:
+            expanded = source = ast.unparse(_PutIn(constants).visit(parsed))
+        except RecursionError:
+            raise ExpressionError(TOO_DEEP) from None
         parsed = ast.parse(source, mode="eval")
     tree = _Reader(source, (*names, *constants)).read(parsed.body)
     return tree.value if isinstance(tree, Number) else Expression(expanded, tree, text)
@@ -137,9 +141,7 @@ class _Reader:
 
     def _tree(self, node: ast.expr, depth: int) -> Tree:
         if depth > MOST_NESTED:
-            raise ExpressionError(
-                f"is nested more than {MOST_NESTED} deep, each term of a sum counted; write it shorter"
-            )
+            raise ExpressionError(TOO_DEEP)
         depth += 1
         match node:
             case ast.Constant(value=bool()):

@@ -84,7 +84,7 @@ def new_record(
         settings.directory,
         command=settings.command,
         backend=summary.backend,
-        seeds={body.name: body.seed for body in loaded.scene.bodies if body.sampling == "jittered"},
+        seeds={body.name: body.seed for body in loaded.scene.bodies if body.sampling in ("jittered", "poisson")},
         files=file_digests(loaded),
         frames_expected=summary.frames_expected,
         particles=summary.particles,
