@@ -2,6 +2,7 @@
 
 import gc
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -30,6 +31,11 @@ GPU = os.environ.get("MPMCLI_TEST_GPU", "vulkan")
 
 # Taichi's variable, and its value for few optimisations.
 FEW = ("TI_ADVANCED_OPTIMIZATION", "0")
+
+# Where the shell has left these ignored, as it does for jobs in the background, so would all processes of tests.
+for name, usual in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
+    if signal.getsignal(getattr(signal, name)) is signal.SIG_IGN:
+        signal.signal(getattr(signal, name), usual)
 
 # Files that take longest, which begin first: at the end of a run one core would wait for the other.
 LONG = ("test_docs", "test_configs", "test_sweep_run", "test_batch", "test_solver_paths", "test_hard_materials")

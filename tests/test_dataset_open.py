@@ -4,6 +4,7 @@ import hashlib
 import pickle
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -156,22 +157,33 @@ def test_an_unfinished_shard_and_the_quarantine_are_left_alone(tmp_path):
     assert len(mpmcli.dataset.open(path)) == 4
 
 
+def computed(directory: Path, number: int) -> folder.Row:
+    """Write a trajectory that waits for its shard, and return its row."""
+    path = directory / "pending" / f"{number:06d}.h5"
+    path.parent.mkdir(exist_ok=True)
+    known = write_single(path, made_trajectory(number), compress=False)
+    row = folder.Row.failed(number, "train")
+    return replace(row, verdict="stable", accepted=1, file=f"pending/{path.name}", checksum=known)
+
+
+def test_a_trajectory_whose_file_is_damaged_is_computed_again(tmp_path):
+    """Its shard could not be sealed, however often the sweep is resumed."""
+    place, row = folder.Folder(tmp_path, 4, 4, (1, 1)), computed(tmp_path, 0)
+    assert place.is_kept(row)
+    content = (tmp_path / row.file).read_bytes()
+    for damaged in (content[:-100], content[:5000] + b"?" + content[5001:]):
+        (tmp_path / row.file).write_bytes(damaged)
+        assert not place.is_kept(row)
+
+
 def test_a_shard_that_is_sealed_again_asks_for_its_own_size(tmp_path, monkeypatch):
     """A retried trajectory joins those of the shard, which lie there in one file."""
     asked = []
     monkeypatch.setattr(folder, "require_free_space", lambda place, size, *_: asked.append(size))
     place = folder.Folder(tmp_path, 4, 4, (1, 1))
-    (tmp_path / "pending").mkdir()
-
-    def computed(number: int) -> folder.Row:
-        path = tmp_path / "pending" / f"{number:06d}.h5"
-        known = write_single(path, made_trajectory(number), compress=False)
-        row = folder.Row.failed(number, "train")
-        return replace(row, verdict="stable", accepted=1, file=f"pending/{path.name}", checksum=known)
-
-    rows = {n: computed(n) if n < 3 else folder.Row.failed(n, "train") for n in range(4)}
+    rows = {n: computed(tmp_path, n) if n < 3 else folder.Row.failed(n, "train") for n in range(4)}
     rows |= {row.number: row for row in place.seal(0, rows)}
-    rows[3] = computed(3)
+    rows[3] = computed(tmp_path, 3)
     sealed = place.seal(0, rows)
     assert [row.file for row in sealed] == ["shards/00000.h5"] * 4
     assert asked[1] < 1.5 * asked[0] and 0.9 * asked[1] < (tmp_path / "shards" / "00000.h5").stat().st_size

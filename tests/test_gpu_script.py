@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
+import psutil
 import pytest
 from conftest import GPU, ROOT
 
@@ -172,11 +173,10 @@ def test_a_call_that_is_ended_ends_its_parts(tmp_path: Path) -> None:
     for line in ended.stderr:
         if line.startswith("limits, copy"):
             break
-    children = subprocess.run(["ps", "-o", "pid=", "--ppid", str(ended.pid)], capture_output=True, text=True)
+    children = psutil.Process(ended.pid).children()
     ended.send_signal(signal.SIGTERM)
     ended.communicate(timeout=60)
-    assert children.stdout.split()
-    assert not any(Path(f"/proc/{pid}").exists() for pid in children.stdout.split())
+    assert children and not any(child.is_running() for child in children)
 
 
 @pytest.mark.parametrize(

@@ -181,6 +181,24 @@ def test_a_killed_run_that_is_resumed_has_the_bytes_of_one_that_was_not(whole, t
     assert record["steps"] == open_result(whole / name).frame(4).step
 
 
+def test_frames_of_a_series_that_are_damaged_are_computed_again(whole, tmp_path):
+    """From the first such frame on, where a copy was cut off, say; one whose first frame is damaged is refused."""
+    shutil.copytree(whole / "series", tmp_path / "series")
+    again = ("simulate", whole / "drop.toml", "-o", tmp_path / "series", "--format", "vtk", "--resume")
+
+    def cut(number: int) -> None:
+        file = tmp_path / "series" / f"particles_{number:06d}.vtu"
+        file.write_bytes(file.read_bytes()[:-100])
+
+    cut(3)
+    outcome = run_here(*again)
+    assert outcome.status == 0 and "resumed: 3 frames kept" in outcome.stderr
+    assert files_of(tmp_path / "series") == files_of(whole / "series")
+    cut(0)
+    outcome = run_here(*again)
+    assert outcome.status == 2 and "the first frame is damaged" in outcome.stderr
+
+
 def interrupted(whole: Path, directory: Path, calls: int, **options: object) -> None:
     """Interrupt a run of the drop at the n-th point where it can stop."""
     count = 0

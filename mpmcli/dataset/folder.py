@@ -17,6 +17,7 @@ from mpmcli import __version__
 from mpmcli.check.finding import Verdict
 from mpmcli.dataset.shard import PENDING, SHARDS, checksum, file_name, group_name, join_trajectories
 from mpmcli.errors import InputError, RunError
+from mpmcli.output.checksums import checksum_is_right
 from mpmcli.output.directory import check_directory
 from mpmcli.output.durable import require_free_space, sealed
 from mpmcli.output.lock import LOCK
@@ -196,8 +197,14 @@ class Folder:
         return f"{SHARDS}/{shard:05d}.h5"
 
     def is_kept(self, row: Row) -> bool:
-        """Return whether a row is final: its frames are where it says. A failed one is tried again."""
-        return row.verdict != "failed" and (not row.file or (self.path / row.file).is_file())
+        """Return whether a row is final: its frames are where it says. A failed one is tried again.
+
+        So is one whose own file is damaged, of which no shard could be made.
+        """
+        path = self.path / row.file
+        if row.verdict == "failed" or not row.file:
+            return row.verdict != "failed"
+        return path.is_file() and (row.file.startswith(f"{SHARDS}/") or checksum_is_right(path))
 
     def seal(self, shard: int, rows: Mapping[int, Row]) -> list[Row]:
         """Join accepted trajectories of a shard durably, return changed rows; RunError: the single files are kept."""

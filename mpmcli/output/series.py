@@ -158,6 +158,25 @@ def read_series(path: Path) -> tuple[FrameIndex, list[Path], Digests | None]:
     return _read(path)
 
 
+def read_sound_series(path: Path) -> FrameIndex | None:
+    """Return the index of the frames of a series up to the first whose file is missing or damaged, None for none.
+
+    InputError: as of `read_series`.
+    """
+    index, files, digests = read_series(path)
+    count = 0
+    for file in files:
+        try:
+            if digests is None:
+                read_vtu(file)
+            elif path_digest(file) not in digests.get(file.name, ()):
+                break
+        except (InputError, OSError):
+            break
+        count += 1
+    return index.first(count) if count else None
+
+
 def _read(path: Path) -> tuple[FrameIndex, list[Path], Digests | None]:
     directory = path.parent
     try:

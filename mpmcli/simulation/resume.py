@@ -19,9 +19,8 @@ from mpmcli.output.directory import SCENE
 from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory
 from mpmcli.output.layout import FrameIndex
 from mpmcli.output.lock import LOCK
-from mpmcli.output.result import open_result
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments, segment_name
-from mpmcli.output.series import SERIES
+from mpmcli.output.series import SERIES, read_sound_series
 from mpmcli.output.verify import verify_file
 from mpmcli.output.vtkhdf import read_index_of
 from mpmcli.plain_text import counted
@@ -83,7 +82,10 @@ def find_resumption(loaded: LoadedScene, directory: Path, form: Literal["vtkhdf"
     _require_same_scene(loaded, directory)
     _require_same_files(loaded, record, directory)
     if form == "vtk":
-        index = open_result(directory / SERIES).index if (directory / SERIES).exists() else None
+        series = directory / SERIES
+        index = read_sound_series(series) if series.exists() else None
+        if index is None and series.exists():
+            raise InputError(f"{directory}: the first frame is damaged, so nothing goes on; --overwrite begins anew.")
     else:
         index = _sound_index(directory)
     frames = 0 if index is None else len(index.times)
