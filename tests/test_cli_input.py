@@ -1,10 +1,13 @@
 """Bad input to the real command: exit code 2, one clear sentence on stderr, and nothing written."""
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-from command import SCENE, Outcome, run_here
+from command import ROOT, SCENE, Outcome, run_here
 
 
 @pytest.fixture
@@ -192,3 +195,12 @@ def test_what_was_not_written_by_mpmcli_is_never_replaced(refused):
     """`-o .` beside the scene, whose name is that of the effective scene of a result."""
     said = refused("simulate", "scene.toml", "-o", ".", "--overwrite")
     assert said == "scene.toml was not written by mpmcli: give another directory with -o."
+
+
+def test_a_directory_that_is_gone_has_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "gone").mkdir()
+    command = f'cd gone && rmdir ../gone && exec "{sys.executable}" -m mpmcli simulate "{tmp_path}/drop.toml"'
+    (tmp_path / "drop.toml").write_text(SCENE, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(["bash", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr == "error: the working directory no longer exists: go to another one.\n"

@@ -3,11 +3,14 @@
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from cached_kernel import TOTAL
+
+from mpmcli.solver.machine import backend
 
 pytestmark = pytest.mark.usefixtures("own_kernels")
 
@@ -77,3 +80,26 @@ def test_processes_may_share_a_damaged_cache_at_once(tmp_path: Path, damage: Cal
     assert outcome(begun(tmp_path)) == (0, str(TOTAL))
     damage(tmp_path)
     assert [outcome(p) for p in [begun(tmp_path) for _ in range(PROCESSES)]] == [(0, str(TOTAL))] * PROCESSES
+
+
+def test_runs_without_a_home_share_a_cache_of_their_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One among temporary files that nobody else can write to; where somebody has made it, a new one."""
+
+    def settled() -> Path:
+        # Empty is as if it were not set, and what was before comes back after the test.
+        monkeypatch.setenv("XDG_CACHE_HOME", "")
+        backend._settle_cache()
+        return Path(os.environ["XDG_CACHE_HOME"])
+
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(backend.Path, "home", homeless)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    first = settled()
+    assert first.parent == tmp_path and first == settled() and first.stat().st_mode & 0o777 == 0o700
+    first.chmod(0o777)
+    assert settled() != first
+    first.rmdir()
+    first.symlink_to(tmp_path)
+    assert settled() not in (first, tmp_path)

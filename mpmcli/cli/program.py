@@ -2,6 +2,7 @@
 
 import errno
 import importlib
+import os
 import sys
 import traceback
 from typing import Any, NoReturn
@@ -135,12 +136,23 @@ def run(arguments: list[str]) -> int:
             place = f"{error.filename} could not be written" if error.filename else "a file could not be written"
             print_error(f"error: {place} ({error.strerror}); what was written before it is kept.")
             return 1
+        if isinstance(error, FileNotFoundError) and _directory_is_gone():
+            print_error("error: the working directory no longer exists: go to another one.")
+            return 2
         kind = type(error).__name__
         # On a bare machine a library of the system may be missing, which a package of ours loads.
         of_system = isinstance(error, ImportError) and not (error.name or "").startswith("mpmcli")
         whose = "mpmcli doctor says what is missing" if of_system else "a fault of mpmcli"
         print_error(f"error: {kind}: {error} ({whose}; --debug shows where)")
         return 1
+
+
+def _directory_is_gone() -> bool:
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        return True
+    return False
 
 
 def _usage_sentence(error: click.ClickException) -> str:

@@ -243,7 +243,7 @@ def current_directory() -> ProbeResult:
 
 def kernel_cache() -> ProbeResult:
     """Examine the cache of compiled kernels, which is optional."""
-    place = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
+    place = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.path.expanduser("~")) / ".cache") / "taichi"
     try:
         place.mkdir(parents=True, exist_ok=True)
         free = _writable_bytes(place)

@@ -9,6 +9,7 @@ import io
 import linecache
 import os
 import platform
+import stat
 import tempfile
 import textwrap
 import time
@@ -178,16 +179,29 @@ def _forget_kernels() -> None:
 def _settle_cache() -> None:
     """Set a writable cache directory, without which Taichi crashes at exit, and free the lock of a killed process."""
     os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
-    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
     try:
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
         lock = folder / "ticache" / "ticache.lock"
         if lock.exists() and time.time() - lock.stat().st_mtime > LONGEST_LOCK:
             lock.unlink(missing_ok=True)
-    except OSError:
-        os.environ["XDG_CACHE_HOME"] = tempfile.mkdtemp(prefix="mpmcli-cache-")
+    # A user without a home and without an entry for users.
+    except (OSError, RuntimeError):
+        os.environ["XDG_CACHE_HOME"] = _spare_cache()
+
+
+def _spare_cache() -> str:
+    """Return a directory among temporary files, the same for every run of this user, if nobody else can write there."""
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    place = Path(tempfile.gettempdir()) / f"mpmcli-cache-{user}"
+    with contextlib.suppress(OSError):
+        place.mkdir(mode=0o700, exist_ok=True)
+        found = place.lstat()
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == user and not found.st_mode & 0o077:
+            return str(place)
+    return tempfile.mkdtemp(prefix="mpmcli-cache-")
 
 
 def _best(precision: str) -> str:
