@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -223,6 +223,22 @@ def test_an_interrupt_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.Mon
     again = run_sweep(sweep, settings)
     assert (again.status, again.kept, again.done) == ("finished", state.done, 6)
     assert verify(tmp_path / "dataset").faults == ()
+
+
+LATE = """
+import logging
+from mpmcli.dataset.compute import local_workers
+with local_workers(1):
+    pass
+for name, level in (("distributed.batched", logging.INFO), ("distributed.client", logging.ERROR)):
+    logging.getLogger(name).log(level, "The connection has closed.")
+"""
+
+
+def test_dask_says_nothing_after_its_cluster_has_ended(run_python: Callable) -> None:
+    """As it does of a connection that closes late, with a traceback."""
+    done = run_python(LATE)
+    assert (done.stdout, done.stderr) == ("", "")
 
 
 def test_ctrl_c_reaches_all_processes_and_shows_no_traceback(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 import os
 import queue
 import signal
@@ -273,6 +274,7 @@ def local_workers(count: int) -> Iterator[Workers]:
     import dask
     from distributed import Client
 
+    _silence_dask()
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(_SETTINGS))
         cluster = stack.enter_context(_local_cluster(count))
@@ -286,6 +288,13 @@ def local_workers(count: int) -> Iterator[Workers]:
                 with suppress(OSError, AttributeError, TypeError):
                     os.kill(nanny.pid, signal.SIGKILL)
             raise
+
+
+def _silence_dask() -> None:
+    """Let Dask say nothing: a connection that is closed has a traceback, even after the cluster has ended."""
+    for name in ("distributed", "distributed.client"):
+        for handler in logging.getLogger(name).handlers:
+            handler.setLevel(logging.CRITICAL)
 
 
 def _local_cluster(count: int) -> "LocalCluster":
@@ -331,6 +340,7 @@ def joined_workers(address: str) -> Iterator[Workers]:
     import dask
     from distributed import Client
 
+    _silence_dask()
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(_SETTINGS))
         try:
