@@ -221,7 +221,8 @@ def test_the_split_has_its_fractions_of_every_first_trajectories(seed):
     names = [sweep.split_of(n) for n in range(10_000)]
     for name, share in (("train", 0.7), ("valid", 0.2), ("test", 0.1)):
         off = np.abs(np.cumsum([one == name for one in names]) - share * np.arange(1, 10_001))
-        assert off[:1000].max() < 4 and off.max() < 5
+        # Among ten the order is random: of the first three none may be for training.
+        assert off.max() < 3 * 0.7 + 1e-9
     assert draw(sweep, 17).split == names[17]
 
 

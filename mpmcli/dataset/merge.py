@@ -20,7 +20,7 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
     facts = [Manifest(part).facts() for part in parts]
     for part, its in zip(parts, facts, strict=True):
         if {**its, "part": None} != {**facts[0], "part": None}:
-            raise InputError(f"{part} is of another sweep than {parts[0]}, or of another version of mpmcli.")
+            raise InputError(f"{part} has another sweep, other files or another version of mpmcli than {parts[0]}.")
     count = facts[0]["part"][1]
     there = sorted(its["part"][0] for its in facts)
     # A part beyond the last shard is empty, and nobody can compute it.

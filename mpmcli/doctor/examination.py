@@ -248,7 +248,7 @@ def kernel_cache() -> ProbeResult:
         place.mkdir(parents=True, exist_ok=True)
         free = _writable_bytes(place)
     except OSError as error:
-        detail = f"{place} cannot be written ({error.strerror}), so every run compiles its kernels anew"
+        detail = f"{place} cannot be written ({error.strerror}), so kernels are kept among temporary files"
         return ProbeResult("information", detail, "make it writable, or let XDG_CACHE_HOME name a directory that is")
     detail = f"{place}, writable, {size_text(free)} free"
     return ProbeResult("ok", detail) if free >= NO_DISK else ProbeResult("information", detail, "free some space")

@@ -6,7 +6,6 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +14,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import plugin_file
 from mpmcli.output import read_record
 from mpmcli.output.checkpoints import Checkpoint, read_checkpoints
+from mpmcli.output.checksums import path_digest
 from mpmcli.output.directory import SCENE
 from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory
 from mpmcli.output.layout import FrameIndex
@@ -144,11 +144,11 @@ def file_digests(loaded: LoadedScene) -> dict[str, str]:
     scene, found = loaded.scene, {}
     for law in sorted({body.material.law for body in scene.sources}):
         if plugin := plugin_file(law):
-            found[f"the plugin of the law {law}"] = sha256(plugin.read_bytes()).hexdigest()
+            found[f"the plugin of the law {law}"] = path_digest(plugin)
     for entry in (*scene.sources, *scene.colliders):
         for name in entry.shape.files:
             with suppress(OSError):
-                found[name] = sha256((Path(loaded.source).parent / name).read_bytes()).hexdigest()
+                found[name] = path_digest(Path(loaded.source).parent / name)
     return found
 
 
