@@ -15,7 +15,9 @@ COUNTS = (30, 24, 36, 24)
 SCENE = """\
 title = "Two that drift"
 [domain]
+origin = [{origin}]
 size = [{size}]
+walls = {{ {walls} }}
 spacing = 0.05
 gravity = [{gravity}]
 [time]
@@ -34,17 +36,24 @@ shape = {{ box = {{ min = [{low}], max = [{high}] }} }}
 """
 
 
-def made_header(dimension: int = 2, *, viscosity: float = 0.0, density: float = 1000.0) -> dict:
-    """Return the header of a run with two bodies of two laws, in a box of 1 m with cells of 0.05 m."""
+def made_header(
+    dimension: int = 2, *, viscosity: float = 0.0, density: float = 1000.0, origin: float = 0.0, periodic: str = ""
+) -> dict:
+    """Return the header of a run with two bodies of two laws, in a box of 1 m with cells of 0.05 m.
+
+    `periodic` has the letters of the axes that repeat.
+    """
 
     def vector(value: float) -> str:
         return ", ".join([repr(value)] * dimension)
 
     text = SCENE.format(
+        origin=vector(origin),
         size=vector(1.0),
+        walls=", ".join(f'{axis}_{end} = "periodic"' for axis in periodic for end in ("min", "max")),
         gravity=vector(-1.0),
-        low=vector(0.25),
-        high=vector(0.5),
+        low=vector(origin + 0.25),
+        high=vector(origin + 0.5),
         cell=2**dimension,
         viscosity=viscosity,
         density=density,
@@ -54,7 +63,7 @@ def made_header(dimension: int = 2, *, viscosity: float = 0.0, density: float = 
         "title": "Two that drift",
         "dimension": dimension,
         "spacing": 0.05,
-        "origin": [0.0] * dimension,
+        "origin": [origin] * dimension,
         "size": [1.0] * dimension,
         "bodies": ["pool", "heap"],
         "materials": list(LAWS),
@@ -84,22 +93,30 @@ def made_trajectory(
     split: str = "train",
     dtype: type = np.float32,
     pause: float = PAUSE,
-    **header: float,
+    speed: float = 0.0,
+    origin: float = 0.0,
+    **header: float | str,
 ) -> TrajectoryData:
-    """Return a trajectory whose paths follow from its number: a third of the particles is of the second body."""
+    """Return a trajectory whose paths follow from its number: a third of the particles is of the second body.
+
+    All drift at `speed` along the first axis, and come in again where it repeats.
+    """
     rng = np.random.default_rng(number)
     start = rng.uniform(0.2, 0.5, (particles, dimension))
     drift, pull = rng.uniform(-0.5, 0.5, (2, particles, dimension))
     t = (np.arange(frames) * pause)[:, None, None]
     body = (np.arange(particles) % 3 == 2).astype(np.int32)
+    drift[:, 0] += speed
     position, velocity = start + drift * t + pull * t**2, drift + 2 * pull * t
+    position[..., 0] %= 1.0
+    position += origin
     pressure = rng.random((frames, particles)).astype(dtype)
     gradient = rng.random((frames, particles, dimension, dimension)).astype(dtype)
     return TrajectoryData(
         number=number,
         split=split,
         draws={"bodies[0].material.viscosity": header.get("viscosity", 0.0), "name": "wide"},
-        header=made_header(dimension, **header),
+        header=made_header(dimension, origin=origin, **header),
         position=position.astype(dtype),
         velocity=velocity.astype(dtype),
         body=body,

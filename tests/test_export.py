@@ -116,6 +116,114 @@ def test_lagrangebench_reads_windows_and_chunks(tmp_path, dimension):
         assert chunk.shape == (max(COUNTS), INPUTS + 2, dimension)
 
 
+def cells_of(positions: np.ndarray, box: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """The cell of each particle as jax_md's cell_list finds it, in float32, and the cells along each axis."""
+    per_side = np.floor(box / radius)
+    return (positions / (box / per_side).astype(np.float32)).astype(int), per_side.astype(int)
+
+
+def neighbours_of(positions: np.ndarray, metadata: dict) -> set[tuple[int, int]]:
+    """Pairs as LagrangeBench finds them: within a radius, in adjacent cells, across faces on all axes or on none."""
+    box = np.diff(metadata["bounds"])[:, 0]
+    radius = metadata["default_connectivity_radius"]
+    cells, per_side = cells_of(positions, box, radius)
+    apart = positions[:, None].astype(float) - positions[None]
+    if any(metadata["periodic_boundary_conditions"]):
+        apart = (apart + box / 2) % box - box / 2
+    steps = (cells[:, None] - cells[None] + 1) % per_side
+    found = (np.linalg.norm(apart, axis=-1) < radius) & (steps <= 2).all(axis=-1)
+    inside = ((cells >= 0) & (cells < per_side)).all(axis=-1)
+    return {(i, j) for i, j in np.argwhere(found) if inside[i] and inside[j]}
+
+
+def true_neighbours(positions: np.ndarray, radius: float, periodic: str) -> set[tuple[int, int]]:
+    apart = positions[:, None].astype(float) - positions[None]
+    for axis in map("xyz".index, periodic):
+        apart[..., axis] -= np.round(apart[..., axis])
+    return {(i, j) for i, j in np.argwhere(np.linalg.norm(apart, axis=-1) < radius)}
+
+
+@pytest.mark.parametrize("periodic", ["", "x", "y", "xy"])
+def test_lagrangebench_finds_the_neighbours_wherever_the_domain_lies(tmp_path, periodic):
+    made = made_trajectory(0, particles=400, origin=-3.7, periodic=periodic, dtype=np.float64)
+    rng = np.random.default_rng(3)
+    # All over the domain, on its corners and faces too.
+    places = rng.choice([0.0, 1.0, *rng.random(9)], (400, 2)) + rng.uniform(-0.02, 0.02, (400, 2))
+    made.position[:] = np.clip(places, 0.0, 1.0) - 3.7
+    exported(write_dataset(tmp_path / "set", [made]), "lagrangebench", tmp_path / "out")
+    metadata = metadata_of(tmp_path / "out")
+    assert metadata["origin"] == [-3.7, -3.7]
+    with h5py.File(tmp_path / "out" / "train.h5") as file:
+        written = file["00000/position"][0]
+    away = written - 3.7 - made.position[0]
+    away -= np.round(away) * ["x" in periodic, "y" in periodic]
+    assert np.abs(away).max() < 3e-6
+    radius = metadata["default_connectivity_radius"]
+    expected = true_neighbours(made.position[0], radius, periodic)
+    fewest = true_neighbours(made.position[0], radius - 1e-5, periodic)
+    assert len(expected) > 2000 and fewest == expected, "an example in which no rounding decides"
+    assert neighbours_of(written, metadata) == expected
+
+
+def test_lagrangebench_bounds_hold_what_reaches_out(tmp_path):
+    box = made_trajectory(0, origin=2.0)
+    exported(write_dataset(tmp_path / "set", [box]), "lagrangebench", tmp_path / "out", "--walls", "all")
+    metadata = metadata_of(tmp_path / "out")
+    assert metadata["bounds"] == [[0.0, 1.0], [0.0, 1.0]]
+    with h5py.File(tmp_path / "out" / "train.h5") as file:
+        written = file["00000/position"][:]
+    cells, per_side = cells_of(written, np.ones(2), metadata["default_connectivity_radius"])
+    assert written.max() > 1 - 2e-6 and (cells < per_side).all() and (cells >= 0).all()
+
+
+def test_fast_particles_of_periodic_domains(tmp_path):
+    """At 12 m/s and 10 ms a particle goes 0.12 of the domain: four frames are 0.48, five are more than a half."""
+    made = [made_trajectory(0, speed=12.0, periodic="x", frames=31)]
+    path = write_dataset(tmp_path / "set", made)
+    # Drawn drifts are at most 0.5 m/s, pulls at most 0.5 m/s^2.
+    for stride, speed in ((1, 12.0), (3, 36.0)):
+        exported(path, "lagrangebench", tmp_path / "out", "--stride", stride, "--overwrite")
+        assert metadata_of(tmp_path / "out")["vel_mean"][0] == pytest.approx(speed * PAUSE, rel=0.05)
+    message = refused(path, "lagrangebench", tmp_path / "other", "--stride", "5")
+    assert "half of the periodic domain" in message and "--stride" in message
+    answer = exported(path, "npz", tmp_path / "out", "--stride", "5", "--overwrite")
+    assert any("no statistics" in note for note in answer["notes"])
+    assert "vel_mean" not in metadata_of(tmp_path / "out")
+    # Whole periods between stored frames: positions alone look as if nothing moved.
+    blur = write_dataset(tmp_path / "blur", [made_trajectory(0, speed=100.0, periodic="x")])
+    outcome = run_here("export", blur, "--to", "lagrangebench", "-o", tmp_path / "more")
+    assert outcome.status == 2 and "half of the periodic domain" in outcome.stderr
+
+
+def test_gns_takes_no_periodic_domain(tmp_path):
+    path = write_dataset(tmp_path / "set", [made_trajectory(0, periodic="y")])
+    assert "periodic faces, which GNS does not know" in refused(path, "gns", tmp_path / "out")
+
+
+def test_periodic_domains_that_differ_are_refused(tmp_path):
+    made = [made_trajectory(0, periodic="x"), made_trajectory(1)]
+    message = refused(write_dataset(tmp_path / "set", made), "lagrangebench", tmp_path / "out")
+    assert "differ in their domain or its periodic faces" in message
+
+
+def test_one_time_between_frames_or_none(tmp_path):
+    made = [made_trajectory(0), made_trajectory(1, pause=2 * PAUSE)]
+    path = write_dataset(tmp_path / "set", made)
+    exported(path, "npz", tmp_path / "out")
+    assert metadata_of(tmp_path / "out")["dt"] is None
+    exported(path, "npz", tmp_path / "out", "--trajectory", 1, "--overwrite")
+    assert metadata_of(tmp_path / "out")["dt"] == pytest.approx(2 * PAUSE)
+
+
+def test_gns_loads_laws_that_differ(tmp_path):
+    """The type tells laws apart: a feature that each law has its own value of is none."""
+    path = made_dataset(tmp_path / "set", density=1500.0)
+    exported(path, "gns", tmp_path / "out")
+    assert metadata_of(tmp_path / "out")["material_feature_names"] == []
+    (_, _, n), _ = GnsReader(tmp_path / "out" / "train.npz")[0]
+    assert n == COUNTS[0]
+
+
 @pytest.mark.parametrize("form", ["lagrangebench", "gns"])
 @pytest.mark.parametrize("stride", [1, 3])
 def test_metadata_of_learners(tmp_path, form, stride):

@@ -39,7 +39,7 @@ def evaluated(real):
     trees = [entries.placed(parse(text, NAMES).tree) for text in texts]
     values = DeviceValues(1, len(entries.found))
     nodes = tuple(enumerate(node_of(tree, values) for tree in trees))
-    numbers = RunValues(values, 0, entries.found, 1.0)
+    numbers = RunValues(values, 0, entries.found, 0.1, 1.0)
     found = ti.field(float, shape=(n, len(texts)))
 
     @ti.kernel

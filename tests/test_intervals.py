@@ -1,5 +1,6 @@
 """Interval arithmetic on expressions against samples of them, and integrals over pulses against closed forms."""
 
+import ast
 import math
 from itertools import pairwise
 
@@ -60,10 +61,11 @@ def test_bounds_are_the_range_where_a_name_occurs_once() -> None:
         ("t * t", 1 / 3, 1.0),
     ],
 )
-def test_a_pulse_between_samples_is_found(text: str, integral: float, peak: float) -> None:
+@pytest.mark.parametrize("pause", [1.0, 0.3, 0.01])
+def test_a_pulse_between_samples_is_found(text: str, integral: float, peak: float, pause: float) -> None:
     """Over [0, 1] s, however short it is; with its peak, and the time of it."""
     tree = parse(text, ["t"]).tree
-    mean = Mean(tree, 1.0)
+    mean = Mean(tree, pause, 1.0)
     assert mean(0.0, 1.0) == pytest.approx(integral, rel=1e-8)
     edges = np.linspace(0.0, 1.0, 300) ** 1.5
     parts = [mean(a, b) * (b - a) for a, b in pairwise(edges.tolist())]
@@ -71,3 +73,22 @@ def test_a_pulse_between_samples_is_found(text: str, integral: float, peak: floa
     assert largest_of(tree, 0.0, 1.0) >= peak * (1 - 1e-12)
     found = max(abs(float(evaluate(tree, {"t": time}))) for time in telling_times(tree, 0.0, 1.0))
     assert found == pytest.approx(peak, rel=0.1)
+
+
+@given(
+    st.floats(1e-9, 1e4), st.integers(1, 400), st.integers(1, 400), st.lists(st.floats(0, 1), min_size=2, max_size=9)
+)
+def test_means_do_not_depend_on_when_a_run_ends(pause: float, few: int, more: int, places: list[float]) -> None:
+    """Runs of few and of more frames as far apart, whose time between frames differs by roundings."""
+    tree = parse("sin(7 * t) + 3 * t", ["t"]).tree
+    end, later = few * pause, (few + more) * pause
+    short, long = Mean(tree, end / few, end), Mean(tree, later / (few + more), later)
+    for start, stop in pairwise(sorted(place * min(end, 50.0) for place in places)):
+        assert short(start, stop) == long(start, stop)
+
+
+@pytest.mark.parametrize(("end", "frames"), [(0.7, 1), (0.7, 50), (1.0, 3)])
+def test_a_root_of_the_time_that_is_left_has_a_mean(end: float, frames: int) -> None:
+    tree = parse("sqrt(tmax - t)", ["t"], {"tmax": ast.parse(repr(end), mode="eval").body}).tree
+    mean = Mean(tree, end / frames, end)
+    assert mean(0.0, end) == pytest.approx(2 / 3 * math.sqrt(end), rel=1e-7)

@@ -12,7 +12,7 @@ from mpmcli.scene.expression_reader import parse
 from mpmcli.scene.quadrature import BOUND, HALF, MIDDLE, Mean
 from mpmcli.solver.drive.expressions import ROOM, TimeTables, thinned
 
-END = 2.0
+END, PAUSE = 2.0, 0.02
 # The last one has more parts in a window than a table has rows for it where all windows must find room.
 TREES = {
     text: parse(text, ("t",)).tree
@@ -40,7 +40,7 @@ def means_of(tables: TimeTables, intervals: np.ndarray) -> tuple[np.ndarray, np.
 def test_a_kernel_takes_the_means_of_the_host(backend_of: Callable, precision: str) -> None:
     backend_of(precision)
     tables = TimeTables(2, len(TREES))
-    means = [Mean(tree, END) for tree in TREES.values()]
+    means = [Mean(tree, PAUSE, END) for tree in TREES.values()]
     for since in (0.0, 0.69, 1.9):
         horizon = tables.fill(1, means, since, coarse=False)
         assert since < horizon < since + END
@@ -59,7 +59,7 @@ def test_all_windows_find_room(backend_of: Callable) -> None:
     """For a kick that takes a large part of a run: the mean over all of it is the integral."""
     backend_of("f64")
     tables = TimeTables(2, len(TREES))
-    horizon = tables.fill(1, [Mean(tree, END) for tree in TREES.values()], 0.0, coarse=True)
+    horizon = tables.fill(1, [Mean(tree, PAUSE, END) for tree in TREES.values()], 0.0, coarse=True)
     assert horizon >= END and (tables.used.to_numpy()[len(TREES) :] <= ROOM).all()
     (found, _) = means_of(tables, np.array([[0.0, END]]))
     for k, tree in enumerate(TREES.values()):
@@ -73,7 +73,7 @@ def test_all_windows_find_room(backend_of: Callable) -> None:
 
 def test_joined_rows_keep_the_integral() -> None:
     """Rows that are joined hold the integral at their ends, and the largest bound of what they join."""
-    rows = Mean(LAST, END).rows(3)
+    rows = Mean(LAST, PAUSE, END).rows(3)
     few = thinned(rows, 16)
     assert len(rows) > 100 and len(few) <= 16
     assert thinned(rows, len(rows)) is rows

@@ -11,7 +11,14 @@ from typing import Any, ClassVar
 import h5py
 import numpy as np
 
-from mpmcli.dataset.metadata import LEAST_FRAMES, learning_facts, require_alike
+from mpmcli.dataset.metadata import (
+    LEAST_FRAMES,
+    RADIUS_IN_SPACINGS,
+    domain_around,
+    learning_facts,
+    outruns_periods,
+    require_alike,
+)
 from mpmcli.dataset.shard import LABELS, MOVING, SPLITS, group_name
 from mpmcli.dataset.thinned import ThinnedTrajectory
 from mpmcli.errors import InputError
@@ -82,12 +89,14 @@ class LearnerFormat(Format):
             else:
                 notes.append(f"No trajectory is of the split {split}: {file} is left out, as loaders need one.")
         # Metadata has one entry for all domains.
-        headers = [each.source.header for each in self.trajectories]
-        if len({(tuple(header.origin), tuple(header.upper)) for header in headers}) > 1:
+        if self._domains_differ:
             notes.append("The domains of the trajectories differ: bounds is the box around all of them.")
-        if len({tuple(header.periodic) for header in headers}) > 1:
-            notes.append("The trajectories differ in periodic faces: metadata has those of the first.")
         return facts | {"particle_types": self.types | self._wall_types(), **statistics}, notes
+
+    @property
+    def _domains_differ(self) -> bool:
+        headers = [each.source.header for each in self.trajectories]
+        return len({(tuple(header.origin), tuple(header.upper), tuple(header.periodic)) for header in headers}) > 1
 
     @cached_property
     def types(self) -> dict[str, int]:
@@ -121,6 +130,10 @@ class LagrangeBench(LearnerFormat):
     Source: github.com/tumaer/lagrangebench, lagrangebench/data/data.py, utils.py (NodeType) and
     data_gen/lagrangebench_data/gen_dataset.py. Trajectory k of a split is the group f"{k:05d}" with `position`,
     (T, N, d) float32, and `particle_type`, (N,) int64; all have the same T.
+
+    Its search for neighbours sorts positions into cells from 0 to below the extent of bounds, and repeats either no
+    axis or all of them (case_setup/case.py; tumaer/jax-sph, jax_md/partition.py): positions are relative to the lower
+    corner of the domain, below the upper one, and bounds leave a gap behind walls where another axis is periodic.
     """
 
     name, suffix = "LagrangeBench", ".h5"
@@ -129,12 +142,47 @@ class LagrangeBench(LearnerFormat):
     free = (8, 7, 6, 5, 4)
     wall, moving_wall = 1, 2
 
+    def check(self) -> None:
+        super().check()
+        periodic = np.any([each.source.header.periodic for each in self.trajectories])
+        if periodic and self._domains_differ:
+            raise InputError(
+                "the trajectories differ in their domain or its periodic faces, of which LagrangeBench has one for "
+                "all: export them apart, or --to npz."
+            )
+        fast = next((each for each in self.trajectories if outruns_periods(each)), None) if periodic else None
+        if fast is not None:
+            raise InputError(
+                f"particles of trajectory {fast.source.number} cross half of the periodic domain between two exported "
+                "frames, so that LagrangeBench cannot tell which way they went: take a smaller --stride, or store "
+                "more frames."
+            )
+
+    @cached_property
+    def _box(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Lower corner of all domains, their extent, and that with the gaps behind walls: (d,), m."""
+        lower, upper = domain_around([each.source.header for each in self.trajectories])
+        for each in self.trajectories:
+            if each.walls.count:
+                # A collider may reach, or move, out of the domain.
+                points = each.walls.positions(each.times)
+                lower, upper = np.minimum(lower, points.min(axis=(0, 1))), np.maximum(upper, points.max(axis=(0, 1)))
+        periodic = self.trajectories[0].source.header.periodic
+        # Two radii: neighbour lists may be searched for at more than one.
+        gap = 2 * RADIUS_IN_SPACINGS * max(each.spacing for each in self.trajectories)
+        return lower, upper - lower, upper - lower + np.where(periodic.any() & ~periodic, gap, 0.0)
+
     def facts(self) -> Written:
         first = self.trajectories[0]
+        lower, extent, box = self._box
+        place = {"bounds": [[0.0, side] for side in box.tolist()], "origin": lower.tolist()}
+        notes = []
+        if (box > extent).any():
+            notes.append("LagrangeBench repeats all axes or none: bounds reach beyond the walls of the others.")
         # As there, the frame that only serves as the last target does not count.
         length = first.frame_count - 1
         lengths = {"sequence_length_train": length, "sequence_length_test": length}
-        return {"solver": "MPM", "case": first.source.header.title, **lengths}, []
+        return {"solver": "MPM", "case": first.source.header.title, **lengths, **place}, notes
 
     def write_split(self, path: Path, chosen: Sequence[ThinnedTrajectory], tick: Callable[[], None]) -> None:
         ask_for(path, sum(map(self._bytes, chosen)))
@@ -150,17 +198,26 @@ class LagrangeBench(LearnerFormat):
         position = group.create_dataset("position", shape, np.float32, chunks=(1, *shape[1:]), compression="gzip")
         first = 0
         for block in trajectory.whole_blocks():
-            position[first : first + len(block)] = block
+            position[first : first + len(block)] = self._placed(block)
             first += len(block)
         group.create_dataset("particle_type", data=self.particle_types(trajectory))
+
+    def _placed(self, positions: np.ndarray) -> np.ndarray:
+        """Return positions (t, n, d) from the lower corner on, m float32: a place on an upper face lies below it."""
+        lower, extent, _ = self._box
+        placed = positions.astype(np.float64) - lower
+        periodic = self.trajectories[0].source.header.periodic
+        placed = np.where(periodic, np.mod(placed, extent), placed)
+        # By a few roundings of the quotient by which a cell is found.
+        return np.clip(placed, 0.0, extent * (1 - 2.0**-20)).astype(np.float32)
 
 
 class Gns(LearnerFormat):
     """train.npz, valid.npz and test.npz, as the particle data loader of GNS reads them.
 
     Source: github.com/geoelements/gns, gns/data_loader.py, gns/train.py and docs/gns_data.md. Each entry is an object
-    array of (positions (T, N, d) float32, particle type (N,) int64), and, where parameters of the materials differ,
-    (N,) or (N, m) float64 with those.
+    array of (positions (T, N, d) float32, particle type (N,) int64), and, where parameters differ within a law, so
+    that the type does not tell them, (N,) or (N, m) float64 with those.
     """
 
     name, suffix = "GNS", ".npz"
@@ -170,16 +227,25 @@ class Gns(LearnerFormat):
     free = (8, 4, 2, 1, 0, 7)
     wall = moving_wall = 3
 
+    def check(self) -> None:
+        for each in self.trajectories:
+            if each.source.header.periodic.any():
+                raise InputError(
+                    f"trajectory {each.source.number} has periodic faces, which GNS does not know: velocities would "
+                    "jump there, and particles at them lack neighbours; --to lagrangebench and --to npz take them."
+                )
+        super().check()
+
     @cached_property
     def parameters(self) -> list[str]:
-        """Names of numeric parameters of materials whose values differ between bodies of any trajectories."""
-        values: dict[str, set[float]] = {}
+        """Names of numeric parameters of materials whose values differ between bodies of a law, in any trajectories."""
+        values: dict[tuple[str, str], set[float]] = {}
         for each in self.trajectories:
             for body in each.source.header.bodies:
                 for name, value in body.material.items():
                     if isinstance(value, int | float) and math.isfinite(value):
-                        values.setdefault(name, set()).add(float(value))
-        return sorted(name for name, different in values.items() if len(different) > 1)
+                        values.setdefault((str(body.material.get("law")), name), set()).add(float(value))
+        return sorted({name for (_, name), different in values.items() if len(different) > 1})
 
     def facts(self) -> Written:
         names, d = self.parameters, self.trajectories[0].layout.dimension
@@ -249,8 +315,13 @@ class Npz(Format):
             facts["colliders"][name] = list(header.collider_names)
             facts["draws"][name] = each.source.draws
             tick()
+        why = ""
         if min(each.frame_count for each in self.trajectories) < LEAST_FRAMES:
-            return facts, ["Some trajectories have fewer than three frames: metadata.json has no statistics of motion."]
+            why = "Some trajectories have fewer than three frames"
+        elif any(outruns_periods(each) for each in self.trajectories):
+            why = "Particles cross half of a periodic domain between two exported frames"
+        if why:
+            return facts, [f"{why}: metadata.json has no statistics of motion."]
         statistics, notes = learning_facts(self.trajectories)
         return facts | statistics, notes
 

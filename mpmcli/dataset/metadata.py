@@ -10,6 +10,7 @@ from mpmcli import __version__
 from mpmcli.dataset.shard import SPLITS
 from mpmcli.dataset.thinned import ThinnedTrajectory
 from mpmcli.errors import InputError
+from mpmcli.output.header import RunHeader
 
 # Neighbours of a particle on the lattice of the start lie at 1 and sqrt(2) spacings, 8 in 2D and 18 in 3D, and the next
 # ones at 2 (2D) and sqrt(3) (3D). LagrangeBench takes about the same (1.45, data_gen/.../gen_dataset.py).
@@ -34,13 +35,15 @@ def common_facts(trajectories: Sequence[ThinnedTrajectory], stride: int) -> dict
             both = f"trajectory {each.source.number} is {header.dimension}D and the first one {first.dimension}D"
             raise InputError(f"{both}: an export holds trajectories of one dimension.")
     placed = all(header.origin is not None for header in headers)
-    bounds = [np.min([h.origin for h in headers], axis=0), np.max([h.upper for h in headers], axis=0)] if placed else []
+    bounds = domain_around(headers) if placed else ()
     spacings = [each.spacing for each in trajectories]
     dx = None if None in spacings else max(spacings)
     cells = [header.spacing for header in headers]
     # Which trajectory of the dataset is which one of the export.
     numbers = {split: [e.source.number for e in trajectories if e.source.split == split] for split in SPLITS}
     lengths = {each.frame_count for each in trajectories}
+    pauses = [time_between(each) for each in trajectories]
+    same = all(pause is not None and abs(pause - pauses[0]) <= UNEVEN * pause for pause in pauses)
     return {
         EXPORTED_BY: f"mpmcli {__version__}",
         FORMAT_KEY: FORMAT,
@@ -49,7 +52,7 @@ def common_facts(trajectories: Sequence[ThinnedTrajectory], stride: int) -> dict
         # Three entries in 2D too, as LagrangeBench has it.
         "periodic_boundary_conditions": [*map(bool, first.periodic), False][:3],
         "bounds": np.transpose(bounds).tolist() if placed else None,
-        "dt": time_between(trajectories[0]),
+        "dt": pauses[0] if same else None,
         "write_every": 1,
         "stride": stride,
         "t_end": float(max(each.times[-1] for each in trajectories)),
@@ -62,6 +65,38 @@ def common_facts(trajectories: Sequence[ThinnedTrajectory], stride: int) -> dict
         **{f"num_trajs_{split}": len(numbers[split]) for split in SPLITS},
         "trajectories": numbers,
     }
+
+
+def domain_around(headers: Sequence[RunHeader]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and the upper corner of the box around the domains of runs, (d,), m; all of them are known."""
+    return np.min([h.origin for h in headers], axis=0), np.max([h.upper for h in headers], axis=0)
+
+
+def outruns_periods(trajectory: ThinnedTrajectory) -> bool:
+    """Return whether a particle goes half of the way of a periodic axis, or more, from one exported frame to the next.
+
+    Positions alone do not tell then which way it went. All frames are read: displacements of those left out add up.
+    """
+    header, stride = trajectory.source.header, trajectory.stride
+    if not header.periodic.any():
+        return False
+    axes = np.flatnonzero(header.periodic)
+    period = (header.upper - header.origin)[axes]
+    longest = np.diff(trajectory.source.times).max(initial=0.0)
+    whole = ThinnedTrajectory(trajectory.source)
+    number, position, way = 0, None, 0.0
+    for block, velocity in zip(whole.blocks("position"), whole.blocks("velocity"), strict=True):
+        if (np.abs(velocity[..., axes]) * longest >= period / 2).any():
+            return True
+        for after in block[..., axes].astype(float):
+            if position is not None:
+                way = way + after - position - period * np.round((after - position) / period)
+            if number % stride == 0:
+                if (np.abs(way) >= period / 2).any():
+                    return True
+                way = 0.0
+            number, position = number + 1, after
+    return False
 
 
 def learning_facts(trajectories: Sequence[ThinnedTrajectory]) -> tuple[dict[str, list[float]], list[str]]:

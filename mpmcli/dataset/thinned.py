@@ -114,7 +114,7 @@ class ThinnedTrajectory:
     ) -> None:
         """Thin a trajectory; nothing is read. `wall_spacing` is that of the particles at the start if None."""
         self.source = source
-        self._stride, self._most = stride, most
+        self.stride, self._most = stride, most
         self.times, self.steps, self.frames = (table[::stride] for table in (source.times, source.steps, source.frames))
         self.particle_count = source.particle_count if most is None else min(source.particle_count, most)
         spacing = wall_spacing or self.spacing
@@ -165,7 +165,7 @@ class ThinnedTrajectory:
         arrays = self.layout.arrays
         layout = arrays["Points" if name == "position" else name]
         row = np.dtype(layout.dtype).itemsize * int(np.prod(layout.shape)) * max(self.source.particle_count, 1)
-        step, particles = self._stride, self.particles
+        step, particles = self.stride, self.particles
         reach = max(1, BLOCK_BYTES // row) * step
         for first in range(0, self.source.frame_count, reach):
             yield self.source.read(name, slice(first, first + reach, step), particles)
@@ -182,8 +182,8 @@ class ThinnedTrajectory:
         """Return a row for each frame: what is counted since the frame before is that of all frames between them."""
         rows = self.source.ledger
         found = []
-        for k in range(0, len(rows), self._stride):
-            first = max(k - self._stride + 1, 0)
+        for k in range(0, len(rows), self.stride):
+            first = max(k - self.stride + 1, 0)
             found.append(joined_row(rows[first : k + 1], rows[max(first - 1, 0)].time))
         return found
 

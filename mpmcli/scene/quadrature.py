@@ -26,8 +26,9 @@ AGREEMENT = 1e-13
 FIRST, CUT = np.array([0.0, 0.23, 0.48, 0.77, 1.0]), 0.46
 # Halvings at most: the edge of a pulse is found to rounding. Parts at most, after which the samples must do.
 DEPTH, MOST_PARTS = 60, 2048
-# Windows of a run that are subdivided for means, and windows kept.
-WINDOWS, KEPT = 128, 8
+# Windows that a step spans at most, windows kept, and their usual width, s: narrower where frames are closer than a
+# quarter of that, and wider where a step, which is no longer than a frame, could span more than WINDOWS.
+WINDOWS, KEPT, LONG = 128, 8, 2.0**-4
 
 
 @dataclass(frozen=True)
@@ -129,14 +130,16 @@ class _Window:
 class Mean:
     """Means of a tree of t over intervals of a run.
 
-    The run is divided into WINDOWS, each of which is subdivided once, so that a mean costs some microseconds. It does
-    not depend on what was asked for before.
+    The run is divided into windows, each of which is subdivided once, so that a mean costs some microseconds. It does
+    not depend on what was asked for before, nor on the end of the run: windows follow the time between frames, which
+    stays where a run goes on for longer, up to rounding. Their width is a power of two.
     """
 
-    def __init__(self, tree: Tree, end: float) -> None:
-        """Prepare for a run of `end` seconds."""
-        self._tree = tree
-        self._width = end / WINDOWS
+    def __init__(self, tree: Tree, pause: float, end: float) -> None:
+        """Prepare for a run of `end` seconds, with frames every `pause` seconds."""
+        self._tree, self._end = tree, end
+        power = 2.0 ** math.floor(math.log2(pause * (1 + 1e-9)))
+        self._width = min(4 * power, max(LONG, 2 * power / WINDOWS))
         self._kept: dict[int, _Window] = {}
 
     def __call__(self, start: float, end: float) -> float:
@@ -168,7 +171,12 @@ class Mean:
         if k not in self._kept:
             if len(self._kept) >= KEPT:
                 self._kept.clear()
-            self._kept[k] = _Window(self._tree, self.start_of(k), self.start_of(k + 1))
+            start, end = self.start_of(k), self.start_of(k + 1)
+            window = _Window(self._tree, start, end)
+            if start < self._end < end and not np.isfinite(window.rows).all():
+                # What has no value after the end, as the root of the time that is left.
+                window = _Window(self._tree, start, self._end)
+            self._kept[k] = window
         return self._kept[k]
 
 

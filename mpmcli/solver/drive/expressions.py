@@ -99,11 +99,13 @@ class DeviceValues:
 class RunValues:
     """The numbers of one run, as the host sets them; timed: whether any of them depends on time."""
 
-    def __init__(self, values: DeviceValues, run: int, entries: Sequence[float | Tree], end: float) -> None:
-        """Set them as of time 0, of a run of `end` seconds."""
+    def __init__(
+        self, values: DeviceValues, run: int, entries: Sequence[float | Tree], pause: float, end: float
+    ) -> None:
+        """Set them as of time 0, of a run of `end` seconds with frames every `pause` seconds."""
         self._values, self._run, self.entries = values, run, tuple(entries)
         self._constants = np.array([entry if isinstance(entry, float) else 0.0 for entry in entries])
-        self.means = {k: Mean(entry, end) for k, entry in enumerate(entries) if not isinstance(entry, float)}
+        self.means = {k: Mean(entry, pause, end) for k, entry in enumerate(entries) if not isinstance(entry, float)}
         self._trees = [entry for entry in entries if not isinstance(entry, float)]
         self.timed = bool(self.means)
         if len(entries):
@@ -136,7 +138,7 @@ class TimeTables:
     def fill(self, run: int, means: Sequence[Mean], since: float, *, coarse: bool) -> float:
         """Fill the tables of a run with the windows from a time, s, on; return that up to which kernels may take means.
 
-        coarse: whether room must be found for as many windows as a run has, with fewer rows for each.
+        coarse: whether room must be found for more windows than a step spans, with fewer rows for each.
         """
         ahead = 2 * WINDOWS if coarse else AHEAD
         horizon = math.inf

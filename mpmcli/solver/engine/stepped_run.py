@@ -89,7 +89,8 @@ class SteppedRun:
         """Write what belongs to the scene, and let the next launch measure the state at time 0."""
         scene, batch = self.scene, self.batch
         drives = Drives.of(scene, [group.bodies for group in self.groups])[1]
-        self._values = RunValues(batch.values.device, self.slot, drives, scene.time.end)
+        end = scene.time.end
+        self._values = RunValues(batch.values.device, self.slot, drives, end / scene.time.frames, end)
         batch.values.of_runs[self.slot] = self._values
         self._tables, self._means = batch.values.tables, list(self._values.means.values())
         self._filled_since, self._coarse = -math.inf, False
