@@ -7,11 +7,15 @@ from types import SimpleNamespace
 import psutil
 import pytest
 from check_scenes import FLUID, SOLID, box, check, found, loaded
+from solver_state import scene_of
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import SEVERITIES
+from mpmcli.check.scene_check import check_scene
 from mpmcli.check.step_rules import HALF_ULP, LOST_MOTION, STRESS_NOISE
+from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
+from mpmcli.scene import LoadedScene
 
 H = 1 / 64
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e7}
@@ -265,3 +269,65 @@ def test_a_law_declares_the_parameters_that_set_its_stiffness(monkeypatch: pytes
     monkeypatch.setattr(laws()["fluid"], "stiffness_parameters", ("unknown", "density"))
     (limit,) = (one for one in check().facts.limits if (one.name, one.state) == ("wave", "rest"))
     assert limit.fix.startswith("A quarter of density = 1000 or ")
+
+
+@pytest.mark.parametrize(("ratio", "severity"), [(0.3, None), (0.5, "warning"), (1.7, "error")])
+def test_a_solid_that_spins_too_fast(ratio: float, severity: str | None) -> None:
+    """3/8 rho v^2 of the rim over Young's modulus, 0.05 and 1; a fluid may fly apart, and moving along is no spin."""
+    disc = {"ball": {"center": [0.5, 0.5], "radius": 0.2}}
+    material = SOLID | {"poissons_ratio": 0.0}
+    rate = ratio * math.sqrt(1e6 / 1000.0) / 0.2
+    spin = [[0.0, -rate], [rate, 0.0]]
+    findings = found("rotation", material=material, shape=disc, velocity_gradient=spin)
+    assert [finding.severity for finding in findings] == ([severity] if severity else [])
+    for finding in findings:
+        assert finding.value == pytest.approx(3 / 8 * ratio**2, rel=0.05)
+    written = [f"-{rate} * (Y - 0.5)", f"{rate} * (X - 0.5)"]
+    assert len(found("rotation", material=material, shape=disc, velocity=written)) == len(findings)
+    assert found("rotation", material=FLUID, shape=disc, velocity_gradient=spin) == []
+    assert found("rotation", material=material, shape=disc, velocity=[40.0, 0.0]) == []
+    assert found("rotation", material=material, shape=disc, velocity_gradient=[[0.0, rate], [rate, 0.0]]) == []
+
+
+@pytest.mark.parametrize(
+    ("size", "speed", "severity"),
+    [
+        # Across the tank, from 0.4 m down: the block of 0.0625 m^2 has 0.3, 0.05 and 0.01 m^2 in the end.
+        ([1.0, 0.2], -0.2, None),
+        ([1.0, 0.2], -0.7, "warning"),
+        ([1.0, 0.2], -0.78, "error"),
+        # There is a way out on one side, and the way up is no trap.
+        ([0.9, 0.2], -0.78, None),
+        ([1.0, 0.2], 0.7, None),
+    ],
+)
+def test_colliders_that_close_a_room(size: list[float], speed: float, severity: str | None) -> None:
+    piston = {"name": "piston", "shape": box([0.0, 0.4], [size[0], 0.4 + size[1]]), "velocity": [0.0, speed]}
+    scene = scene_of(
+        domain={"size": [1.0, 1.0], "cells": [64, 64], "gravity": [0.0, -10.0], "walls": "slip"},
+        time={"end": 0.5, "frames": 10},
+        bodies=[{"name": "block", "material": SOLID, "shape": box([0.25, 0.0], [0.5, 0.25])}],
+        colliders=[piston],
+    )
+    findings = [one for one in check_scene(LoadedScene(scene, (), "scene.toml")).findings if one.rule == "room"]
+    assert [finding.severity for finding in findings] == ([severity] if severity else [])
+    for finding in findings:
+        assert finding.value == pytest.approx((0.4 + 0.5 * speed) / 0.0625, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("gravity", "fine"),
+    [
+        ("-9.81 * sqrt(t - 0.1)", False),
+        ("-9.81 * sqrt(0.45 - t)", False),
+        ("-9.81 * sqrt(0.5 - t)", True),
+        ("-9.81 * sin(t) / t", True),
+        ("log(t - 0.1) if t > 0.2 else 0", True),
+    ],
+)
+def test_gravity_that_is_no_number_at_some_time(gravity: str, fine: bool) -> None:
+    if fine:
+        check(domain={"gravity": [0.0, gravity]})
+        return
+    with pytest.raises(InputError, match=r"domain\.gravity\[1\]: must be finite from time 0 to time\.end"):
+        check(domain={"gravity": [0.0, gravity]})

@@ -4,6 +4,7 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
+from mpmcli.check.drive_rules import drive_findings
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import SEVERITIES, Finding, gravest_first, passes
 from mpmcli.check.forecast import Forecast, forecast_of, output_findings
@@ -93,7 +94,7 @@ def check_scene(
     if plan is None:
         plan = make_plan(scene, Backend("cpu", available_cores(), scene.solver.precision, compile_cache=True))
     forecast = forecast_of(facts, plan, probe)
-    rules = (step_findings, shape_findings, material_findings, loss_findings, rounding_findings)
+    rules = (step_findings, shape_findings, material_findings, drive_findings, loss_findings, rounding_findings)
     findings = [finding for rule in rules for finding in rule(facts)]
     findings += output_findings(facts, plan, forecast, directory)
     if probe is not None and probe.failure:

@@ -14,7 +14,7 @@ from mpmcli.scene.expression import Expression
 from mpmcli.scene.mesh import Mesh, leaving, moved_inside
 from mpmcli.scene.primitives import Polygon, grid_points
 from mpmcli.scene.problem import Problem, hint_at, listed
-from mpmcli.scene.quadrature import integral_of
+from mpmcli.scene.quadrature import integral_of, parts_of
 from mpmcli.scene.quantity import AXES, place_text
 from mpmcli.scene.sampling import (
     has_expressions,
@@ -105,6 +105,17 @@ _SLACK = 0.1
 _MOST_PLACES = 1_000_000
 # Cells within the bounding box of a collider whose distances are kept on a grid, of as many nodes.
 _MOST_CELLS = 100_000_000
+
+
+def gravity_problems(scene: Scene) -> Iterator[Problem]:
+    """Find gravity that is not finite at some time of the run."""
+    for path, entry in entries_in(scene.domain.gravity, ("domain", "gravity")):
+        if isinstance(entry, Expression):
+            parts = parts_of(entry.tree, 0.0, scene.time.end, precise=False)
+            lost = ~np.isfinite(parts.values)
+            if lost.any():
+                time = float(parts.times()[lost][0])
+                yield Problem(path, f"must be finite from time 0 to time.end; at {time:.3g} s it is not a number")
 
 
 def collider_problems(scene: Scene) -> Iterator[Problem]:
@@ -203,7 +214,7 @@ def problems_in(scene: Scene) -> list[Problem]:
     colliding = [] if outside or empty else list(collider_problems(scene))
     where = [*_repeated_names(scene), *outside, *_overlaps(scene), *empty]
     found = [*where, *unstarted, *colliding, *_pushed(scene), *_unstored(scene), *_total(scene)]
-    return [*found, *emitter_problems(scene)]
+    return [*found, *gravity_problems(scene), *emitter_problems(scene)]
 
 
 def _repeated_names(scene: Scene) -> Iterator[Problem]:
