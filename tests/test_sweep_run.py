@@ -26,9 +26,10 @@ from mpmcli.dataset.compute import Task, compute
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import status_of, verify
+from mpmcli.dataset.sources import standing_alone
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_file import load_sweep
-from mpmcli.dataset.sweep_run import SweepSettings, SweepState, _tasks, run_sweep, taken_folder
+from mpmcli.dataset.sweep_run import SweepSettings, SweepState, _tasks, discard_beginning, run_sweep, taken_folder
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
@@ -408,3 +409,45 @@ def test_a_dataset_is_not_resumed_with_other_files(of_points: Sweep) -> None:
     refused = pytest.raises(InputError, match=r"grains.csv has changed since dataset was begun")
     with refused, taken_folder(of_points, replace(settings, resume=True)):
         pass
+
+
+def test_a_dataset_goes_on_from_its_own_sweep(of_points: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With its base, its geometry and its count, though all that it was made of is gone."""
+    Path("grains").mkdir()
+    Path("grains.csv").rename("grains/of sand.csv")
+    base = Path("base.toml").read_text(encoding="utf-8").replace("grains.csv", "grains/of sand.csv")
+    Path("scene.toml").write_text(base, encoding="utf-8")
+    Path("sweep.toml").write_text(OF_POINTS.replace("base.toml", "scene.toml"), encoding="utf-8")
+    sweep = load_sweep("sweep.toml", laws=parameter_models(), count=3)
+    settings = SweepSettings(Path("dataset").absolute(), workers=1)
+    with taken_folder(sweep, settings):
+        pass
+    for name in ("base.toml", "scene.toml", "sweep.toml", "grains/of sand.csv"):
+        Path(name).unlink()
+    monkeypatch.chdir("elsewhere")
+    own = load_sweep(settings.directory / "sweep.toml", laws=parameter_models())
+    assert own.key == sweep.key and own.count == 3
+    with taken_folder(own, replace(settings, resume=True)) as (folder, _):
+        assert folder.count == 3
+    made = sorted(path.name for path in settings.directory.iterdir())
+    assert "grains" in made
+    discard_beginning(settings.directory, [settings.directory])
+    assert not settings.directory.exists()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'base = "a.toml"\ncount = 5\n[vary]\nx = { uniform = [0, 1] }',
+        'seed = 3\n  base="a.toml" # of old\n[vary]\ncount = { choice = [1, 2] }\nbase = { choice = [1] }',
+        "count = 9\r\nbase = 'a.toml'\r\n",
+        'base = """\na.toml"""\ncount = 3\n',
+        "[vary]\nx = 1\n[split]\ntrain = 1.0",
+        'place = [\n  { template = "a" },\n]\nbase = "a.toml"',
+    ],
+)
+def test_a_sweep_that_stands_alone_says_the_same(text: str) -> None:
+    data = tomllib.loads(text)
+    found = tomllib.loads(standing_alone(SimpleNamespace(text=text, data=data, count=7)))
+    assert found in ({**data, "base": "base.toml", "count": 7}, data)
+    assert found != data or '"""' in text

@@ -9,6 +9,7 @@ from mpmcli.dataset.card import write_card
 from mpmcli.dataset.folder import Manifest, require_empty
 from mpmcli.dataset.report import Status, status_of, verify
 from mpmcli.dataset.shard import BASE, QUARANTINE, SHARDS, SWEEP
+from mpmcli.dataset.sources import copy_sources
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.durable import require_free_space, sealed, write_text
 from mpmcli.output.lock import take_lock
@@ -53,6 +54,7 @@ def _join(parts: Sequence[Path], target: Path, files: Sequence[Path], facts: Map
                 shutil.copyfile(file, temporary)
         for name in (SWEEP, BASE):
             write_text(target / name, (parts[0] / name).read_text(encoding="utf-8"))
+        copy_sources(facts.get("files", ()), parts[0], target)
     except OSError as error:
         raise RunError(f"{target} could not be written ({error.strerror}); the parts are kept.") from error
     manifest = Manifest(target)

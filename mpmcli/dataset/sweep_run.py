@@ -21,7 +21,7 @@ from mpmcli.dataset.compute import LOOK_AHEAD, Task, Workers, joined_workers, lo
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.folder import MANIFEST, SHARD_BYTES, VERDICTS, Folder, Manifest, Row, require_empty
 from mpmcli.dataset.shard import BASE, LABELS, SWEEP
-from mpmcli.dataset.sources import source_digests, source_files
+from mpmcli.dataset.sources import copy_sources, remove_copies, source_digests, source_files, standing_alone
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import load_plugins
@@ -138,7 +138,7 @@ def open_folder(
         if facts["key"] != sweep.key:
             raise InputError(
                 f"{directory} holds the dataset of another sweep, or of another count: give another directory with "
-                f"-o, or the sweep of {directory / SWEEP}."
+                f"-o, or go on with the sweep {directory / SWEEP}."
             )
         if (i, n) != settings.part:
             raise InputError(f"{directory} holds part {i}/{n} of the sweep; resume it with --shard {i}/{n}.")
@@ -175,11 +175,12 @@ def open_folder(
     if not settings.resume:
         # Another sweep may have come and gone meanwhile.
         require_empty(directory, locked=True)
-    write_text(directory / SWEEP, sweep.text)
-    write_text(directory / BASE, sweep.base_text)
     facts = {"key": sweep.key, "count": sweep.count, "seed": sweep.seed, "accept": sweep.accept}
     facts["files"] = source_digests(sweep, settings.plugins)
+    write_text(directory / SWEEP, standing_alone(sweep))
+    write_text(directory / BASE, sweep.base_text)
     manifest.create({**facts, "per_shard": per_shard, "part": list(settings.part), "version": __version__})
+    copy_sources(facts["files"], sweep.base.parent, directory)
     return folder, manifest
 
 
@@ -189,6 +190,7 @@ def discard_beginning(directory: Path, made: Sequence[Path]) -> None:
         return
     with take_lock(directory):
         Folder(directory, 0, 1, (1, 1)).close()
+        remove_copies(Manifest(directory).facts().get("files", ()), directory)
         for name in (SWEEP, BASE, MANIFEST):
             (directory / name).unlink(missing_ok=True)
     for path in reversed(made):
