@@ -115,7 +115,8 @@ def gravity_problems(scene: Scene) -> Iterator[Problem]:
             lost = ~np.isfinite(parts.values)
             if lost.any():
                 time = float(parts.times()[lost][0])
-                yield Problem(path, f"must be finite from time 0 to time.end; at {time:.3g} s it is not a number")
+                value = "not a number" if np.isnan(parts.values[lost][0]) else "infinite"
+                yield Problem(path, f"must be finite from time 0 to time.end; at {time:.3g} s it is {value}")
 
 
 def collider_problems(scene: Scene) -> Iterator[Problem]:
