@@ -50,6 +50,7 @@ def test_force_takes_the_step_and_the_guard_ends_the_run(unstable: Path, tmp_pat
     assert any(note.startswith("error: ") for note in summary["notes"])
     result = open_result(tmp_path / "result")
     assert 'time.step = "auto"' in result.record["failure"]["suggestion"]
+    assert result.record["forced"] is True
     assert result.frame_count == summary["frames"]
     assert all(row.limit == "forced" and row.step_max == pytest.approx(5e-3) for row in result.ledger[1:])
     checked = run_here("check", tmp_path / "result", "--json")

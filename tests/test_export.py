@@ -532,3 +532,7 @@ def test_an_export_says_what_the_dataset_lacks(tmp_path):
         assert [note for note in notes if "complete" in note] == [f"The dataset is not complete: {lack}."] * bool(lack)
         told = metadata_of(tmp_path / "out")["dataset"]
         assert (told["part"], told["accepted"], told["done"]) == (part, 4, 5 + len(lost))
+    manifest.put([replace(rows[0], number=6)])
+    refused = run_here("export", path, "--to", "npz", "-o", tmp_path / "other")
+    assert refused.status == 2 and "lacks 1 trajectory of its manifest, 000006 among them" in refused.stderr
+    assert not (tmp_path / "other").exists()

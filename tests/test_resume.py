@@ -8,6 +8,7 @@ import sys
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.output.checkpoints import CHECKPOINTS, Checkpoint, read_checkpoints, write_checkpoint
 from mpmcli.scene import Scene, load_scene, parse_scene
-from mpmcli.simulation.resume import find_resumption, require_same_run
+from mpmcli.simulation.resume import find_resumption, go_on, require_same_run
 from mpmcli.simulation.simulate import RunSettings, simulate
 from mpmcli.solver.engine import exchange
 from mpmcli.solver.engine.build import build_run
@@ -89,6 +90,7 @@ TOTAL = {
 KILLED = """
 import os, signal, sys
 from pathlib import Path
+from types import SimpleNamespace
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import load_scene
 from mpmcli.simulation import stored_run
@@ -144,6 +146,28 @@ def test_a_state_that_is_loaded_elsewhere_goes_on_with_the_same_bytes(data, shor
         assert repr(row) == repr(same)
         assert frame.position.tobytes() == before.position.tobytes()
         assert frame.velocity.tobytes() == before.velocity.tobytes()
+
+
+def test_a_run_that_goes_on_for_longer_knows_how_fast_its_colliders_become():
+    """Their speed grows: at most half a cell in a step at the new end, not at that of the checkpoint."""
+    states = {}
+    for end in (0.1, 10.0):
+        changed = {**CHANGING, "emitters": [], "time": {**CHANGING["time"], "end": end}}
+        scene = parse_scene(changed, laws=parameter_models(), source="<test>").scene
+        run = run_of(scene)
+        states[end] = run.save().copied()
+        bound = scene.domain.spacing / 2 / max(one.fastest(scene.domain, end) for one in scene.colliders)
+    run.load(states[0.1])
+    assert run._row.number("collider") == pytest.approx(bound)
+
+
+def test_frames_of_a_forced_run_are_kept_by_no_other():
+    """Before the first checkpoint as well."""
+    for began in (False, True):
+        found = SimpleNamespace(checkpoint=None, record={"forced": began})
+        go_on(None, found, None, forced=began)
+        with pytest.raises(InputError, match="resume it in the same way"):
+            go_on(None, found, None, forced=not began)
 
 
 @pytest.fixture(scope="module")

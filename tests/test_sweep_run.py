@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -26,7 +27,7 @@ from mpmcli.dataset.compute import Task, compute
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import status_of, verify
-from mpmcli.dataset.sources import standing_alone
+from mpmcli.dataset.sources import source_files, standing_alone
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.dataset.sweep_run import SweepSettings, SweepState, _tasks, discard_beginning, run_sweep, taken_folder
@@ -102,6 +103,15 @@ def test_parts_and_another_number_of_workers_make_the_same_dataset(
     with pytest.raises(InputError, match="a part is given twice"):
         merge([parts[0], parts[0], parts[1]], tmp_path / "half")
     assert not (tmp_path / "half").exists()
+
+    # What is left of a merge that was ended is not whole.
+    def ended(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shutil, "copyfile", ended)
+    with pytest.raises(KeyboardInterrupt):
+        merge(parts, tmp_path / "ended")
+    assert verify(tmp_path / "ended").faults
 
 
 def test_a_dataset_that_is_being_written_is_refused(tmp_path: Path) -> None:
@@ -409,6 +419,13 @@ def test_a_dataset_is_not_resumed_with_other_files(of_points: Sweep) -> None:
     refused = pytest.raises(InputError, match=r"grains.csv has changed since dataset was begun")
     with refused, taken_folder(of_points, replace(settings, resume=True)):
         pass
+
+
+def test_a_file_that_the_sweep_names_for_all_is_one_of_its_files(of_points: Sweep) -> None:
+    Path("other.csv").write_text("x,y\n0.3,0.3\n", encoding="utf-8")
+    Path("sweep.toml").write_text(OF_POINTS + '"bodies.sand.shape.points.file" = "other.csv"\n', encoding="utf-8")
+    sweep = load_sweep("sweep.toml", laws=parameter_models())
+    assert set(source_files(sweep, [])) == {"grains.csv", "other.csv"}
 
 
 def test_a_dataset_goes_on_from_its_own_sweep(of_points: Sweep, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -96,6 +96,12 @@ def export(
     lack = ""
     if settings.trajectory is None and (dataset.path / MANIFEST).exists():
         status = status_of(dataset.path)
+        gone = {row.number for row in status.rows if row.accepted} - set(numbers)
+        if gone:
+            raise InputError(
+                f"{dataset.path} lacks {counted(len(gone), 'trajectory')} of its manifest, {min(gone):06d} among them: "
+                "what made it was ended, or a file is gone; --trajectory N exports one that is there."
+            )
         lack, told = status.lack(), status.as_dict()
         metadata["dataset"] = {name: told[name] for name in ("part", "trajectories", "done", "accepted", "verdicts")}
     if any(each.particle_count < each.source.particle_count for each in chosen):

@@ -46,6 +46,10 @@ def _join(parts: Sequence[Path], target: Path, files: Sequence[Path], facts: Map
     """Copy files of the parts, and write what belongs to the whole."""
     size = sum(file.stat().st_size for file in files)
     require_free_space(target, size, "the merged dataset", "the parts are kept", several=True)
+    # First, so that what a kill leaves lacks what its manifest names.
+    manifest = Manifest(target)
+    manifest.create({**facts, "part": [1, 1]})
+    manifest.put(row for part in parts for row in Manifest(part).rows())
     try:
         for file in files:
             copy = target / file.parent.name / file.name
@@ -57,7 +61,4 @@ def _join(parts: Sequence[Path], target: Path, files: Sequence[Path], facts: Map
         copy_sources(facts.get("files", ()), parts[0], target)
     except OSError as error:
         raise RunError(f"{target} could not be written ({error.strerror}); the parts are kept.") from error
-    manifest = Manifest(target)
-    manifest.create({**facts, "part": [1, 1]})
-    manifest.put(row for part in parts for row in Manifest(part).rows())
     write_card(target)

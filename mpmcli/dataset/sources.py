@@ -25,7 +25,7 @@ def source_files(sweep: Sweep, plugins: Sequence[Path]) -> dict[str, Path]:
     """Return the absolute paths of the files that are there, by their names in the scenes, and `--plugin NAME`."""
     names = set(_named(sweep.base_data))
     for key, distribution in sweep.distributions.items():
-        for value in getattr(distribution, "values", ()):
+        for value in getattr(distribution, "values", None) or (getattr(distribution, "constant", None),):
             names.update(_named({str(key_parts(key)[-1]): value}))
     found = {name: (sweep.base.parent / name).absolute() for name in sorted(names)}
     same = Counter(path.name for path in plugins)

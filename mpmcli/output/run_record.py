@@ -35,6 +35,7 @@ class RunRecord:
         files: SHA-256 of each file that the scene reads, by name.
         resumed: for each time that the run went on: when (at), frames kept, and the step it went on from.
         seeds: seed of each body by name, for those that have one.
+        forced: whether time.step is taken as it is, by --force.
         frames_expected, particles: as planned.
         notes: sentences about what was chosen for the user ("auto" values).
         status: "running" until `close`; "interrupted" by a signal, "stopped" at a limit or for want of room.
@@ -49,6 +50,7 @@ class RunRecord:
     command: Sequence[str] = ()
     backend: dict[str, Any] = field(default_factory=dict)
     seeds: dict[str, int] = field(default_factory=dict)
+    forced: bool = False
     files: dict[str, str] = field(default_factory=dict)
     frames_expected: int = 0
     particles: int = 0

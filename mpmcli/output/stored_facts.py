@@ -66,6 +66,7 @@ _Failure = _table(message=str, limit=str, step=_Count, time=_Number | None)
 _Record = _table(
     status=str,
     command=list[str],
+    forced=bool,
     backend=_Any,
     frames_expected=_Count,
     frames_written=_Count,

@@ -96,14 +96,16 @@ def find_resumption(loaded: LoadedScene, directory: Path, form: Literal["vtkhdf"
 def go_on(run: Run, resumption: Resumption, backend: Backend, *, forced: bool) -> None:
     """Put the checkpoint's state, if any, in place of the start; InputError: another backend, --force, or particles."""
     point = resumption.checkpoint
+    # Frames that were stored before any checkpoint are kept as well.
+    began = resumption.record.get("forced", forced) if point is None else point.forced
+    if began != forced:
+        raise InputError(f"The run was begun with{'' if began else 'out'} --force: resume it in the same way.")
     if point is None:
         return
     if point.backend != {"arch": backend.arch, "precision": backend.precision}:
         raise InputError(
             f"The run was computed with --arch {point.backend['arch']}: give that to resume it; found {backend.arch}."
         )
-    if point.forced != forced:
-        raise InputError(f"The run was begun with{'' if point.forced else 'out'} --force: resume it in the same way.")
     try:
         run.load(SavedState(dict(point.numbers), dict(point.arrays)))
     except (KeyError, TypeError, ValueError) as error:

@@ -85,6 +85,7 @@ def new_record(
         command=settings.command,
         backend=summary.backend,
         seeds={body.name: body.seed for body in loaded.scene.bodies if body.sampling in ("jittered", "poisson")},
+        forced=settings.force and loaded.scene.time.step != "auto",
         files=file_digests(loaded),
         frames_expected=summary.frames_expected,
         particles=summary.particles,

@@ -110,8 +110,8 @@ def shape_of(field: ti.Field) -> tuple[int, ...]:
 
 # The tiles of a sparse grid that have numbers; of the table of a sort what concerns these.
 BLOCKS, START = "grid.blocks", "{}.block_start"
-# Columns that the scene sets, and that one which goes on for longer sets otherwise.
-OF_SCENE = ("end", "until"), ("frames", "sheets")
+# Columns that the scene sets, and that one which goes on for longer sets otherwise: a collider may become faster.
+OF_SCENE = ("end", "until", "collider"), ("frames", "sheets")
 
 
 def read_batch(batch: Batch) -> ArraysOnDevice:
