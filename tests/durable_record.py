@@ -1,7 +1,7 @@
 """What a power cut would leave of a directory, recorded while a program writes into it.
 
 Contents are as they were last synced, and empty where they never were. Names are as of the last sync of their
-directory, in four variants, since a file system may write names sooner, and in any order.
+directory, in five variants, since a file system may write names sooner, and in any order.
 """
 
 import os
@@ -23,6 +23,10 @@ VARIANTS: dict[str, Callable[[Names, Names], Names]] = {
     "names of the moment": lambda synced, live: live,
     "removed names come back": lambda synced, live: synced | live,
     "old files under their names": lambda synced, live: live | synced,
+    # The folder of the run is as of the moment, and in those below it removed names come back.
+    "removed names come back below": lambda synced, live: (
+        live if {"scene.toml", "out", "run"} & {*live} else synced | live
+    ),
 }
 
 

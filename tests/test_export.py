@@ -536,3 +536,16 @@ def test_an_export_says_what_the_dataset_lacks(tmp_path):
     refused = run_here("export", path, "--to", "npz", "-o", tmp_path / "other")
     assert refused.status == 2 and "lacks 1 trajectory of its manifest, 000006 among them" in refused.stderr
     assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("most", [1, 10, 30, 990])
+def test_small_bodies_do_not_come_before_a_large_one(most: int) -> None:
+    """Each body, and all small ones together, have their share to less than one."""
+    sizes = np.array([1] * 20 + [5] * 6 + [150, 800])
+    body = np.random.default_rng(0).permutation(np.repeat(np.arange(len(sizes)), sizes))
+    chosen = chosen_particles(body, most, 0)
+    assert len(set(chosen)) == most and (np.diff(chosen) > 0).all()
+    found = np.bincount(body[chosen], minlength=len(sizes))
+    share = most * sizes / sizes.sum()
+    assert np.abs(found - share).max() < 1
+    assert abs(found[:20].sum() - share[:20].sum()) < 1

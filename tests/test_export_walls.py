@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -11,7 +12,8 @@ import pytest
 from command import run_here
 from drawn_results import WATER, frame, header, lattice, row, write
 
-from mpmcli.dataset.thinned import joined_row
+from mpmcli.dataset import thinned
+from mpmcli.dataset.thinned import ThinnedTrajectory, joined_row
 
 H = 0.05
 POST = {"name": "post", "shape": {"ball": {"center": [0.7, 0.5], "radius": 0.1}}}
@@ -139,3 +141,30 @@ def test_walls_inside_of_others_have_no_particles(tmp_path: Path) -> None:
     lengths = {-1: 2 * half + 2 * (half + 0.2), 0: 0.6 * 2 * (np.pi / 2 - 2 * np.arcsin(half / 0.6)), 1: 1.0}
     for number, length in lengths.items():
         assert (numbers == number).sum() == pytest.approx(length / 0.01, abs=6), number
+
+
+def test_walls_move_on_from_block_to_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame is a block."""
+    monkeypatch.setattr(thinned, "BLOCK_BYTES", 1)
+    path = run(tmp_path / "run", [POST, ROD])
+    export(path, "lagrangebench", tmp_path / "out", "--walls", "colliders")
+    with h5py.File(tmp_path / "out" / "train.h5") as file:
+        positions, types = file["00000/position"][:], file["00000/particle_type"][:]
+    assert_on_walls(*split(positions, types, moving=2))
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3, 4])
+def test_the_impulse_of_left_out_frames_is_kept(stride: int) -> None:
+    """Forces are means since the frame before: their sum over all times is that of all frames up to there."""
+    forces = np.array([0.0, 1.0, 3.0, 5.0, -2.0, 7.0, 4.0, 0.5, 6.0])
+    times = np.cumsum([0.0, 0.1, 0.3, 0.1, 0.2, 0.1, 0.4, 0.2, 0.1])
+    rows = [
+        replace(row(time, 2), collider_force=((force, 0.0),), collider_torque=((2 * force,),))
+        for time, force in zip(times, forces, strict=True)
+    ]
+    found = ThinnedTrajectory.ledger(SimpleNamespace(source=SimpleNamespace(ledger=rows), stride=stride))
+    assert [one.time for one in found] == times[::stride].tolist()
+    impulse = np.cumsum(forces * np.diff(times, prepend=0.0))[::stride]
+    spans = np.diff(times[::stride], prepend=0.0)
+    assert np.cumsum([one.collider_force[0][0] for one in found] * spans) == pytest.approx(impulse, rel=1e-12)
+    assert np.cumsum([one.collider_torque[0][0] for one in found] * spans) == pytest.approx(2 * impulse, rel=1e-12)

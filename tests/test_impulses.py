@@ -7,6 +7,7 @@ import pytest
 from solver_state import scene_of
 
 from mpmcli.scene import sample_bodies
+from mpmcli.scene.entry import value_of
 from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.machine.backend import Backend
 
@@ -35,3 +36,19 @@ def test_the_momentum_is_the_integral(backend_of: Callable[..., Backend]) -> Non
     assert rows[1].linear_momentum == (0.0, 0.0)
     expected = body.mass * np.array([linear.sum(), -0.5 * gauss.sum()])
     assert np.array(rows[2].linear_momentum) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("direction", [[3.0, 4.0], [-5.0, 12.0, 2.0], [0.0, 1e-3]])
+def test_a_direction_of_any_length_pushes_by_the_strength(direction: list[float]) -> None:
+    d = len(direction)
+    place = [0.5] * d
+    scene = scene_of(
+        domain={"size": [1.0] * d, "cells": [8] * d},
+        time={"end": 1.0, "frames": 2},
+        bodies=[{"name": "b", "material": JELLY, "shape": {"box": {"min": [0.3] * d, "max": [0.7] * d}}}],
+        impulses=[{**PUSH, "end": 0.5, "center": place, "strength": 2.0, "direction": direction, "falloff": "none"}],
+    )
+    at = dict(zip("xyz", place, strict=False)) | {"t": 0.2}
+    found = [float(value_of(entry, **at)) for entry in scene.pushes[0].acceleration]
+    expected = 2.0 / (0.5 - PUSH["start"]) * np.array(direction) / np.linalg.norm(direction)
+    assert found == pytest.approx(expected, rel=1e-12)

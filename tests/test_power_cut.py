@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 from durable_record import DurableRecord, Image, make_copy, recorded
+from test_resume import invented
 
 from mpmcli.frames.frame import Frame
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result, store
+from mpmcli.output.checkpoints import read_checkpoints, write_checkpoint
 from mpmcli.scene import LoadedScene, parse_scene
 from mpmcli.simulation import stored_run
 from mpmcli.simulation.settings import RunSettings
@@ -187,3 +189,15 @@ def test_no_reported_frame_is_lost_while_a_run_is_resumed(longer: dict, tmp_path
 def test_resumed_after_any_cut_it_ends_with_the_same_bytes(whole: dict, tmp_path: Path) -> None:
     images = list(whole["record"].images.values())
     require_same_end(images[::5], whole["bytes"], tmp_path)
+
+
+def test_a_checkpoint_that_was_written_outlives_a_cut(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    with recorded(root, lambda: 0) as record:
+        write_checkpoint(root, invented(7), 1000)
+        record.images.clear()
+        record.cut("the end")
+    for k, (image, _, moment) in enumerate(record.images.values()):
+        found = list(read_checkpoints(make_copy(image, tmp_path / f"copy{k}")))
+        assert [point.step for point in found] == [7], moment

@@ -15,13 +15,20 @@ import pytest
 from command import SCENE, run_here
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_result import made_frame, made_header, made_row
+from test_output_frames import make_frame
+from test_output_segments import fill
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
-from mpmcli.output import open_result
+from mpmcli.output import SegmentStore, open_result
 from mpmcli.output.checkpoints import CHECKPOINTS, Checkpoint, read_checkpoints, write_checkpoint
+from mpmcli.output.layout import FrameIndex
+from mpmcli.output.segments import sealed_segments
+from mpmcli.output.vtkhdf import read_index_of
 from mpmcli.scene import Scene, load_scene, parse_scene
-from mpmcli.simulation.resume import find_resumption, go_on, require_same_run
+from mpmcli.simulation.checkpointing import Checkpointer
+from mpmcli.simulation.resume import Resumption, find_resumption, go_on, require_same_run, take_over
 from mpmcli.simulation.simulate import RunSettings, simulate
 from mpmcli.solver.engine import exchange
 from mpmcli.solver.engine.build import build_run
@@ -367,3 +374,34 @@ def test_a_checkpoint_that_claims_more_than_it_holds_is_not_read(tmp_path, chang
         with zipfile.ZipFile(path, "a") as file:
             file.writestr("state/c.npy", np.lib.format.magic(1, 0) + b"\x76\0" + header)
     assert list(read_checkpoints(tmp_path)) == []
+
+
+@pytest.mark.parametrize("sound", [1, 2, 3])
+def test_no_segment_stays_from_the_damaged_one_on(tmp_path: Path, sound: int) -> None:
+    fill(tmp_path, [make_frame(k, 5, 2) for k in range(4)], finish=False)
+    before = sealed_segments(tmp_path)
+    assert len(before) == 4
+    before[sound].write_bytes(before[sound].read_bytes()[:1000])
+    index = FrameIndex.joined([read_index_of(path) for path in before[:sound]])
+    take_over(tmp_path, Resumption(index, None, False, {}))
+    assert sealed_segments(tmp_path) == before[:sound]
+
+
+class SizedArrays(dict):
+    nbytes = 1000
+
+
+def test_frames_before_a_checkpoint_are_sealed(tmp_path: Path) -> None:
+    store = SegmentStore(tmp_path, made_header(2), hold=1e9)
+    for k in range(3):
+        store.write(made_frame(k, 2), made_row(k, 2))
+    assert store.frames_written == 0
+    saved = SimpleNamespace(
+        numbers={"frames": [3, 0, 0.0], "step_count": 30, "time": 0.05}, arrays=SizedArrays(a=np.zeros(3))
+    )
+    run = SimpleNamespace(save=lambda: saved)
+    backend = {"arch": "cpu", "precision": "f32"}
+    Checkpointer(tmp_path, run, store, backend, size=1000, forced=False, every=0.0).take()
+    (point,) = read_checkpoints(tmp_path)
+    on_disk = sum(len(read_index_of(path).times) for path in sealed_segments(tmp_path))
+    assert point.frame == on_disk == store.frames_written == 3

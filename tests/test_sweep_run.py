@@ -23,8 +23,9 @@ from test_plugin import LAW
 from tiny_sweep import BASE, contents, small_shards, tiny_sweep, told, write_sweep
 
 from mpmcli.dataset import open as open_dataset
-from mpmcli.dataset.compute import Task, compute
+from mpmcli.dataset.compute import Task, _with_step, compute
 from mpmcli.dataset.draw import draw
+from mpmcli.dataset.folder import Manifest
 from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import status_of, verify
 from mpmcli.dataset.sources import source_files, standing_alone
@@ -198,12 +199,14 @@ def test_a_sweep_that_is_killed_and_resumed_makes_the_same_dataset(tmp_path: Pat
     """SIGKILL at random times, to the command and to its workers."""
     base = BASE.replace("end = 0.05", "end = 0.5").replace("cells = [16, 16]", "cells = [32, 32]")
     path = write_sweep(tmp_path, count, base)
-    whole = run_here("sweep", path, "-o", tmp_path / "whole", "--workers", 1, "-q")
-    assert whole.status == 0, whole.stderr
     began = time.monotonic()
+    with started(tmp_path, "sweep", path, "-o", "whole", "--workers", 1, "-q") as process:
+        _, err = process.communicate()
+    assert process.returncode == 0, err
+    took = time.monotonic() - began
     command = ["sweep", path, "-o", "killed", "--resume", "--workers", "2", "-q"]
-    killed = _kill_often(list(map(str, command)), tmp_path, kills, random.Random(5), 6.0)
-    assert killed >= 1, f"nothing was killed in {time.monotonic() - began:.0f} s"
+    killed = _kill_often(list(map(str, command)), tmp_path, kills, random.Random(5), took / 2)
+    assert killed >= 1, f"nothing was killed; one worker takes {took:.1f} s"
     assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
     assert told(tmp_path / "killed") == told(tmp_path / "whole")
     assert run_here("dataset", "verify", tmp_path / "killed", "-q").status == 0
@@ -468,3 +471,42 @@ def test_a_sweep_that_stands_alone_says_the_same(text: str) -> None:
     found = tomllib.loads(standing_alone(SimpleNamespace(text=text, data=data, count=7)))
     assert found in ({**data, "base": "base.toml", "count": 7}, data)
     assert found != data or '"""' in text
+
+
+def test_parts_without_a_shard_are_not_asked_for(tmp_path: Path) -> None:
+    """Two trajectories are one shard, and the second of two parts has none."""
+    state = run_sweep(tiny_sweep(tmp_path, count=2), SweepSettings(tmp_path / "first", workers=1, part=(1, 2)))
+    assert (state.done, state.expected) == (2, 2)
+    merge([tmp_path / "first"], tmp_path / "whole")
+    assert open_dataset(tmp_path / "whole").numbers == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"split": "other"}, "other draws or another split"),
+        ({"draws": "{}"}, "other draws or another split"),
+        ({"frames": 4}, "other counts"),
+        ({"particles": 1}, "other counts"),
+        ({"checksum": "0" * 8}, "has changed"),
+    ],
+)
+def test_a_row_that_contradicts_its_trajectory_is_a_fault(truth: Path, change: dict, said: str) -> None:
+    manifest = Manifest(truth)
+    row = manifest.rows()[3]
+    manifest.put([replace(row, **change)])
+    faults = verify(truth).faults
+    manifest.put([row])
+    assert len(faults) == 1 and said in faults[0]
+
+
+@pytest.mark.parametrize("step", ["auto", 1e-4])
+def test_a_retry_halves_whatever_sets_the_step(tmp_path, step):
+    more = "" if step == "auto" else f"step = {step}\n"
+    sweep = tiny_sweep(tmp_path, 1, BASE.replace("frames = 4\n", f"frames = 4\n{more}"))
+    scene = draw(sweep, 0).scene(parameter_models()).scene
+    assert _with_step(scene, 1) == scene
+    shorter = _with_step(scene, 0.25)
+    assert shorter.time.safety == 0.25 * scene.time.safety
+    assert shorter.time.step == ("auto" if step == "auto" else 0.25 * step)
+    assert shorter.model_copy(update={"time": scene.time}) == scene
