@@ -59,7 +59,9 @@ def test_the_plan_counts_every_field(
     assert plan.particles == run.particle_count
     assert plan.bytes_per_particle == state + 4 * len(group.arrays.labels) + widest * real + 4 + 4
     assert plan.nodes == run.grid.node_count
-    assert plan.bytes_per_node == real * run.grid.nodes.n
+    fine = run.grid.fine.fill.shape[0] if run.grid.fine else 0
+    assert plan.bytes_per_node * plan.nodes == real * (run.grid.nodes.n * plan.nodes + fine)
+    assert (fine > 0) == group.law.flows
     if (dimension, material, bodies, precision) == (3, "fluid", 1, "f32"):
         assert plan.bytes_per_particle <= 160
 

@@ -173,6 +173,7 @@ solids = "updated"
 f_bar = "auto"
 walls = "folded"
 grid = "auto"
+redistribute = "auto"
 deterministic = false
 """
     )

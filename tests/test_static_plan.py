@@ -24,6 +24,7 @@ MODULES = {
     "periodic faces": {"solver.grid.period.Period"},
     # Not asked for by the scene with features either.
     "grids of distances": {"boundaries.distances.GridDistance"},
+    "shifts": {"solver.transfer.redistribution"},
     "means of volume": {"solver.transfer.volume_average"},
 }
 
@@ -37,7 +38,9 @@ def scene(*, with_features: bool) -> Scene:
             {"name": "pool", "material": WATER, "shape": {"box": {"min": [0.0, 0.0], "max": [1.0, 0.4]}}},
         ],
     }
-    if with_features:
+    if not with_features:
+        tables["solver"] = {"redistribute": False}
+    else:
         tables["domain"] |= {
             "walls": {"default": "separate", "x_min": "periodic", "x_max": "periodic"},
             "friction": {"y_min": 0.3},

@@ -306,6 +306,22 @@ class Colliders:
         return result
 
     @ti.func
+    def held_back(self, x: ti.template(), way: ti.template()):
+        """Return the way, m, that a particle at x may go: at most half of that to the surface of a collider."""
+        result = way
+        for k in range(self.count[self.run]):
+            i = self.run * self.room + k
+            arm = x - self.place[i]
+            near = True
+            for a in ti.static(range(self.dimension)):
+                near = near and arm[a] >= self.reach[i][0, a] and arm[a] <= self.reach[i][1, a]
+            if near:
+                for face in range(self.faces_of(i)):
+                    phi, normal = self.distance(i, arm, face)
+                    result += ti.max(-0.5 * ti.max(phi, 0.0) - result.dot(normal), 0.0) * normal
+        return result
+
+    @ti.func
     def faces_of(self, i: int):
         """Return the number of faces of collider i that act in turn: of a box around the material one per axis.
 

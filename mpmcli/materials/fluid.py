@@ -36,6 +36,10 @@ QUIET_SPEED = 1.0
 # The pressure of a nonlinear equation of state is constant below this J, so that J^-g stays within single precision for
 # the largest exponent. The value is far outside weak compressibility; it keeps crushed particles finite.
 CRUSHED = 0.05
+# Suction that a viscous fluid bears where it takes no other tension, in stresses by its own viscosity. The side of a
+# stream that gravity stretches is free of stress only if the fluid pulls inwards as much as it resists: without it the
+# stream widens (docs/theory.md, 5.2). From 1 to 6 it makes no difference.
+SUCTION = 3.0
 # Share of the difference between J and what the grid sees made up while sound crosses a cell: 1 % in ten steps in 2D.
 # Half leaves a broken dam 5 % too shallow; twice gives a floating raft 0.5 % of energy.
 RELAXATION = 0.00175
@@ -158,6 +162,15 @@ def relaxed_volume(J: float, seen: float, crossings: float, rate: float, opens: 
 
 
 @ti.func
+def shear_rate(C: ti.template()):
+    """Return sqrt(2 D':D'), 1/s, D' the deviator in 3D of the symmetric part of C."""
+    square = -2.0 / 3.0 * C.trace() ** 2
+    for i, j in ti.static(ti.ndrange(C.n, C.n)):
+        square += 0.5 * (C[i, j] + C[j, i]) ** 2
+    return ti.sqrt(ti.max(square, 0.0))
+
+
+@ti.func
 def opened_volume(J_minus_1: float, growth: float):
     """Return J - 1 after J grew by the factor 1 + growth, for material that remembers how far it opened."""
     opened = J_minus_1 + (growth + growth * J_minus_1)
@@ -175,7 +188,8 @@ class Fluid(Law):
     """p = K/g (J^-g - 1) and tau = -J p I + viscosity (C + C^T - (2/3) tr C I) + bulk_viscosity tr C I.
 
     With tension_cutoff fluid that expands in a splash, J > 1, has no pressure. With volume_correction J stays there and
-    follows the density of the grid; without it J falls back to 1. Source: docs/theory.md, 5.2 and 5.11.
+    follows the density of the grid, and p >= -3 viscosity sqrt(2 D':D'), D' the deviator of the rate of strain in 3D;
+    without it J falls back to 1. Source: docs/theory.md, 5.2 and 5.11.
     """
 
     name = "fluid"
@@ -265,10 +279,13 @@ class Fluid(Law):
             excess = -exp_minus_1(-constants[EXPONENT] * log(crushed))
             spherical = constants[BULK_MODULUS] * crushed * excess / constants[EXPONENT]
         if ti.static(self.relaxes):
+            suction = 0.0
+            if ti.static(self.viscous):
+                suction = SUCTION * constants[VISCOSITY] * shear_rate(C)
             if ti.static(self.all_relax):
-                spherical = ti.min(spherical, 0.0)
+                spherical = ti.min(spherical, suction)
             elif constants[SOUND_SPEED] > 0.0:
-                spherical = ti.min(spherical, 0.0)
+                spherical = ti.min(spherical, suction)
         if ti.static(self.viscous):
             spherical += constants[SECOND_VISCOSITY] * C.trace()
         tau = spherical * ti.Matrix.identity(float, C.n)

@@ -43,6 +43,7 @@ from mpmcli.solver.solids.contact import DRIFT, contact_between
 from mpmcli.solver.solids.reference_grid import slips_in
 from mpmcli.solver.transfer.node_update import NodeUpdate
 from mpmcli.solver.transfer.particle_update import BEYOND, ParticleUpdate
+from mpmcli.solver.transfer.redistribution import FineGrid
 from mpmcli.solver.transfer.splines import PAD, scheme_of
 from mpmcli.solver.transfer.volume_average import averages_volume
 
@@ -127,6 +128,8 @@ class Batch:
             runs,
             on_cpu=on_cpu,
         )
+        if kind.fine:
+            grid.fine = FineGrid(grid.shape, kind.fine, runs)
         if deterministic:
             grid.fixed = FixedPoint(grid, groups, backend.arch)
         self._buffers = SortBuffers(groups, runs) if sorts else None

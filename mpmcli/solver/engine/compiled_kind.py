@@ -14,6 +14,7 @@ from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.plan import members_of
 from mpmcli.solver.machine.room import in_steps, power_of_two, roomy_cells, roomy_colliders
 from mpmcli.solver.particles.inflow import Inflow
+from mpmcli.solver.transfer.redistribution import fine_nodes
 from mpmcli.solver.transfer.volume_relaxation import needs_filling
 
 
@@ -27,7 +28,7 @@ class CompiledKind:
         faces: words of the walls, per axis; rough, moving: (axis, side) of those with friction, and that move.
         flags: of each law in the order of their names, the name and the terms that it has.
         cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
-        keeps_filling: whether nodes keep the volume scattered to them.
+        keeps_filling: whether nodes keep the volume scattered to them; fine: fine nodes per cell and axis, or 0.
         sparse: whether nodes are there where particles are alone, on the CPU, where such runs share nothing.
         colliders: their forms, and which of them move.
         drives: gravity that varies, forces, and motions of colliders.
@@ -46,6 +47,7 @@ class CompiledKind:
     particles: tuple[int, ...]
     bodies: tuple[int, ...]
     keeps_filling: bool
+    fine: int
     sparse: bool
     colliders: ColliderKind
     drives: Drives
@@ -73,6 +75,7 @@ class CompiledKind:
             tuple(sum(len(particles[i].position) for i in own) for own in places),
             tuple(len(own) for own in places),
             needs_filling(scene, members),
+            fine_nodes(scene, members),
             wants_sparse(scene),
             ColliderKind.of(scene),
             Drives.of(scene, places)[0],

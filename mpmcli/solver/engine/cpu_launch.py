@@ -20,6 +20,7 @@ from mpmcli.solver.frames.reader import SOUND, sum_entries, sum_range
 from mpmcli.solver.grid.grid import box_of
 from mpmcli.solver.particles.sort import CHUNK, find_places, scratch_offset
 from mpmcli.solver.particles.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
+from mpmcli.solver.transfer.redistribution import farthest_shift
 from mpmcli.solver.transfer.splines import PAD
 
 Notes = ti.types.ndarray(ti.f64, 3)
@@ -40,7 +41,8 @@ class CpuLaunch:
         self.dimension, self.room = device.grid.dimension, tuple(device.room)
         self.members, self.stencils = tuple(enumerate(device.groups)), device.stencils
         drifts = device.particles.touches or not all(group.total for group in device.groups)
-        self.steps = StepSize(layout, [group.law for group in device.groups], device.values, drifts=drifts)
+        laws, shift = [group.law for group in device.groups], farthest_shift(device.grid.fine)
+        self.steps = StepSize(layout, laws, device.values, drifts=drifts, shift=shift)
         self.phases = CpuPhases(device, layout)
         self.team = CpuThreads(self.phases, device.runs)
         self.emission = CpuEmission(device, layout, device.stencils)
@@ -143,10 +145,11 @@ class CpuLaunch:
             elif going and not arrived and counts[w, self.count.budget] > 0:
                 if ti.static(self.emission.needed):
                     self.enter(w, numbers, counts)
-                if numbers[w, self.real.drift] >= numbers[w, self.real.drift_allowed]:
+                drift = numbers[w, self.real.drift] + self.steps.shift_ahead(w, counts)
+                if drift >= numbers[w, self.real.drift_allowed]:
                     phase = self.phases.sorts
                 elif self.begin_step(w, numbers, counts):
-                    phase = 0
+                    phase = self.phases.first_of_step(w)
         return phase
 
     @ti.func
@@ -157,8 +160,9 @@ class CpuLaunch:
         numbers[w, self.real.deformation] = deformation
         counts[w, self.count.step_limit] = limit
         if dt > 0:
+            relaxed = self.steps.relaxed_in(w, dt, numbers, counts)
             self.find_box(w, numbers, counts)
-            self.phases.begin_step(w, dt, kick, self.steps.relaxed_in(w, dt, numbers, counts), numbers)
+            self.phases.begin_step(w, dt, kick, relaxed, numbers)
         return dt > 0
 
     @ti.func
@@ -304,8 +308,8 @@ class CpuLaunch:
         while (phase := self.next_phase(phase, numbers, counts, notes)) >= 0:
             began = time.perf_counter()
             self.work(phase, numbers, counts, shown)
-            bodies = [kind.body for kind in self.phases.kinds if kind.first <= phase < kind.after]
-            seconds[BESIDE.get(bodies[0], bodies[0])] += time.perf_counter() - began
+            names = [kind.name for kind in self.phases.kinds if kind.first <= phase < kind.after]
+            seconds[BESIDE.get(names[0], names[0])] += time.perf_counter() - began
         began = time.perf_counter()
         if status == MEASURE or (status == GOING and counts[0, self.count.status] == ATTEND):
             counts[0, self.count.status] = ATTEND

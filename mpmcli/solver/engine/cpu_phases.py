@@ -7,13 +7,14 @@ own for Taichi as well (`ti.real_func`). Such a function knows nothing of its ca
 asks for the numbers of the run anew.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from mpmcli.boundaries.mirror_images import find_friction
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.engine.cpu_regions import CpuRegions
 from mpmcli.solver.engine.device import Device, views
-from mpmcli.solver.engine.phases import sorted_fields
+from mpmcli.solver.engine.phases import Phase, sorted_fields
 from mpmcli.solver.engine.run_numbers import Layout
 from mpmcli.solver.frames.reader import show_range
 from mpmcli.solver.grid.sparse_grid import BLOCKS, PENCILS
@@ -47,14 +48,16 @@ MOVED, KICK, RELAXED, SPEED, VECTORS = range(5)
 class PartKind(NamedTuple):
     """The parts of some phases that have one body.
 
-    body: name of the method; group: number of the group of particles. first, after: number of the first phase, and the
-    one after the last.
+    name: of the phases; group: number of the group of particles. first, after: number of the first phase, and the
+    one after the last. body: name of the method. item: what that does for each node or particle, where it says nothing.
     """
 
-    body: str
+    name: str
     group: int
     first: int
     after: int
+    body: str
+    item: Callable | None
 
 
 class Part:
@@ -62,13 +65,17 @@ class Part:
 
     Attributes:
         grid, nodes, particles, order, group: see `views`; the last two are those of a group of particles.
+        item: what is done for each node or particle; atomic: whether sums need atomics, False.
         g: number of the group; w: of the run; turn: of the phase among those of its kind.
         region, part: of the part; t: of the thread.
         numbers, counts, shown: see `Batch`.
     """
 
-    def __init__(self, run: tuple, g: int, *variables: object) -> None:
+    atomic = False
+
+    def __init__(self, run: tuple, kind: PartKind, *variables: object) -> None:
         """Keep a view, and variables of a kernel."""
+        g, self.item = kind.group, kind.item
         self.grid, self.nodes, self.particles, orders, groups = run
         self.g, self.group, self.order = g, groups[g], orders[g] if orders else None
         self.w, self.turn, self.region, self.part, self.t, self.numbers, self.counts, self.shown = variables
@@ -78,12 +85,13 @@ class Part:
 class CpuPhases:
     """The phases of the runs of a batch, w being the number of a run, region and part those of a part.
 
-    A step begins with phase 0, a sort with `sorts`, the end of what comes before a frame is `showing`.
+    A step begins with `first_of_step`, a sort with `sorts`, the end of what comes before a frame is `showing`.
 
     Attributes:
         shared: whether several threads work on one run; regions: of each run, one for each of them.
         places: of the regions in the particles and the nodes; shares: parts of a loop over a region.
         kinds: of the parts.
+        clears: number of the first phase of steps that shift no particles.
         last_of_step, sorts, marking, last_of_sort, before_showing, showing: numbers of phases.
         coloured: (group, first phase) of the phases that go over the pencils of a group, of which there are `passes`.
         values: numbers of the step of each run.
@@ -107,13 +115,14 @@ class CpuPhases:
         self.kinds: tuple[PartKind, ...] = ()
         coloured, end = [], 0
         for phase in device.phases:
-            length = self.passes if phase.adds else 1
-            if self.kinds and not phase.adds and self.kinds[-1].body == phase.name:
+            length = self.passes if phase.adds else phase.turns
+            if self.kinds and not phase.adds and self.kinds[-1].name == phase.name:
                 end -= 1
-            end = self._add(phase.name, phase.group, end, length)
+            end = self._add(phase.name, phase.group, end, length, phase)
             if phase.adds:
                 coloured.append((phase.group, end - length))
         self.coloured, self.last_of_step, self.sorts = tuple(coloured), end - 1, end
+        self.clears = next(kind.first for kind in self.kinds if kind.name == "clear")
         # Tiles of a sparse grid are numbered before anything is sorted: old numbers are taken, then tiles that hold
         # particles marked.
         self.marking = self.sorts + 1
@@ -136,9 +145,12 @@ class CpuPhases:
         for g, _ in self.members:
             self._add("show", g, self.showing, 1)
 
-    def _add(self, body: str, group: int, first: int, length: int) -> int:
+    def _add(self, name: str, group: int, first: int, length: int, phase: Phase | None = None) -> int:
         """Number phases, and return the number after the last."""
-        self.kinds += (PartKind(body, group, first, first + length),)
+        item, body = phase and (phase.ranged or phase.body), name
+        if item:
+            body = "each_node" if phase.over == "nodes" else "each_in_pencils" if phase.adds else "each_particle"
+        self.kinds += (PartKind(name, group, first, first + length, body, item),)
         return first + length
 
     def body(self, kind: PartKind) -> object:
@@ -187,6 +199,14 @@ class CpuPhases:
             # A law may have no particle yet.
             self.values[w, self.rates + 2 * g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
             self.values[w, self.rates + 2 * g + 1] = 0.0
+
+    @ti.func
+    def first_of_step(self, w: int):
+        """Return the first phase of the step: only where it relaxes volumes are particles shifted before all else."""
+        phase = 0
+        if self.values[w, RELAXED] == 0.0:
+            phase += ti.static(self.clears)
+        return phase
 
     @ti.func
     def end_step(self, w: int, dt: ti.f64, numbers: ti.template()):
@@ -244,10 +264,46 @@ class CpuPhases:
             h, inverse, scale, box, last, extent = self.view_numbers(w, numbers, counts)
             run = ti.static(views(self.device, w, h, inverse, scale, box, last, extent))
             turn = phase - ti.static(self.kinds[k].first)
-            (at,) = ti.static((Part(run, self.kinds[k].group, w, turn, region, part, t, numbers, counts, shown),))
+            (at,) = ti.static((Part(run, self.kinds[k], w, turn, region, part, t, numbers, counts, shown),))
             ti.static(self.body(self.kinds[k]))(at)
         if ti.static(k + 1 < len(self.kinds)):
             self.do(ti.static(k + 1), w, phase, region, part, t, numbers, counts, shown)
+
+    # Parts of phases that say what they do for each node or particle, on a dense grid.
+
+    @ti.func
+    def each_node(self, at: ti.template()):
+        """Go through nodes."""
+        first, after = self.places.rows_of(at.grid, at.region)
+        first, after = self.share(first, after, at.part)
+        last_axis = ti.static(self.dimension - 1)
+        for row in range(first, after):
+            node = at.grid.row_start(row)
+            for _ in range(at.grid.box[1, last_axis]):
+                ti.static(at.item)(at, node, self.values[at.w, RELAXED])
+                node[last_axis] += 1
+
+    @ti.func
+    def each_in_pencils(self, at: ti.template()):
+        """Go through particles that add to nodes."""
+        first, after = 0, 0
+        if at.turn < self.colours:
+            first, after = self.pencils(at.order, at.turn, at.region, at.part)
+            for r in range(first, after):
+                pencil = at.order.pencil_of(at.turn, r)
+                begin, end = at.order.first_particle_of(pencil), at.order.first_particle_of(pencil + 1)
+                ti.static(at.item)(at, begin, end, self.values[at.w, RELAXED])
+        if ti.static(self.device.comes_and_goes):
+            if at.turn == self.colours and at.region == 0 and at.part == 0:
+                first, after = self.come_in(at.g, at.order, at.w, at.counts)
+                ti.static(at.item)(at, first, after, self.values[at.w, RELAXED])
+
+    @ti.func
+    def each_particle(self, at: ti.template()):
+        """Go through particles."""
+        first, after = self.places.particles_of(at.g, at.w, at.region, at.counts[at.w, self.count.particles[at.g]])
+        first, after = self.share(first, after, at.part)
+        ti.static(at.item)(at, first, after, self.values[at.w, RELAXED])
 
     @ti.func
     def clear(self, at: ti.template()):

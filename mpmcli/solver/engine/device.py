@@ -67,6 +67,7 @@ class Device:
             friction=self.nodes.needs_friction,
             deterministic=self.grid.deterministic,
             loads=self.grid.deterministic and self.nodes.collides,
+            shifts=self.grid.dimension if self.grid.fine else 0,
         )
 
 
@@ -85,10 +86,11 @@ def views(
     w: its number. This and what follows are variables of the kernel; h, inverse, scale: spacing, inverse_spacing and
     gradient_scale of the `Grid`; box: its box; last: node of the upper walls per axis; extent: size of the domain, m.
     """
-    fixed = device.grid.fixed
+    fixed, fine = device.grid.fixed, device.grid.fine
     grid = _changed(
         device.grid,
         fixed=None if fixed is None else _changed(fixed, run=w),
+        fine=None if fine is None else _changed(fine, first_node=w * fine.node_count),
         spacing=h,
         inverse_spacing=inverse,
         gradient_scale=scale,

@@ -14,7 +14,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.solver.drive.forces import HostValues
 from mpmcli.solver.engine.device import Device
 from mpmcli.solver.engine.gpu_phases import KICK, PULL, RELAXED, STABLE, STEP, GpuPhases
-from mpmcli.solver.engine.phases import sorted_fields
+from mpmcli.solver.engine.phases import Phase, sorted_fields
 from mpmcli.solver.engine.run_numbers import ATTEND, GOING, MEASURE, Layout
 from mpmcli.solver.engine.step_size import StepSize
 from mpmcli.solver.frames.columns import FrameColumns
@@ -25,12 +25,16 @@ from mpmcli.solver.particles.sort import SPAN, keep, take
 from mpmcli.solver.particles.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
 from mpmcli.solver.transfer.lanes import LANES
 from mpmcli.solver.transfer.particle_update import NOT_LOST
+from mpmcli.solver.transfer.redistribution import farthest_shift
 from mpmcli.solver.transfer.splines import PAD
+from mpmcli.solver.transfer.volume_relaxation import INTERVAL
 
 # Most steps of a launch, after which the host attends to the runs that need it.
 STEPS = 32
 # Of a step under way, per run: columns of float64.
 DT, SPLITS, DEFORMATION, WIDTH = range(4)
+# What phases run over beside particles: nodes in use, nodes on planes of faces, rows of nodes for each collider.
+OVER = ("nodes", "planes", "loads")
 
 
 @ti.data_oriented
@@ -39,8 +43,8 @@ class GpuLaunch:
 
     Attributes:
         phases: their bodies, and the numbers of runs that these read; steps: how a step is chosen.
-        doubles: whether the device has double precision.
-        reach: the largest number of nodes in use of a run, and of nodes on planes of faces.
+        doubles: whether the device has double precision; shifts: whether some steps shift particles.
+        reach: the largest number of items of a run of each kind, see OVER.
     """
 
     def __init__(self, device: Device, layout: Layout, *, doubles: bool) -> None:
@@ -48,10 +52,11 @@ class GpuLaunch:
         self.real, self.count = layout.real, layout.count
         self.dimension, self.runs, groups = device.grid.dimension, device.runs, device.groups
         self.room, self.members = tuple(device.room), tuple(enumerate(groups))
-        self.phases, self.list = GpuPhases(device, layout), device.phases
+        self.phases, self.shifts = GpuPhases(device, layout), device.grid.fine is not None
         drifts = device.particles.touches or not all(group.total for group in groups)
         values = device.values if doubles else HostValues(device.values)
-        self.steps = StepSize(layout, [group.law for group in groups], values, drifts=drifts)
+        shift = farthest_shift(device.grid.fine)
+        self.steps = StepSize(layout, [group.law for group in groups], values, drifts=drifts, shift=shift)
         self.sorts, self.moved = device.sorts, sorted_fields(groups)
         self.averages, self.moves = any(group.averaged for group in groups), device.motion is not None
         self.loads = device.nodes.colliders.rows * device.nodes.colliders.room if device.nodes.collides else 0
@@ -59,9 +64,9 @@ class GpuLaunch:
         self.counts = ti.field(ti.i32, shape=(runs, layout.counts))
         self.numbers = double_field(runs, layout.reals) if doubles else None
         self.under_way = double_field(runs, width=WIDTH) if doubles else None
-        self.limits, self.stepping, self.sorting = (ti.field(int, shape=runs) for _ in range(3))
+        self.limits, self.stepping, self.begun, self.sorting = (ti.field(int, shape=runs) for _ in range(4))
         self.active = ti.field(int, shape=(runs, len(groups)))
-        self.reach = ti.field(int, shape=2)
+        self.reach = ti.field(int, shape=len(OVER))
         self.maxima = ti.field(float, shape=(runs, len(groups), widest))
         self.stencils = ti.field(int, shape=(2 * runs, self.dimension))
         if device.emission is not None:
@@ -95,8 +100,11 @@ class GpuLaunch:
         self.numbers.from_numpy(numbers)
         room = numbers[going, self.real.drift_allowed] - numbers[going, self.real.drift]
         steps = np.min(room / np.maximum(numbers[going, self.real.courant], 1e-3), initial=STEPS)
-        for _ in range(max(1, min(STEPS, int(steps), int(counts[going, self.count.budget].max())))):
-            self.step()
+        waited = counts[going, self.count.unrelaxed_steps]
+        for k in range(max(1, min(STEPS, int(steps), int(counts[going, self.count.budget].max())))):
+            if self.shifts and ((waited + k + 1) % INTERVAL == 0).any():
+                self.step(True)
+            self.step(False)
         numbers[:], counts[:] = self.numbers.to_numpy(), self.counts.to_numpy()
 
     def _take_host_step(self, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
@@ -112,7 +120,9 @@ class GpuLaunch:
                 own[w, [PULL + a for a in dimension]] = [kick * numbers[w, self.real.gravity[a]] for a in dimension]
         self.stepping.from_numpy(stepping)
         self.phases.step.from_numpy(own.astype(self.device.groups[0].real))
-        self.step()
+        if self.shifts and own[:, RELAXED].any():
+            self.step(True)
+        self.step(False)
         speeds, lost = self.phases.speed_squared.to_numpy(), self.device.particles.lost.to_numpy()
         rates, changes = self.phases.rates.to_numpy(), self.phases.changes.to_numpy()
         for w, (dt, splits, limit, deformation) in taken.items():
@@ -123,37 +133,34 @@ class GpuLaunch:
             self.steps.end(w, dt, splits, limit, deformation, speed, numbers, counts)
 
     @ti.kernel
-    def step(self):
-        """Take a step of every run that goes on."""
+    def step(self, shifts: ti.template()):
+        """Take a step of every run that goes on, or begin it and shift particles alone, which few steps do."""
         for w in range(self.runs):
             if ti.static(self.doubles):
-                self.begin(w)
+                if self.begun[w] == 0:
+                    self.begin(w)
+                self.begun[w] = ti.cast(shifts, int) * self.stepping[w]
             self.prepare(w)
-        for phase in ti.static(self.list):
-            if ti.static(phase.over == "nodes"):
-                for q in range(self.runs * self.reach[0]):
-                    w = q // self.reach[0]
+        for phase, turn in ti.static(self.listed(shifts)):
+            if ti.static(phase.over != "particles"):
+                for q in range(self.runs * self.reach[OVER.index(phase.over)]):
+                    w = q // self.reach[OVER.index(phase.over)]
                     if self.stepping[w] == 1:
-                        self.phases.do(phase, w, q % self.reach[0], self.counts)
-            if ti.static(phase.over == "planes"):
-                for q in range(self.runs * self.reach[1]):
-                    w = q // self.reach[1]
-                    if self.stepping[w] == 1:
-                        self.phases.do(phase, w, q % self.reach[1], self.counts)
-            if ti.static(phase.over == "loads"):
-                for q in range(self.runs * self.loads):
-                    w = q // self.loads
-                    if self.stepping[w] == 1:
-                        self.phases.do(phase, w, q % self.loads, self.counts)
+                        self.phases.do(phase, turn, w, q % self.reach[OVER.index(phase.over)], self.counts)
             if ti.static(phase.over == "particles"):
                 for p in range(self.runs * self.room[phase.group]):
                     w = p // self.room[phase.group]
                     if self.stepping[w] == 1 and self.takes_part(phase.group, w, p):
-                        self.phases.do(phase, w, p, self.counts)
-        if ti.static(self.doubles):
+                        self.phases.do(phase, turn, w, p, self.counts)
+        if ti.static(self.doubles and not shifts):
             for w in range(self.runs):
                 if self.stepping[w] == 1:
                     self.end(w)
+
+    def listed(self, shifts: bool) -> list[tuple[Phase, int]]:
+        """Return the phases that shift particles, or all others, with their turns."""
+        own = [phase for phase in self.device.phases if (phase.body is not None) == shifts]
+        return [(phase, turn) for phase in own for turn in range(phase.turns)]
 
     @ti.func
     def takes_part(self, g: ti.template(), w: int, p: int):
@@ -358,6 +365,7 @@ class GpuLaunch:
                     self.device.grid.box[2 * w + 1, a] = last - first + 1
         for k in range(2):
             self.reach[k] = 0
+        self.reach[2] = self.loads
         for w in range(self.runs):
             nodes, planes = self.phases.nodes_in_use(w, self.counts)
             ti.atomic_max(self.reach[0], nodes)

@@ -20,11 +20,14 @@ class Item:
     """A node, a particle, or a row of nodes that a thread works on, with the view that its run has of the device.
 
     grid, nodes, particles, order, group: see `views`; the last two are those of a group of particles. g: number of the
-    group; w: of the run; q: of the item.
+    group; w: of the run; turn: of the phase; q: of the item. atomic: whether sums need atomics, True.
     """
 
-    def __init__(self, run: tuple, g: int, *variables: object) -> None:
+    atomic = True
+
+    def __init__(self, run: tuple, phase: Phase, turn: int, *variables: object) -> None:
         """Keep a view, and variables of a kernel."""
+        g, self.item, self.turn = phase.group, phase.body, turn
         self.grid, self.nodes, self.particles, orders, groups = run
         self.g, self.group, self.order = g, groups[g], orders[g] if orders else None
         self.w, self.q = variables
@@ -73,16 +76,30 @@ class GpuPhases:
         return result
 
     @ti.func
-    def do(self, phase: ti.template(), w: int, q: int, counts: ti.template()):
-        """Do what a phase does for one item of a run."""
+    def do(self, phase: ti.template(), turn: ti.template(), w: int, q: int, counts: ti.template()):
+        """Do what a phase does for one item of a run in one of its turns."""
         h, inverse, scale, box, last, extent = self.view_numbers(w, counts)
         run = ti.static(views(self.device, w, h, inverse, scale, box, last, extent))
-        (at,) = ti.static((Item(run, phase.group, w, q),))
+        (at,) = ti.static((Item(run, phase, turn, w, q),))
         ti.static(self.body(phase))(at)
 
     def body(self, phase: Phase) -> object:
         """Return the method of a phase."""
+        if phase.body:
+            return self.each_node if phase.over == "nodes" else self.each_particle
         return getattr(self, phase.name)
+
+    @ti.func
+    def each_node(self, at: ti.template()):
+        """Do what the phase says for a node, in the steps that shift particles."""
+        if self.step[at.w][RELAXED] > 0.0 and at.q < at.grid.box_nodes():
+            ti.static(at.item)(at, at.grid.box_node(at.q), self.step[at.w][RELAXED])
+
+    @ti.func
+    def each_particle(self, at: ti.template()):
+        """Do what the phase says for a particle, in the steps that shift particles."""
+        if self.step[at.w][RELAXED] > 0.0:
+            ti.static(at.item)(at, at.q, self.step[at.w][RELAXED])
 
     @ti.func
     def clear(self, at: ti.template()):

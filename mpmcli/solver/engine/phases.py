@@ -4,17 +4,20 @@ The body of a phase is the method of its name: of `cpu_phases.CpuPhases`, for a 
 `gpu_phases.GpuPhases`, for one of them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.transfer import redistribution as by
 
 
 @dataclass(frozen=True)
 class Phase:
     """A loop of a step; the next one begins when it is done.
+
+    Those with a body of their own make up the shift, before all others, in the steps that relax volumes.
 
     Attributes:
         name: of its body.
@@ -22,12 +25,33 @@ class Phase:
             of nodes for each collider.
         group: number of the group of particles.
         adds: whether particles add to nodes. Without atomics pencils of one colour after another do.
+        turns: how often it runs, with `turn` counting up from 0.
+        body: of one node or particle; ranged: of a range of particles on the CPU. Those of a shift have them.
     """
 
     name: str
     over: Literal["nodes", "planes", "particles", "loads"]
     group: int = 0
     adds: bool = False
+    turns: int = 1
+    body: Callable | None = None
+    ranged: Callable | None = None
+
+
+def shift_phases(laws: Sequence[Law], dimension: int, *, deterministic: bool) -> tuple[Phase, ...]:
+    """Return the phases that shift particles of laws that flow."""
+    groups = range(len(laws))
+    flowing = [g for g in groups if laws[g].flows]
+    return (
+        Phase("clear_fine", "nodes", body=by.clear_fine),
+        *(Phase("fill_fine", "particles", g, True, 1, by.fill_fine, by.fill_range) for g in groups),
+        *[Phase("settle_fine", "nodes", body=by.settle_fine)] * deterministic,
+        Phase("fold_fine", "nodes", turns=dimension, body=by.fold_fine),
+        *(Phase("shift", "particles", g, True, 1, by.shift, by.shift_range) for g in flowing),
+        *[Phase("settle_shift", "nodes", body=by.settle_shift)] * deterministic,
+        Phase("fold_shift", "nodes", turns=dimension, body=by.fold_shift),
+        *(Phase("unshift", "particles", g, False, 1, by.unshift, by.unshift_range) for g in flowing),
+    )
 
 
 def step_phases(
@@ -38,14 +62,17 @@ def step_phases(
     friction: bool,
     deterministic: bool = False,
     loads: bool = False,
+    shifts: int = 0,
 ) -> tuple[Phase, ...]:
     """Return the phases of a step; neighbours of one name that add nothing to nodes may be carried out at once.
 
     averaged: whether the particles of each law share their change of volume; contact, friction: whether walls let go,
-    or rub; deterministic: whether P2G is in fixed point; loads: whether there are colliders, too.
+    or rub; deterministic: whether P2G is in fixed point; loads: whether there are colliders, too; shifts: the
+    dimension where particles are shifted, else 0.
     """
     groups = range(len(laws))
     return (
+        *(shift_phases(laws, shifts, deterministic=deterministic) if shifts else ()),
         Phase("clear", "nodes"),
         *(Phase("average", "particles", g, adds=True) for g in groups if averaged[g]),
         *(Phase("scatter", "particles", g, adds=True) for g in groups),

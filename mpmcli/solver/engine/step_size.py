@@ -32,9 +32,11 @@ def as_double(number: ti.template()):
 class StepSize:
     """The steps of the runs of a batch, w being the number of a run; numbers and counts as of `run_numbers`."""
 
-    def __init__(self, layout: Layout, laws: Sequence[Law], values: DriveValues, *, drifts: bool) -> None:
-        """Prepare; `drifts` says whether particles move on the grid."""
-        self.drifts = drifts
+    def __init__(
+        self, layout: Layout, laws: Sequence[Law], values: DriveValues, *, drifts: bool, shift: float = 0.0
+    ) -> None:
+        """Prepare; `drifts`: whether particles move on the grid; shift: cells by which some steps shift them."""
+        self.drifts, self.shift = drifts, shift
         self.real, self.count = layout.real, layout.count
         self.values = values
         self.laws = tuple(laws)
@@ -172,9 +174,18 @@ class StepSize:
         counts[w, self.count.arrived] = 0
 
     @ti.pyfunc
+    def shift_ahead(self, w: int, counts: ti.template()):
+        """Return the cells by which the next step may shift particles before it scatters them."""
+        cells = as_double(0.0)
+        if counts[w, self.count.unrelaxed_steps] + 1 >= INTERVAL:
+            cells = as_double(self.shift)
+        return cells
+
+    @ti.pyfunc
     def relaxed_in(self, w: int, dt: ti.f64, numbers: ti.template(), counts: ti.template()):
         """Count a step and return the time over which it relaxes volumes, s."""
         relaxed = numbers[w, self.real.unrelaxed] + dt
+        numbers[w, self.real.drift] = numbers[w, self.real.drift] + self.shift_ahead(w, counts)
         if counts[w, self.count.unrelaxed_steps] + 1 < INTERVAL:
             counts[w, self.count.unrelaxed_steps] += 1
             numbers[w, self.real.unrelaxed] = relaxed

@@ -78,6 +78,8 @@ class FixedSums:
 
 
 FARTHEST, DENSEST = 16.0, 32.0
+# Bound on the fine cells whose particles are around one fine node.
+CROWDED = 4096.0
 # Bound on |ln J| that counts, above that of the smallest J.
 LARGEST_LOG = 16.0
 NOTHING = 2**31 - 1
@@ -91,6 +93,7 @@ class FixedPoint:
     """The sums of a grid: nodes, before, filling, means, of its fields of that name, None where it has none.
 
     Attributes:
+        fine: of the fraction of fine cells that particles fill, None where they are not shifted; of_fine: their scale.
         reach: cells from the middle node of a stencil to its farthest one; run: that a view is for.
         scales: of each run, see OF_MASS; pace: scale of momenta, its inverse, and the speed that has room.
         beyond: of each run, the smallest id of a particle that is too fast for the sums, and the smallest index of a
@@ -105,6 +108,9 @@ class FixedPoint:
         self.before = sums(grid.width) if grid.scheme.keeps_before else None
         self.filling = sums(grid.width) if grid.keeps_filling else None
         self.means = tuple(sums(2) if group.averaged else None for group in groups)
+        wide, fine = arch in WIDE, grid.fine
+        self.fine = FixedSums(1, grid.runs * fine.node_count, wide=wide) if fine else None
+        self.of_fine = self.fine.scale(CROWDED) if fine else 0.0
         self.kept = tuple(sums for sums in (self.nodes, self.before, self.filling, *self.means) if sums is not None)
         self.stencil, self.reach = grid.scheme.spline.nodes, grid.scheme.spline.nodes - 2
         self.run, self._node_count = 0, grid.node_count

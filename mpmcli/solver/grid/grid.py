@@ -81,6 +81,7 @@ class Grid(LinearNodes):
         opens: (axis, side) of every face that material may leave through: nodes beyond it are like all others.
         fixed: sums in fixed point, from which `FixedPoint.settle` sets the fields; None where P2G adds to these itself.
             deterministic: whether there are such sums; then there are no `means`.
+        fine: the grid by which particles are shifted (`redistribution.FineGrid`), None where they are not.
         box: (2, d) ints: first node in use and number of nodes in use, per axis.
     """
 
@@ -126,7 +127,7 @@ class Grid(LinearNodes):
         )
         self.kept_means = tuple(means for means in self.means if means is not None)
         self.period, self.weighs_before = period, walls_move and scheme.keeps_before
-        self.deterministic, self.fixed = deterministic, None
+        self.deterministic, self.fixed, self.fine = deterministic, None, None
         self.box = ti.field(int, shape=(2 * runs, dimension))
 
     def stored_nodes(self) -> int:

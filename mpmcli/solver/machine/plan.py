@@ -30,6 +30,7 @@ from mpmcli.solver.particles.arrays import particle_fields
 from mpmcli.solver.particles.sort import TileOrder
 from mpmcli.solver.solids.contact import ParticleContact, bins_along
 from mpmcli.solver.solids.reference_grid import slips_in
+from mpmcli.solver.transfer.redistribution import fine_nodes
 from mpmcli.solver.transfer.splines import scheme_of
 from mpmcli.solver.transfer.volume_average import averages_volume
 from mpmcli.solver.transfer.volume_relaxation import needs_filling
@@ -95,7 +96,7 @@ class Plan:
     Attributes:
         nodes: number of grid nodes, on a sparse grid those that there is memory for at first.
         entries: of the longest array, which is addressed by one index: numbers of particles in a frame or in the sort,
-            counts of the tiles of each thread, nodes, bins of bodies that meet.
+            counts of the tiles of each thread, nodes, fine ones, bins of bodies that meet.
         scratch_bytes: per particle, of the sort buffers.
         grid_bytes: of all nodes, the tables of the sort, what is found at walls, and what colliders need.
         host_bytes: see `host_bytes_of`.
@@ -221,9 +222,13 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         nodes = blocks * tile**dimension
     filling, deterministic = needs_filling(scene, members), scene.solver.deterministic and not backend.on_cpu
     node_bytes = real * (width * (1 + scheme.keeps_before + filling) + 2 * sum(averaged))
+    # Nothing where that is 0.
+    fine = fine_nodes(scene, members) ** dimension
+    node_bytes += real * fine
     if deterministic:
         shared = sum(averaged)
         node_bytes += FixedPoint.bytes_needed(width, before=scheme.keeps_before, filling=filling, averaged=shared)
+        node_bytes += FixedPoint.bytes_needed(1, before=False, filling=False, averaged=0) * fine
         # In their place.
         node_bytes -= real * 2 * shared
     all_tiles, bins = all_nodes // tile**dimension, 0
@@ -244,7 +249,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     shown = sum(map(in_steps, counts.values())) * frame_columns(scene, members)
     sorted_entries = max(map(in_steps, counts.values())) * max(len(groups), widest // real)
     counted = (blocks if sparse else all_tiles) * backend.threads
-    entries = max(nodes, all_tiles, bins, shown, sorted_entries, counted)
+    entries = max(nodes * max(fine, 1), all_tiles, bins, shown, sorted_entries, counted)
     return Plan(groups, nodes, widest + 8, node_bytes, grid_bytes, host_bytes, passes, backend.arch, sparse, entries)
 
 

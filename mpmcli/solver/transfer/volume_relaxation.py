@@ -164,23 +164,35 @@ def mirrored_sum(node: ti.template(), grid: ti.template(), last: ti.template(), 
         place, exists = node, True
         for a in ti.static(range(d)):
             if images >> a & 1 == 1:
-                if ti.static(a in grid.period.axes):
-                    if node[a] <= 2 * PAD:
-                        place[a] = node[a] + last[a] - PAD
-                    elif node[a] >= last[a] - PAD:
-                        place[a] = node[a] - last[a] + PAD
-                    else:
-                        exists = False
-                elif node[a] <= PAD + reach:
-                    place[a] = 2 * PAD - node[a]
-                    if ti.static((a, 0) in grid.opens):
-                        exists = False
-                elif node[a] >= last[a] - reach:
-                    place[a] = 2 * last[a] - node[a]
-                    if ti.static((a, 1) in grid.opens):
-                        exists = False
-                else:
-                    exists = False
+                image, found = image_along(node[a], a, grid, last, reach, 1)
+                place[a] = image
+                exists = exists and found
         if exists:
             total += grid.holding[grid.linear_index(place)][d]
     return total
+
+
+@ti.func
+def image_along(
+    j: int, axis: ti.template(), grid: ti.template(), last: ti.template(), reach: ti.template(), n: ti.template()
+):
+    """Return the image of node j behind the faces of an axis, itself where it has none, and whether it has one.
+
+    reach: of the nodes inside a wall, those that have images; n: nodes in a cell.
+    """
+    image, exists = j, True
+    first, end = ti.static(PAD * n), last[axis] * n
+    if ti.static(axis in grid.period.axes):
+        if j <= 2 * first:
+            image = j + end - first
+        elif j >= end - first:
+            image = j - end + first
+        else:
+            exists = False
+    elif j <= first + reach and ti.static((axis, 0) not in grid.opens):
+        image = 2 * first - j
+    elif j >= end - reach and ti.static((axis, 1) not in grid.opens):
+        image = 2 * end - j
+    else:
+        exists = False
+    return image, exists

@@ -1,7 +1,5 @@
 """The elliptical drop of Monaghan (1994): a free surface whose every particle has an exact path."""
 
-import math
-
 import numpy as np
 
 from mpmcli.scene import Scene
@@ -35,10 +33,12 @@ class EllipticalDrop(Case):
     varies = ("precision", "kernel", "transfer", "per_axis", "safety")
     levels = {"coarse": (10, 20), "default": (10, 20, 40), "fine": (20, 40, 80)}  # noqa: RUF012
     measures = (
-        text.measure("position error (R)", lambda n: 1.3e-3 * math.sqrt(20 / n), expected=1.0),
+        # 0.04 h of it by shifts, a first-order part of the way that strain asks for.
+        text.measure("position error (R)", lambda n: 2.1e-3 * 20 / n, expected=1.0),
         # What compressibility adds, 1 / (4 SOUND^2), and a grid that is fine enough less.
         text.measure("axes error", lambda n: min(1 / (4 * SOUND**2), 5e-4 + 1e-3 * 20 / n), expected=1.0),
-        text.measure("energy loss", lambda n: 2e-5 * 20 / n, expected=1.0),
+        # Shifts widen the drop by noise of the same size at any resolution.
+        text.measure("energy loss", 1.5e-4),
     )
 
     def tables(self, n: int) -> Tables:

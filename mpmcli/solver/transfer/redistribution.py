@@ -1,0 +1,397 @@
+"""Shifts particles of liquids and grains out of crowds that flow piles up (docs/theory.md, 5.12).
+
+Flow stretches the lattice of particles along its own axes: rows part and planes pile up, which the grid cannot see, as
+planes a cell apart fill it as evenly as any. In the steps that relax volumes, a fine grid with a node for about each
+particle shows the crowds, and particles move out of them by as much as the flow has strained them since the last time.
+The mean of that motion, as the grid itself sees it, is taken back. v changes by C times the way: velocities of places
+stay.
+
+Below are the bodies of the phases that do this, each for one node or one particle, `at` being a `Part` of a CPU or an
+`Item` of a GPU, and time that since the last shift, s.
+"""
+
+import math
+from collections.abc import Sequence
+
+from mpmcli.materials.fluid import shear_rate
+from mpmcli.materials.law import Law
+from mpmcli.quick_taichi import ti
+from mpmcli.scene import Scene
+from mpmcli.scene.sampling import points_per_cell
+from mpmcli.solver.grid.grid import LinearNodes
+from mpmcli.solver.grid.sparse_grid import wants_sparse
+from mpmcli.solver.particles.arrays import MASS, VOLUME
+from mpmcli.solver.transfer.lanes import (
+    LANES,
+    load_entry,
+    load_vectors,
+    matrix_of,
+    repeat_first,
+    store_lanes,
+    vector_of,
+    weights_of,
+    zero_lanes,
+)
+from mpmcli.solver.transfer.splines import PAD, SPLINES, TransferScheme, bounded
+from mpmcli.solver.transfer.stencils import add_linear, gather_linear, origin_of
+from mpmcli.solver.transfer.volume_relaxation import image_along
+
+# Share of a crowd's slope that a particle follows: 8 times the strain since the last shift, 1 for large strains.
+PUSH = 8.0
+# Longest way, and longest way back, in distances of fine nodes.
+FARTHEST = 0.2
+
+
+def fine_nodes(scene: Scene, laws: Sequence[Law]) -> int:
+    """Return the fine nodes per cell along an axis, as many as particles of what flows; 0 where nothing is shifted."""
+    flowing = {law.name for law in laws if law.flows}
+    if not scene.solver.redistribute or wants_sparse(scene):
+        return 0
+    counts = [points_per_cell(body, scene.domain.spacing) for body in scene.bodies if body.material.law in flowing]
+    counts += [emitter.particles_per_cell for emitter in scene.emitters if emitter.material.law in flowing]
+    return max((max(1, round(count ** (1 / scene.dimension))) for count in counts), default=0)
+
+
+def farthest_shift(fine: "FineGrid | None") -> float:
+    """Return by how many cells a shift moves particles at most, there and back."""
+    return 2 * FARTHEST / fine.per_cell if fine else 0.0
+
+
+@ti.data_oriented
+class FineGrid(LinearNodes):
+    """Nodes about as far apart as particles: of those of a grid every `per_cell`-th along each axis.
+
+    Attributes:
+        per_cell: nodes per cell along an axis; in_cell: in all.
+        fill: Vector(1) field: the fraction of a fine cell that particles fill, then what exceeds a whole one.
+    """
+
+    width = 1
+
+    def __init__(self, shape: Sequence[int], per_cell: int, runs: int) -> None:
+        """Allocate for a number of runs; `shape` is that of the grid."""
+        self.dimension, self.per_cell, self.runs, self.first_node = len(shape), per_cell, runs, 0
+        self.in_cell = per_cell**self.dimension
+        self.scheme, self.planes = TransferScheme(SPLINES["quadratic"]), 3 if self.dimension == 3 else 1
+        self.strides = tuple(math.prod(per_cell * n for n in shape[a + 1 :]) for a in range(self.dimension))
+        self.node_count = math.prod(per_cell * n for n in shape)
+        self.fill = ti.Vector.field(1, float, shape=runs * self.node_count)
+
+    @ti.func
+    def place_in_cell(self, node: ti.template(), q: int):
+        """Return the integer coordinates of the q-th fine node in the cell behind a node of the grid."""
+        place = node * self.per_cell
+        for a in ti.static(range(self.dimension)):
+            place[a] += q // ti.static(self.per_cell ** (self.dimension - 1 - a)) % self.per_cell
+        return place
+
+    @ti.func
+    def stencil(self, x: ti.template(), inverse_spacing: float):
+        """Return the first node of the stencil of a point and the distance to it; inverse_spacing: that of the grid."""
+        base, distance = self.scheme.spline.stencil(x, inverse_spacing * self.per_cell)
+        return base + ti.static(PAD * (self.per_cell - 1)), distance
+
+
+@ti.func
+def inside_along(j: int, axis: ti.template(), grid: ti.template(), last: ti.template(), n: ti.template()):
+    """Return whether node j of a grid with n nodes in a cell is no image behind a face of an axis."""
+    inside = True
+    if ti.static((axis, 0) not in grid.opens):
+        inside = j >= ti.static(PAD * n)
+    if ti.static((axis, 1) not in grid.opens):
+        inside = inside and j <= last[axis] * n - ti.static(axis in grid.period.axes)
+    return inside
+
+
+@ti.func
+def clear_fine(at: ti.template(), node: ti.template(), time: float):
+    """Clear a node, and the fine nodes of the cell behind it."""
+    at.grid.clear(at.grid.linear_index(node))
+    for q in range(ti.static(at.grid.fine.in_cell)):
+        index = at.grid.fine.linear_index(at.grid.fine.place_in_cell(node, q))
+        at.grid.fine.fill[index][0] = 0.0
+        if ti.static(at.grid.deterministic):
+            at.grid.fixed.fine.clear(index)
+
+
+@ti.func
+def fill_fine(at: ti.template(), p: int, time: float):
+    """Add the volume of particle p to the fine nodes around it, as a fraction of a fine cell, at most a whole one."""
+    (fine,) = ti.static((at.grid.fine,))
+    base, distance = fine.stencil(at.group.x[p], at.grid.inverse_spacing)
+    volume = at.group.row(p)[VOLUME]
+    for _ in ti.static(range(fine.dimension)):
+        volume *= ti.static(float(fine.per_cell)) * at.grid.inverse_spacing
+    # What is coarser than the fine grid is no crowd by itself.
+    volume = ti.min(volume, 1.0)
+    w = fine.scheme.spline.weights(distance)
+    even = ti.Matrix.zero(float, fine.dimension, 1)
+    first = fine.linear_index(base)
+    if ti.static(at.grid.deterministic):
+        scaled = ti.Vector([volume * ti.static(at.grid.fixed.of_fine)])
+        add_linear(at.grid.fixed.fine, fine, first, w, scaled, even, at.atomic)
+    else:
+        add_linear(fine.fill, fine, first, w, ti.Vector([volume]), even, at.atomic)
+
+
+@ti.func
+def fill_range(at: ti.template(), first: int, last: int, time: float):
+    """Add the volumes of particles first to last - 1 to fine nodes."""
+    for p in range(first, last):
+        fill_fine(at, p, time)
+
+
+@ti.func
+def settle_fine(at: ti.template(), node: ti.template(), time: float):
+    """Read sums in fixed point."""
+    for q in range(ti.static(at.grid.fine.in_cell)):
+        index = at.grid.fine.linear_index(at.grid.fine.place_in_cell(node, q))
+        at.grid.fine.fill[index][0] = at.grid.fixed.fine.value(index)[0] / ti.static(at.grid.fixed.of_fine)
+
+
+@ti.func
+def fold_fine(at: ti.template(), node: ti.template(), time: float):
+    """Add to fine nodes what their images behind the faces of an axis hold; after the last axis keep what exceeds 1.
+
+    Nodes on a wall count twice: half of what is around them is outside. Images get the same.
+    """
+    grid, fine, last, d = ti.static((at.grid, at.grid.fine, at.particles.last, at.grid.dimension))
+    for axis in ti.static(range(d)):
+        if at.turn == axis:
+            _, near = image_along(node[axis], axis, grid, last, 1, 1)
+            if ti.static(axis == d - 1) or near:
+                for q in range(ti.static(fine.in_cell)):
+                    place = fine.place_in_cell(node, q)
+                    if inside_along(place[axis], axis, grid, last, fine.per_cell):
+                        image, exists = image_along(place[axis], axis, grid, last, 1, fine.per_cell)
+                        index = fine.linear_index(place)
+                        place[axis] = image
+                        total, beyond = fine.fill[index][0], fine.linear_index(place)
+                        if exists:
+                            total += fine.fill[beyond][0]
+                        if ti.static(axis == d - 1):
+                            total = ti.max(total - 1.0, 0.0)
+                        fine.fill[index][0] = total
+                        if exists:
+                            fine.fill[beyond][0] = total
+
+
+@ti.func
+def shift(at: ti.template(), p: int, time: float):
+    """Move particle p down the slope of its crowd, and add how far it moved, and its mass, to the nodes around it."""
+    grid, fine, group, d = ti.static((at.grid, at.grid.fine, at.group, at.grid.dimension))
+    v, C = group.motion(p)
+    x = group.x[p]
+    fine_base, fine_distance = fine.stencil(x, grid.inverse_spacing)
+    slope = slope_of(fine, fine.linear_index(fine_base), fine.scheme.spline.weights(fine_distance), fine_distance)
+    way = held_back(at, x, way_down(at, slope, C, time))
+    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
+    add_shift(at, grid.linear_index(base), grid.scheme.spline.weights(distance), group.row(p)[MASS], way)
+    for a in ti.static(range(d)):
+        group.x[p][a] = x[a] + way[a]
+        group.v[p][a] = v[a] + (C @ way)[a]
+
+
+@ti.func
+def unshift(at: ti.template(), p: int, time: float):
+    """Move particle p back by the mean motion around it."""
+    grid, group, d = ti.static((at.grid, at.group, at.grid.dimension))
+    v, C = group.motion(p)
+    x = group.x[p]
+    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
+    mean, _ = gather_linear(grid.nodes, grid, grid.linear_index(base), grid.scheme.spline.weights(distance))
+    back = ti.Vector.zero(float, d)
+    for a in ti.static(range(d)):
+        back[a] = -mean[a]
+    way = held_back(at, x, back)
+    for a in ti.static(range(d)):
+        group.x[p][a] = x[a] + way[a]
+        group.v[p][a] = v[a] + (C @ way)[a]
+
+
+@ti.func
+def shift_range(at: ti.template(), first: int, last: int, time: float):
+    """Shift particles first to last - 1."""
+    shift_lanes(at, first, last, time, False)
+
+
+@ti.func
+def unshift_range(at: ti.template(), first: int, last: int, time: float):
+    """Move particles first to last - 1 back by the mean motion around them."""
+    shift_lanes(at, first, last, time, True)
+
+
+@ti.func
+def shift_lanes(at: ti.template(), first: int, last: int, time: float, back: ti.template()):
+    """Do so with LANES of them at once; see `lanes`."""
+    grid, fine, group, d = ti.static((at.grid, at.grid.fine, at.group, at.grid.dimension))
+    nodes = ti.static(grid.scheme.spline.nodes)
+    x, v, affine, ways = zero_lanes(d), zero_lanes(d), zero_lanes(ti.static(d * d)), zero_lanes(d)
+    first_node, weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(nodes * d))
+    first_fine, fine_weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(3 * d))
+    distances, masses = zero_lanes(d), ti.Vector.zero(float, LANES)
+    begin = first
+    while begin < last:
+        count, origin = ti.min(LANES, last - begin), bounded(begin)
+        load_vectors(x, group.x, origin)
+        load_vectors(v, group.v, origin)
+        for c, a in ti.static(ti.ndrange(d, d)):
+            load_entry(affine, c * d + a, group.gradient, (a, c), origin)
+        if count < LANES:
+            repeat_first(x, count)
+        for lane in range(LANES):
+            base, distance = grid.scheme.spline.stencil(vector_of(x, 0, d, lane), grid.inverse_spacing)
+            first_node[lane] = grid.linear_index(base)
+            store_weights(weights, grid.scheme.spline.weights(distance), lane)
+            if ti.static(not back):
+                base, distance = fine.stencil(vector_of(x, 0, d, lane), grid.inverse_spacing)
+                first_fine[lane] = fine.linear_index(base)
+                store_weights(fine_weights, fine.scheme.spline.weights(distance), lane)
+                for a in ti.static(range(d)):
+                    distances[a, lane] = distance[a]
+        for lane in range(count):
+            if ti.static(back):
+                w = weights_of(weights, nodes, d, lane)
+                mean, _ = gather_linear(grid.nodes, grid, first_node[lane], w)
+                for a in ti.static(range(d)):
+                    ways[a, lane] = -mean[a]
+            else:
+                masses[lane] = group.row(begin + lane)[MASS]
+                w = weights_of(fine_weights, 3, d, lane)
+                slope = slope_of(fine, first_fine[lane], w, vector_of(distances, 0, d, lane))
+                for a in ti.static(range(d)):
+                    ways[a, lane] = slope[a]
+        for lane in range(LANES):
+            C, way = matrix_of(affine, d, lane), vector_of(ways, 0, d, lane)
+            if ti.static(not back):
+                way = way_down(at, way, C, time)
+            way = held_back(at, vector_of(x, 0, d, lane), way)
+            change = C @ way
+            for a in ti.static(range(d)):
+                ways[a, lane] = way[a]
+                x[a, lane] += way[a]
+                v[a, lane] += change[a]
+        if count == LANES:
+            for a in ti.static(range(d)):
+                store_lanes(group.x, (a,), origin, x, a)
+                store_lanes(group.v, (a,), origin, v, a)
+        else:
+            for lane in range(count):
+                for a in ti.static(range(d)):
+                    group.x[begin + lane][a] = x[a, lane]
+                    group.v[begin + lane][a] = v[a, lane]
+        if ti.static(not back):
+            for lane in range(count):
+                w = weights_of(weights, nodes, d, lane)
+                add_shift(at, first_node[lane], w, masses[lane], vector_of(ways, 0, d, lane))
+        begin += LANES
+
+
+@ti.func
+def store_weights(lanes: ti.template(), w: ti.template(), lane: int):
+    for k, a in ti.static(ti.ndrange(w.n, w.m)):
+        lanes[k * w.m + a, lane] = w[k, a]
+
+
+@ti.func
+def slope_of(fine: ti.template(), first: int, w: ti.template(), distance: ti.template()):
+    """Return the gradient of `FineGrid.fill` per fine cell, sum n_j grad w_j over a stencil."""
+    d = ti.static(fine.dimension)
+    slopes = ti.Matrix.rows([distance - 1.5, 2.0 - 2.0 * distance, distance - 0.5])
+    result, origin = ti.Vector.zero(float, d), origin_of(first, fine)
+    for i, j in ti.static(ti.ndrange(fine.planes, 3)):
+        total, slope = 0.0, 0.0
+        for k in ti.static(range(3)):
+            fill = fine.fill[origin + ti.static(fine.line_node(i, j) + k)][0]
+            total += w[k, d - 1] * fill
+            slope += slopes[k, d - 1] * fill
+        if ti.static(d == 3):
+            result += ti.Vector(
+                [slopes[i, 0] * w[j, 1] * total, w[i, 0] * slopes[j, 1] * total, w[i, 0] * w[j, 1] * slope]
+            )
+        else:
+            result += ti.Vector([slopes[j, 0] * total, w[j, 0] * slope])
+    return result
+
+
+@ti.func
+def way_down(at: ti.template(), slope: ti.template(), C: ti.template(), time: float):
+    """Return the way of a particle down the slope of its crowd, m; what is at rest stays as it is."""
+    strain = PUSH * time * shear_rate(C)
+    way = -strain / (1.0 + strain) * slope
+    return way * (FARTHEST / ti.max(way.norm(), FARTHEST) * (at.grid.spacing * ti.static(1.0 / at.grid.fine.per_cell)))
+
+
+@ti.func
+def add_shift(at: ti.template(), first: int, w: ti.template(), mass: float, way: ti.template()):
+    """Add the way of a particle times its mass, and its mass, to the nodes of a stencil."""
+    grid, d = ti.static((at.grid, at.grid.dimension))
+    value, even = ti.Vector.zero(float, grid.width), ti.Matrix.zero(float, d, grid.width)
+    for a in ti.static(range(d)):
+        value[a] = mass * way[a]
+    value[d] = mass
+    if ti.static(grid.deterministic):
+        # As a speed for which the sums have room.
+        for a in ti.static(range(d)):
+            value[a] *= grid.fixed.pace[grid.fixed.run][2] * grid.inverse_spacing
+        if grid.fixed.scaled(mass, value, even):
+            add_linear(grid.fixed.nodes, grid, first, w, value, even, at.atomic)
+    else:
+        add_linear(grid.nodes, grid, first, w, value, even, at.atomic)
+
+
+@ti.func
+def settle_shift(at: ti.template(), node: ti.template(), time: float):
+    """Read sums in fixed point."""
+    (grid,) = ti.static((at.grid,))
+    index = grid.linear_index(node)
+    grid.fixed.settle(grid, index, 0.0)
+    for a in ti.static(range(grid.dimension)):
+        grid.nodes[index][a] *= grid.spacing / grid.fixed.pace[grid.fixed.run][2]
+
+
+@ti.func
+def fold_shift(at: ti.template(), node: ti.template(), time: float):
+    """Add to nodes what their images behind the faces of an axis hold; after the last axis they have the mean motion.
+
+    That of images is mirrored: odd along the normal of a wall.
+    """
+    grid, last, d = ti.static((at.grid, at.particles.last, at.grid.dimension))
+    for axis in ti.static(range(d)):
+        if at.turn == axis and inside_along(node[axis], axis, grid, last, 1):
+            reach = ti.static(grid.scheme.spline.nodes - 2)
+            place, index = node, grid.linear_index(node)
+            image, exists = image_along(node[axis], axis, grid, last, reach, 1)
+            place[axis] = image
+            total, beyond = grid.nodes[index], grid.linear_index(place)
+            if exists:
+                total += mirrored(grid.nodes[beyond], axis, grid)
+            if ti.static(axis == d - 1):
+                if total[d] > 0.0:
+                    total /= total[d]
+            grid.nodes[index] = total
+            if exists:
+                grid.nodes[beyond] = mirrored(total, axis, grid)
+
+
+@ti.func
+def mirrored(value: ti.template(), axis: ti.template(), grid: ti.template()):
+    result = value
+    if ti.static(axis not in grid.period.axes):
+        result[axis] = -value[axis]
+    return result
+
+
+@ti.func
+def held_back(at: ti.template(), x: ti.template(), way: ti.template()):
+    """Return the way, m, that a particle at x may go: at most half of that to a wall or a collider."""
+    (grid,) = ti.static((at.grid,))
+    result = way
+    if ti.static(at.nodes.collides):
+        result = at.nodes.colliders.held_back(x, way)
+    for a in ti.static(range(grid.dimension)):
+        if ti.static(a not in grid.period.axes and (a, 0) not in grid.opens):
+            result[a] = ti.max(result[a], -0.5 * x[a])
+        if ti.static(a not in grid.period.axes and (a, 1) not in grid.opens):
+            result[a] = ti.min(result[a], 0.5 * (at.particles.extent[a] - x[a]))
+    return result
