@@ -128,11 +128,8 @@ def spinning(**knobs: object) -> Scene:
 
 
 def test_cubic_splines_keep_both_momenta(backend_of: Callable) -> None:
-    """To round-off, with C's own angular momentum m h^2/3 axl(C); with the h^2/4 of quadratic ones it is not kept.
-
-    A shift changes them by what is of second order in its way (test_redistribution.py).
-    """
-    linear, angular = momenta_lost(spinning(kernel="cubic", redistribute=False), backend_of("f64", 2), 0.01, 300)
+    """To round-off, with C's own angular momentum m h^2/3 axl(C); with the h^2/4 of quadratic ones it is not kept."""
+    linear, angular = momenta_lost(spinning(kernel="cubic"), backend_of("f64", 2), 0.01, 300)
     assert linear < 1e-13 and angular < 1e-13
 
 

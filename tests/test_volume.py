@@ -18,7 +18,7 @@ from mpmcli.scene import Scene, parse_scene, sample_bodies
 from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.machine.plan import make_plan
 from mpmcli.solver.transfer.splines import PAD
-from mpmcli.solver.transfer.volume_relaxation import INTERVAL
+from mpmcli.stability.transfer_factors import INTERVAL
 from mpmcli.validation.carry_out import scene_of
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases

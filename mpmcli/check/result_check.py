@@ -10,7 +10,7 @@ from mpmcli.check.finding import Finding, FrameFindings, Verdict, passes
 from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, arrays_of, check_order, kept_entries, open_entries
 from mpmcli.check.result_ledger import AgreementCheck, check_ledger
 from mpmcli.check.result_motion import MomentumCheck, MotionCheck, screen
-from mpmcli.check.result_state import StateCheck, StretchCheck
+from mpmcli.check.result_state import CrowdCheck, StateCheck, StretchCheck
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -33,6 +33,8 @@ TOLD = {
     "volume_ratio_max": "largest J",
     "volume_error": "lasting volume error",
     "neighbour_distance": "farthest neighbours, cells",
+    "densest_cell": "densest cell / meant, liquids and grains",
+    "empty_cells": "empty cells inside of them",
     "step_min": "smallest step, s",
     "step_max": "largest step, s",
 }
@@ -146,6 +148,7 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings) -> dict[str, fl
     state, motion = StateCheck(header, findings, stored=stored), MotionCheck(header, findings)
     agreement, stretch = AgreementCheck(header, findings), StretchCheck(header, findings)
     momentum = MomentumCheck(header, findings, opened.entries[0].row)
+    crowd = CrowdCheck(header, findings, len(opened.entries))
     size = 0
     before: tuple[int, int] | None = None
     screened = None if stored else screen(header, opened.entries)
@@ -164,6 +167,7 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings) -> dict[str, fl
             motion.passed(number, frame, float(screened.ratio[k]))
             momentum.check(number, frame, row, (screened.lowest[k], screened.highest[k]))
             stretch.check(number, frame)
+            crowd.check(k, number, frame)
             continue
         # Values that are not finite have one finding, and must not cause others.
         with np.errstate(invalid="ignore", over="ignore"):
@@ -178,6 +182,7 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings) -> dict[str, fl
                 if stored:
                     agreement.check(number, frame, row, J, steps)
                 momentum.check(number, frame, row)
+                crowd.check(k, number, frame, J)
                 if not header.comes_and_goes:
                     stretch.check(number, frame)
             else:
@@ -187,6 +192,8 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings) -> dict[str, fl
         "displacement_ratio": motion.largest_ratio,
         "deformation_max": motion.deformation,
         "neighbour_distance": stretch.largest,
+        "densest_cell": crowd.densest,
+        "empty_cells": crowd.empty,
         "momentum_drift": momentum.drift,
         "momentum_frames": momentum.frames,
         "ledger_difference": agreement.largest if stored else None,

@@ -152,12 +152,12 @@ def _outlier_threshold(spacing: float, allowed: float | np.ndarray) -> float | n
 
 
 def _reach(header: RunHeader, row: LedgerRow, stored: np.dtype) -> float | None:
-    """Return the largest displacement in a row's steps, m, with rounding in steps and file; None: not known."""
+    """Return the largest displacement in a row's steps, m, with shifts and rounding; None: not known."""
     if header.spacing is None or not np.isfinite(row.courant_max):
         return None
     factor = GPU_FACTOR if header.on_gpu else 1.0
     rounding = row.steps * header.step_error + 2 * header.place_error(stored)
-    return factor * row.steps * row.courant_max * header.spacing * (1 + 1e-3) + rounding
+    return factor * row.steps * row.courant_max * header.spacing * (1 + 1e-3) + header.shifted(row.steps) + rounding
 
 
 class MomentumCheck(FrameCheck):

@@ -6,6 +6,7 @@ import numpy as np
 
 from mpmcli.check.finding import FrameFindings
 from mpmcli.frames.frame import Frame
+from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader
 from mpmcli.plain_text import counted
 
@@ -23,6 +24,14 @@ STRETCHED, SPARSE = 0.9, 1.25
 TORN = 1.5
 # Distance at the start, over that of a lattice, up to which two particles count as neighbours; the diagonal is at 1.41.
 NEIGHBOUR = 1.2
+# Frames of a run that are searched for crowds, and the most cells around its material of which that is done.
+FEW, MOST_CELLS = 4, 3e7
+# Particles in a cell over those meant, and share of empty cells inside, from which on it is said.
+CROWDED, GAPS = 3.0, 0.05
+# Mean J of a viscous liquid from which on it is said.
+OPENED = 1.2
+# Cells to each side of one that is inside, and how full they are on average then.
+WINDOW, INSIDE = 2, 0.85
 
 
 class FrameCheck:
@@ -309,3 +318,79 @@ class StretchCheck(FrameCheck):
             return False
         law = self._header.laws[material]
         return law.deformation == "F" and law.coherent and not law.projects
+
+
+class CrowdCheck(FrameCheck):
+    """Looks for crowds of liquids and grains, and for viscous liquids that spray, in a few frames and the last one.
+
+    Attributes:
+        densest: particles in the fullest cell over those meant; empty: share of empty cells of those inside, in the
+            last frame that was looked at. None without such material.
+    """
+
+    def __init__(self, header: RunHeader, findings: FrameFindings, frames: int) -> None:
+        super().__init__(header, findings)
+        flowing = {name for name, law in laws().items() if law.flows}
+        self._flows = np.array([law.name in flowing for law in header.laws])
+        self._viscous = np.array([body.material.get("viscosity", 0) > 0 for body in header.bodies], bool)
+        self._share = np.array([1 / body.particles_per_cell for body in header.bodies])
+        known = header.spacing is not None and header.origin is not None
+        # Of fewer than two along an axis a crowd is no more than chance.
+        coarse = (self._share > 2.0**-header.dimension).any()
+        self._every = max(1, frames // FEW) if known and self._flows.any() and not coarse else 0
+        self._last = frames - 1
+        self.densest: float | None = None
+        self.empty: float | None = None
+
+    def check(self, k: int, number: int, frame: Frame, J: np.ndarray | None = None) -> None:
+        """Check the k-th frame, of finite values, with the J of its particles, (n,), where they are known."""
+        if self._every == 0 or (k % self._every and k != self._last):
+            return
+        if J is not None and _within(frame.body, len(self._viscous)):
+            self._spray(number, frame, J)
+        frame, d, h = frame.of_present, self._header.dimension, self._header.spacing
+        if not (_within(frame.body, len(self._share)) and _within(frame.material, len(self._flows))):
+            return
+        rows = self._flows[frame.material]
+        if not rows.any():
+            return
+        cells = np.floor((frame.position[rows] - self._header.origin) / h).astype(np.int64)
+        # Before the first cell a margin of empty ones, which the sums below subtract.
+        first = cells.min(axis=0) - WINDOW - 1
+        shape = cells.max(axis=0) - first + 1 + WINDOW
+        if np.prod(shape.astype(float)) > MOST_CELLS:
+            return
+        places = np.ravel_multi_index((cells - first).T, shape)
+        filled = np.bincount(places, self._share[frame.body[rows]], int(np.prod(shape))).reshape(shape)
+        around = filled
+        for axis in range(d):
+            total = np.cumsum(around, axis=axis)
+            # Over the cells of the domain alone, as nothing can be behind its walls.
+            along = np.arange(shape[axis]) + first[axis]
+            end = round((self._header.upper[axis] - self._header.origin[axis]) / h) - 1
+            count = np.minimum(along + WINDOW, end) - np.maximum(along - WINDOW, 0) + 1
+            count = np.where((along >= 0) & (along <= end), count, np.inf)
+            count = np.expand_dims(count, [a for a in range(d) if a != axis])
+            ahead = np.take(total, np.minimum(np.arange(shape[axis]) + WINDOW, shape[axis] - 1), axis)
+            around = (ahead - np.roll(total, WINDOW + 1, axis)) / count
+        inside = around > INSIDE
+        self.densest = float(filled.max())
+        self.empty = float((filled[inside] == 0).mean()) if inside.any() else 0.0
+        if self.densest > CROWDED or self.empty > GAPS:
+            what = (
+                f"In frame {number} a cell of liquid or grains has {self.densest:.3g} times the particles meant, and "
+                f"{100 * self.empty:.2g} % of the cells inside have none: flow has piled particles up"
+            )
+            fix = 'Set solver.redistribute = "auto", or jitter the sampling.'
+            self._findings.add("note", "crowd", number, what, fix, value=self.densest)
+
+    def _spray(self, number: int, frame: Frame, J: np.ndarray) -> None:
+        """Find viscous bodies that have opened, as only what falls apart into drops does."""
+        for label in np.flatnonzero(self._viscous).tolist():
+            own = frame.body == label
+            mean = float(J[own].mean()) if own.any() else 0.0
+            if mean > OPENED:
+                name = self._header.bodies[label].name
+                what = f'In frame {number} the viscous liquid of "{name}" has a mean J of {mean:.3g}: it falls apart'
+                fix = "Refine the domain across it, or pour it thicker."
+                self._findings.add("note", "spray", number, what, fix, value=mean, body=name, kind=name)

@@ -21,6 +21,7 @@ from mpmcli.scene.schema import SolverSettings, usual_particles_per_cell
 from mpmcli.scene.shapes import BodyShape
 from mpmcli.scene.sheets import emitted_volumes
 from mpmcli.scene.triangles import ClosedSurface
+from mpmcli.stability.transfer_factors import FARTHEST, INTERVAL
 
 # Of a scene that does not say.
 _TRANSFER, _SOLIDS = (SolverSettings.model_fields[name].default for name in ("transfer", "solids"))
@@ -137,6 +138,7 @@ class RunHeader:
         open_axes: per axis, whether a face normal to it is open.
         total: whether elastic bodies are on the grid of their state at rest.
         keeps_spin: whether the transfers conserve angular momentum, as those of APIC do where bodies move on the grid.
+        shifts: whether particles of liquids and grains are shifted.
         sticking: per axis, whether a face normal to it sticks or has friction.
         periodic: (d,), whether the domain repeats along each axis.
         bodies: in the order of their labels in the frames.
@@ -160,6 +162,7 @@ class RunHeader:
     open_axes: tuple[bool, ...]
     total: bool
     keeps_spin: bool
+    shifts: bool
     sticking: tuple[bool, ...] | None
     periodic: np.ndarray
     bodies: tuple[BodyHeader, ...]
@@ -239,6 +242,8 @@ class RunHeader:
             open_axes=opens,
             total=total,
             keeps_spin=solver.get("transfer", _TRANSFER) == "apic" and not total,
+            # A scene is stored with all of its keys: what lacks this one is older.
+            shifts=solver.get("redistribute") == "auto",
             sticking=sticking_axes(words, domain.get("friction", 0.0)),
             periodic=periodic,
             bodies=body_headers([str(name) for name in stored.get("bodies", ())], tables, volumes, d),
@@ -309,6 +314,11 @@ class RunHeader:
     def place_error(self, stored: np.dtype) -> float:
         """Return the rounding of a position in a file of this type, m, that of the solver included."""
         return self.step_error + float(np.finfo(stored).eps) * self.farthest
+
+    def shifted(self, steps: int) -> float:
+        """Return the farthest that shifts move a particle in so many steps, m, of one particle per cell."""
+        known = self.shifts and self.spacing is not None
+        return (steps // INTERVAL + 1) * 2 * FARTHEST * self.spacing if known else 0.0
 
     def way(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Return the ways between places, (..., d), m, less than half of the domain along axes that repeat."""

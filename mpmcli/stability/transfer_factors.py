@@ -12,6 +12,11 @@ INVERSE_MOMENT = {"quadratic": 4, "cubic": 3}
 # of a step with two and three particles per cell and axis (docs/theory.md, 2.4).
 APIC_LOSS = {"quadratic": 0.024, "cubic": 0.047}
 
+# Steps from one relaxation of volumes, and one shift of particles, to the next (docs/theory.md, 5.11 and 5.12).
+INTERVAL = 50
+# Longest way of a particle in a shift, and back, in distances of fine nodes.
+FARTHEST = 0.2
+
 # Of an impact, measured on bars of 8 to 64 cells at 0.0005 to 0.1 of their wave speed, in pairs and on walls
 # (docs/theory.md, 2.5): -ln(1 - loss) = IMPACT_LOSS sqrt(min(1 / M, n / SLOW)) / (n C) in n cells, at the Mach number M
 # of a bar and the Courant number C of a step.

@@ -27,7 +27,7 @@ from mpmcli.solver.transfer.lanes import LANES
 from mpmcli.solver.transfer.particle_update import NOT_LOST
 from mpmcli.solver.transfer.redistribution import farthest_shift
 from mpmcli.solver.transfer.splines import PAD
-from mpmcli.solver.transfer.volume_relaxation import INTERVAL
+from mpmcli.stability.transfer_factors import INTERVAL
 
 # Most steps of a launch, after which the host attends to the runs that need it.
 STEPS = 32

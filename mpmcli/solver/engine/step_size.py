@@ -11,8 +11,8 @@ from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.drive.forces import DriveValues
 from mpmcli.solver.engine.run_numbers import ATTEND, BEYOND, COLLAPSED, LIMITS, LOST, Layout
-from mpmcli.solver.transfer.volume_relaxation import INTERVAL
 from mpmcli.stability.limits import COURANT, DEFORMATION
+from mpmcli.stability.transfer_factors import INTERVAL
 
 COLLIDER, DEFORMING, FORCE, FORCED, MAXIMUM, CROSSING = (
     LIMITS.index(name) for name in ("collider", "deformation", "force", "forced", "maximum", "speed")

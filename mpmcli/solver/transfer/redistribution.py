@@ -35,16 +35,18 @@ from mpmcli.solver.transfer.lanes import (
 from mpmcli.solver.transfer.splines import PAD, SPLINES, TransferScheme, bounded
 from mpmcli.solver.transfer.stencils import add_linear, gather_linear, origin_of
 from mpmcli.solver.transfer.volume_relaxation import image_along
+from mpmcli.stability.transfer_factors import FARTHEST
 
 # Share of a crowd's slope that a particle follows: 8 times the strain since the last shift, 1 for large strains.
 PUSH = 8.0
-# Longest way, and longest way back, in distances of fine nodes.
-FARTHEST = 0.2
 
 
 def fine_nodes(scene: Scene, laws: Sequence[Law]) -> int:
-    """Return the fine nodes per cell along an axis, as many as particles of what flows; 0 where nothing is shifted."""
-    flowing = {law.name for law in laws if law.flows}
+    """Return the fine nodes per cell along an axis, as many as particles of what is shifted; 0 where nothing is.
+
+    Of other laws the volume follows no grid, and would grow with what a shift leaves of it.
+    """
+    flowing = {law.name for law in laws if law.relaxes}
     if not scene.solver.redistribute or wants_sparse(scene):
         return 0
     counts = [points_per_cell(body, scene.domain.spacing) for body in scene.bodies if body.material.law in flowing]

@@ -1,6 +1,6 @@
 """Relaxes the volumes of particles towards those that the grid sees (docs/theory.md, 5.11).
 
-Only laws that ask for it (`Law.relaxes`) have any of this compiled, and only one step in INTERVAL does it.
+Only laws that ask for it (`Law.relaxes`) have any of this compiled, and only one step in `INTERVAL` does it.
 """
 
 from collections.abc import Sequence
@@ -12,9 +12,6 @@ from mpmcli.scene import Scene
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.state_bounds import volume_ratio
 from mpmcli.solver.transfer.splines import PAD
-
-# Steps from one relaxation to the next.
-INTERVAL = 50
 
 
 def needs_filling(scene: Scene, laws: Sequence[Law]) -> bool:
