@@ -33,8 +33,8 @@ TOLD = {
     "volume_ratio_max": "largest J",
     "volume_error": "lasting volume error",
     "neighbour_distance": "farthest neighbours, cells",
-    "densest_cell": "densest cell / meant, liquids and grains",
-    "empty_cells": "empty cells inside of them",
+    "densest_cell": "densest cell / meant",
+    "empty_cells": "empty cells inside",
     "step_min": "smallest step, s",
     "step_max": "largest step, s",
 }

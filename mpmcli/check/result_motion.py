@@ -55,7 +55,7 @@ class MotionCheck(FrameCheck):
         moved = self._header.way(before.position, frame.position)
         squares = np.einsum("ij,ij->i", moved, moved)
         squares = np.where(np.isfinite(squares), squares, 0.0) if sound is not None else squares
-        allowed = _reach(self._header, row, frame.position.dtype)
+        allowed = _reach(self._header, row, frame)
         p = int(np.argmax(squares))
         farthest = float(np.sqrt(float(squares[p])))
         if farthest == 0.0:
@@ -151,13 +151,14 @@ def _outlier_threshold(spacing: float, allowed: float | np.ndarray) -> float | n
     return OUTLIER_CELLS * spacing + OUTLIER_PART * allowed
 
 
-def _reach(header: RunHeader, row: LedgerRow, stored: np.dtype) -> float | None:
+def _reach(header: RunHeader, row: LedgerRow, frame: Frame) -> float | None:
     """Return the largest displacement in a row's steps, m, with shifts and rounding; None: not known."""
     if header.spacing is None or not np.isfinite(row.courant_max):
         return None
     factor = GPU_FACTOR if header.on_gpu else 1.0
-    rounding = row.steps * header.step_error + 2 * header.place_error(stored)
-    return factor * row.steps * row.courant_max * header.spacing * (1 + 1e-3) + header.shifted(row.steps) + rounding
+    rounding = row.steps * header.step_error + 2 * header.place_error(frame.position.dtype)
+    shifted = header.shifted(row.steps, frame.step)
+    return factor * row.steps * row.courant_max * header.spacing * (1 + 1e-3) + shifted + rounding
 
 
 class MomentumCheck(FrameCheck):
@@ -199,7 +200,7 @@ class MomentumCheck(FrameCheck):
             return
         self._taken += np.sum(row.collider_force, axis=0) * (row.time - self._time)
         self._time = row.time
-        allowed = _reach(header, row, frame.position.dtype)
+        allowed = _reach(header, row, frame)
         if number > 0:
             near = self.MARGIN * header.spacing
             gone = self._distance is None or allowed is None
@@ -293,7 +294,7 @@ def _screen(header: RunHeader, entries: Sequence[KeptEntry], part: slice, screen
     J = np.array([(row.volume_ratio_min, row.volume_ratio_max) for row in rows[new]])
     quiet &= (J[:, 0] > CRUSHED * (1 + ROUNDING)) & (J[:, 1] < BLOWN_UP * (1 - ROUNDING))
     follows = np.array([b.number == a.number + 1 for a, b in pairwise(entries)], bool)
-    allowed = np.array([_reach(header, row, x.dtype) or 0.0 for row in rows[1:]])
+    allowed = np.array([_reach(header, row, frame) or 0.0 for frame, row in zip(frames[1:], rows[1:], strict=True)])
     moved = header.way(x[:-1], x[1:])
     farthest = np.sqrt(np.einsum("tij,tij->ti", moved, moved).max(axis=1, initial=0.0))
     times = np.array([row.time for row in rows])

@@ -30,8 +30,8 @@ FEW, MOST_CELLS = 4, 3e7
 CROWDED, GAPS = 3.0, 0.05
 # Mean J of a viscous liquid from which on it is said.
 OPENED = 1.2
-# Cells to each side of one that is inside, and how full they are on average then.
-WINDOW, INSIDE = 2, 0.85
+# Cells to each side of one that is inside, how full they are on average then, and the fewest that tell a share.
+WINDOW, INSIDE, ENOUGH = 2, 0.85, 64
 
 
 class FrameCheck:
@@ -375,7 +375,7 @@ class CrowdCheck(FrameCheck):
             around = (ahead - np.roll(total, WINDOW + 1, axis)) / count
         inside = around > INSIDE
         self.densest = float(filled.max())
-        self.empty = float((filled[inside] == 0).mean()) if inside.any() else 0.0
+        self.empty = float((filled[inside] == 0).mean()) if inside.sum() >= ENOUGH else 0.0
         if self.densest > CROWDED or self.empty > GAPS:
             what = (
                 f"In frame {number} a cell of liquid or grains has {self.densest:.3g} times the particles meant, and "

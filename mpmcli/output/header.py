@@ -315,10 +315,10 @@ class RunHeader:
         """Return the rounding of a position in a file of this type, m, that of the solver included."""
         return self.step_error + float(np.finfo(stored).eps) * self.farthest
 
-    def shifted(self, steps: int) -> float:
-        """Return the farthest that shifts move a particle in so many steps, m, of one particle per cell."""
-        known = self.shifts and self.spacing is not None
-        return (steps // INTERVAL + 1) * 2 * FARTHEST * self.spacing if known else 0.0
+    def shifted(self, steps: int, last: int) -> float:
+        """Return the farthest that shifts move a particle in so many steps up to the last one, m, of one per cell."""
+        shifts = last // INTERVAL - (last - steps) // INTERVAL
+        return shifts * 2 * FARTHEST * self.spacing if self.shifts and self.spacing is not None else 0.0
 
     def way(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Return the ways between places, (..., d), m, less than half of the domain along axes that repeat."""
