@@ -84,6 +84,7 @@ from mpmcli.bench.ours import Ours, particles_of, scene_of
 data = scene_of(case, "f64")
 data["domain"]["walls"] = "slip"
 data["solver"]["walls"] = "zeroed"
+data["solver"]["redistribute"] = False
 data["bodies"][0]["material"]["tension_cutoff"] = False
 particles = [replace(particles_of(case), velocity=v)]
 side = Ours(data, case.step, particles, threads=1, precision="f64", arch="cpu", force=True)

@@ -61,7 +61,7 @@ def test_the_plan_counts_every_field(
     assert plan.nodes == run.grid.node_count
     fine = run.grid.fine.fill.shape[0] if run.grid.fine else 0
     assert plan.bytes_per_node * plan.nodes == real * (run.grid.nodes.n * plan.nodes + fine)
-    assert (fine > 0) == group.law.relaxes
+    assert (fine > 0) == group.law.shifts
     if (dimension, material, bodies, precision) == (3, "fluid", 1, "f32"):
         assert plan.bytes_per_particle <= 160
 

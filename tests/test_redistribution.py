@@ -169,7 +169,7 @@ def test_a_shift_is_that_of_its_formulas(backend_of: Callable, kind: str, path: 
         x, C = random_state(run, clear=0.01)
         counts = [group.count for group in run.groups]
         mass = np.concatenate([np.full(n, law.members[0].density) for n, law in zip(counts, laws, strict=True)])
-        flows = np.repeat([law.relaxes for law in laws], counts)
+        flows = np.repeat([law.shifts for law in laws], counts)
         expected = shifted(scene, np.concatenate(x), np.concatenate(C), mass, flows, T)
         found = one_shift(run, x, C, T)
         way = np.abs(expected - np.concatenate(x)).max()
@@ -194,7 +194,7 @@ def test_what_does_not_strain_is_not_shifted(backend_of: Callable, pool: Scene) 
     turning = [own - own.transpose(0, 2, 1) for own in C]
     assert np.abs(one_shift(run, x, turning, 1.0) - before).max() < 1e-6 * H
     sheared = one_shift(run, x, C, 1.0)
-    solid = np.repeat([not group.law.relaxes for group in run.groups], [group.count for group in run.groups])
+    solid = np.repeat([not group.law.shifts for group in run.groups], [group.count for group in run.groups])
     assert np.abs(sheared - before)[~solid].max() > 0.05 * H
     # Their step of 1e-12 s alone.
     assert np.abs(sheared - before)[solid].max() < 1e-9 * H

@@ -39,7 +39,8 @@ def free_scene(dimension: int, precision: str, gravity: list[float] | None = Non
             **({"gravity": gravity} if gravity else {}),
         },
         time={"end": 1.0, "frames": 1},
-        solver={"precision": precision},
+        # A shift changes momenta, by what is of second order in its way (test_redistribution.py).
+        solver={"precision": precision, "redistribute": False},
         bodies=[
             {
                 "name": "block",

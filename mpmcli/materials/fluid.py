@@ -197,6 +197,7 @@ class Fluid(Law):
     deformation = "J"
     coherent = True
     flows = True
+    shifts = True
 
     def __init__(self, members: tuple[FluidParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)

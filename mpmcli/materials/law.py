@@ -96,6 +96,7 @@ class Law(ABC):
         locks: whether a body has a Poisson's ratio at which its changes of volume are averaged over cells by default
             (docs/theory.md, 4.4).
         flows: whether it is a liquid or grains, whose volume the ledger compares with what they fill on the grid.
+        shifts: whether particles are shifted out of crowds (docs/theory.md, 5.12).
         elastic: whether the stress is a function of F alone, so that the body can be computed on the grid of its state
             at rest (docs/theory.md, 2.6).
         sensitivity: growth of the logarithm of the largest stiffness per stored strain, dimensionless. It sets how
@@ -114,6 +115,7 @@ class Law(ABC):
     grows_by_constants: bool = False
     coherent: ClassVar[bool] = False
     flows: ClassVar[bool] = False
+    shifts: ClassVar[bool] = False
     elastic: ClassVar[bool] = False
     stiffness_parameters: ClassVar[tuple[str, ...]] = ("bulk_modulus", "youngs_modulus", "shear_modulus")
     viscosity_parameters: ClassVar[tuple[str, ...]] = ("viscosity", "consistency", "bulk_viscosity")

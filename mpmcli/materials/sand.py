@@ -119,6 +119,7 @@ class Sand(HenckyLaw):
     parameters = SandParameters
     projects = True
     flows = True
+    shifts = True
 
     def __init__(self, members: tuple[SandParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)

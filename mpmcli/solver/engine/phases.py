@@ -39,9 +39,9 @@ class Phase:
 
 
 def shift_phases(laws: Sequence[Law], dimension: int, *, deterministic: bool) -> tuple[Phase, ...]:
-    """Return the phases that shift particles of laws whose volume follows the grid."""
+    """Return the phases that shift particles, of laws that have it."""
     groups = range(len(laws))
-    flowing = [g for g in groups if laws[g].relaxes]
+    flowing = [g for g in groups if laws[g].shifts]
     return (
         Phase("clear_fine", "nodes", body=by.clear_fine),
         *(Phase("fill_fine", "particles", g, True, 1, by.fill_fine, by.fill_range) for g in groups),

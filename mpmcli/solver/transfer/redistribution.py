@@ -42,11 +42,8 @@ PUSH = 8.0
 
 
 def fine_nodes(scene: Scene, laws: Sequence[Law]) -> int:
-    """Return the fine nodes per cell along an axis, as many as particles of what is shifted; 0 where nothing is.
-
-    Of other laws the volume follows no grid, and would grow with what a shift leaves of it.
-    """
-    flowing = {law.name for law in laws if law.relaxes}
+    """Return the fine nodes per cell along an axis, as many as particles of what is shifted; 0 where nothing is."""
+    flowing = {law.name for law in laws if law.shifts}
     if not scene.solver.redistribute or wants_sparse(scene):
         return 0
     counts = [points_per_cell(body, scene.domain.spacing) for body in scene.bodies if body.material.law in flowing]
