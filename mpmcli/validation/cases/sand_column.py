@@ -49,8 +49,8 @@ class SandColumn(Case):
         self.measures = (
             text.measure("run-out from mid-band (L0)", (runout[1] - runout[0]) / 2),
             text.measure("height from mid-band (L0)", (height[1] - height[0]) / 2),
-            # Rounding decides where grains roll to: run-outs differ by up to 0.02 from precision to precision.
-            text.measure("run-out against refinement (L0)", refined[2], rounding=0.08),
+            # Rounding decides where grains roll to: run-outs differ by up to 0.1 from precision to precision.
+            text.measure("run-out against refinement (L0)", refined[2], rounding=0.1),
             text.measure("height against refinement (L0)", settled[1], rounding=0.01),
             text.measure("run-out (L0)"),
             text.measure("height (L0)"),
@@ -117,7 +117,7 @@ CASES = (
         # 1.6 a^(2/3) (Lube) to 2.2 a (mu(I)); 0.65 a^0.35 (mu(I)) to a^0.4 (Lube).
         (4.68, 11.0),
         (1.14, 1.9),
-        (7.4, 6.5, 0.22),
-        (1.21, 0.03),
+        (7.28, 3.5, 0.22),
+        (1.46, 0.03),
     ),
 )
