@@ -120,11 +120,14 @@ def shifted(scene: Scene, x: np.ndarray, C: np.ndarray, mass: np.ndarray, flows:
     return np.where(flows[:, None], after, x)
 
 
-def one_shift(run: Run, x: Sequence[np.ndarray], C: Sequence[np.ndarray], T: float, v: float = 0.0) -> np.ndarray:
+def one_shift(
+    run: Run, x: Sequence[np.ndarray], C: Sequence[np.ndarray], T: float, v: float | Sequence[np.ndarray] = 0.0
+) -> np.ndarray:
     """Return where particles are after a step so short that they only move by a shift for a time T, s."""
     step = 1e-12
-    for group, place, gradient in zip(run.groups, x, C, strict=True):
-        group.replace(x=place, C=gradient, v=np.full_like(place, v), id=np.sort(group.read()["id"]))
+    speeds = [np.full_like(place, v) for place in x] if isinstance(v, float) else v
+    for group, place, gradient, speed in zip(run.groups, x, C, speeds, strict=True):
+        group.replace(x=place, C=gradient, v=speed, id=np.sort(group.read()["id"]))
     run.state_was_replaced()
     run.state.unrelaxed, run.state.unrelaxed_steps = T - step, INTERVAL - 1
     run.step(step)
@@ -200,6 +203,18 @@ def test_what_does_not_strain_is_not_shifted(backend_of: Callable, pool: Scene) 
     assert np.abs(sheared - before)[solid].max() < 1e-9 * H
     moving = one_shift(run, x, C, 1.0, v=3.0)
     assert np.abs(moving - sheared).max() < 1e-9 * H
+
+
+def test_the_velocity_of_a_place_stays(backend_of: Callable, pool: Scene) -> None:
+    """v = C (x - c) holds where particles are after a shift as before it, as v changes by C times the way."""
+    run = build_run(pool, backend_of("f64", 1))
+    x, _ = random_state(run, clear=0.25)
+    C, middle = np.array([[1.0, -0.5], [2.0, -1.0]]), np.array([0.5, 0.5])
+    rates = [np.tile(C, (len(own), 1, 1)) for own in x]
+    after = one_shift(run, x, rates, 1.0, v=[(own - middle) @ C.T for own in x])
+    assert np.abs(after - np.concatenate(x)).max() > 0.05 * H
+    v = np.concatenate([(state := group.read())["v"][np.argsort(state["id"])] for group in run.groups])
+    assert np.abs(v - (after - middle) @ C.T).max() < 1e-6 * H
 
 
 def test_momenta_stay_where_drops_collide(backend_of: Callable) -> None:
