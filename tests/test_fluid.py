@@ -195,6 +195,24 @@ def test_viscous_modes(probes: Probes, d: int) -> None:
     assert ours == pytest.approx(d * K / rho * (dt / h) ** 2 + 4 * (mu / rho) * dt / h**2)
 
 
+@pytest.mark.parametrize("d", [2, 3])
+def test_suction_is_bounded_by_viscosity(probes: Probes, d: int) -> None:
+    """tau = min(K (J - 1), 3 mu sqrt(2 D':D')) I + 2 mu D', D' in 3D: none at rest, and none without viscosity."""
+    rng = np.random.default_rng(4)
+    J, mu = np.linspace(1.0, 1.002, 40), 5.0
+    C = rng.normal(0, 20.0, (len(J), d, d)) * (np.arange(len(J)) > 4)[:, None, None]
+    D = np.zeros((len(J), 3, 3))
+    D[:, :d, :d] = (C + C.transpose(0, 2, 1)) / 2
+    D -= np.trace(D, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+    bound = 3 * mu * np.sqrt(2 * (D**2).sum((1, 2)))
+    assert (bound < K * (J - 1)).any() and (bound > K * (J - 1))[5:].any()
+    expected = np.minimum(K * (J - 1), bound)[:, None, None] * np.eye(3) + 2 * mu * D
+    found = probes(d, viscosity=mu)(swollen(J, d), C=C).tau
+    # J - 1 is rounded against 1.
+    assert np.abs(found - expected).max() < 8 * probes.epsilon * K
+    assert not probes(d)(swollen(J, d), C=C).tau.any()
+
+
 def test_what_is_not_asked_for_is_not_compiled() -> None:
     """A law knows from its members whether any is viscous, nonlinear, or cut off."""
     forgetful = fluid(volume_correction=False)

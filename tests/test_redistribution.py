@@ -317,7 +317,6 @@ def test_a_gpu_shifts_as_the_cpu_does(backend_of: Callable) -> None:
 
 def test_colliders_hold_particles_back(backend_of: Callable) -> None:
     """None that is outside goes farther than half of the way to the surface, in a shift and on its way back."""
-    scene = crowded({"default": "slip"})
     ball = {"name": "ball", "shape": {"ball": {"center": [0.5, 0.4], "radius": 0.2}}}
     scene = scene_of(
         **{

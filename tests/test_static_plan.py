@@ -22,9 +22,9 @@ MODULES = {
     "forces": {"solver.drive.expressions.Application", "solver.drive.expressions.TimeTables"},
     "moving walls": {"boundaries.walls.MovingFaces"},
     "periodic faces": {"solver.grid.period.Period"},
+    "shifts": {"solver.transfer.redistribution"},
     # Not asked for by the scene with features either.
     "grids of distances": {"boundaries.distances.GridDistance"},
-    "shifts": {"solver.transfer.redistribution"},
     "means of volume": {"solver.transfer.volume_average"},
 }
 

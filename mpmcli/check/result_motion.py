@@ -17,6 +17,7 @@ from mpmcli.check.result_state import BLOWN_UP, CRUSHED, TOUCHED, FrameCheck, ex
 from mpmcli.check.scene_limits import deformation_rate
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader
 from mpmcli.stability.limits import DEFORMATION
 
@@ -157,7 +158,9 @@ def _reach(header: RunHeader, row: LedgerRow, frame: Frame) -> float | None:
         return None
     factor = GPU_FACTOR if header.on_gpu else 1.0
     rounding = row.steps * header.step_error + 2 * header.place_error(frame.position.dtype)
-    shifted = header.shifted(row.steps, frame.step)
+    known, shifted = laws(), 0.0
+    if any(law.name in known and known[law.name].shifts for law in header.laws):
+        shifted = header.shifted(row.steps, frame.step)
     return factor * row.steps * row.courant_max * header.spacing * (1 + 1e-3) + shifted + rounding
 
 

@@ -33,7 +33,7 @@ class EllipticalDrop(Case):
     varies = ("precision", "kernel", "transfer", "per_axis", "safety")
     levels = {"coarse": (10, 20), "default": (10, 20, 40), "fine": (20, 40, 80)}  # noqa: RUF012
     measures = (
-        # 0.04 h of it by shifts, a first-order part of the way that strain asks for.
+        # 0.03 h of it by shifts, which move particles off their paths.
         text.measure("position error (R)", lambda n: 2.1e-3 * 20 / n, expected=1.0),
         # What compressibility adds, 1 / (4 SOUND^2), and a grid that is fine enough less.
         text.measure("axes error", lambda n: min(1 / (4 * SOUND**2), 5e-4 + 1e-3 * 20 / n), expected=1.0),
