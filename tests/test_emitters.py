@@ -65,6 +65,8 @@ def mixed_scene(other: bool = False) -> Scene:
                 "material": MATERIALS["snow"],
                 "shape": {"ball": {"center": [0.6, 0.4], "radius": 0.06 - 0.02 * other}},
                 "velocity": [0.0, -1.0],
+                "sampling": "jittered",
+                "seed": 3 + other,
                 "start": 0.1,
                 "volume": 0.015,
             },
@@ -74,6 +76,7 @@ def mixed_scene(other: bool = False) -> Scene:
                 "material": MATERIALS["fluid"],
                 "shape": {"ball": {"center": [0.2, 0.25], "radius": 0.05}},
                 "velocity": [0.0, -1.0],
+                "sampling": "lattice" if other else "turned",
                 "start": 0.1,
             },
         ],
@@ -88,16 +91,15 @@ def jet(backend_of: Callable[..., Backend]) -> Output:
 
 
 def test_the_jet_flows_as_its_velocity_says(jet: Output) -> None:
-    """8 particles a sheet, one each SPACING / SPEED: emitted mass to 1e-6, and every particle at x0 + v (t - due)."""
+    """8 particles each SPACING / SPEED, one by one: emitted mass to 1e-6, and every particle at x0 + v (t - due)."""
     waiting = sample_bodies(jet_scene())[1]
     first = len(jet[0][0].position) - len(waiting.position)
-    sheet = np.arange(len(waiting.position)) // 8
     for frame, row in jet:
         status = frame.fields["status"]
         assert status.dtype == np.int8 and status[:first].min() != 0
-        due = sheet * SPACING / SPEED
-        # A sheet that is due at a frame enters in the next step.
-        assert row.emitted == 8 * np.count_nonzero(due[::8] < frame.time - 1e-9)
+        due = np.arange(len(waiting.position)) * (SPACING / SPEED / 8)
+        # What is due in a step enters in the next one.
+        assert 0 <= np.count_nonzero(due < frame.time - 1e-9) - row.emitted <= 8 * SPEED * row.step_max / SPACING
         assert row.emitted_mass == pytest.approx(1000.0 * 0.1 * SPACING * row.emitted / 8, rel=1e-6)
         # Beyond the face a particle stays when it has gone two cells.
         mine = (status[first:] == 1) & (frame.position[first:, 0] < 1.0)
@@ -111,11 +113,13 @@ def test_the_jet_flows_as_its_velocity_says(jet: Output) -> None:
 
 
 def test_the_jet_leaves_as_if_nothing_were_there(jet: Output) -> None:
-    """No pressure comes back from the open face: J stays 1, and the velocity what it was, to rounding."""
+    """No pressure comes back from the open face: the velocity stays what it was, to rounding, and J what it is of how
+    evenly particles lie: 1.4e-2 at most, 2e-4 in the mean."""
     frame, row = jet[-1]
     assert row.retired > 100
     there = (frame.fields["status"] == 1) & (frame.body == 1)
-    assert np.abs(frame.fields["volume_ratio"][there] - 1).max() < 2e-5
+    J = frame.fields["volume_ratio"][there]
+    assert np.abs(J - 1).max() < 0.02 and abs(J.mean() - 1) < 5e-4
     assert np.abs(frame.velocity[there] - [SPEED, 0.0]).max() < 2e-5
     gone = frame.fields["status"] == 2
     assert row.retired == gone.sum() and (frame.position[gone, 0] == 1.0).all()
@@ -209,7 +213,7 @@ def test_a_result_says_who_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     check = check_result(Path("out"))
     assert check.passes(strict=True), check.text()
     result = open_result(Path("out"))
-    assert result.field_names[-1] == "status" and result.ledger[-1].emitted == 768
+    assert result.field_names[-1] == "status" and 764 <= result.ledger[-1].emitted <= 768
     frame = result.present_frame(3, ())
     assert len(frame.position) == np.count_nonzero(result.frame(3).fields["status"] == 1)
     refused = run_here("export", "out", "--to", "gns", "-o", "gns")

@@ -161,7 +161,9 @@ def _reach(header: RunHeader, row: LedgerRow, frame: Frame) -> float | None:
     known, shifted = laws(), 0.0
     if any(law.name in known and known[law.name].shifts for law in header.laws):
         shifted = header.shifted(row.steps, frame.step)
-    return factor * row.steps * row.courant_max * header.spacing * (1 + 1e-3) + shifted + rounding
+    # What an emitter lets in begins where it would be, had it entered when it was due: up to a step before.
+    steps = row.steps + bool(row.emitted)
+    return factor * steps * row.courant_max * header.spacing * (1 + 1e-3) + shifted + rounding
 
 
 class MomentumCheck(FrameCheck):

@@ -305,8 +305,8 @@ def draw(sweep: Sweep, number: int, given: Mapping[str, Any] = MappingProxyType(
     """Draw one trajectory, always the same; PlacementError: bodies have no place; ValueError: there is no such one.
 
     Random values depend on the seed, the number and their own key alone; Sobol and Latin ones also on which keys are
-    continuous, Latin ones on the count. Bodies sampled at random get seeds of their own unless [vary] has them. A force
-    on a replaced body acts on each in its place. `given` values replace drawn ones.
+    continuous, Latin ones on the count. Bodies and emitters sampled at random get seeds of their own unless [vary] has
+    them. A force on a replaced body acts on each in its place. `given` values replace drawn ones.
     """
     if not 0 <= number < sweep.count:
         raise ValueError(f"The sweep has trajectories 0 to {sweep.count - 1}; there is no trajectory {number}.")
@@ -325,9 +325,11 @@ def draw(sweep: Sweep, number: int, given: Mapping[str, Any] = MappingProxyType(
             _put_in_place(data, name, {place.template: bodies for place, bodies in placed if place.list == name})
             for name in ("bodies", "colliders")
         )
-    for body, origin in zip(data["bodies"], origins, strict=True):
-        if body.get("sampling") in ("jittered", "poisson") and ("bodies", origin, "seed") not in varied:
-            body["seed"] = int(generator(sweep.seed, number, f"bodies.{body['name']}.seed").integers(SEEDS))
+    emitters = data.get("emitters", [])
+    for kind, sources, places in (("bodies", data["bodies"], origins), ("emitters", emitters, range(len(emitters)))):
+        for source, origin in zip(sources, places, strict=True):
+            if source.get("sampling") in ("jittered", "poisson") and (kind, origin, "seed") not in varied:
+                source["seed"] = int(generator(sweep.seed, number, f"{kind}.{source['name']}.seed").integers(SEEDS))
     source, split = f"{sweep.path}: trajectory {number}", sweep.split_of(number)
     return Draw(number, split, values, data, origins, collider_origins, source, sweep.base.parent)
 

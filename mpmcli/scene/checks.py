@@ -27,7 +27,7 @@ from mpmcli.scene.sampling import (
 )
 from mpmcli.scene.schema import Body, Emitter, ParticleField, Scene
 from mpmcli.scene.shapes import Box, Composite
-from mpmcli.scene.sheets import most_in_mouth, mouth_of, sheets_of, sheets_until
+from mpmcli.scene.sheets import most_in_mouth, most_until_end, mouth_of, sheets_of
 
 # Lengths below this fraction of the grid spacing are round-off.
 _TOLERANCE = 1e-6
@@ -69,17 +69,17 @@ def emitter_problems(scene: Scene) -> Iterator[Problem]:
 
 def _emitted(emitter: Emitter, scene: Scene) -> Iterator[tuple[str, str]]:
     sheets = sheets_of(emitter, scene)
-    most = sheets_until(emitter, scene, sheets.period)
-    n = len(sheets.places)
-    for key, unit, one in (("particles", "particles", n), ("volume", "m^3", n * sheets.volume)):
+    most = most_until_end(emitter, scene, sheets.period, sheets.size)
+    for key, unit, one in (("particles", "particles", 1.0), ("volume", "m^3", sheets.volume)):
         asked = getattr(emitter, key)
         if asked is not None and round(asked / one) > most:
             end = "end" if emitter.end is not None else "time.end"
             unit = "m^2" if key == "volume" and scene.dimension == 2 else unit
+            pace = sheets.period / sheets.size
             yield (
                 key,
-                f'takes {round(asked / one) * sheets.period:.4g} s to flow out of "{emitter.name}", which has '
-                f"{most * sheets.period:.4g} s until {end}; {most * one:.6g} {unit} at most come out by then",
+                f'takes {asked / one * pace:.4g} s to flow out of "{emitter.name}", which has '
+                f"{most * pace:.4g} s until {end}; {most * one:.6g} {unit} at most come out by then",
             )
     if sheets.particles > _MOST:
         yield "particles", f"would be {sheets.particles:.3g}, more than a run can number, {_MOST}; give fewer"

@@ -296,7 +296,7 @@ def sample_bodies(scene: Scene) -> list[BodyParticles]:
 def _waiting(emitter: Emitter, scene: Scene) -> BodyParticles:
     """Return the particles of an emitter, sheet after sheet, at the places where they will enter."""
     sheets = sheets_of(emitter, scene)
-    position = np.tile(sheets.places, (sheets.count, 1))
+    position = sheets.places(emitter)
     n, d = position.shape
     affine = np.broadcast_to(np.zeros((d, d)), (n, d, d))
     mass = emitter.material.density * sheets.volume

@@ -83,8 +83,8 @@ Material = Annotated[
 class Emitter(Table):
     """A mouth that material flows out of at a steady velocity.
 
-    The mouth is the section of the shape through its centre, across the velocity. Particles lie on a lattice that moves
-    with the velocity: a sheet of it enters each time the one before has moved on by the distance of two sheets.
+    The mouth is the section of the shape through its centre, across the velocity. Particles move with the velocity, in
+    sheets: a layer as thick as their distance enters as one sheet, or as eight.
     """
 
     name: str = Field(pattern=NAME, description="Name of the emitter, used in messages and --set.")
@@ -94,12 +94,18 @@ class Emitter(Table):
     start: NotNegative = Field(0.0, description="When the first sheet enters, s.")
     end: Positive | None = Field(None, description="No sheet enters from then on, s. Default: the end of the scene.")
     particles: Integer | None = Field(
-        None, ge=1, description="Particles in all, as far as whole sheets allow; or give volume. Default: until end."
+        None, ge=1, description="Particles in all, of a lattice whole sheets; or give volume. Default: until end."
     )
     volume: Positive | None = Field(
         None, description="Volume at rest in all, m^3 (m^2 in 2D); or give particles. Default: until end."
     )
+    sampling: Literal["turned", "jittered", "lattice"] = Field(
+        "turned",
+        description="A lattice turned such that no stretch lines its particles up, one at random in each cell of a "
+        "lattice that moves along, or the sheets of that lattice.",
+    )
     particles_per_cell: ParticlesPerCell = None  # type: ignore[assignment]
+    seed: Integer = Field(0, ge=0, le=2**63 - 1, description="Seed of the random positions; of a jittered sample.")
 
     @field_validator("velocity")
     @classmethod

@@ -1,4 +1,8 @@
-"""The sheets of particles that an emitter lets in: where they lie, how many there are, and when they come."""
+"""The particles that an emitter lets in, sheet after sheet: where they lie, how many there are, and when they come.
+
+A layer has a particle for each cell of the lattice on the mouth. It enters as one sheet, or as several, one after the
+other: a slow stream that gravity stretches tears between sheets that are as far apart as particles.
+"""
 
 import math
 from dataclasses import dataclass
@@ -14,6 +18,10 @@ from mpmcli.scene.shapes import Shape
 _MEASURED = {2: 4096, 3: 768}
 # Sheets that are a part of a period late count as in time.
 _SLACK = 1e-9
+# Sheets of a layer, where they are not the whole of it.
+_PER_LAYER = 8
+# Golden and plastic number, the smallest real roots above 1 of z^2 = z + 1 and z^3 = z + 1.
+_ROOTS = {2: (1 + math.sqrt(5)) / 2, 3: 1.3247179572447460}
 
 
 @dataclass(frozen=True)
@@ -31,9 +39,12 @@ class Mouth:
 
     @property
     def places(self) -> np.ndarray:
-        """Where the particles of a sheet enter, (n, d), m."""
-        cells = np.argwhere(self.filled)
-        return self.centre + (self.low + (cells + 0.5) * self.spacing[1:]) @ self.across
+        """The middles of cells that hold a particle, (n, d), m."""
+        return self.place(np.argwhere(self.filled) + 0.5)
+
+    def place(self, cells: np.ndarray) -> np.ndarray:
+        """Return places on the section, (n, d), m, of those on the lattice, (n, d - 1), in cells."""
+        return self.centre + (self.low + cells * self.spacing[1:]) @ self.across
 
 
 @dataclass(frozen=True)
@@ -41,16 +52,61 @@ class Sheets:
     """All sheets of an emitter."""
 
     mouth: Mouth
-    places: np.ndarray  # of the particles of one, (n, d), m
-    count: int
+    size: int  # particles of one; the last one may have fewer
+    per_layer: int  # sheets of a layer
+    particles: int  # of all sheets
     period: float  # between two of them, s
     start: float  # when the first one is due, s
     volume: float  # of a particle at rest, m^3 (m^2 in 2D)
 
     @property
-    def particles(self) -> int:
-        """Particles of all sheets."""
-        return self.count * len(self.places)
+    def count(self) -> int:
+        return -(-self.particles // max(1, self.size))
+
+    def places(self, emitter: Emitter) -> np.ndarray:
+        """Return where all particles enter, (n, d), m, in the order in which they do.
+
+        Those of a sheet that is a part of a layer lie in front of the mouth, where they would be had each entered at a
+        time of its own since the sheet before.
+        """
+        mouth, number = self.mouth, np.arange(self.particles)
+        filled = np.argwhere(mouth.filled)
+        if emitter.sampling == "lattice":
+            return mouth.place(filled[number % len(filled)] + 0.5)
+        if emitter.sampling == "jittered":
+            layers = -(-self.particles // len(filled))
+            random = np.random.default_rng(emitter.seed).random((layers, len(filled), len(mouth.centre)))
+            order = np.argsort(random[..., 0], axis=1)
+            random = np.take_along_axis(random, order[..., None], axis=1)
+            due = ((np.arange(layers)[:, None] + random[..., 0]) * (len(filled) / self.size)).reshape(-1)[number]
+            cells = (filled[order] + random[..., 1:]).reshape(-1, len(mouth.counts))[number]
+        else:
+            cells, due = _even_cells(mouth, emitter.shape, self.particles), (number + 0.5) / self.size
+        ahead = (number // self.size + 1 - due) * (self.period * np.linalg.norm(emitter.velocity))
+        return mouth.place(cells) + ahead[:, None] * mouth.direction
+
+
+def _even_cells(mouth: Mouth, shape: Shape, count: int) -> np.ndarray:
+    """Return points of an even sequence on the lattice of a mouth, (count, d - 1), in cells."""
+    # Of the lattice a part is filled, and of the sequence about as much.
+    many, d = 16 + int(1.1 * count * mouth.filled.size / max(1, mouth.filled.sum())), len(mouth.centre)
+    while True:
+        cells = even_sequence(d, many) * mouth.counts
+        cells = cells[shape.form.contains(mouth.place(cells))]
+        if len(cells) >= count:
+            return cells[:count]
+        many *= 2
+
+
+def even_sequence(d: int, count: int) -> np.ndarray:
+    """Return the first points of a sequence that fills the unit interval (2D) or square (3D), (count, d - 1).
+
+    Point k is (k / r mod 1, k / r^2 mod 1), r the golden number in 2D and the plastic one in 3D. With k as one more
+    coordinate these are points of a lattice, which keep apart however it is stretched along that one
+    (docs/theory.md, 8.2).
+    """
+    steps = _ROOTS[d] ** -np.arange(1.0, d)
+    return (0.5 + np.arange(count)[:, None] * steps) % 1.0
 
 
 def mouth_of(emitter: Emitter, h: float) -> Mouth:
@@ -110,25 +166,27 @@ def _section(shape: Shape, direction: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def sheets_of(emitter: Emitter, scene: Scene) -> Sheets:
     """Return the sheets of an emitter of a scene.
 
-    A sheet holds the material of a slice of the mouth that is as thick as sheets are apart, so that the flow is the
-    area times the speed.
+    A layer holds the material of a slice of the mouth that is as thick as sheets of a lattice are apart, so that the
+    flow is the area times the speed.
     """
     mouth = mouth_of(emitter, scene.domain.spacing)
-    places = mouth.places
-    period = float(mouth.spacing[0] / np.linalg.norm(emitter.velocity))
-    slice_volume = mouth.area * float(mouth.spacing[0])
-    count = sheets_until(emitter, scene, period)
-    if emitter.particles is not None and len(places):
-        count = min(count, max(1, round(emitter.particles / len(places))))
-    if emitter.volume is not None and slice_volume > 0:
-        count = min(count, max(1, round(emitter.volume / slice_volume)))
-    return Sheets(mouth, places, count, period, emitter.start, slice_volume / max(1, len(places)))
+    layer, whole = int(mouth.filled.sum()), emitter.sampling == "lattice"
+    size = layer if whole else max(1, round(layer / _PER_LAYER))
+    volume = mouth.area * float(mouth.spacing[0]) / max(1, layer)
+    period = float(mouth.spacing[0] / np.linalg.norm(emitter.velocity)) * size / max(1, layer)
+    step = size if whole else 1
+    totals = [most_until_end(emitter, scene, period, size)]
+    totals += [emitter.particles] * (emitter.particles is not None)
+    if emitter.volume is not None and volume > 0:
+        totals.append(emitter.volume / volume)
+    particles = step * max(1, round(min(totals) / step)) if totals[0] and layer else 0
+    return Sheets(mouth, size, max(1, round(layer / max(1, size))), particles, period, emitter.start, volume)
 
 
-def sheets_until(emitter: Emitter, scene: Scene, period: float) -> int:
-    """Return how many sheets enter up to the end of an emitter, or of its scene."""
+def most_until_end(emitter: Emitter, scene: Scene, period: float, size: int) -> int:
+    """Return how many particles enter up to the end of an emitter, or of its scene, in sheets of a size."""
     end = min(scene.time.end, math.inf if emitter.end is None else emitter.end)
-    return max(0, math.ceil((end - emitter.start) / period - _SLACK))
+    return max(0, math.ceil((end - emitter.start) / period - _SLACK)) * size
 
 
 def emitted_volumes(scene: Scene) -> list[float]:

@@ -84,7 +84,9 @@ def new_record(
         settings.directory,
         command=settings.command,
         backend=summary.backend,
-        seeds={body.name: body.seed for body in loaded.scene.bodies if body.sampling in ("jittered", "poisson")},
+        seeds={
+            source.name: source.seed for source in loaded.scene.sources if source.sampling in ("jittered", "poisson")
+        },
         forced=settings.force and loaded.scene.time.step != "auto",
         files=file_digests(loaded),
         frames_expected=summary.frames_expected,

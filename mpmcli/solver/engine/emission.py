@@ -1,18 +1,21 @@
-"""What the kernel of a batch does for particles that come and go, on the thread that leads a run.
+"""How sheets of emitters enter: on the CPU on the thread that leads a run, on a GPU between launches.
 
 A sheet enters at the first step after it was due; the next one is due a period after it was. Particles whose cell of
-the lattice is occupied stay out. Where these are half of the sheet or more, it tries again after a share of the period,
-and all that follow are due later by as much. `GpuLaunch` does the same.
+the lattice is occupied when a layer begins stay out. Where these are half of the layer or more, it tries again after a
+share of the time that it takes, and all that follow are due later by as much.
 """
 
 import math
 from collections.abc import Sequence
+
+import numpy as np
 
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene, highest_speed
 from mpmcli.solver.engine.device import Device
 from mpmcli.solver.engine.run_numbers import Layout, Row
 from mpmcli.solver.particles.inflow import RETRY, first_ids
+from mpmcli.solver.particles.sort import ACTIVE, BLOCKED, WAITING
 
 
 @ti.data_oriented
@@ -41,18 +44,22 @@ class CpuEmission:
             while going and numbers[w, self.real.due_of[e]] <= time:
                 late = ti.cast(time - numbers[w, self.real.due_of[e]], float)
                 period = numbers[w, self.real.period[e]]
-                self.look(e, w, late, counts)
-                blocked, size = self.emission.occupied(e, w), self.emission.ids[w, e][1]
-                if 2 * blocked >= size:
-                    numbers[w, self.real.due_of[e]] = time + RETRY * period
+                sheet, blocked, layer = counts[w, self.count.entered[e]], 0, 1
+                first = w * ti.static(self.device.room[g])
+                begin, after = first + counts[w, self.count.particles[g]], first + counts[w, self.count.capacity[g]]
+                if sheet % self.emission.ids[w, e][2] == 0:
+                    self.look(e, w, sheet, late, counts)
+                    blocked = self.emission.count_blocked(e, group, w, sheet, begin, after)
+                    layer = self.emission.particles_of(e, w, sheet, self.emission.ids[w, e][2])
+                if 2 * blocked >= layer:
+                    numbers[w, self.real.due_of[e]] = time + RETRY * period * self.emission.ids[w, e][2]
                     if counts[w, self.count.waits[e]] == 0:
                         counts[w, self.count.waits[e]] = 1
-                        counts[w, self.count.blocked] += size
+                        counts[w, self.count.blocked] += layer
                 else:
+                    if blocked > 0:
+                        self.emission.keep_out(e, group, w, sheet, begin, after)
                     counts[w, self.count.blocked] += blocked
-                    sheet = counts[w, self.count.entered[e]]
-                    first = w * ti.static(self.device.room[g])
-                    begin, after = first + counts[w, self.count.particles[g]], first + counts[w, self.count.capacity[g]]
                     end = self.emission.enter(e, group, w, sheet, late, begin, after)
                     counts[w, self.count.particles[g]] = end - first
                     for p in range(begin, end):
@@ -80,13 +87,13 @@ class CpuEmission:
         return before and counts[w, self.count.entered[e]] < counts[w, self.count.sheets[e]]
 
     @ti.func
-    def look(self, e: ti.template(), w: int, late: float, counts: ti.template()):
-        """Find which cells of a sheet that was due `late` s ago hold a particle."""
+    def look(self, e: ti.template(), w: int, sheet: int, late: float, counts: ti.template()):
+        """Find which cells of the layer that begins with a sheet, which was due `late` s ago, hold a particle."""
         self.emission.clear(e, w)
         for g, group in ti.static(self.numbered):
             first = w * ti.static(self.device.room[g])
             for p in range(first, first + counts[w, self.count.particles[g]]):
-                self.emission.mark(e, w, late, group.x[p])
+                self.emission.mark(e, group, w, sheet, late, p)
 
     @ti.func
     def count_active(self, w: int, counts: ti.template()):
@@ -97,6 +104,116 @@ class CpuEmission:
                 counts[w, self.count.particles[g]] = self.device.orders[g].start[after] - w * ti.static(
                     self.device.room[g]
                 )
+
+
+@ti.data_oriented
+class GpuEmission:
+    """The sheets of the emitters of the runs of a batch on a GPU; a sort follows each of them.
+
+    Attributes:
+        counts: (runs, counts) int, those of `Batch` on the device.
+        enters: (runs) int, whether the next sheet of an emitter enters; sheet: its number; late: s since it was due.
+        blocked: (runs) int, particles of its layer that find no room; layer: particles of that.
+    """
+
+    def __init__(self, device: Device, layout: Layout, counts: ti.Field) -> None:
+        self.device, self.emission, self.counts, self.runs = device, device.emission, counts, device.runs
+        self.real, self.count, self.room = layout.real, layout.count, tuple(device.room)
+        self.members = tuple(enumerate(device.groups))
+        self.enters, self.sheet, self.blocked, self.layer = (ti.field(int, shape=self.runs) for _ in range(4))
+        self.late = ti.field(float, shape=self.runs)
+
+    def enter(self, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
+        """Let the sheets enter that are due in these runs."""
+        due = going & (numbers[:, self.real.due] <= numbers[:, self.real.time])
+        while due.any():
+            for e, _ in self.emission.members:
+                self._enter_one(e, numbers, counts, due)
+            numbers[due, self.real.drift] = np.inf
+            for w in np.flatnonzero(due):
+                left = [numbers[w, k] for e, k in enumerate(self.real.due_of) if self._is_left(e, w, numbers, counts)]
+                numbers[w, self.real.due] = min(left, default=np.inf)
+            due &= numbers[:, self.real.due] <= numbers[:, self.real.time]
+
+    def _is_left(self, e: int, w: int, numbers: np.ndarray, counts: np.ndarray) -> bool:
+        """Return whether another sheet of an emitter enters, at whatever time."""
+        before = numbers[w, self.real.due_of[e]] < numbers[w, self.real.until[e]]
+        return bool(before and counts[w, self.count.entered[e]] < counts[w, self.count.sheets[e]])
+
+    def _enter_one(self, e: int, numbers: np.ndarray, counts: np.ndarray, due: np.ndarray) -> None:
+        """Let one sheet of an emitter enter in each of these runs where it is due and finds room."""
+        time, due_of = numbers[:, self.real.time], numbers[:, self.real.due_of[e]]
+        asked = due & (due_of <= time) & [self._is_left(e, w, numbers, counts) for w in range(self.runs)]
+        if not asked.any():
+            return
+        period, sheet, per_layer = (
+            numbers[:, self.real.period[e]],
+            counts[:, self.count.entered[e]].copy(),
+            self.emission.ids.to_numpy()[:, e, 2],
+        )
+        self.late.from_numpy(np.where(asked, time - due_of, 0.0).astype(self.device.groups[0].real))
+        self.enters.from_numpy(asked.astype(np.int32))
+        self.sheet.from_numpy(sheet)
+        blocked, waits = np.zeros_like(sheet), np.zeros_like(asked)
+        if (asked & (sheet % per_layer == 0)).any():
+            self.find_blocked(e)
+            blocked, layer = self.blocked.to_numpy(), self.layer.to_numpy()
+            waits = asked & (2 * blocked >= layer)
+            first_wait = waits & (counts[:, self.count.waits[e]] == 0)
+            counts[first_wait, self.count.blocked] += layer[first_wait]
+        enters = asked & ~waits
+        counts[waits, self.count.waits[e]] = 1
+        numbers[waits, self.real.due_of[e]] = (time + RETRY * period * per_layer)[waits]
+        counts[enters, self.count.blocked] += blocked[enters]
+        counts[enters, self.count.entered[e]] += 1
+        counts[enters, self.count.waits[e]] = 0
+        numbers[enters, self.real.due_of[e]] += period[enters]
+        self.enters.from_numpy(enters.astype(np.int32))
+        self.let_enter(e)
+
+    @ti.kernel
+    def find_blocked(self, e: ti.template()):
+        """Find how many particles of the layer that an emitter begins find no room, and how many it has."""
+        source = ti.static(self.emission.members[e][1])
+        for w in range(self.runs):
+            self.emission.clear(e, w)
+            self.blocked[w], self.layer[w] = 0, 1
+            if self.looks(e, w):
+                self.layer[w] = self.emission.particles_of(e, w, self.sheet[w], self.emission.ids[w, e][2])
+        for g, group in ti.static(self.members):
+            for p in range(self.runs * self.room[g]):
+                w = p // self.room[g]
+                if self.looks(e, w) and self.is_one(g, w, p) and group.activity[p] == ACTIVE:
+                    self.emission.mark(e, group, w, self.sheet[w], self.late[w], p)
+        for p in range(self.runs * self.room[source]):
+            w = p // self.room[source]
+            if self.looks(e, w) and self.is_one(source, w, p):
+                self.blocked[w] += ti.cast(
+                    self.emission.keeps_out(e, self.device.groups[source], w, p, self.sheet[w]), int
+                )
+
+    @ti.func
+    def looks(self, e: ti.template(), w: int):
+        """Return whether the next sheet of an emitter may enter, and begins a layer."""
+        return self.enters[w] == 1 and self.sheet[w] % self.emission.ids[w, e][2] == 0
+
+    @ti.func
+    def is_one(self, g: ti.template(), w: int, p: int):
+        """Return whether a run has a particle at place p of a group."""
+        return p - w * self.room[g] < self.counts[w, self.count.capacity[g]]
+
+    @ti.kernel
+    def let_enter(self, e: ti.template()):
+        """Let what has room of the next sheet of an emitter take part, and keep out what has none of its layer."""
+        g = ti.static(self.emission.members[e][1])
+        (group,) = ti.static((self.device.groups[g],))
+        for p in range(self.runs * self.room[g]):
+            w = p // self.room[g]
+            if self.enters[w] == 1 and self.is_one(g, w, p):
+                if self.looks(e, w) and self.emission.keeps_out(e, group, w, p, self.sheet[w]):
+                    group.activity[p] = BLOCKED
+                elif group.activity[p] == WAITING and self.emission.is_due(e, group, w, p, self.sheet[w], 1):
+                    self.emission.begin(e, group, w, p, self.late[w])
 
 
 def begin_emission(batch: object, slot: int, scene: Scene, particles: Sequence[int]) -> None:

@@ -13,6 +13,7 @@ from mpmcli.boundaries.doubles import double_field
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.drive.forces import HostValues
 from mpmcli.solver.engine.device import Device
+from mpmcli.solver.engine.emission import GpuEmission
 from mpmcli.solver.engine.gpu_phases import KICK, PULL, RELAXED, STABLE, STEP, GpuPhases
 from mpmcli.solver.engine.phases import Phase, sorted_fields
 from mpmcli.solver.engine.run_numbers import ATTEND, GOING, MEASURE, Layout
@@ -20,7 +21,6 @@ from mpmcli.solver.engine.step_size import StepSize
 from mpmcli.solver.frames.columns import FrameColumns
 from mpmcli.solver.frames.reader import chosen_columns, show_range
 from mpmcli.solver.grid.grid import box_of
-from mpmcli.solver.particles.inflow import RETRY
 from mpmcli.solver.particles.sort import SPAN, keep, take
 from mpmcli.solver.particles.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
 from mpmcli.solver.transfer.lanes import LANES
@@ -69,10 +69,7 @@ class GpuLaunch:
         self.reach = ti.field(int, shape=len(OVER))
         self.maxima = ti.field(float, shape=(runs, len(groups), widest))
         self.stencils = ti.field(int, shape=(2 * runs, self.dimension))
-        if device.emission is not None:
-            # Of each run: whether the next sheet of an emitter enters, its number, and how late; then what blocks it.
-            self.enters, self.sheet, self.blocked = (ti.field(int, shape=runs) for _ in range(3))
-            self.late = ti.field(float, shape=runs)
+        self.emission = GpuEmission(device, layout, self.counts) if device.emission is not None else None
         self.readers = [self._reader(g) for g in range(len(groups))]
 
     # A launch.
@@ -82,8 +79,8 @@ class GpuLaunch:
         going = (counts[:, self.count.status] == GOING) & (counts[:, self.count.budget] > 0)
         self._write_domains(numbers)
         if going.any():
-            if self.device.emission is not None:
-                self._let_enter(numbers, counts, going)
+            if self.emission is not None:
+                self.emission.enter(numbers, counts, going)
             self.counts.from_numpy(counts)
             self._sort_where_due(numbers, counts, going)
             (self._take_steps if self.doubles else self._take_host_step)(numbers, counts, going)
@@ -143,10 +140,11 @@ class GpuLaunch:
             self.prepare(w)
         for phase, turn in ti.static(self.listed(shifts)):
             if ti.static(phase.over != "particles"):
-                for q in range(self.runs * self.reach[OVER.index(phase.over)]):
-                    w = q // self.reach[OVER.index(phase.over)]
+                kind = ti.static(OVER.index(phase.over))
+                for q in range(self.runs * self.reach[kind]):
+                    w = q // self.reach[kind]
                     if self.stepping[w] == 1:
-                        self.phases.do(phase, turn, w, q % self.reach[OVER.index(phase.over)], self.counts)
+                        self.phases.do(phase, turn, w, q % self.reach[kind], self.counts)
             if ti.static(phase.over == "particles"):
                 for p in range(self.runs * self.room[phase.group]):
                     w = p // self.room[phase.group]
@@ -370,85 +368,6 @@ class GpuLaunch:
             nodes, planes = self.phases.nodes_in_use(w, self.counts)
             ti.atomic_max(self.reach[0], nodes)
             ti.atomic_max(self.reach[1], planes)
-
-    # Emitters.
-
-    def _let_enter(self, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
-        """Let the sheets of emitters enter that are due, as `CpuEmission` does on the CPU; a sort follows."""
-        due = going & (numbers[:, self.real.due] <= numbers[:, self.real.time])
-        while due.any():
-            for e, _ in self.device.emission.members:
-                self._let_one_enter(e, numbers, counts, due)
-            numbers[due, self.real.drift] = np.inf
-            for w in np.flatnonzero(due):
-                left = [numbers[w, k] for e, k in enumerate(self.real.due_of) if self._is_left(e, w, numbers, counts)]
-                numbers[w, self.real.due] = min(left, default=np.inf)
-            due &= numbers[:, self.real.due] <= numbers[:, self.real.time]
-
-    def _is_left(self, e: int, w: int, numbers: np.ndarray, counts: np.ndarray) -> bool:
-        """Return whether another sheet of an emitter enters, at whatever time."""
-        before = numbers[w, self.real.due_of[e]] < numbers[w, self.real.until[e]]
-        return bool(before and counts[w, self.count.entered[e]] < counts[w, self.count.sheets[e]])
-
-    def _let_one_enter(self, e: int, numbers: np.ndarray, counts: np.ndarray, due: np.ndarray) -> None:
-        """Let one sheet of an emitter enter in each of these runs where it is due and finds room."""
-        time, due_of, period = (
-            numbers[:, self.real.time],
-            numbers[:, self.real.due_of[e]],
-            numbers[:, self.real.period[e]],
-        )
-        asked = due & (due_of <= time) & [self._is_left(e, w, numbers, counts) for w in range(self.runs)]
-        if not asked.any():
-            return
-        self.late.from_numpy(np.where(asked, time - due_of, 0.0).astype(self.device.groups[0].real))
-        self.enters.from_numpy(asked.astype(np.int32))
-        self.sheet.from_numpy(counts[:, self.count.entered[e]].copy())
-        self.find_blocked(e)
-        blocked, size = self.blocked.to_numpy(), self.device.emission.ids.to_numpy()[:, e, 1]
-        waits = asked & (2 * blocked >= size)
-        first_wait = waits & (counts[:, self.count.waits[e]] == 0)
-        enters = asked & ~waits
-        counts[first_wait, self.count.blocked] += size[first_wait]
-        counts[waits, self.count.waits[e]] = 1
-        numbers[waits, self.real.due_of[e]] = time[waits] + RETRY * period[waits]
-        counts[enters, self.count.blocked] += blocked[enters]
-        counts[enters, self.count.entered[e]] += 1
-        counts[enters, self.count.waits[e]] = 0
-        numbers[enters, self.real.due_of[e]] += period[enters]
-        self.enters.from_numpy(enters.astype(np.int32))
-        self.let_enter(e)
-
-    @ti.kernel
-    def find_blocked(self, e: ti.template()):
-        """Find how many particles of the next sheet of an emitter find no room."""
-        for w in range(self.runs):
-            if self.enters[w] == 1:
-                self.device.emission.clear(e, w)
-        for g, group in ti.static(self.members):
-            for p in range(self.runs * self.room[g]):
-                w = p // self.room[g]
-                if self.enters[w] == 1 and p - w * self.room[g] < self.counts_of(g, w):
-                    if group.activity[p] == 1:
-                        self.device.emission.mark(e, w, self.late[w], group.x[p])
-        for w in range(self.runs):
-            self.blocked[w] = 0
-            if self.enters[w] == 1:
-                self.blocked[w] = self.device.emission.occupied(e, w)
-
-    @ti.func
-    def counts_of(self, g: ti.template(), w: int):
-        """Return the number of particles of a group that a run has."""
-        return self.counts[w, self.count.capacity[g]]
-
-    @ti.kernel
-    def let_enter(self, e: ti.template()):
-        """Let what has room of the next sheet of an emitter take part."""
-        emission, g = ti.static((self.device.emission, self.device.emission.members[e][1]))
-        for p in range(self.runs * self.room[g]):
-            w = p // self.room[g]
-            if self.enters[w] == 1 and p - w * self.room[g] < self.counts_of(g, w):
-                if emission.is_next(e, self.device.groups[g], w, p, self.sheet[w]):
-                    emission.begin(e, self.device.groups[g], w, p, self.late[w])
 
     # Frames.
 

@@ -11,7 +11,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.frames.columns import FrameArrays, FrameColumns, ParticleConstants, RunConstants, parts_of
 from mpmcli.solver.frames.ledger_sums import StepsTaken, Sums, ledger_rows, ledger_sums
-from mpmcli.solver.particles.sort import ACTIVE, RETIRED, WAITING
+from mpmcli.solver.particles.sort import ACTIVE, BLOCKED, RETIRED, WAITING
 from mpmcli.stability.transfer_factors import affine_moment
 
 # Fewest cells inside the material that say anything: the edge of what is inside is sharp to a particle or so.
@@ -249,7 +249,10 @@ class _Totals:
             seen = active & ((place >= 0) & (place <= self._extent)).all(axis=1)
             for _, filled in self._filled[t : t + 1]:
                 filled.add(place[None, seen], (J * constants.volume)[None, seen], constants.flows[seen])
-            for counts, own in ((self._entered, state != WAITING), (self._retired, state == RETIRED)):
+            for counts, own in (
+                (self._entered, (state != WAITING) & (state != BLOCKED)),
+                (self._retired, state == RETIRED),
+            ):
                 counts[t] += np.bincount(body[own], minlength=len(self._waits))
 
     def entries(self, masses: np.ndarray) -> dict[str, np.ndarray]:

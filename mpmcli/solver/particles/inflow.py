@@ -2,7 +2,7 @@
 
 Each has a status. The sort moves those that take part to the front of their group, so that all other loops run over
 them alone, and retires what lies beyond an open face. The particles of a sheet of an emitter lie at the mouth until it
-enters, and begin as far in front of it as they would have moved since they were due. On the CPU they then follow those
+enters, and begin as far in front of that as they would have moved since it was due. On the CPU they then follow those
 that were sorted, and are scattered after them by one thread; on a GPU all are sorted again.
 """
 
@@ -14,9 +14,9 @@ import numpy as np
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sheets import Sheets, sheets_of
-from mpmcli.solver.particles.sort import ACTIVE, WAITING, entry_count
+from mpmcli.solver.particles.sort import ACTIVE, BLOCKED, WAITING, entry_count
 
-# Periods after which a sheet of which half or more found its place occupied tries again.
+# Periods of a layer of which half or more finds its place occupied, after which it tries again.
 RETRY = 0.25
 
 
@@ -62,45 +62,37 @@ class Emission:
 
     Attributes:
         members: of each emitter its number and that of its law.
-        ids: (runs, emitters) Vector: first id, and particles of a sheet.
+        ids: (runs, emitters) Vector: first id, particles of a sheet, sheets of a layer, and particles of all sheets.
         centre: of the mouth from the origin of the domain, m; axes: rows, the first one along the flow; velocity: m/s.
         spacing, low: of the lattice along these axes, m; cells: their number across (1 along the flow).
-        places: (runs * emitters, cells) int, the cell of each particle of a sheet; marks: whether a cell is occupied.
+        marks: (runs * emitters, cells) int, whether a cell is occupied.
     """
 
     def __init__(self, inflow: Inflow, dimension: int, runs: int = 1) -> None:
         self.members = tuple(enumerate(inflow.groups))
         self.dimension, self.runs, d = dimension, runs, dimension
         n = max(1, len(self.members))
-        self.ids = ti.Vector.field(2, int, shape=(runs, n))
+        self.ids = ti.Vector.field(4, int, shape=(runs, n))
         self.centre, self.velocity, self.spacing, self.low = (
             ti.Vector.field(d, float, shape=(runs, n)) for _ in range(4)
         )
         self.axes = ti.Matrix.field(d, d, float, shape=(runs, n))
         self.cells = ti.Vector.field(d, int, shape=(runs, n))
-        self.places, self.marks = (ti.field(int, shape=(runs * n, max(1, inflow.cells))) for _ in range(2))
+        self.marks = ti.field(int, shape=(runs * n, max(1, inflow.cells)))
 
     def write(self, scene: Scene, ids: Sequence[int], run: int = 0) -> list[Sheets]:
         """Set the mouths of a run, whose emitters have these first ids; return their sheets."""
         found = [sheets_of(emitter, scene) for emitter in scene.emitters]
         for e, (sheets, emitter) in enumerate(zip(found, scene.emitters, strict=True)):
             mouth = sheets.mouth
-            self.ids[run, e] = [ids[e], len(sheets.places)]
+            self.ids[run, e] = [ids[e], sheets.size, sheets.per_layer, sheets.particles]
             self.centre[run, e] = (mouth.centre - np.array(scene.domain.origin)).tolist()
             self.axes[run, e] = np.vstack([mouth.direction, mouth.across]).tolist()
             self.velocity[run, e] = list(emitter.velocity)
             self.spacing[run, e] = mouth.spacing.tolist()
             self.low[run, e] = [-0.5 * mouth.spacing[0], *mouth.low.tolist()]
             self.cells[run, e] = [1, *mouth.counts]
-            row = np.zeros(self.places.shape[1], np.int32)
-            row[: len(sheets.places)] = np.flatnonzero(mouth.filled)
-            self._fill(run * max(1, len(self.members)) + e, row)
         return found
-
-    @ti.kernel
-    def _fill(self, place: int, row: ti.types.ndarray(ti.i32, 1)):
-        for k in range(row.shape[0]):
-            self.places[place, k] = row[k]
 
     @ti.func
     def clear(self, e: ti.template(), run: int):
@@ -108,44 +100,74 @@ class Emission:
             self.marks[self.row(e, run), k] = 0
 
     @ti.func
-    def mark(self, e: ti.template(), run: int, late: float, x: ti.template()):
-        """Note the cell that a point lies in, of the sheet that was due `late` s ago."""
-        d = ti.static(self.dimension)
-        inside, index = True, 0
-        away = x - self.centre[run, e] - late * self.velocity[run, e]
-        axes, low, spacing, cells = self.axes[run, e], self.low[run, e], self.spacing[run, e], self.cells[run, e]
-        for a in ti.static(range(d)):
-            along = 0.0
-            for c in ti.static(range(d)):
-                along += axes[a, c] * away[c]
-            place = (along - low[a]) / spacing[a]
-            if not (place >= 0.0 and place < ti.cast(cells[a], float)):
-                inside = False
+    def mark(self, e: ti.template(), group: ti.template(), run: int, sheet: int, late: float, p: int):
+        """Note the cell that particle p lies in, of the layer that begins with a sheet which was due `late` s ago.
+
+        The last sheets but the first of the layer before have not come far enough yet.
+        """
+        if not self.is_due(e, group, run, p, ti.max(sheet - self.ids[run, e][2] + 1, 0), self.ids[run, e][2]):
+            index, inside = self.cell_of(e, run, group.x[p] - late * self.velocity[run, e])
             if inside:
-                index = index * cells[a] + ti.cast(place, int)
-        if inside:
-            self.marks[self.row(e, run), index] = 1
+                self.marks[self.row(e, run), index] = 1
 
     @ti.func
-    def occupied(self, e: ti.template(), run: int):
-        """Return how many particles of the sheet find their cell occupied."""
-        found = 0
-        for q in range(self.ids[run, e][1]):
-            found += self.marks[self.row(e, run), self.places[self.row(e, run), q]]
-        return found
+    def cell_of(self, e: ti.template(), run: int, x: ti.template()):
+        """Return the cell of the mouth in front of or behind which a point lies, and whether it lies in the cell."""
+        inside, index = True, 0
+        away = x - self.centre[run, e]
+        axes, low, spacing, cells = self.axes[run, e], self.low[run, e], self.spacing[run, e], self.cells[run, e]
+        for a in ti.static(range(self.dimension)):
+            along = 0.0
+            for c in ti.static(range(self.dimension)):
+                along += axes[a, c] * away[c]
+            place = ti.floor((along - low[a]) / spacing[a])
+            last = ti.cast(cells[a] - 1, float)
+            inside = inside and place >= 0.0 and place <= last
+            index = index * cells[a] + ti.cast(ti.min(ti.max(place, 0.0), last), int)
+        return index, inside
 
     @ti.func
     def row(self, e: ti.template(), run: int):
         return run * ti.static(max(1, len(self.members))) + e
 
     @ti.func
-    def is_next(self, e: ti.template(), group: ti.template(), run: int, p: int, sheet: int):
-        """Return whether particle p of a group waits in this sheet, and its cell is free."""
-        ids, result = self.ids[run, e], False
-        q = group.id[p] - ids[0] - sheet * ids[1]
-        if group.activity[p] == WAITING and q >= 0 and q < ids[1]:
-            result = self.marks[self.row(e, run), self.places[self.row(e, run), q]] == 0
+    def particles_of(self, e: ti.template(), run: int, sheet: int, sheets: int):
+        """Return how many particles some sheets of an emitter have."""
+        return ti.min((sheet + sheets) * self.ids[run, e][1], self.ids[run, e][3]) - sheet * self.ids[run, e][1]
+
+    @ti.func
+    def is_due(self, e: ti.template(), group: ti.template(), run: int, p: int, sheet: int, sheets: int):
+        """Return whether particle p of a group belongs to some sheets of an emitter."""
+        q = group.id[p] - self.ids[run, e][0] - sheet * self.ids[run, e][1]
+        return q >= 0 and q < self.particles_of(e, run, sheet, sheets)
+
+    @ti.func
+    def keeps_out(self, e: ti.template(), group: ti.template(), run: int, p: int, sheet: int):
+        """Return whether particle p belongs to the layer that begins with a sheet, and its cell is occupied."""
+        result = self.is_due(e, group, run, p, sheet, self.ids[run, e][2])
+        if result:
+            index, _ = self.cell_of(e, run, group.x[p])
+            result = self.marks[self.row(e, run), index] == 1
         return result
+
+    @ti.func
+    def count_blocked(self, e: ti.template(), group: ti.template(), run: int, sheet: int, active: int, after: int):
+        """Return how many particles of the layer that begins with a sheet find no room; see `enter`."""
+        blocked, seen, p = 0, 0, active
+        size = self.particles_of(e, run, sheet, self.ids[run, e][2])
+        while p < after and seen < size:
+            if self.is_due(e, group, run, p, sheet, self.ids[run, e][2]):
+                seen += 1
+                blocked += ti.cast(self.keeps_out(e, group, run, p, sheet), int)
+            p += 1
+        return blocked
+
+    @ti.func
+    def keep_out(self, e: ti.template(), group: ti.template(), run: int, sheet: int, active: int, after: int):
+        """Keep those out for good."""
+        for p in range(active, after):
+            if self.keeps_out(e, group, run, p, sheet):
+                group.activity[p] = BLOCKED
 
     @ti.func
     def begin(self, e: ti.template(), group: ti.template(), run: int, p: int, late: float):
@@ -158,17 +180,20 @@ class Emission:
 
     @ti.func
     def enter(self, e: ti.template(), group: ti.template(), run: int, sheet: int, late: float, active: int, after: int):
-        """Let what has room of a sheet enter behind those that take part; return where these end now; on one thread.
+        """Let what waits of a sheet enter behind those that take part; return where these end now; on one thread.
 
         active: where they ended; after: the first particle that is not of this run.
         """
-        end, p, last = active, active, active + self.ids[run, e][1] - self.occupied(e, run)
-        while p < after and end < last:
-            if self.is_next(e, group, run, p, sheet):
-                for field in ti.static(group.moved):
-                    swap(field, p, end)
-                self.begin(e, group, run, end, late)
-                end += 1
+        end, p, seen = active, active, 0
+        size = self.particles_of(e, run, sheet, 1)
+        while p < after and seen < size:
+            if self.is_due(e, group, run, p, sheet, 1):
+                seen += 1
+                if group.activity[p] == WAITING:
+                    for field in ti.static(group.moved):
+                        swap(field, p, end)
+                    self.begin(e, group, run, end, late)
+                    end += 1
             p += 1
         return end
 

@@ -12,8 +12,8 @@ from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 
-# Whether a particle waits, takes part, or has left.
-WAITING, ACTIVE, RETIRED = range(3)
+# Whether a particle waits, takes part, has left, or stays out for good.
+WAITING, ACTIVE, RETIRED, BLOCKED = range(4)
 # Taichi gives a CPU thread at least this many iterations of a parallel loop.
 CHUNK = 512
 # Tiles per entry of the two-level prefix sum.
