@@ -147,6 +147,11 @@ BAD = [
     ("[2.0, 1.5], max = [2.2, 1.6]", "[3.9, 1.5], max = [4.5, 1.6]",
      'emitters[0].shape: the mouth of "jet" reaches out of the domain along x by 0.495 m; move it or enlarge the '
      "domain"),
+    ("[2.0, 1.5], max = [2.2, 1.6]", "[0.5, 0.1], max = [0.9, 0.3]",
+     'emitters[0].shape: the mouth of "jet" lies in body "column", for example at [0.505, 0.2]; move one of them'),
+    ("[[emitters]]",
+     '[[colliders]]\nname = "post"\nshape = { box = { min = [2.05, 1.0], max = [2.15, 1.9] } }\n[[emitters]]',
+     'emitters[0].shape: the mouth of "jet" lies in collider "post", for example at [2.055, 1.55]; move one of them'),
     ('name = "jet"', 'name = "column"',
      'emitters[0].name: "column" is the name of bodies[0] already; every emitter needs its own'),
     ("radius = 0.3", "radius = 0.3\ndirection = [0, 0]",

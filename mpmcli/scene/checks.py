@@ -59,12 +59,32 @@ def emitter_problems(scene: Scene) -> Iterator[Problem]:
         for axis in np.flatnonzero(beyond > _TOLERANCE * scene.domain.spacing):
             said = f'the mouth of "{emitter.name}" reaches out of the domain along {AXES[axis]} by {beyond[axis]:.6g} m'
             yield Problem((*where, "shape"), said + "; move it or enlarge the domain")
+        yield from (Problem((*where, "shape"), said) for said in _in_the_way(emitter, places, scene))
         if emitter.start >= scene.time.end:
             said = f"must be before the end of the scene, {scene.time.end:g} s; found {emitter.start:g}"
             yield Problem((*where, "start"), said)
             continue
         yield from (Problem((*where, key), said) for key, said in _emitted(emitter, scene))
     yield from _unsuited(scene)
+
+
+def _in_the_way(emitter: Emitter, places: np.ndarray, scene: Scene) -> Iterator[str]:
+    """Find what a mouth lies in: bodies, if it lets in from the start, and colliders that never move."""
+    h = scene.domain.spacing
+    found = [
+        (f'body "{body.name}"', body.shape.form.contains(places, inset=_TOLERANCE * h))
+        for body in scene.bodies
+        if emitter.start == 0
+    ]
+    found += [
+        (f'collider "{collider.name}"', collider.signed_distance(places) < -_SLACK * h)
+        for collider in scene.colliders
+        if not collider.motion.moves
+    ]
+    for what, inside in found:
+        if inside.any():
+            where = place_text(places[inside.argmax()])
+            yield f'the mouth of "{emitter.name}" lies in {what}, for example at {where}; move one of them'
 
 
 def _emitted(emitter: Emitter, scene: Scene) -> Iterator[tuple[str, str]]:

@@ -83,6 +83,8 @@ class RunSummary:
                 f"{last.elastic:.4g}, potential {last.potential:.4g})"
             )
             lines.append(f"volume ratio J at the end: {last.volume_ratio_min:.4g} to {last.volume_ratio_max:.4g}")
+        if self.last is not None and self.last.blocked:
+            lines.append(f"blocked: {self.last.blocked} particles of emitters found their place occupied")
         if self.path is not None:
             lines.append(f"result: {self.path}")
         return "\n".join(lines)
