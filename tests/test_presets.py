@@ -87,7 +87,7 @@ def test_a_preset_is_its_law_with_its_values(name, dimension):
 
     text = scene_to_toml(loaded.scene)
     written = tomllib.loads(text)["bodies"][0]["material"]
-    assert written.keys() == type(material).model_fields.keys()
+    assert written.keys() == type(material).model_fields.keys() - type(material).sets.keys()
     again = parse_scene(tomllib.loads(text), laws=parameter_models(), text=text)
     assert again.scene == loaded.scene and again.notes == ()
 

@@ -10,6 +10,7 @@ import taichi as ti
 from law_probe import LawProbe, Response
 from law_tangent import largest_stiffness
 from pydantic import ValidationError
+from solver_state import scene_of
 
 from mpmcli.materials.law import StateBound
 from mpmcli.materials.sand import REAL_MODULUS, Sand, SandParameters
@@ -343,6 +344,23 @@ def test_nothing_makes_sand_say_nan(probes: Probes, kind: str, dimension: int) -
 def test_angles_that_are_none_are_refused(angle: float) -> None:
     with pytest.raises(ValidationError, match="than"):
         sand(friction_angle=angle)
+
+
+def test_a_heap_says_its_friction_angle() -> None:
+    """sin(phi) = tan(repose), 35.26 degrees of 30; in place of a preset's angle, not beside one that the scene gives."""
+    parameters = sand(repose_angle=30.0)
+    assert math.sin(math.radians(parameters.friction_angle)) == pytest.approx(1 / math.sqrt(3), rel=1e-12)
+    assert SandParameters.model_validate(parameters.model_dump()) == parameters
+    box = {"box": {"min": [0.0, 0.0], "max": [0.5, 0.5]}}
+    heap = {"name": "heap", "material": {"preset": "sand", "repose_angle": 30.0}, "shape": box}
+    scene = scene_of(domain={"size": [1.0, 1.0], "spacing": 0.1}, time={"end": 1.0, "frames": 1}, bodies=[heap])
+    assert scene.bodies[0].material.friction_angle == parameters.friction_angle
+    with pytest.raises(ValidationError, match="sets friction_angle, which is given as well"):
+        sand(repose_angle=30.0, friction_angle=30.0)
+    for bad, why in ((45.0, "less than 45"), (0.0, "greater than 0"), ("30", "number")):
+        with pytest.raises(ValidationError, match=why) as found:
+            SandParameters.model_validate({"density": 1600.0, "repose_angle": bad})
+        assert found.value.error_count() == 1
 
 
 def test_angles_that_a_cone_cannot_have_are_refused() -> None:

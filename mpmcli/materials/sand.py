@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from mpmcli.materials.elasticity import (
     MODULUS_PER_STRENGTH,
@@ -48,9 +48,22 @@ class SandParameters(HenckyParameters):
     compressibility: Compressibility = 0.002
     friction_angle: Annotated[
         float,
-        Knob("grip", 20.0, 45.0, "0 is smooth beads, 0.4 loose sand, 0.6 packed sand, 1 crushed rock", scale="linear"),
+        Knob(
+            "grip",
+            20.0,
+            45.0,
+            "0 is smooth beads, 0.4 loose sand, 0.6 packed sand, 1 crushed rock",
+            scale="linear",
+            excludes=("repose_angle",),
+        ),
     ] = Field(
         gt=0, lt=90, description="Friction angle that acts in plane strain, degrees; glass beads 22, dry sand 30 to 40."
+    )
+    repose_angle: float | None = Field(
+        None,
+        gt=0,
+        lt=45,
+        description="Slope of a heap, degrees; sets friction_angle, whose sine is its tangent. Dry sand 30 to 35.",
     )
     cohesion: NotNegative = Field(
         0.0, description="Shear strength that is left without pressure, Pa; dry sand 0, damp sand 1e3."
@@ -61,11 +74,25 @@ class SandParameters(HenckyParameters):
         "again before it bears pressure. False makes it gain volume each time it is stirred.",
     )
 
+    sets: ClassVar[Mapping[str, str]] = {"repose_angle": "friction_angle"}
     internal: ClassVar[tuple[Internal, ...]] = (
         Internal(
             "plastic_volume_strain", 0.0, "Volume gained by coming apart, as the logarithm of a ratio, dimensionless."
         ),
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_the_heap(cls, said: Any) -> Any:
+        """Set the friction angle by that of a heap, sin(phi) = tan(repose) (Davis 1968; docs/theory.md, 5.7)."""
+        slope = said.get("repose_angle") if isinstance(said, Mapping) else None
+        if slope is None:
+            return said
+        number = isinstance(slope, int | float) and 0 < slope < 45
+        angle = math.degrees(math.asin(math.tan(math.radians(slope)))) if number else 30.0
+        if not math.isclose(said.get("friction_angle", angle), angle, rel_tol=1e-6):
+            raise flaw("sets friction_angle, which is given as well; leave one of them out", "repose_angle")
+        return {**said, "friction_angle": angle}
 
     @field_validator("friction_angle")
     @classmethod

@@ -1,5 +1,6 @@
 """The laws and presets as plain data, and the JSON Schema of scenes with which editors complete them."""
 
+from itertools import combinations
 from typing import Any
 
 from pydantic.json_schema import GenerateJsonSchema
@@ -77,7 +78,7 @@ def _preset_table(
 
 
 def _add_knobs(table: dict[str, Any], law: type[MaterialParameters]) -> None:
-    """Add the knobs of a law to the table of its parameters: either the knob or the parameter it sets."""
+    """Add the knobs of a law to the table of its parameters: either the knob or the parameter that it sets."""
     required = table.get("required", [])
     rules: list[dict[str, Any]] = []
     for name, (parameter, knob) in knobs_of(law).items():
@@ -85,8 +86,10 @@ def _add_knobs(table: dict[str, Any], law: type[MaterialParameters]) -> None:
         text = f"Knob, 0 to 1, that sets {parameter}: {reach}; {knob.meaning}."
         entry = {"description": text, "type": "number", "minimum": 0, "maximum": 1}
         table["properties"] = {**table["properties"], name: entry}
-        either = {"oneOf": [{"required": [parameter]}, {"required": [name]}]}
-        rules.append(either if parameter in required else {"not": {"required": [parameter, name]}})
+        ways = [parameter, name, *(key for key, other in law.sets.items() if other == parameter)]
+        either = {"oneOf": [{"required": [way]} for way in ways]}
+        pairs = [{"not": {"required": list(pair)}} for pair in combinations(ways, 2)]
+        rules += [either] if parameter in required else pairs
     table["required"] = [key for key in required if key not in {parameter for parameter, _ in knobs_of(law).values()}]
     if rules:
         table["allOf"] = rules

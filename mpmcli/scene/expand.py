@@ -114,7 +114,9 @@ class _Material:
             if sentence := self._foreign(key, law):
                 self._fault((*self.path, key), sentence)
                 del own[key]
-        result = {"law": law, **(preset.parameters if preset else {}), **own}
+        replaced = [other for key, other in model.sets.items() if key in own]
+        held = {key: value for key, value in (preset.parameters if preset else {}).items() if key not in replaced}
+        result = {"law": law, **held, **own}
         for key in [key for key in said if key in knobs]:
             parameter, knob = knobs[key]
             if sentence := _beside(knob, parameter, own):

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple, Self
 
@@ -123,6 +124,7 @@ class MaterialParameters(BaseModel):
     range and a description that names its unit. Validation is strict: "1000" and true are no numbers.
 
     Attributes:
+        sets: of parameters that are other words for one of the law, the name of that.
         internal: what a particle stores beside its deformation.
         stores: what it stores of its deformation, "J" or "F", as the law says that these parameters belong to.
         elastic: whether its stress is a function of F alone.
@@ -134,6 +136,7 @@ class MaterialParameters(BaseModel):
     law: str = Field(description="Name of the constitutive law.")
     density: Positive = Field(description="Density at rest, kg/m^3.")
 
+    sets: ClassVar[Mapping[str, str]] = {}
     internal: ClassVar[tuple[Internal, ...]] = ()
     stores: ClassVar[Literal["J", "F"]] = "F"
     elastic: ClassVar[bool] = False

@@ -8,7 +8,7 @@ from mpmcli.scene import Scene
 from mpmcli.validation.case import Case, Frames, case_text
 from mpmcli.validation.tables import Tables, body, box, elastic, problem
 
-GRAVITY, DENSITY, FRICTION, NU = 9.81, 1600.0, 30.0, 0.3
+GRAVITY, DENSITY, REPOSE, NU = 9.81, 1600.0, 30.0, 0.3
 L0 = 0.2
 # Bulk modulus of the plane over density g H0: compressed by two thousandths at the base.
 STIFFNESS = 500.0
@@ -63,7 +63,7 @@ class SandColumn(Case):
         height = self.aspect * L0
         # E for K = lambda + mu, the bulk modulus of the plane.
         young = STIFFNESS * DENSITY * GRAVITY * height * 2 * (1 + NU) * (1 - 2 * NU)
-        material = elastic("sand", DENSITY, young, NU, friction_angle=FRICTION)
+        material = elastic("sand", DENSITY, young, NU, repose_angle=REPOSE)
         return problem(
             {
                 "size": [across * h, up * h],
