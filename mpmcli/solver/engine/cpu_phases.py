@@ -269,19 +269,26 @@ class CpuPhases:
         if ti.static(k + 1 < len(self.kinds)):
             self.do(ti.static(k + 1), w, phase, region, part, t, numbers, counts, shown)
 
-    # Parts of phases that say what they do for each node or particle, on a dense grid.
+    # Parts of phases that say what they do for each node or particle.
 
     @ti.func
     def each_node(self, at: ti.template()):
-        """Go through nodes."""
-        first, after = self.places.rows_of(at.grid, at.region)
-        first, after = self.share(first, after, at.part)
+        """Go through nodes, on a sparse grid those of all blocks."""
         last_axis = ti.static(self.dimension - 1)
-        for row in range(first, after):
-            node = at.grid.row_start(row)
-            for _ in range(at.grid.box[1, last_axis]):
+        if ti.static(at.grid.sparse):
+            first, after = self.places.even_part(at.grid.sizes[BLOCKS] - 1, at.region)
+            first, after = self.share(first + 1, after + 1, at.part)
+            for index in range(first * ti.static(at.grid.block), after * ti.static(at.grid.block)):
+                node = at.grid.place_of(index)
                 ti.static(at.item)(at, node, self.values[at.w, RELAXED])
-                node[last_axis] += 1
+        else:
+            first, after = self.places.rows_of(at.grid, at.region)
+            first, after = self.share(first, after, at.part)
+            for row in range(first, after):
+                node = at.grid.row_start(row)
+                for _ in range(at.grid.box[1, last_axis]):
+                    ti.static(at.item)(at, node, self.values[at.w, RELAXED])
+                    node[last_axis] += 1
 
     @ti.func
     def each_in_pencils(self, at: ti.template()):
@@ -293,7 +300,7 @@ class CpuPhases:
                 pencil = at.order.pencil_of(at.turn, r)
                 begin, end = at.order.first_particle_of(pencil), at.order.first_particle_of(pencil + 1)
                 ti.static(at.item)(at, begin, end, self.values[at.w, RELAXED])
-        if ti.static(self.device.comes_and_goes):
+        if ti.static(self.device.comes_and_goes and not at.grid.sparse):
             if at.turn == self.colours and at.region == 0 and at.part == 0:
                 first, after = self.come_in(at.g, at.order, at.w, at.counts)
                 ti.static(at.item)(at, first, after, self.values[at.w, RELAXED])

@@ -155,25 +155,80 @@ def room_for_blocks(particles: int) -> int:
 def most_blocks(grid: "SparseGrid") -> int:
     """Return the number of blocks that a larger grid may have in what memory is free, and indices reach."""
     fields = [field for field in (grid.nodes, grid.before, grid.filling) if field is not None]
-    numbers = grid.width * len(fields) + 2 * len(grid.kept_means)
+    fine, free = grid.fine.in_cell if grid.fine else 0, psutil.virtual_memory().available
+    numbers = grid.width * len(fields) + 2 * len(grid.kept_means) + fine
     # And of the tables of a sort on some threads.
     block = (4 if grid.nodes.dtype == ti.f32 else 8) * numbers * grid.block + 4 * 16
-    return int(min(MEMORY_SHARE * psutil.virtual_memory().available // block, LARGEST_INDEX // grid.block))
+    return int(min(MEMORY_SHARE * free // block, LARGEST_INDEX // (grid.block * max(fine, 1))))
 
 
 @ti.data_oriented
-class SparseGrid(Grid):
-    """See `Grid`; of one run, on the CPU.
+class BlockNodes(LinearNodes):
+    """Nodes that are stored tile by tile.
+
+    Attributes:
+        tile: edge of a tile, nodes; tiles: per axis; block: nodes of a tile.
+        table: (tiles of the domain) int, their numbers.
+    """
+
+    sparse = True
+    tile: int
+    tiles: tuple[int, ...]
+    block: int
+    table: ti.Field
+
+    @ti.func
+    def tile_number(self, node: ti.template()):
+        return self.table[self.tile_index(node)]
+
+    @ti.func
+    def tile_index(self, node: ti.template()):
+        """Return the linear index of the tile that holds the node at these integer coordinates."""
+        index = 0
+        for a in ti.static(range(self.dimension)):
+            index = index * ti.static(self.tiles[a]) + ti.raw_div(node[a], ti.static(self.tile))
+        return index
+
+    @ti.func
+    def linear_index(self, base: ti.template()):
+        inner = 0
+        for a in ti.static(range(self.dimension)):
+            inner = inner * ti.static(self.tile) + base[a] % ti.static(self.tile)
+        return self.tile_number(base) * ti.static(self.block) + inner
+
+    @ti.func
+    def stencil_at(self, base: ti.template()):
+        """Return what each node adds, along each axis, to the index of its tile, and then to that in the tile."""
+        nodes, d = ti.static((self.scheme.spline.nodes, self.dimension))
+        shares = ti.Matrix.zero(int, nodes, ti.static(2 * d))
+        for k, a in ti.static(ti.ndrange(nodes, d)):
+            tile = ti.raw_div(base[a] + k, ti.static(self.tile))
+            shares[k, a] = tile * ti.static(math.prod(self.tiles[a + 1 :]))
+            shares[k, d + a] = (base[a] + k - tile * self.tile) * ti.static(self.tile ** (d - 1 - a))
+        return shares
+
+    @ti.func
+    def node_of(self, shares: ti.template(), i: ti.template(), j: ti.template(), k: ti.template()):
+        """Return the linear index of node k of line j in plane i of the stencil with these shares."""
+        d = ti.static(self.dimension)
+        tile, inner = shares[j, d - 2] + shares[k, d - 1], shares[j, 2 * d - 2] + shares[k, 2 * d - 1]
+        if ti.static(d == 3):
+            tile += shares[i, 0]
+            inner += shares[i, 3]
+        return self.table[tile] * ti.static(self.block) + inner
+
+
+@ti.data_oriented
+class SparseGrid(BlockNodes, Grid):
+    """See `Grid` and `BlockNodes`; of one run, on the CPU.
 
     Attributes:
         tile_count: blocks that there is room for, number 0 included.
-        table: (tiles of the domain) int, their numbers; tile_at: (tile_count) int, the tile of each; sizes: see BLOCKS.
+        tile_at: (tile_count) int, the tile of each number; sizes: see BLOCKS.
         pencils: (tile_count + 1) int, the first block of each pencil; coloured: (colours, tile_count) int, the numbers
             of the pencils of each colour.
         window: of the nodes near a tile, for each thread.
     """
-
-    sparse = True
 
     def __init__(self, *args: object, blocks: int, threads: int, **options: object) -> None:
         """Allocate; `blocks` is the room for blocks, and the rest that of `Grid`."""
@@ -241,18 +296,6 @@ class SparseGrid(Grid):
             tiles[k] = self.tile_at[k + 1]
 
     @ti.func
-    def tile_number(self, node: ti.template()):
-        return self.table[self.tile_index(node)]
-
-    @ti.func
-    def tile_index(self, node: ti.template()):
-        """Return the linear index of the tile that holds the node at these integer coordinates."""
-        index = 0
-        for a in ti.static(range(self.dimension)):
-            index = index * ti.static(self.tiles[a]) + ti.raw_div(node[a], ti.static(self.tile))
-        return index
-
-    @ti.func
     def tile_place(self, index: int):
         place, rest = ti.Vector.zero(int, self.dimension), index
         for b in ti.static(range(self.dimension)):
@@ -260,13 +303,6 @@ class SparseGrid(Grid):
             place[a] = rest % ti.static(self.tiles[a])
             rest = rest // ti.static(self.tiles[a])
         return place
-
-    @ti.func
-    def linear_index(self, base: ti.template()):
-        inner = 0
-        for a in ti.static(range(self.dimension)):
-            inner = inner * ti.static(self.tile) + base[a] % ti.static(self.tile)
-        return self.tile_number(base) * ti.static(self.block) + inner
 
     @ti.func
     def place_of(self, index: int):
