@@ -184,7 +184,7 @@ def test_scenes_choose_their_grid() -> None:
 
 
 def test_memory_is_that_of_what_is_occupied() -> None:
-    """A million particles in 1024^3 cells take less than 1 GiB; a dense grid would take 17 GB."""
+    """A million particles in 1024^3 cells take less than 1 GiB, fine nodes included; a dense grid would take 17 GB."""
     ball = {"name": "ball", "material": FLUID, "shape": {"ball": {"center": [0.5] * 3, "radius": 31 / 1024}}}
     plans = [
         make_plan(scene_in, Backend("cpu", 2, "f32", False))
@@ -193,6 +193,8 @@ def test_memory_is_that_of_what_is_occupied() -> None:
     assert plans[0].particles == pytest.approx(1e6, rel=0.02)
     assert plans[0].machine_bytes < 0.7 * 2**30
     require_room(plans[0])
+    # Momentum and mass, and 8 fine nodes for each node.
+    assert plans[0].bytes_per_node == 4 * (4 + 8)
     assert plans[1].device_bytes > 17e9
     assert [plan.as_dict()["sparse"] for plan in plans] == [True, False]
 

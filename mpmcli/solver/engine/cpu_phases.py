@@ -273,22 +273,15 @@ class CpuPhases:
 
     @ti.func
     def each_node(self, at: ti.template()):
-        """Go through nodes, on a sparse grid those of all blocks."""
+        """Go through nodes."""
+        first, after = self.places.rows_of(at.grid, at.region)
+        first, after = self.share(first, after, at.part)
         last_axis = ti.static(self.dimension - 1)
-        if ti.static(at.grid.sparse):
-            first, after = self.places.even_part(at.grid.sizes[BLOCKS] - 1, at.region)
-            first, after = self.share(first + 1, after + 1, at.part)
-            for index in range(first * ti.static(at.grid.block), after * ti.static(at.grid.block)):
-                node = at.grid.place_of(index)
+        for row in range(first, after):
+            node = at.grid.row_start(row)
+            for _ in range(at.grid.row_length()):
                 ti.static(at.item)(at, node, self.values[at.w, RELAXED])
-        else:
-            first, after = self.places.rows_of(at.grid, at.region)
-            first, after = self.share(first, after, at.part)
-            for row in range(first, after):
-                node = at.grid.row_start(row)
-                for _ in range(at.grid.box[1, last_axis]):
-                    ti.static(at.item)(at, node, self.values[at.w, RELAXED])
-                    node[last_axis] += 1
+                node[last_axis] += 1
 
     @ti.func
     def each_in_pencils(self, at: ti.template()):

@@ -196,6 +196,10 @@ class Grid(LinearNodes):
         return start
 
     @ti.func
+    def row_length(self):
+        return self.box[1, ti.static(self.dimension - 1)]
+
+    @ti.func
     def box_nodes(self):
         return self.row_count() * self.box[1, ti.static(self.dimension - 1)]
 

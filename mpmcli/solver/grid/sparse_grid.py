@@ -18,6 +18,7 @@ from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.scene.sheets import sheets_of
+from mpmcli.solver.grid.blocks import BlockNodes
 from mpmcli.solver.grid.grid import Grid, LinearNodes, drift_allowed
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.machine.device_memory import LARGEST_INDEX, MEMORY_SHARE
@@ -163,62 +164,6 @@ def most_blocks(grid: "SparseGrid") -> int:
 
 
 @ti.data_oriented
-class BlockNodes(LinearNodes):
-    """Nodes that are stored tile by tile.
-
-    Attributes:
-        tile: edge of a tile, nodes; tiles: per axis; block: nodes of a tile.
-        table: (tiles of the domain) int, their numbers.
-    """
-
-    sparse = True
-    tile: int
-    tiles: tuple[int, ...]
-    block: int
-    table: ti.Field
-
-    @ti.func
-    def tile_number(self, node: ti.template()):
-        return self.table[self.tile_index(node)]
-
-    @ti.func
-    def tile_index(self, node: ti.template()):
-        """Return the linear index of the tile that holds the node at these integer coordinates."""
-        index = 0
-        for a in ti.static(range(self.dimension)):
-            index = index * ti.static(self.tiles[a]) + ti.raw_div(node[a], ti.static(self.tile))
-        return index
-
-    @ti.func
-    def linear_index(self, base: ti.template()):
-        inner = 0
-        for a in ti.static(range(self.dimension)):
-            inner = inner * ti.static(self.tile) + base[a] % ti.static(self.tile)
-        return self.tile_number(base) * ti.static(self.block) + inner
-
-    @ti.func
-    def stencil_at(self, base: ti.template()):
-        """Return what each node adds, along each axis, to the index of its tile, and then to that in the tile."""
-        nodes, d = ti.static((self.scheme.spline.nodes, self.dimension))
-        shares = ti.Matrix.zero(int, nodes, ti.static(2 * d))
-        for k, a in ti.static(ti.ndrange(nodes, d)):
-            tile = ti.raw_div(base[a] + k, ti.static(self.tile))
-            shares[k, a] = tile * ti.static(math.prod(self.tiles[a + 1 :]))
-            shares[k, d + a] = (base[a] + k - tile * self.tile) * ti.static(self.tile ** (d - 1 - a))
-        return shares
-
-    @ti.func
-    def node_of(self, shares: ti.template(), i: ti.template(), j: ti.template(), k: ti.template()):
-        """Return the linear index of node k of line j in plane i of the stencil with these shares."""
-        d = ti.static(self.dimension)
-        tile, inner = shares[j, d - 2] + shares[k, d - 1], shares[j, 2 * d - 2] + shares[k, 2 * d - 1]
-        if ti.static(d == 3):
-            tile += shares[i, 0]
-            inner += shares[i, 3]
-        return self.table[tile] * ti.static(self.block) + inner
-
-
-@ti.data_oriented
 class SparseGrid(BlockNodes, Grid):
     """See `Grid` and `BlockNodes`; of one run, on the CPU.
 
@@ -313,6 +258,19 @@ class SparseGrid(BlockNodes, Grid):
             place[a] = place[a] * ti.static(self.tile) + rest % ti.static(self.tile)
             rest = rest // ti.static(self.tile)
         return place
+
+    @ti.func
+    def row_count(self):
+        """Return the number of rows of nodes in the blocks in use, number 0 left out."""
+        return (self.sizes[BLOCKS] - 1) * ti.static(self.block // self.tile)
+
+    @ti.func
+    def row_start(self, row: int):
+        return self.place_of(ti.static(self.block) + row * ti.static(self.tile))
+
+    @ti.func
+    def row_length(self):
+        return self.tile
 
     @ti.func
     def forget(self, begin: int, end: int):

@@ -18,8 +18,9 @@ from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import points_per_cell
+from mpmcli.solver.grid.blocks import BlockNodes
 from mpmcli.solver.grid.grid import Grid, LinearNodes
-from mpmcli.solver.grid.sparse_grid import BlockNodes, SparseGrid
+from mpmcli.solver.grid.sparse_grid import SparseGrid
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.transfer.lanes import (
     LANES,
@@ -173,9 +174,10 @@ def fold_fine(at: ti.template(), node: ti.template(), time: float):
                     if inside_along(place[axis], axis, grid, last, fine.per_cell):
                         image, exists = image_along(place[axis], axis, grid, last, 1, fine.per_cell)
                         index = fine.linear_index(place)
-                        place[axis] = image
-                        total, beyond = fine.fill[index][0], fine.linear_index(place)
+                        total, beyond = fine.fill[index][0], index
                         if exists:
+                            place[axis] = image
+                            beyond = fine.linear_index(place)
                             total += fine.fill[beyond][0]
                         if ti.static(axis == d - 1):
                             total = ti.max(total - 1.0, 0.0)
@@ -378,9 +380,10 @@ def fold_shift(at: ti.template(), node: ti.template(), time: float):
             reach = ti.static(grid.scheme.spline.nodes - 2)
             place, index = node, grid.linear_index(node)
             image, exists = image_along(node[axis], axis, grid, last, reach, 1)
-            place[axis] = image
-            total, beyond = grid.nodes[index], grid.linear_index(place)
+            total, beyond = grid.nodes[index], index
             if exists:
+                place[axis] = image
+                beyond = grid.linear_index(place)
                 total += mirrored(grid.nodes[beyond], axis, grid)
             if ti.static(axis == d - 1):
                 if total[d] > 0.0:
