@@ -301,6 +301,35 @@ def test_runs_have_the_same_bytes_alone_and_together(backend_of: Callable) -> No
     assert list(same(first + list(run.frames()), alone[1])) == []
 
 
+def far_apart(dimension: int, grid: str) -> Scene:
+    """Return water in two corners of a domain that is nearly empty, sheared, at walls and a face that repeats."""
+    d, walls = dimension, {"default": "slip", "x_min": "periodic", "x_max": "periodic"}
+    strip = {"box": {"min": [0.0, 0.0, 0.5][:d], "max": [0.12, 0.12, 0.62][:d]}}
+    corner = {"box": {"min": [0.88, 0.86, 0.6][:d], "max": [1.0, 1.0, 0.7][:d]}}
+    bodies = [
+        {"name": "strip", "shape": strip, "velocity": ["-1.0", "0.5 - 8.0 * X", "-3.0 * Y"][:d]},
+        {"name": "corner", "shape": corner, "velocity": ["5.0 * (Y - 0.9)", "1.0", "4.0 * (X - 0.9)"][:d]},
+    ]
+    return scene_of(
+        domain={"size": [1.0] * d, "spacing": 1 / 60 if d == 2 else 1 / 36, "walls": walls},
+        time={"end": 0.18, "frames": 1},
+        bodies=[body | {"material": WATER, "sampling": "jittered"} for body in bodies],
+        solver={"precision": "f64", "grid": grid, "kernel": "cubic" if d == 2 else "quadratic"},
+    )
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_sparse_grid_shifts_as_a_dense_one(backend_of: Callable, dimension: int) -> None:
+    """Over several intervals, with images behind walls and across the domain in blocks of their own, to rounding."""
+    found = []
+    for grid in ("dense", "sparse"):
+        run = build_run(far_apart(dimension, grid), backend_of("f64", 2))
+        assert run.batch.device.grid.sparse == (grid == "sparse")
+        found.append([frame for frame, _ in run.frames()][-1])
+    assert found[0].step == found[1].step > 2 * INTERVAL
+    assert np.abs(found[1].position - found[0].position).max() < 1e-9 * run.scene.domain.spacing
+
+
 @pytest.mark.gpu
 def test_a_gpu_shifts_as_the_cpu_does(backend_of: Callable) -> None:
     """Over two intervals to rounding, and with equal bytes where it adds in fixed point."""

@@ -246,8 +246,7 @@ class SolverSettings(Table):
     redistribute: Literal["auto", False] = Field(
         "auto",
         description="Whether particles of liquids and grains are shifted out of crowds that flow piles up. "
-        '"auto": those of fluid and sand, every 50 steps, by two fifths of their distance at most; on a sparse grid '
-        "none.",
+        '"auto": those of fluid and sand, every 50 steps, by two fifths of their distance at most.',
     )
     deterministic: Flag = Field(
         False,

@@ -43,7 +43,7 @@ from mpmcli.solver.solids.contact import DRIFT, contact_between
 from mpmcli.solver.solids.reference_grid import slips_in
 from mpmcli.solver.transfer.node_update import NodeUpdate
 from mpmcli.solver.transfer.particle_update import BEYOND, ParticleUpdate
-from mpmcli.solver.transfer.redistribution import FineGrid
+from mpmcli.solver.transfer.redistribution import FineBlocks, FineGrid
 from mpmcli.solver.transfer.splines import PAD, scheme_of
 from mpmcli.solver.transfer.volume_average import averages_volume
 
@@ -128,8 +128,6 @@ class Batch:
             runs,
             on_cpu=on_cpu,
         )
-        if kind.fine:
-            grid.fine = FineGrid(grid.shape, kind.fine, runs)
         if deterministic:
             grid.fixed = FixedPoint(grid, groups, backend.arch)
         self._buffers = SortBuffers(groups, runs) if sorts else None
@@ -194,7 +192,7 @@ class Batch:
         scheme = scheme_of(kind.settings)
         tile = tile_edge(scheme.spline.nodes, kind.dimension, on_cpu=on_cpu)
         sparse = {"blocks": blocks, "threads": self.backend.threads} if kind.sparse and on_cpu else {}
-        return (SparseGrid if sparse else Grid)(
+        grid = (SparseGrid if sparse else Grid)(
             kind.dimension,
             1.0,
             kind.cells,
@@ -210,6 +208,9 @@ class Batch:
             deterministic=deterministic,
             **sparse,
         )
+        if kind.fine:
+            grid.fine = (FineBlocks if sparse else FineGrid)(grid, kind.fine)
+        return grid
 
     def _make_orders(self, groups: Sequence[ParticleArrays], grid: Grid) -> list[TileOrder]:
         """Return the tile order of each group."""

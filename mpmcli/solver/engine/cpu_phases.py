@@ -269,7 +269,7 @@ class CpuPhases:
         if ti.static(k + 1 < len(self.kinds)):
             self.do(ti.static(k + 1), w, phase, region, part, t, numbers, counts, shown)
 
-    # Parts of phases that say what they do for each node or particle, on a dense grid.
+    # Parts of phases that say what they do for each node or particle.
 
     @ti.func
     def each_node(self, at: ti.template()):
@@ -279,7 +279,7 @@ class CpuPhases:
         last_axis = ti.static(self.dimension - 1)
         for row in range(first, after):
             node = at.grid.row_start(row)
-            for _ in range(at.grid.box[1, last_axis]):
+            for _ in range(at.grid.row_length()):
                 ti.static(at.item)(at, node, self.values[at.w, RELAXED])
                 node[last_axis] += 1
 
@@ -293,7 +293,7 @@ class CpuPhases:
                 pencil = at.order.pencil_of(at.turn, r)
                 begin, end = at.order.first_particle_of(pencil), at.order.first_particle_of(pencil + 1)
                 ti.static(at.item)(at, begin, end, self.values[at.w, RELAXED])
-        if ti.static(self.device.comes_and_goes):
+        if ti.static(self.device.comes_and_goes and not at.grid.sparse):
             if at.turn == self.colours and at.region == 0 and at.part == 0:
                 first, after = self.come_in(at.g, at.order, at.w, at.counts)
                 ti.static(at.item)(at, first, after, self.values[at.w, RELAXED])

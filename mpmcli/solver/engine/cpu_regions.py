@@ -28,7 +28,9 @@ class CpuRegions:
     def rows_of(self, grid: ti.template(), region: int):
         """Return the first row of nodes of a region, and the first after it."""
         first, after = 0, grid.row_count()
-        if ti.static(self.regions > 1):
+        if ti.static(grid.sparse):
+            first, after = self.even_part(after, region)
+        elif ti.static(self.regions > 1):
             if region > 0:
                 first = self.rows[region - 1]
             if region < self.regions - 1:

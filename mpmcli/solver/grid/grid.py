@@ -40,6 +40,7 @@ def node_width(dimension: int, *, on_cpu: bool) -> int:
 class LinearNodes:
     """Nodes of a box addressed by one linear index, with `strides` per axis; `first_node` is that of node 0."""
 
+    sparse = False
     dimension: int
     strides: tuple[int, ...]
     first_node: int
@@ -54,6 +55,11 @@ class LinearNodes:
         for a in ti.static(range(self.dimension)):
             index += base[a] * self.strides[a]
         return index
+
+    @ti.func
+    def stencil_at(self, base: ti.template()):
+        """Return what a walk over the stencil that begins at a node takes: its linear index."""
+        return self.linear_index(base)
 
 
 @ti.data_oriented
@@ -84,8 +90,6 @@ class Grid(LinearNodes):
         fine: the grid by which particles are shifted (`redistribution.FineGrid`), None where they are not.
         box: (2, d) ints: first node in use and number of nodes in use, per axis.
     """
-
-    sparse = False
 
     def __init__(
         self,
@@ -190,6 +194,10 @@ class Grid(LinearNodes):
             rest = rest // self.box[1, a]
         start[ti.static(self.dimension - 1)] = self.box[0, ti.static(self.dimension - 1)]
         return start
+
+    @ti.func
+    def row_length(self):
+        return self.box[1, ti.static(self.dimension - 1)]
 
     @ti.func
     def box_nodes(self):

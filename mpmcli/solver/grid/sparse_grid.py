@@ -18,6 +18,7 @@ from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.scene.sheets import sheets_of
+from mpmcli.solver.grid.blocks import BlockNodes
 from mpmcli.solver.grid.grid import Grid, LinearNodes, drift_allowed
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.machine.device_memory import LARGEST_INDEX, MEMORY_SHARE
@@ -155,25 +156,24 @@ def room_for_blocks(particles: int) -> int:
 def most_blocks(grid: "SparseGrid") -> int:
     """Return the number of blocks that a larger grid may have in what memory is free, and indices reach."""
     fields = [field for field in (grid.nodes, grid.before, grid.filling) if field is not None]
-    numbers = grid.width * len(fields) + 2 * len(grid.kept_means)
+    fine, free = grid.fine.in_cell if grid.fine else 0, psutil.virtual_memory().available
+    numbers = grid.width * len(fields) + 2 * len(grid.kept_means) + fine
     # And of the tables of a sort on some threads.
     block = (4 if grid.nodes.dtype == ti.f32 else 8) * numbers * grid.block + 4 * 16
-    return int(min(MEMORY_SHARE * psutil.virtual_memory().available // block, LARGEST_INDEX // grid.block))
+    return int(min(MEMORY_SHARE * free // block, LARGEST_INDEX // (grid.block * max(fine, 1))))
 
 
 @ti.data_oriented
-class SparseGrid(Grid):
-    """See `Grid`; of one run, on the CPU.
+class SparseGrid(BlockNodes, Grid):
+    """See `Grid` and `BlockNodes`; of one run, on the CPU.
 
     Attributes:
         tile_count: blocks that there is room for, number 0 included.
-        table: (tiles of the domain) int, their numbers; tile_at: (tile_count) int, the tile of each; sizes: see BLOCKS.
+        tile_at: (tile_count) int, the tile of each number; sizes: see BLOCKS.
         pencils: (tile_count + 1) int, the first block of each pencil; coloured: (colours, tile_count) int, the numbers
             of the pencils of each colour.
         window: of the nodes near a tile, for each thread.
     """
-
-    sparse = True
 
     def __init__(self, *args: object, blocks: int, threads: int, **options: object) -> None:
         """Allocate; `blocks` is the room for blocks, and the rest that of `Grid`."""
@@ -241,18 +241,6 @@ class SparseGrid(Grid):
             tiles[k] = self.tile_at[k + 1]
 
     @ti.func
-    def tile_number(self, node: ti.template()):
-        return self.table[self.tile_index(node)]
-
-    @ti.func
-    def tile_index(self, node: ti.template()):
-        """Return the linear index of the tile that holds the node at these integer coordinates."""
-        index = 0
-        for a in ti.static(range(self.dimension)):
-            index = index * ti.static(self.tiles[a]) + ti.raw_div(node[a], ti.static(self.tile))
-        return index
-
-    @ti.func
     def tile_place(self, index: int):
         place, rest = ti.Vector.zero(int, self.dimension), index
         for b in ti.static(range(self.dimension)):
@@ -260,13 +248,6 @@ class SparseGrid(Grid):
             place[a] = rest % ti.static(self.tiles[a])
             rest = rest // ti.static(self.tiles[a])
         return place
-
-    @ti.func
-    def linear_index(self, base: ti.template()):
-        inner = 0
-        for a in ti.static(range(self.dimension)):
-            inner = inner * ti.static(self.tile) + base[a] % ti.static(self.tile)
-        return self.tile_number(base) * ti.static(self.block) + inner
 
     @ti.func
     def place_of(self, index: int):
@@ -277,6 +258,19 @@ class SparseGrid(Grid):
             place[a] = place[a] * ti.static(self.tile) + rest % ti.static(self.tile)
             rest = rest // ti.static(self.tile)
         return place
+
+    @ti.func
+    def row_count(self):
+        """Return the number of rows of nodes in the blocks in use, number 0 left out."""
+        return (self.sizes[BLOCKS] - 1) * ti.static(self.block // self.tile)
+
+    @ti.func
+    def row_start(self, row: int):
+        return self.place_of(ti.static(self.block) + row * ti.static(self.tile))
+
+    @ti.func
+    def row_length(self):
+        return self.tile
 
     @ti.func
     def forget(self, begin: int, end: int):

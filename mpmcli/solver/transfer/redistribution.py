@@ -18,8 +18,9 @@ from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import points_per_cell
-from mpmcli.solver.grid.grid import LinearNodes
-from mpmcli.solver.grid.sparse_grid import wants_sparse
+from mpmcli.solver.grid.blocks import BlockNodes
+from mpmcli.solver.grid.grid import Grid, LinearNodes
+from mpmcli.solver.grid.sparse_grid import SparseGrid
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.transfer.lanes import (
     LANES,
@@ -33,7 +34,7 @@ from mpmcli.solver.transfer.lanes import (
     zero_lanes,
 )
 from mpmcli.solver.transfer.splines import PAD, SPLINES, TransferScheme, bounded
-from mpmcli.solver.transfer.stencils import add_linear, gather_linear, origin_of
+from mpmcli.solver.transfer.stencils import add_linear, gather_linear, node_of, origin_of
 from mpmcli.solver.transfer.volume_relaxation import image_along
 from mpmcli.stability.transfer_factors import FARTHEST
 
@@ -44,7 +45,7 @@ PUSH = 8.0
 def fine_nodes(scene: Scene, laws: Sequence[Law]) -> int:
     """Return the fine nodes per cell along an axis, as many as particles of what is shifted; 0 where nothing is."""
     flowing = {law.name for law in laws if law.shifts}
-    if not scene.solver.redistribute or wants_sparse(scene):
+    if not scene.solver.redistribute:
         return 0
     counts = [points_per_cell(body, scene.domain.spacing) for body in scene.bodies if body.material.law in flowing]
     counts += [emitter.particles_per_cell for emitter in scene.emitters if emitter.material.law in flowing]
@@ -67,14 +68,13 @@ class FineGrid(LinearNodes):
 
     width = 1
 
-    def __init__(self, shape: Sequence[int], per_cell: int, runs: int) -> None:
-        """Allocate for a number of runs; `shape` is that of the grid."""
-        self.dimension, self.per_cell, self.runs, self.first_node = len(shape), per_cell, runs, 0
+    def __init__(self, grid: Grid, per_cell: int) -> None:
+        self.dimension, self.per_cell, self.runs, self.first_node = grid.dimension, per_cell, grid.runs, 0
         self.in_cell = per_cell**self.dimension
         self.scheme, self.planes = TransferScheme(SPLINES["quadratic"]), 3 if self.dimension == 3 else 1
-        self.strides = tuple(math.prod(per_cell * n for n in shape[a + 1 :]) for a in range(self.dimension))
-        self.node_count = math.prod(per_cell * n for n in shape)
-        self.fill = ti.Vector.field(1, float, shape=runs * self.node_count)
+        self.strides = tuple(math.prod(per_cell * n for n in grid.shape[a + 1 :]) for a in range(self.dimension))
+        self.node_count = self.in_cell * grid.node_count
+        self.fill = ti.Vector.field(1, float, shape=self.runs * self.node_count)
 
     @ti.func
     def place_in_cell(self, node: ti.template(), q: int):
@@ -89,6 +89,16 @@ class FineGrid(LinearNodes):
         """Return the first node of the stencil of a point and the distance to it; inverse_spacing: that of the grid."""
         base, distance = self.scheme.spline.stencil(x, inverse_spacing * self.per_cell)
         return base + ti.static(PAD * (self.per_cell - 1)), distance
+
+
+@ti.data_oriented
+class FineBlocks(BlockNodes, FineGrid):
+    """Those of a sparse grid: a block has the fine nodes of its cells."""
+
+    def __init__(self, grid: SparseGrid, per_cell: int) -> None:
+        super().__init__(grid, per_cell)
+        self.tile, self.tiles, self.table = per_cell * grid.tile, grid.tiles, grid.table
+        self.block = self.tile**self.dimension
 
 
 @ti.func
@@ -125,7 +135,7 @@ def fill_fine(at: ti.template(), p: int, time: float):
     volume = ti.min(volume, 1.0)
     w = fine.scheme.spline.weights(distance)
     even = ti.Matrix.zero(float, fine.dimension, 1)
-    first = fine.linear_index(base)
+    first = fine.stencil_at(base)
     if ti.static(at.grid.deterministic):
         scaled = ti.Vector([volume * ti.static(at.grid.fixed.of_fine)])
         add_linear(at.grid.fixed.fine, fine, first, w, scaled, even, at.atomic)
@@ -164,9 +174,10 @@ def fold_fine(at: ti.template(), node: ti.template(), time: float):
                     if inside_along(place[axis], axis, grid, last, fine.per_cell):
                         image, exists = image_along(place[axis], axis, grid, last, 1, fine.per_cell)
                         index = fine.linear_index(place)
-                        place[axis] = image
-                        total, beyond = fine.fill[index][0], fine.linear_index(place)
+                        total, beyond = fine.fill[index][0], index
                         if exists:
+                            place[axis] = image
+                            beyond = fine.linear_index(place)
                             total += fine.fill[beyond][0]
                         if ti.static(axis == d - 1):
                             total = ti.max(total - 1.0, 0.0)
@@ -182,10 +193,10 @@ def shift(at: ti.template(), p: int, time: float):
     v, C = group.motion(p)
     x = group.x[p]
     fine_base, fine_distance = fine.stencil(x, grid.inverse_spacing)
-    slope = slope_of(fine, fine.linear_index(fine_base), fine.scheme.spline.weights(fine_distance), fine_distance)
+    slope = slope_of(fine, fine.stencil_at(fine_base), fine.scheme.spline.weights(fine_distance), fine_distance)
     way = held_back(at, x, way_down(at, slope, C, time))
     base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
-    add_shift(at, grid.linear_index(base), grid.scheme.spline.weights(distance), group.row(p)[MASS], way)
+    add_shift(at, grid.stencil_at(base), grid.scheme.spline.weights(distance), group.row(p)[MASS], way)
     for a in ti.static(range(d)):
         group.x[p][a] = x[a] + way[a]
         group.v[p][a] = v[a] + (C @ way)[a]
@@ -198,7 +209,7 @@ def unshift(at: ti.template(), p: int, time: float):
     v, C = group.motion(p)
     x = group.x[p]
     base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
-    mean, _ = gather_linear(grid.nodes, grid, grid.linear_index(base), grid.scheme.spline.weights(distance))
+    mean, _ = gather_linear(grid.nodes, grid, grid.stencil_at(base), grid.scheme.spline.weights(distance))
     back = ti.Vector.zero(float, d)
     for a in ti.static(range(d)):
         back[a] = -mean[a]
@@ -211,13 +222,21 @@ def unshift(at: ti.template(), p: int, time: float):
 @ti.func
 def shift_range(at: ti.template(), first: int, last: int, time: float):
     """Shift particles first to last - 1."""
-    shift_lanes(at, first, last, time, False)
+    if ti.static(at.grid.sparse):
+        for p in range(first, last):
+            shift(at, p, time)
+    else:
+        shift_lanes(at, first, last, time, False)
 
 
 @ti.func
 def unshift_range(at: ti.template(), first: int, last: int, time: float):
     """Move particles first to last - 1 back by the mean motion around them."""
-    shift_lanes(at, first, last, time, True)
+    if ti.static(at.grid.sparse):
+        for p in range(first, last):
+            unshift(at, p, time)
+    else:
+        shift_lanes(at, first, last, time, True)
 
 
 @ti.func
@@ -293,7 +312,7 @@ def store_weights(lanes: ti.template(), w: ti.template(), lane: int):
 
 
 @ti.func
-def slope_of(fine: ti.template(), first: int, w: ti.template(), distance: ti.template()):
+def slope_of(fine: ti.template(), first: ti.template(), w: ti.template(), distance: ti.template()):
     """Return the gradient of `FineGrid.fill` per fine cell, sum n_j grad w_j over a stencil."""
     d = ti.static(fine.dimension)
     slopes = ti.Matrix.rows([distance - 1.5, 2.0 - 2.0 * distance, distance - 0.5])
@@ -301,7 +320,7 @@ def slope_of(fine: ti.template(), first: int, w: ti.template(), distance: ti.tem
     for i, j in ti.static(ti.ndrange(fine.planes, 3)):
         total, slope = 0.0, 0.0
         for k in ti.static(range(3)):
-            fill = fine.fill[origin + ti.static(fine.line_node(i, j) + k)][0]
+            fill = fine.fill[node_of(origin, fine, i, j, k)][0]
             total += w[k, d - 1] * fill
             slope += slopes[k, d - 1] * fill
         if ti.static(d == 3):
@@ -322,7 +341,7 @@ def way_down(at: ti.template(), slope: ti.template(), C: ti.template(), time: fl
 
 
 @ti.func
-def add_shift(at: ti.template(), first: int, w: ti.template(), mass: float, way: ti.template()):
+def add_shift(at: ti.template(), first: ti.template(), w: ti.template(), mass: float, way: ti.template()):
     """Add the way of a particle times its mass, and its mass, to the nodes of a stencil."""
     grid, d = ti.static((at.grid, at.grid.dimension))
     value, even = ti.Vector.zero(float, grid.width), ti.Matrix.zero(float, d, grid.width)
@@ -361,9 +380,10 @@ def fold_shift(at: ti.template(), node: ti.template(), time: float):
             reach = ti.static(grid.scheme.spline.nodes - 2)
             place, index = node, grid.linear_index(node)
             image, exists = image_along(node[axis], axis, grid, last, reach, 1)
-            place[axis] = image
-            total, beyond = grid.nodes[index], grid.linear_index(place)
+            total, beyond = grid.nodes[index], index
             if exists:
+                place[axis] = image
+                beyond = grid.linear_index(place)
                 total += mirrored(grid.nodes[beyond], axis, grid)
             if ti.static(axis == d - 1):
                 if total[d] > 0.0:

@@ -15,7 +15,7 @@ from mpmcli.solver.transfer.splines import LOW_BITS, bounded
 def add_linear(
     field: ti.template(),
     grid: ti.template(),
-    first: int,
+    first: ti.template(),
     w: ti.template(),
     middle: ti.template(),
     change: ti.template(),
@@ -23,7 +23,7 @@ def add_linear(
 ):
     """Add to the nodes of a stencil a quantity that varies linearly over it, weighted by the spline.
 
-    field: of the nodes, or sums in fixed point, to which the rest is scaled; first: linear index of the first node;
+    field: of the nodes, or sums in fixed point, to which the rest is scaled; first: `stencil_at` the first node;
     middle: the quantity at the middle node; change: its change per cell, a row per axis.
     """
     d = ti.static(grid.dimension)
@@ -44,21 +44,29 @@ def add_linear(
             add_multiple(line, ti.static(j - 1), across)
             line *= w[j, d - 2]
             step = along * w[j, d - 2]
-            node = origin + ti.static(grid.line_node(i, j))
-            add(field, node, (line - step) * w[0, d - 1], atomic)
-            add(field, node + 1, line * w[1, d - 1], atomic)
-            add(field, node + 2, (line + step) * w[2, d - 1], atomic)
+            add(field, node_of(origin, grid, i, j, 0), (line - step) * w[0, d - 1], atomic)
+            add(field, node_of(origin, grid, i, j, 1), line * w[1, d - 1], atomic)
+            add(field, node_of(origin, grid, i, j, 2), (line + step) * w[2, d - 1], atomic)
             if ti.static(grid.scheme.spline.nodes == 4):
-                add(field, node + 3, (line + 2.0 * step) * w[3, d - 1], atomic)
+                add(field, node_of(origin, grid, i, j, 3), (line + 2.0 * step) * w[3, d - 1], atomic)
 
 
 @ti.func
-def origin_of(first: int, grid: ti.template()):
-    """Return the linear index of the first node of a stencil, `bounded` where the grid has few enough nodes."""
-    if ti.static(grid.runs * grid.node_count <= LOW_BITS):
+def origin_of(first: ti.template(), grid: ti.template()):
+    """Return `stencil_at` the first node of a stencil, `bounded` where a dense grid has few enough nodes."""
+    if ti.static(not grid.sparse and grid.runs * grid.node_count <= LOW_BITS):
         return bounded(first)
     else:
         return first
+
+
+@ti.func
+def node_of(origin: ti.template(), grid: ti.template(), i: ti.template(), j: ti.template(), k: ti.template()):
+    """Return the linear index of node k of line j in plane i of a stencil."""
+    if ti.static(grid.sparse):
+        return grid.node_of(origin, i, j, k)
+    else:
+        return origin + ti.static(grid.line_node(i, j) + k)
 
 
 @ti.func
@@ -93,7 +101,7 @@ def add(field: ti.template(), node: int, share: ti.template(), atomic: ti.templa
 
 
 @ti.func
-def gather_linear(field: ti.template(), grid: ti.template(), first: int, w: ti.template()):
+def gather_linear(field: ti.template(), grid: ti.template(), first: ti.template(), w: ti.template()):
     """Return the weighted sums over a stencil of what nodes hold, and of that times the cells from the middle node."""
     d = ti.static(grid.dimension)
     origin = origin_of(first, grid)
@@ -105,13 +113,12 @@ def gather_linear(field: ti.template(), grid: ti.template(), first: int, w: ti.t
         across = ti.Vector.zero(float, grid.width)
         along = ti.Vector.zero(float, grid.width)
         for j in ti.static(range(grid.scheme.spline.nodes)):
-            node = origin + ti.static(grid.line_node(i, j))
-            low = field[node] * w[0, d - 1]
-            mid = field[node + 1] * w[1, d - 1]
-            high = field[node + 2] * w[2, d - 1]
+            low = field[node_of(origin, grid, i, j, 0)] * w[0, d - 1]
+            mid = field[node_of(origin, grid, i, j, 1)] * w[1, d - 1]
+            high = field[node_of(origin, grid, i, j, 2)] * w[2, d - 1]
             total, slope = (low + high) + mid, high - low
             if ti.static(grid.scheme.spline.nodes == 4):
-                far = field[node + 3] * w[3, d - 1]
+                far = field[node_of(origin, grid, i, j, 3)] * w[3, d - 1]
                 total += far
                 slope += 2.0 * far
             total *= w[j, d - 2]
