@@ -71,7 +71,8 @@ def scenes(draw):
     optional = {
         "velocity": vector,
         "velocity_gradient": st.lists(vector, min_size=d, max_size=d),
-        "sampling": st.just("jittered"),
+        "sampling": st.sampled_from(["jittered", "turned"]),
+        "relaxed": st.booleans(),
         "particles_per_cell": st.sampled_from([1, 2**d, 3**d]),
         "seed": st.integers(0, 2**63 - 1),
     }
@@ -146,6 +147,7 @@ name = "column"
 shape = { box = { min = [0.0, 0.0], max = [1.0, 2.0] } }
 velocity = [0.0, 0.0]
 sampling = "lattice"
+relaxed = false
 particles_per_cell = 4
 seed = 0
 

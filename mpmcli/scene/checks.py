@@ -222,6 +222,8 @@ _CLEAR = 2
 _APART = 3
 # Points per axis that are tried where two bodies may overlap, 2D and 3D.
 _MOST_TRIED = {2: 512, 3: 64}
+# Cells within the bounding box of a body that is relaxed: some 1.6 GB of nodes.
+_MOST_RELAXED = 10_000_000
 # Lattices above this size are not searched for a first particle; sampling does it later.
 _MOST_SEARCHED = 1_000_000
 
@@ -233,7 +235,7 @@ def problems_in(scene: Scene) -> list[Problem]:
     empty = [] if outside else list(_empty(scene))
     unstarted = [] if outside or empty else list(_initial(scene))
     colliding = [] if outside or empty else list(collider_problems(scene))
-    where = [*_repeated_names(scene), *outside, *_overlaps(scene), *empty]
+    where = [*_repeated_names(scene), *outside, *_overlaps(scene), *empty, *_too_large_to_relax(scene)]
     found = [*where, *unstarted, *colliding, *_pushed(scene), *_unstored(scene), *_total(scene)]
     return [*found, *gravity_problems(scene), *emitter_problems(scene)]
 
@@ -311,6 +313,16 @@ def _empty(scene: Scene) -> Iterator[Problem]:
         fitted = isinstance(body.shape.form, Box) and body.sampling != "poisson"
         if not fitted and lattice_points(body, h) <= _MOST_SEARCHED and not holds_particles(body, i, h):
             yield Problem(("bodies", i, "shape"), no_particles(body, h))
+
+
+def _too_large_to_relax(scene: Scene) -> Iterator[Problem]:
+    for i, body in enumerate(scene.bodies):
+        count = float(np.prod(np.ptp(np.array(body.shape.form.bounds()), axis=0) / scene.domain.spacing + 1))
+        if body.relaxed and not count <= _MOST_RELAXED:
+            said = (
+                f'is for bodies of {_MOST_RELAXED:g} cells at most, and "{body.name}" spans {count:.3g}; leave it out'
+            )
+            yield Problem(("bodies", i, "relaxed"), said)
 
 
 def _initial(scene: Scene) -> Iterator[Problem]:

@@ -15,8 +15,10 @@ from mpmcli.scene.points import Points
 from mpmcli.scene.primitives import Box
 from mpmcli.scene.problem import Path, path_text
 from mpmcli.scene.quantity import place_text
+from mpmcli.scene.relaxation import relaxed
 from mpmcli.scene.schema import Body, Emitter, Scene
 from mpmcli.scene.sheets import sheets_of
+from mpmcli.scene.turned import turned_box, turned_points
 
 # Points per radius^d of a sample, as measured, in 2D and 3D. Without end it would be 0.6965 and 0.7334.
 DENSITY = {2: 0.680, 3: 0.652}
@@ -353,7 +355,10 @@ def _lattice_counts(body: Body, h: float) -> list[int]:
 
 
 def particle_places(body: Body, index: int, h: float) -> np.ndarray:
-    """Return where the particles of a body start, (n, d), m, from its index in the scene and the grid spacing h."""
+    """Return where the particles of a body start, (n, d), m, from its index in the scene and the grid spacing h.
+
+    Those of a relaxed body are moved a little from there.
+    """
     form = body.shape.form
     if isinstance(form, Points):
         return form.position
@@ -361,7 +366,19 @@ def particle_places(body: Body, index: int, h: float) -> np.ndarray:
         radius = disk_radius(lattice_spacing(body, h), len(body.velocity))
         points = poisson_disk(*form.bounds(), radius, _generator(body, index))
         return points[form.contains(points)]
+    if body.sampling == "turned":
+        return _turned(body, h)
     return np.concatenate([points[form.contains(points)] for points in _lattice(body, index, h)])
+
+
+def _turned(body: Body, h: float) -> np.ndarray:
+    """Return the points of a turned lattice in a body, (n, d), m; see `_lattice_counts`."""
+    form, spacing = body.shape.form, lattice_spacing(body, h)
+    lower, upper = form.bounds()
+    if isinstance(form, Box):
+        return turned_box(lower, upper, np.array(_lattice_counts(body, h)))
+    points = (lower + upper) / 2 + spacing * turned_points((upper - lower) / (2 * spacing))
+    return points[form.contains(points)]
 
 
 def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
@@ -369,6 +386,9 @@ def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
     position = particle_places(body, index, domain.spacing)
     if not len(position):
         raise InputError(no_particles(body, domain.spacing))
+    volume = form.volume / len(position)
+    if body.relaxed:
+        position = relaxed(position, volume, form, domain)
     # A body too large to be looked at when the scene was loaded.
     faults = [f"{path_text(('bodies', index, *key))}: {said}" for key, said in initial_faults(body, position, domain)]
     if faults:
@@ -376,7 +396,6 @@ def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
     velocity, affine = initial_motion(body, position)
     if isinstance(form, Points) and form.file_velocity is not None:
         velocity = velocity + form.file_velocity
-    volume = form.volume / len(position)
     deformation = initial_deformation(body, position, domain)
     return BodyParticles(body.name, position, velocity, affine, volume, body.material.density * volume, deformation)
 
@@ -392,6 +411,8 @@ def holds_particles(body: Body, index: int, h: float) -> bool:
     if body.sampling == "poisson":
         # Points at random miss no body that holds as many of them, however thin.
         return estimate_body(body, h) > _SURE or len(particle_places(body, index, h)) > 0
+    if body.sampling == "turned":
+        return len(_turned(body, h)) > 0
     return any(body.shape.form.contains(points).any() for points in _lattice(body, index, h))
 
 

@@ -284,6 +284,13 @@ class Time(Table):
     )
 
 
+def _not_for_points(relaxed: bool, info: ValidationInfo) -> bool:
+    # An invalid shape has a message of its own, and is absent from the data.
+    if relaxed and getattr(info.data.get("shape"), "points", None):
+        raise flaw("moves particles, and points are particles as they are; leave it out")
+    return relaxed
+
+
 class Body(Table):
     """One body: a shape filled with particles of one material."""
 
@@ -314,13 +321,19 @@ class Body(Table):
         description='"hydrostatic": a fluid starts with the J at which it carries its own weight, density g times '
         "the depth below the top of its bounding box. Default: none.",
     )
-    sampling: Literal["lattice", "jittered", "poisson"] = Field(
+    sampling: Literal["lattice", "turned", "jittered", "poisson"] = Field(
         "lattice",
-        description="Particles on a lattice, one at random in each cell of that lattice, or a Poisson-disk sample: "
-        "as many at random, none closer than 0.82 (2D) or 0.87 (3D) of its spacing to another.",
+        description="Particles on a lattice, on one turned such that no flow along the axes lines them up, one at "
+        "random in each cell of the lattice, or a Poisson-disk sample: as many at random, none closer than 0.82 (2D) "
+        "or 0.87 (3D) of its spacing to another.",
+    )
+    relaxed: Annotated[Flag, AfterValidator(_not_for_points)] = Field(
+        False,
+        description="Whether particles are moved a little, until each node of the grid whose spline the body fills, "
+        "with its images behind walls, has the volume and the centre of a full cell. Not for points.",
     )
     particles_per_cell: ParticlesPerCell = None  # type: ignore[assignment]
-    seed: Integer = Field(0, ge=0, le=2**63 - 1, description="Seed of the random positions; unused by a lattice.")
+    seed: Integer = Field(0, ge=0, le=2**63 - 1, description="Seed of the random positions; unused by lattices.")
 
 
 class Force(Table):

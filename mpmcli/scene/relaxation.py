@@ -1,0 +1,198 @@
+"""Relaxed samples: particles moved a little, until nodes of the grid have the volume and the centre of a full cell."""
+
+from collections.abc import Iterator
+from functools import reduce
+from itertools import product
+
+import numpy as np
+
+from mpmcli.scene.domain import PERIODIC, Domain
+from mpmcli.scene.shapes import Form
+
+# Descents in 2D and 3D, the part of a Newton step that each of them takes, and the part of the one before that it goes
+# on with. Steps above 0.65 swing at the edges of walls in 3D.
+_DESCENTS, _STEP, _MOMENTUM = {2: 24, 3: 14}, 0.5, 0.7
+# Integrals over space of |grad w|^2 and |grad (w r)|^2, w the spline of a node and r the distance along one axis.
+_CURVATURES = {2: (1.1, 0.3243), 3: (0.9075, 0.2206)}
+# Deviation of a node that is small enough; and the farthest that a descent moves a particle along an axis, of the edge
+# of what it stands for.
+_ENOUGH, _FARTHEST = 1e-3, 0.1
+# Cells that are round-off, and the reach of a spline less that.
+_SLACK = 1e-4
+_REACH = 1.5 - _SLACK
+# Particles that are looked at together, so that what is computed of them stays in the cache.
+_AT_ONCE = 2**16
+# The spline w of the node before the nearest one, of that one and of the next, and w r, r the distance from the node:
+# coefficients of the powers 0 to 3 of the distance t from the nearest one.
+_SPLINE = np.array([[1 / 8, -1 / 2, 1 / 2, 0], [3 / 4, 0, -1, 0], [1 / 8, 1 / 2, 1 / 2, 0]]).T
+_MOMENT = np.array([[1 / 8, -3 / 8, 0, 1 / 2], [0, 3 / 4, 0, -1], [-1 / 8, -3 / 8, 0, 1 / 2]]).T
+
+
+def _products(d: int) -> np.ndarray:
+    """Return the coefficients of the volumes and the moments of all nodes around one, (4^d, (1 + d) 3^d)."""
+    kinds = [[_MOMENT if e == a else _SPLINE for a in range(d)] for e in (None, *range(d))]
+    return np.concatenate([reduce(np.kron, kind) for kind in kinds], axis=1, dtype=np.float32)
+
+
+_SPLINES = {d: _products(d) for d in (2, 3)}
+
+
+def relaxed(position: np.ndarray, volume: float, form: Form, domain: Domain) -> np.ndarray:
+    """Return particles of a form, (n, d), m, moved such that full nodes have the volume h^d, and no first moment.
+
+    Full are nodes whose quadratic splines the form fills, with its images behind walls and beyond periodic faces.
+    Descent with momentum on the squares of what they lack: particles go along the gradient of a field of splines, those
+    alone that reach a node which lacks anything. None leaves the form.
+
+    Args:
+        position: (n, d) float64, m.
+        volume: of a particle, m^3 (m^2 in 2D).
+        form: what the particles fill.
+        domain: its grid and its walls.
+    """
+    bounds = np.array(form.bounds())
+    nodes = _Nodes(bounds, domain)
+    d, share = len(nodes.counts), volume / domain.spacing ** len(nodes.counts)
+    order = np.argsort(nodes.in_cells(position)[0], kind="stable")
+    sums = nodes.sums(position[order], share)
+    weights = nodes.weights(form, sums)
+    lacking = np.any(np.abs(nodes.lack(sums)) > _ENOUGH, axis=0) & (weights > 0)
+    for a in range(d):
+        lacking = lacking | np.roll(lacking, 1, a) | np.roll(lacking, -1, a)
+    order = order[lacking.reshape(-1)[nodes.in_cells(position[order])[0]]]
+    if not len(order):
+        return position
+    found, moving = position.copy(), position[order]
+    rest = sums - nodes.sums(moving, share)
+    # A Newton step of one node alone; those on walls respond twice as much for each, as they meet images as well.
+    weights = _STEP * weights / np.reshape([_CURVATURES[d][min(e, 1)] for e in range(1 + d)], (1 + d,) + (1,) * d)
+    lower, upper = np.clip(bounds, domain.origin, domain.upper)
+    most, steps = _FARTHEST * share ** (1 / d), np.zeros(moving.shape)
+    for _ in range(_DESCENTS[d]):
+        field = nodes.unfolded(weights * nodes.lack(rest + nodes.sums(moving, share)))
+        for first in range(0, len(moving), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            steps[some] = np.clip(_MOMENTUM * steps[some] + nodes.gradient(moving[some], field), -most, most)
+            new = np.clip(moving[some] + nodes.h * steps[some], lower, upper)
+            outside = ~form.contains(new)
+            new[outside], steps[some][outside] = moving[some][outside], 0.0
+            moving[some] = new
+    found[order] = moving
+    return found
+
+
+class _Nodes:
+    """The nodes around a bounding box, as an array with one axis for each of space; lengths are in cells.
+
+    A field on them is an array (1 + d, *counts): of volumes, and of first moments along each axis.
+    """
+
+    def __init__(self, bounds: np.ndarray, domain: Domain) -> None:
+        self.h, self.cells, self.origin = domain.spacing, np.array(domain.cells), np.array(domain.origin)
+        lower, upper = (bounds - self.origin) / self.h
+        self.first = np.floor(lower).astype(int) - 2
+        self.counts = tuple((np.ceil(upper).astype(int) + 3 - self.first).tolist())
+        self.strides = np.cumprod([1, *self.counts[:0:-1]])[::-1]
+        faces = domain.walls.faces(len(self.cells))
+        spans = (lower < _SLACK) & (upper > self.cells - _SLACK)
+        self.periodic = spans & np.array([PERIODIC in pair for pair in faces])
+        self.walls = np.array([[word not in (PERIODIC, "open") for word in pair] for pair in faces])
+        ends = np.array([np.full(len(spans), _SLACK), self.cells - _SLACK])
+        self.reach = np.where(self.walls.T, ends, [[-np.inf], [np.inf]])
+        self.folds = list(self._folds())
+
+    def _folds(self) -> Iterator[tuple[int, list[int], list[int], np.ndarray]]:
+        """Yield the axis, nodes in the domain, those beyond a face that are their images, and the signs of these."""
+        d = len(self.counts)
+        for a, (begin, end) in enumerate(zip(-self.first, self.cells - self.first, strict=True)):
+            even, odd = np.ones((2, 1 + d, *(1,) * (d - 1)))
+            odd[1 + a] = -1.0
+            pairs = [([begin, begin + 1, end - 1], [end, end + 1, begin - 1], even)] if self.periodic[a] else []
+            for wall, ahead, is_wall in zip((begin, end), (1, -1), self.walls[a], strict=True):
+                if is_wall:
+                    pairs.append(([wall, wall + ahead], [wall, wall - ahead], odd))
+            for front, behind, sign in pairs:
+                # From a wall far away there is nothing to fold.
+                if min(front + behind) >= 0 and max(front + behind) < self.counts[a]:
+                    yield a, front, behind, sign
+
+    def folded(self, field: np.ndarray) -> np.ndarray:
+        """Add what lies beyond faces to the nodes that it is an image of, or the same as; in place."""
+        for a, front, behind, sign in self.folds:
+            along = np.moveaxis(field, 1 + a, 0)
+            along[front] += sign * along[behind]
+        return field
+
+    def unfolded(self, field: np.ndarray) -> np.ndarray:
+        """Do the transpose of `folded`."""
+        for a, front, behind, sign in reversed(self.folds):
+            along = np.moveaxis(field, 1 + a, 0)
+            along[behind] += sign * along[front]
+        return field
+
+    def weights(self, form: Form, sums: np.ndarray) -> np.ndarray:
+        """Return 1 for full nodes, halved for each wall that they lie on, and 0 for others, (*counts)."""
+        # Where less than half of the volume is, a hole was missed that is smaller than the distance of the points.
+        some = np.flatnonzero(sums[0] > 0.5)
+        places = np.stack(np.unravel_index(some, self.counts), axis=1) + self.first
+        full = np.all((places >= 0) & (places <= self.cells - self.periodic), axis=1)
+        for offset in product((-_REACH, 0.0, _REACH), repeat=len(self.counts)):
+            # Of what lies behind a wall there is an image if the form reaches as far as the wall.
+            points = np.clip(places[full] + np.array(offset), *self.reach)
+            points = np.where(self.periodic, points % self.cells, points)
+            full[full] = form.contains(self.origin + self.h * points)
+        on_walls = np.sum(((places == 0) & self.walls[:, 0]) | ((places == self.cells) & self.walls[:, 1]), axis=1)
+        found = np.zeros(self.counts)
+        found.reshape(-1)[some] = full * 0.5**on_walls
+        return found
+
+    def lack(self, sums: np.ndarray) -> np.ndarray:
+        """Return what a field of sums lacks to that of full cells."""
+        found = -sums
+        found[0] += 1.0
+        return found
+
+    def in_cells(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the numbers of the nodes next to places (n, d), m, (n,), and the distances from them, (d, n)."""
+        places = (position - self.origin) / self.h - self.first
+        nearest = np.rint(places)
+        return nearest.astype(np.int64) @ self.strides, (places - nearest).T.astype(np.float32)
+
+    def sums(self, position: np.ndarray, share: float) -> np.ndarray:
+        """Return the volumes and the first moments of particles (n, d), m, each of them `share` of a cell: a field."""
+        d = len(self.counts)
+        found = np.zeros((1 + d, int(np.prod(self.counts))))
+        for first in range(0, len(position), _AT_ONCE):
+            index, distances = self.in_cells(position[first : first + _AT_ONCE])
+            low = index.min()
+            index -= low
+            n, terms = index.max() + 1, [np.full(len(index), share, np.float32)]
+            for t in distances:
+                terms = [value for term in terms for value in (term, term * t, term * (t * t), term * (t * t * t))]
+            powers = np.array([np.bincount(index, term, n) for term in terms], np.float32)
+            for total, values in zip(self._around(found, low, n), _SPLINES[d].T @ powers, strict=True):
+                total += values
+        return self.folded(found.reshape(-1, *self.counts))
+
+    def gradient(self, position: np.ndarray, field: np.ndarray) -> np.ndarray:
+        """Return the gradient at particles (n, d), m, of the splines and moments of nodes times a field, (n, d)."""
+        index, distances = self.in_cells(position)
+        low = index.min()
+        index -= low
+        around = self._around(field.reshape(len(field), -1), low, index.max() + 1)
+        powers = _SPLINES[len(distances)] @ np.array(around, np.float32)
+        return np.stack(_polynomial(powers.reshape(*(4,) * len(distances), -1), index, distances)[1:], axis=1)
+
+    def _around(self, field: np.ndarray, low: int, n: int) -> list[np.ndarray]:
+        """Return the parts of a field, (1 + d, nodes), that lie about n nodes from one on, in the order of _SPLINES."""
+        offsets = [int(np.dot(offset, self.strides)) for offset in product((-1, 0, 1), repeat=len(self.counts))]
+        return [values[low + offset : low + offset + n] for values in field for offset in offsets]
+
+
+def _polynomial(powers: np.ndarray, index: np.ndarray, distances: np.ndarray) -> list[np.ndarray]:
+    """Return polynomials, of coefficients (4, ..., nodes), at distances (d, n) from nodes (n,), and their slopes."""
+    if not len(distances):
+        return [powers[index]]
+    t, (c0, c1, c2, c3) = distances[0], (_polynomial(part, index, distances[1:]) for part in powers)
+    values = [((z * t + y) * t + x) * t + w for w, x, y, z in zip(c0, c1, c2, c3, strict=True)]
+    return [values[0], (3 * c3[0] * t + 2 * c2[0]) * t + c1[0], *values[1:]]
