@@ -218,26 +218,34 @@ def test_the_velocity_of_a_place_stays(backend_of: Callable, pool: Scene) -> Non
 
 
 def test_momenta_stay_where_drops_collide(backend_of: Callable) -> None:
-    """Of two drops that meet off centre, far from walls: P to 1e-6 of M v, L to 1e-4 of its own."""
-    drops = [
-        {
-            "name": f"drop {1 + sign}",
-            "material": WATER,
-            "shape": {"ball": {"center": [1.5 + 0.25 * sign, 1.5 + 0.05 * sign], "radius": 0.2}},
-            "velocity": [-1.0 * sign, 0.0],
-        }
-        for sign in (-1, 1)
-    ]
-    scene = scene_of(
-        domain={"size": [3.0, 3.0], "spacing": 0.02, "walls": "separate"},
-        time={"end": 0.35, "frames": 1},
-        bodies=drops,
-        solver={"precision": "f64"},
-    )
-    rows = [row for _, row in build_run(scene, backend_of("f64", 1)).frames()]
-    change = np.subtract(rows[-1].linear_momentum, rows[0].linear_momentum)
-    assert np.abs(change).max() < 1e-6 * rows[0].mass
-    assert rows[-1].angular_momentum == pytest.approx(rows[0].angular_momentum, rel=1e-4)
+    """Of two drops that meet off centre, far from walls: P to 1e-6 of M v, L to 1e-4.
+
+    Where they lie between the nodes does not matter: moved by 0.3 of a cell they spread by as much, to 0.5 %. Nodes and
+    particles are then no images of each other, and P is kept to 5e-6, L to 3e-4.
+    """
+    backend, spread = backend_of("f64", 1), []
+    for moved in (0.0, 0.3 * 0.02):
+        drops = [
+            {
+                "name": f"drop {1 + sign}",
+                "material": WATER,
+                "shape": {"ball": {"center": [1.5 + 0.25 * sign + moved, 1.5 + 0.05 * sign - moved], "radius": 0.2}},
+                "velocity": [-1.0 * sign, 0.0],
+            }
+            for sign in (-1, 1)
+        ]
+        scene = scene_of(
+            domain={"size": [3.0, 3.0], "spacing": 0.02, "walls": "separate"},
+            time={"end": 0.35, "frames": 1},
+            bodies=drops,
+            solver={"precision": "f64"},
+        )
+        (_, before), (frame, after) = build_run(scene, backend).frames()
+        change = np.subtract(after.linear_momentum, before.linear_momentum)
+        assert np.abs(change).max() < (5e-6 if moved else 1e-6) * before.mass
+        assert after.angular_momentum == pytest.approx(before.angular_momentum, rel=3e-4 if moved else 1e-4)
+        spread.append([frame.position[frame.body == k].std(axis=0) for k in (0, 1)])
+    assert np.abs(np.divide(*spread) - 1).max() < 0.005
 
 
 def test_a_shift_moves_no_centre_of_mass(backend_of: Callable, pool: Scene) -> None:

@@ -96,11 +96,11 @@ CASES = (
     SandColumn(
         1,
         (24, 48, 64),
-        # 1.2 a (Lube) to 2.2 a (mu(I)); 0.65 a^0.35 (mu(I)) to a (Lube).
-        (1.2, 2.2),
+        # 1.2 a (Lube), less a tenth, by which experiments differ, to 2.2 a (mu(I)); 0.65 a^0.35 (mu(I)) to a (Lube).
+        (1.1, 2.2),
         (0.65, 1.0),
-        (1.7, 9.6, 0.05),
-        (0.79, 0.02),
+        (1.35, 8.1, 0.05),
+        (0.853, 0.02),
     ),
     SandColumn(
         2,
@@ -108,8 +108,8 @@ CASES = (
         # 1.2 a (Lube) and half as much again, and room around a^0.4 = 1.32: the band that judges MUD, an SPH code.
         (2.4, 3.6),
         (0.8, 1.7),
-        (3.41, 8.0, 0.15),
-        (1.02, 0.03),
+        (2.76, 7.2, 0.15),
+        (1.12, 0.03),
     ),
     SandColumn(
         5,
@@ -117,7 +117,7 @@ CASES = (
         # 1.6 a^(2/3) (Lube) to 2.2 a (mu(I)); 0.65 a^0.35 (mu(I)) to a^0.4 (Lube).
         (4.68, 11.0),
         (1.14, 1.9),
-        (7.28, 3.5, 0.22),
-        (1.46, 0.03),
+        (5.99, 7.2, 0.22),
+        (1.62, 0.03),
     ),
 )
