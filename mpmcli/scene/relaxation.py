@@ -11,7 +11,7 @@ from mpmcli.scene.shapes import Form
 
 # Descents in 2D and 3D, the part of a Newton step that each of them takes, and the part of the one before that it goes
 # on with. Steps above 0.65 swing at the edges of walls in 3D.
-_DESCENTS, _STEP, _MOMENTUM = {2: 24, 3: 14}, 0.5, 0.7
+_DESCENTS, _STEP, _MOMENTUM = {2: 24, 3: 13}, 0.5, 0.7
 # Integrals over space of |grad w|^2 and |grad (w r)|^2, w the spline of a node and r the distance along one axis.
 _CURVATURES = {2: (1.1, 0.3243), 3: (0.9075, 0.2206)}
 # Deviation of a node that is small enough; and the farthest that a descent moves a particle along an axis, of the edge
