@@ -347,7 +347,7 @@ def test_angles_that_are_none_are_refused(angle: float) -> None:
 
 
 def test_a_heap_says_its_friction_angle() -> None:
-    """sin(phi) = tan(repose), 35.26 degrees of 30; in place of a preset's angle, not beside one that the scene gives."""
+    """sin(phi) = tan(repose), 35.26 degrees of 30, in place of a preset's; not beside one that is given."""
     parameters = sand(repose_angle=30.0)
     assert math.sin(math.radians(parameters.friction_angle)) == pytest.approx(1 / math.sqrt(3), rel=1e-12)
     assert SandParameters.model_validate(parameters.model_dump()) == parameters

@@ -102,8 +102,8 @@ def even_sequence(d: int, count: int) -> np.ndarray:
     """Return the first points of a sequence that fills the unit interval (2D) or square (3D), (count, d - 1).
 
     Point k is (k / r mod 1, k / r^2 mod 1), r the golden number in 2D and the plastic one in 3D. With k as one more
-    coordinate these are points of a lattice, which keep apart however it is stretched along that one
-    (docs/theory.md, 8.2).
+    coordinate these are points of a lattice, which keep apart however it is stretched along that one (docs/theory.md,
+    5.13).
     """
     steps = _ROOTS[d] ** -np.arange(1.0, d)
     return (0.5 + np.arange(count)[:, None] * steps) % 1.0

@@ -108,7 +108,7 @@ CASES = (
         # 1.2 a (Lube) and half as much again, and room around a^0.4 = 1.32: the band that judges MUD, an SPH code.
         (2.4, 3.6),
         (0.8, 1.7),
-        (2.76, 7.2, 0.15),
+        (2.74, 7.2, 0.18),
         (1.12, 0.03),
     ),
     SandColumn(
