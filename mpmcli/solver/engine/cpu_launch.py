@@ -18,7 +18,7 @@ from mpmcli.solver.engine.run_numbers import ATTEND, CROWDED, GOING, LOST, MEASU
 from mpmcli.solver.engine.step_size import StepSize
 from mpmcli.solver.frames.reader import SOUND, sum_entries, sum_range
 from mpmcli.solver.grid.grid import box_of
-from mpmcli.solver.particles.sort import CHUNK, find_places, scratch_offset
+from mpmcli.solver.particles.sort import CHUNK, find_places, scratch_offset, stay_rolled
 from mpmcli.solver.particles.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
 from mpmcli.solver.transfer.redistribution import farthest_shift
 from mpmcli.solver.transfer.splines import PAD
@@ -172,6 +172,7 @@ class CpuLaunch:
             own = ti.Vector([NOTHING] * ti.static(entries(group)))
             first = w * ti.static(self.room[g])
             for p in range(first, first + counts[w, self.count.particles[g]]):
+                stay_rolled(self.device.orders[g].buffers.real, p)
                 v, C = group.motion(p)
                 widen_motion(own, v, deformation_rate(group, C))
                 widen_state(group, own, p)

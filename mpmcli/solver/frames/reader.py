@@ -6,6 +6,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.solver.frames.columns import FrameColumns, stress_entries
 from mpmcli.solver.frames.ledger_sums import Sums, axis_pairs
 from mpmcli.solver.particles.arrays import MASS, VOLUME
+from mpmcli.solver.particles.sort import stay_rolled
 from mpmcli.solver.particles.state_bounds import volume_ratio
 from mpmcli.solver.transfer.lanes import (
     LANES,
@@ -159,6 +160,7 @@ def sum_range(group: ti.template(), first: int, count: int, energies: ti.templat
     total = ti.Vector.zero(ti.f64, ti.static(sum_entries(group.dimension)))
     fastest, sound = 0.0, 1
     for p in range(first, first + count):
+        stay_rolled(energies, p)
         table = group.row(p)
         m = ti.cast(table[MASS], ti.f64)
         velocity, C = group.motion(p)

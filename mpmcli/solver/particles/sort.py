@@ -184,14 +184,27 @@ class TileOrder:
 
 
 @ti.func
+def stay_rolled(scratch: ti.template(), index: int):
+    """Keep LLVM from unrolling the loop around on the CPU, for an index that is never negative, as LLVM does not know.
+
+    A call that is never made is enough. Loops that copy or sum gain nothing by it, and the time to compile them grows
+    with the square of their length.
+    """
+    if index < 0:
+        scratch[0] = ti.cast(ti.acos(ti.cast(index, float)), scratch.dtype)
+
+
+@ti.func
 def count_tiles(order: ti.template(), run: int, t: int, first: int, begin: int, end: int):
     """Count the particles of each tile in share t of those of a run, which begin at `first`: from `begin` to `end`."""
     cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.room)
     for tile in range(order.bins):
+        stay_rolled(order.buffers.real, cursor + tile)
         order.cursor[cursor + tile, t] = 0
     for q in range(begin, end):
         order.settle(first + q)
         tile = order.bin_of(first + q)
+        stay_rolled(order.buffers.real, tile)
         order.buffers.key[own + q] = tile
         order.cursor[cursor + tile, t] = order.cursor[cursor + tile, t] + 1
 
@@ -201,6 +214,7 @@ def find_places(order: ti.template(), run: int, first: int):
     """Set the first particle of each tile of a run, and where each share places its particles of the tile."""
     cursor, place = run * ti.static(order.bins), 0
     for tile in range(order.bins):
+        stay_rolled(order.buffers.real, place)
         order.start[order.first_tile + tile] = first + place
         for t in range(ti.static(order.threads)):
             size = order.cursor[cursor + tile, t]
@@ -215,6 +229,7 @@ def place_particles(order: ti.template(), run: int, t: int, first: int, begin: i
     cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.room)
     for q in range(begin, end):
         tile = cursor + order.buffers.key[own + q]
+        stay_rolled(order.buffers.real, tile)
         order.buffers.order[own + order.cursor[tile, t]] = first + q
         order.cursor[tile, t] = order.cursor[tile, t] + 1
 
