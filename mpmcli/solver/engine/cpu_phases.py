@@ -18,15 +18,7 @@ from mpmcli.solver.engine.phases import Phase, sorted_fields
 from mpmcli.solver.engine.run_numbers import Layout
 from mpmcli.solver.frames.reader import show_range
 from mpmcli.solver.grid.sparse_grid import BLOCKS, PENCILS
-from mpmcli.solver.particles.sort import (
-    count_tiles,
-    keep,
-    place_particles,
-    scratch_offset,
-    share_start,
-    stay_rolled,
-    take,
-)
+from mpmcli.solver.particles.sort import count_tiles, keep_all, place_particles, scratch_offset, share_start, take_all
 from mpmcli.solver.particles.state_bounds import NOTHING
 from mpmcli.solver.transfer.cpu_transfers import (
     advance_range,
@@ -456,13 +448,9 @@ class CpuPhases:
             place_particles(at.order, at.w, at.region, first, begin, end)
         for i, field in ti.static(enumerate(self.moved[at.g])):
             if at.turn == ti.static(2 + 2 * i):
-                for q in range(begin, end):
-                    stay_rolled(at.order.buffers.real, q)
-                    keep(at.order.buffers, field, own, q, at.order.buffers.order[own + q])
+                keep_all(at.order.buffers, field, own, begin, end)
             if at.turn == ti.static(3 + 2 * i):
-                for q in range(begin, end):
-                    stay_rolled(at.order.buffers.real, q)
-                    take(at.order.buffers, field, own, q, first + q)
+                take_all(at.order.buffers, field, own, begin, end, first)
 
     @ti.func
     def average_shown(self, at: ti.template()):

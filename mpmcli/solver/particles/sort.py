@@ -264,3 +264,18 @@ def take(buffers: ti.template(), field: ti.template(), first: int, q: int, p: in
         for e in ti.static(range(entries)):
             place = ti.static(e if field.m == 1 else (e // field.m, e % field.m))
             field[p][place] = buffers.real[first * ti.static(buffers.widest) + q * entries + e]
+
+
+@ti.func
+def keep_all(buffers: ti.template(), field: ti.template(), own: int, begin: int, end: int):
+    """Copy the entries of the particles that come to places begin to end - 1 of a run, on the CPU."""
+    for q in range(begin, end):
+        stay_rolled(buffers.real, q)
+        keep(buffers, field, own, q, buffers.order[own + q])
+
+
+@ti.func
+def take_all(buffers: ti.template(), field: ti.template(), own: int, begin: int, end: int, first: int):
+    for q in range(begin, end):
+        stay_rolled(buffers.real, q)
+        take(buffers, field, own, q, first + q)
