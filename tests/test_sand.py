@@ -357,6 +357,10 @@ def test_a_heap_says_its_friction_angle() -> None:
     assert scene.bodies[0].material.friction_angle == parameters.friction_angle
     with pytest.raises(ValidationError, match="sets friction_angle, which is given as well"):
         sand(repose_angle=30.0, friction_angle=30.0)
+    with pytest.raises(ValidationError, match="sets friction_angle, which is given as well"):
+        SandParameters.model_validate({"density": 1600.0, "repose_angle": 30.0, "friction_angle": "35"})
+    with pytest.raises(ValidationError, match=r"at most 40.8 degrees in 3D.*; found 42"):
+        SandParameters.model_validate({"density": 1600.0, "repose_angle": 42.0}, context={"dimension": 3})
     for bad, why in ((45.0, "less than 45"), (0.0, "greater than 0"), ("30", "number")):
         with pytest.raises(ValidationError, match=why) as found:
             SandParameters.model_validate({"density": 1600.0, "repose_angle": bad})

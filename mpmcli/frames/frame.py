@@ -20,7 +20,7 @@ class Frame:
         body: (n,) int32, index into the scene's bodies.
         material: (n,) int32, index into the run's list of laws.
         fields: further arrays of the scene's `output.fields`, (n,) or (n, k), by name; and where particles come and
-            go `STATUS`, (n,) int8: 0 waiting, 1 there, 2 gone.
+            go `STATUS`, (n,) int8: 0 waiting, 1 there, 2 gone, 3 kept out.
         id: (n,), number of each particle where only some are in the frame; None where row i is particle i.
     """
 

@@ -38,6 +38,11 @@ BAND = 0.025
 RELAXATION = 0.0175
 # Above this angle, degrees, the cone in 3D admits a tensile principal stress.
 STEEPEST_3D = 60.0
+_PULLED = "above which the yield cone lets sand be pulled"
+
+
+def _is_3d(info: ValidationInfo) -> bool:
+    return isinstance(info.context, dict) and scene_dimension(info) == 3
 
 
 class SandParameters(HenckyParameters):
@@ -83,27 +88,29 @@ class SandParameters(HenckyParameters):
 
     @model_validator(mode="before")
     @classmethod
-    def _of_the_heap(cls, said: Any) -> Any:
+    def _of_the_heap(cls, said: Any, info: ValidationInfo) -> Any:
         """Set the friction angle by that of a heap, sin(phi) = tan(repose) (Davis 1968; docs/theory.md, 5.7)."""
         slope = said.get("repose_angle") if isinstance(said, Mapping) else None
         if slope is None:
             return said
-        number = isinstance(slope, int | float) and 0 < slope < 45
-        angle = math.degrees(math.asin(math.tan(math.radians(slope)))) if number else 30.0
-        if not math.isclose(said.get("friction_angle", angle), angle, rel_tol=1e-6):
+        if not (isinstance(slope, int | float) and 0 < slope < 45):
+            # The field says what is wrong with it.
+            return {"friction_angle": 30.0, **said}
+        angle = math.degrees(math.asin(math.tan(math.radians(slope))))
+        given = said.get("friction_angle", angle)
+        if not (isinstance(given, int | float) and math.isclose(given, angle, rel_tol=1e-6)):
             raise flaw("sets friction_angle, which is given as well; leave one of them out", "repose_angle")
+        if _is_3d(info) and angle > STEEPEST_3D:
+            most = math.floor(10 * math.degrees(math.atan(math.sin(math.radians(STEEPEST_3D))))) / 10
+            raise flaw(f"must be at most {most:g} degrees in 3D, {_PULLED}; found {slope:g}", "repose_angle")
         return {**said, "friction_angle": angle}
 
     @field_validator("friction_angle")
     @classmethod
     def _within_the_cone(cls, value: float, info: ValidationInfo) -> float:
         """Reject angles whose cone in 3D admits tension: triaxial extension reaches p (1 - 2 sin(phi) / sqrt(3))."""
-        in_3d = isinstance(info.context, dict) and scene_dimension(info) == 3
-        if in_3d and value > STEEPEST_3D:
-            raise flaw(
-                f"must be at most {STEEPEST_3D:g} degrees in 3D, above which the yield cone lets sand be pulled; "
-                f"found {value:g}"
-            )
+        if _is_3d(info) and value > STEEPEST_3D:
+            raise flaw(f"must be at most {STEEPEST_3D:g} degrees in 3D, {_PULLED}; found {value:g}")
         return value
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:

@@ -105,7 +105,7 @@ class Emitter(Table):
         "lattice that moves along, or the sheets of that lattice.",
     )
     particles_per_cell: ParticlesPerCell = None  # type: ignore[assignment]
-    seed: Integer = Field(0, ge=0, le=2**63 - 1, description="Seed of the random positions; of a jittered sample.")
+    seed: Integer = Field(0, ge=0, le=2**63 - 1, description="Seed of the random positions of a jittered sample.")
 
     @field_validator("velocity")
     @classmethod

@@ -16,7 +16,7 @@ from mpmcli.scene import Scene
 from mpmcli.scene.sheets import Sheets, sheets_of
 from mpmcli.solver.particles.sort import ACTIVE, BLOCKED, WAITING, entry_count
 
-# Periods of a layer of which half or more finds its place occupied, after which it tries again.
+# Part of the time that a layer takes to enter, after which it tries again if half of it or more finds no room.
 RETRY = 0.25
 
 
@@ -103,7 +103,7 @@ class Emission:
     def mark(self, e: ti.template(), group: ti.template(), run: int, sheet: int, late: float, p: int):
         """Note the cell that particle p lies in, of the layer that begins with a sheet which was due `late` s ago.
 
-        The last sheets but the first of the layer before have not come far enough yet.
+        Those of the layer before are left out, but for its first sheet: they have not come far enough yet.
         """
         if not self.is_due(e, group, run, p, ti.max(sheet - self.ids[run, e][2] + 1, 0), self.ids[run, e][2]):
             index, inside = self.cell_of(e, run, group.x[p] - late * self.velocity[run, e])
@@ -112,7 +112,7 @@ class Emission:
 
     @ti.func
     def cell_of(self, e: ti.template(), run: int, x: ti.template()):
-        """Return the cell of the mouth in front of or behind which a point lies, and whether it lies in the cell."""
+        """Return the cell of the mouth that a point lies in, or is nearest to, and whether it lies in that."""
         inside, index = True, 0
         away = x - self.centre[run, e]
         axes, low, spacing, cells = self.axes[run, e], self.low[run, e], self.spacing[run, e], self.cells[run, e]
