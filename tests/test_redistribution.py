@@ -293,6 +293,32 @@ def test_a_broken_dam_has_no_crowds(backend_of: Callable) -> None:
     assert found["auto"][1] > 0.99 * found[False][1]
 
 
+@pytest.mark.slow
+def test_two_liquids_have_no_crowds(backend_of: Callable) -> None:
+    """Lock exchange: 8 particles at most in a cell meant for 4, where 28 are without shifts; these take no energy."""
+    backend, found = backend_of("f64", 1), {}
+    for redistribute in (False, "auto"):
+        bodies = [
+            {
+                "name": name,
+                "material": {"law": "fluid", "density": density, "bulk_modulus": 2e5},
+                "shape": {"box": {"min": [low, 0.0], "max": [low + 0.5, 0.40625]}},
+            }
+            for name, density, low in (("salt", 1000.0, 0.0), ("fresh", 800.0, 0.5))
+        ]
+        scene = scene_of(
+            domain={"size": [1.0, 0.5], "spacing": 1 / 64, "gravity": [0.0, -9.81], "walls": "slip"},
+            time={"end": 2.0, "frames": 4},
+            bodies=bodies,
+            solver={"redistribute": redistribute, "precision": "f64"},
+        )
+        frames = list(build_run(scene, backend).frames())
+        found[redistribute] = max(densest(frame.position, 1 / 64) for frame, _ in frames), frames[-1][1].energy
+    (crowd, lost), (most, energy) = found[False], found["auto"]
+    assert most <= 8 < 16 < crowd
+    assert energy > lost
+
+
 def test_runs_have_the_same_bytes_alone_and_together(backend_of: Callable) -> None:
     """On any number of threads, in a batch, and gone on with from the middle of an interval."""
     scenes = [column(redistribute="auto", sampling=sampling) for sampling in ("lattice", "jittered")]
