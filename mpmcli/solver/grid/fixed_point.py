@@ -107,7 +107,7 @@ class FixedPoint:
         self.nodes = sums(grid.width)
         self.before = sums(grid.width) if grid.scheme.keeps_before else None
         self.filling = sums(grid.width) if grid.keeps_filling else None
-        self.means = tuple(sums(2) if group.averaged else None for group in groups)
+        self.means = tuple(sums(3) if group.averaged else None for group in groups)
         wide, fine = arch in WIDE, grid.fine
         self.fine = FixedSums(1, grid.runs * fine.node_count, wide=wide) if fine else None
         self.of_fine = self.fine.scale(CROWDED) if fine else 0.0
@@ -136,7 +136,7 @@ class FixedPoint:
     @staticmethod
     def bytes_needed(width: int, *, before: bool, filling: bool, averaged: int) -> int:
         """Return the bytes of the sums of a node, of `averaged` groups that average volumes."""
-        return 8 * (width * (1 + before + filling) + 2 * averaged)
+        return 8 * (width * (1 + before + filling) + 3 * averaged)
 
     @ti.func
     def set_step(self, run: int, step: float):
@@ -207,15 +207,20 @@ class FixedPoint:
                 grid.filling[node][d] = self.filling.value(node)[d] / self.scales[self.run][OF_VOLUME]
 
     @ti.func
-    def add_mean(self, g: ti.template(), cell: int, volume: float, log: float):
-        """Add ln J of a particle of the g-th group, times its volume, m^3, to its cell."""
-        held, scales = ti.max(ti.min(log, LARGEST_LOG), -LARGEST_LOG), self.scales[self.run]
-        self.means[g].add(cell, ti.Vector([volume * held * scales[OF_LOG], volume * scales[OF_CELL]]))
+    def add_mean(self, g: ti.template(), cell: int, volume: float, log: float, growth: float):
+        """Add ln J of a particle of the g-th group, what it grew by, and 1, times its volume, m^3, to its cell."""
+        scales = self.scales[self.run]
+        more = ti.Vector([log, growth, 1.0])
+        for k in ti.static(range(2)):
+            more[k] = ti.max(ti.min(more[k], LARGEST_LOG), -LARGEST_LOG) * scales[OF_LOG]
+        more[2] = scales[OF_CELL]
+        self.means[g].add(cell, volume * more)
 
     @ti.func
     def mean(self, g: ti.template(), cell: int):
         """Return what `Grid.means` holds."""
         value = self.means[g].value(cell)
-        value[0] /= self.scales[self.run][OF_LOG]
-        value[1] /= self.scales[self.run][OF_CELL]
+        for k in ti.static(range(2)):
+            value[k] /= self.scales[self.run][OF_LOG]
+        value[2] /= self.scales[self.run][OF_CELL]
         return value

@@ -81,8 +81,9 @@ class Grid(LinearNodes):
         filling: Vector(width) field: where the mass is in `nodes` it has the volume of particles at rest, m^3, in the
             steps that relax volumes; None where the mass says as much. keeps_filling: whether it is there.
         holding: `filling`, or else `nodes`.
-        means: Vector(2) field per group: of the particles in the cell behind a node the volume at rest times ln J, and
-            the volume at rest, m^3; None of groups that do not average them (`volume_average`). kept_means: the others.
+        means: Vector(3) field per group: of the particles in the cell behind a node the volume at rest times ln J, and
+            times what that grew by, and the volume at rest, m^3; None of groups that do not average them
+            (`volume_average`). kept_means: the others.
         weighs_before: whether `before` holds masses too, of which walls that move ask for.
         opens: (axis, side) of every face that material may leave through: nodes beyond it are like all others.
         fixed: sums in fixed point, from which `FixedPoint.settle` sets the fields; None where P2G adds to these itself.
@@ -127,7 +128,7 @@ class Grid(LinearNodes):
         self.filling = ti.Vector.field(width, float, shape=count) if keeps_filling else None
         self.holding = self.filling if keeps_filling else self.nodes
         self.means = tuple(
-            ti.Vector.field(2, float, shape=count) if wanted and not deterministic else None for wanted in averaged
+            ti.Vector.field(3, float, shape=count) if wanted and not deterministic else None for wanted in averaged
         )
         self.kept_means = tuple(means for means in self.means if means is not None)
         self.period, self.weighs_before = period, walls_move and scheme.keeps_before
@@ -158,7 +159,7 @@ class Grid(LinearNodes):
             if ti.static(self.keeps_filling):
                 self.filling[node] = ti.Vector.zero(float, self.width)
             for means in ti.static(self.kept_means):
-                means[node] = ti.Vector.zero(float, 2)
+                means[node] = ti.Vector.zero(float, 3)
 
     @ti.func
     def tile_number(self, node: ti.template()):

@@ -157,7 +157,7 @@ def most_blocks(grid: "SparseGrid") -> int:
     """Return the number of blocks that a larger grid may have in what memory is free, and indices reach."""
     fields = [field for field in (grid.nodes, grid.before, grid.filling) if field is not None]
     fine, free = grid.fine.in_cell if grid.fine else 0, psutil.virtual_memory().available
-    numbers = grid.width * len(fields) + 2 * len(grid.kept_means) + fine
+    numbers = grid.width * len(fields) + 3 * len(grid.kept_means) + fine
     # And of the tables of a sort on some threads.
     block = (4 if grid.nodes.dtype == ti.f32 else 8) * numbers * grid.block + 4 * 16
     return int(min(MEMORY_SHARE * free // block, LARGEST_INDEX // (grid.block * max(fine, 1))))

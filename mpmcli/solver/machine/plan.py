@@ -205,6 +205,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 several=bodies[name] > 1,
                 keeps_initial=scene.solver.solids == "total" or needs_initial(scene, members_of(scene, name)),
                 averaged=shares,
+                total=scene.solver.solids == "total",
                 slips=slips_in(scene.solver, rough_faces(scene)),
                 comes_and_goes=scene.comes_and_goes,
             ),
@@ -221,7 +222,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         blocks = room_for_blocks(sum(map(in_steps, counts.values())))
         nodes = blocks * tile**dimension
     filling, deterministic = needs_filling(scene, members), scene.solver.deterministic and not backend.on_cpu
-    node_bytes = real * (width * (1 + scheme.keeps_before + filling) + 2 * sum(averaged))
+    node_bytes = real * (width * (1 + scheme.keeps_before + filling) + 3 * sum(averaged))
     # Nothing where that is 0.
     fine = fine_nodes(scene, members) ** dimension
     node_bytes += real * fine
@@ -230,7 +231,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         node_bytes += FixedPoint.bytes_needed(width, before=scheme.keeps_before, filling=filling, averaged=shared)
         node_bytes += FixedPoint.bytes_needed(1, before=False, filling=False, averaged=0) * fine
         # In their place.
-        node_bytes -= real * 2 * shared
+        node_bytes -= real * 3 * shared
     all_tiles, bins = all_nodes // tile**dimension, 0
     tables = len(groups) * TileOrder.bytes_needed(blocks if sparse else all_tiles, backend.threads)
     if sparse:

@@ -30,6 +30,7 @@ def particle_fields(
     several: bool,
     keeps_initial: bool = False,
     averaged: bool = False,
+    total: bool = False,
     slips: bool = False,
     comes_and_goes: bool = False,
 ) -> dict[str, tuple[type, int, int]]:
@@ -45,6 +46,7 @@ def particle_fields(
     fields |= {name: (float, 1, 1) for name in internal}
     fields |= {"initial_position": (float, d, 1)} if keeps_initial else {}
     fields |= {"volume_to_mean": (float, 1, 1), "cell": (int, 1, 1)} if averaged else {}
+    fields |= {"volume_growth": (float, 1, 1)} if averaged and not total else {}
     fields |= {"slip": (float, d, 1)} if slips else {}
     fields |= {"id": (int, 1, 1)} | ({"body": (int, 1, 1)} if several else {})
     return fields | ({"activity": (int, 1, 1)} if comes_and_goes else {})
@@ -80,6 +82,8 @@ class ParticleArrays:
             since they are `total`.
         averaged: whether particles of a cell share their change of volume (`volume_average`): then each has its `cell`,
             (n), and `to_mean`, (n), ln J during P2G, and where a frame is read what it lacks to the mean of its cell.
+        growth: by which ln J of such a particle grew in the last step, (n); None unless the group is `evened`: where
+            particles change cells they take the mean growth of their cell in G2P.
         slip: how far a particle has slipped on the wall that pushes it, (n) Vector(d), m, where there is friction
             (`slips`), see `reference_grid`.
         activity: (n) int, whether each waits, takes part or has left (`particles.sort`); None where all take part
@@ -109,7 +113,7 @@ class ParticleArrays:
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.carries = self.real == np.float32
         self.several, self.serial, self.total, self.averaged = several, serial, total, averaged
-        self.keeps_initial = keeps_initial or total
+        self.keeps_initial, self.evened = keeps_initial or total, averaged and not total
         self.slips, self.comes_and_goes = slips, comes_and_goes
         wanted = particle_fields(
             law.deformation,
@@ -119,6 +123,7 @@ class ParticleArrays:
             several=several,
             keeps_initial=self.keeps_initial,
             averaged=averaged,
+            total=total,
             slips=slips,
             comes_and_goes=comes_and_goes,
         )
@@ -127,7 +132,7 @@ class ParticleArrays:
         self.displacement_gradient, self.J_minus_1 = made.get("deformation_gradient"), made.get("volume_ratio")
         self.internal = tuple(made[name] for name in names)
         self.initial, self.slip = made.get("initial_position"), made.get("slip")
-        self.cell, self.to_mean = made.get("cell"), made.get("volume_to_mean")
+        self.cell, self.to_mean, self.growth = (made.get(name) for name in ("cell", "volume_to_mean", "volume_growth"))
         self.id, self.body, self.activity = made["id"], made.get("body"), made.get("activity")
         self.pushed, self.force, self.run = False, None, 0
         self.repeats = False
@@ -155,8 +160,8 @@ class ParticleArrays:
         """Every real field that the sort must move."""
         initial = () if self.initial is None else (self.initial,)
         deformation = self.J_minus_1 if self.displacement_gradient is None else self.displacement_gradient
-        slip = (self.slip,) if self.slips else ()
-        return (self.x, self.v, self.gradient, deformation, *self.internal, *initial, *slip)
+        more = tuple(field for field in (self.slip, self.growth) if field is not None)
+        return (self.x, self.v, self.gradient, deformation, *self.internal, *initial, *more)
 
     @property
     def labels(self) -> tuple[ti.Field, ...]:
@@ -171,7 +176,7 @@ class ParticleArrays:
     def fields(self) -> dict[str, ti.Field]:
         """Return every field of the particles that changes during a run or is sorted, by name."""
         names = ["position", "velocity", "velocity_gradient", "deformation", *(v.name for v in self.law.internal)]
-        initial = ["initial_position"] * self.keeps_initial + ["slip"] * self.slips
+        initial = ["initial_position"] * self.keeps_initial + ["slip"] * self.slips + ["volume_growth"] * self.evened
         labels = ["id"] + ["body"] * (self.body is not None) + ["activity"] * self.comes_and_goes
         return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
 
@@ -276,6 +281,8 @@ class ParticleArrays:
             if ti.static(self.slips):
                 for c in ti.static(range(d)):
                     self.slip[p][c] = 0.0
+            if ti.static(self.evened):
+                self.growth[p] = 0.0
             self.id[p] = labels[q, 0]
             if ti.static(self.several):
                 self.body[p] = labels[q, 1]

@@ -38,7 +38,14 @@ from mpmcli.solver.transfer.particle_update import (
 )
 from mpmcli.solver.transfer.splines import bounded
 from mpmcli.solver.transfer.stencils import add_linear, gather_linear
-from mpmcli.solver.transfer.volume_average import average_range, missing_to_mean, stretch_to
+from mpmcli.solver.transfer.volume_average import (
+    average_range,
+    even,
+    log_volume,
+    missing_growth,
+    missing_to_mean,
+    stretch_to,
+)
 
 
 @ti.func
@@ -228,7 +235,8 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
     speeds, gradients, rates = zero_lanes(d), zero_lanes(ti.static(d * d)), ti.Vector.zero(float, LANES)
     moved, beyond, after = zero_lanes(d), ti.Vector.zero(float, LANES), zero_lanes(ti.static(stored_entries(group)))
     here = zero_lanes(ti.static(d if group.total else 1))
-    remainders = zero_lanes(d)
+    # What ln J misses of the mean growth, and then its growth, of groups that are `evened`.
+    remainders, growths = zero_lanes(d), zero_lanes(1)
     rows = zero_lanes(ti.static(group.table.n if group.law.grows_by_constants else CONSTANTS + 1))
     sharpest = NOTHING
     if ti.static(group.law.grows_by_constants and not group.several):
@@ -261,6 +269,8 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                     weights[k * d + a, lane] = w[k, a]
 
         for lane in range(count):
+            if ti.static(group.evened):
+                growths[0, lane] = missing_growth(grid, g, group, begin + lane)
             w = weights_of(weights, nodes, d, lane)
             velocity, moment = gather_linear(near.nodes, near, first_node[lane], w)
             for c in ti.static(range(width)):
@@ -300,7 +310,11 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
             beyond[lane] = outside
             rates[lane] = deformation_rate(group, C)
             if ti.static(keeps_F and not group.total):
-                deformed = deformed_gradient(matrix_of(deformation, d, lane), C, dt)
+                stored = matrix_of(deformation, d, lane)
+                if ti.static(group.evened):
+                    stored = even(stored, growths[0, lane])
+                    growths[0, lane] = log_volume(dt * C)
+                deformed = deformed_gradient(stored, C, dt)
                 for i, j in ti.static(ti.ndrange(d, d)):
                     after[i * d + j, lane] = deformed[i, j]
             if ti.static(not keeps_F):
@@ -323,6 +337,8 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 if ti.static(keeps_F):
                     for a in ti.static(range(d)):
                         store_lanes(group.displacement_gradient, (c, a), origin, after, c * d + a)
+            if ti.static(group.evened):
+                store_lanes(group.growth, (), origin, growths, 0)
             if ti.static(not keeps_F):
                 store_lanes(group.J_minus_1, (), origin, after, 0)
         else:
@@ -337,6 +353,8 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 if ti.static(keeps_F):
                     for i, j in ti.static(ti.ndrange(d, d)):
                         group.displacement_gradient[p][i, j] = after[i * d + j, lane]
+                    if ti.static(group.evened):
+                        group.growth[p] = growths[0, lane]
                 else:
                     group.J_minus_1[p] = after[0, lane]
                 if beyond[lane] <= 0.5 * grid.spacing:

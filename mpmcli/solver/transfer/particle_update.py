@@ -16,7 +16,7 @@ from mpmcli.solver.solids.contact import ParticleContact
 from mpmcli.solver.solids.reference_grid import friction_of_walls, pulled_back, push_of_walls
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.solver.transfer.stencils import add_linear, gather_linear
-from mpmcli.solver.transfer.volume_average import missing_to_mean, stretch_to
+from mpmcli.solver.transfer.volume_average import even, log_volume, missing_growth, missing_to_mean, stretch_to
 from mpmcli.solver.transfer.volume_relaxation import relax_volume
 
 
@@ -291,6 +291,10 @@ class ParticleUpdate:
 
         # Deformation. The rate here, where C is at hand, takes half the time that it would take at the end.
         deforming = deformation_rate(group, C)
+        if ti.static(group.evened):
+            missing = missing_growth(self.grid, g, group, p)
+            group.displacement_gradient[p] = even(group.displacement_gradient[p], missing)
+            group.growth[p] = log_volume(dt * C)
         if ti.static(group.law.deformation == "F" and not group.total):
             group.displacement_gradient[p] = deformed_gradient(group.displacement_gradient[p], C, dt)
         if ti.static(group.law.deformation == "J"):

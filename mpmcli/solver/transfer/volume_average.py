@@ -1,11 +1,12 @@
 """Lets the particles of a cell share their change of volume, so that nearly incompressible material does not lock.
 
 The law of a particle sees F (J'/J)^(1/d), where ln J' is the mean of ln J over the particles of its cell, weighted by
-their volumes at rest: F-bar (de Souza Neto et al. 1996) with the projection of B-bar (Hughes 1980). See docs/theory.md,
-4.4. Only groups that ask for it (`ParticleArrays.averaged`) have any of this compiled.
+their volumes at rest: F-bar (de Souza Neto et al. 1996) with the projection of B-bar (Hughes 1980). Where particles
+change cells (`ParticleArrays.evened`) F itself grows by the mean growth of its cell. See docs/theory.md, 4.4. Only
+groups that ask for it (`ParticleArrays.averaged`) have any of this compiled.
 """
 
-from mpmcli.materials.elementary import exp, log
+from mpmcli.materials.elementary import exp, exp_minus_1, log
 from mpmcli.materials.law import SMALLEST, Law
 from mpmcli.materials.tensors import volume_strain
 from mpmcli.quick_taichi import ti
@@ -14,6 +15,7 @@ from mpmcli.solver.particles.arrays import VOLUME
 from mpmcli.solver.transfer.lanes import (
     LANES,
     load_deformation,
+    load_entry,
     load_vectors,
     matrix_of,
     repeat_first,
@@ -55,11 +57,14 @@ def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), f
     d = ti.static(group.dimension)
     x, deformation = zero_lanes(d), zero_lanes(ti.static(d * d))
     volumes, logs, cells = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES), ti.Vector.zero(int, LANES)
+    growths = zero_lanes(1)
     begin = first
     while begin < last:
         count = ti.min(LANES, last - begin)
         load_deformation(group, bounded(begin), deformation)
         load_vectors(x, group.place_on_grid, bounded(begin))
+        if ti.static(group.evened):
+            load_entry(growths, 0, group.growth, (), bounded(begin))
         if count < LANES:
             repeat_first(deformation, count)
             repeat_first(x, count)
@@ -72,7 +77,8 @@ def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), f
         for lane in range(count):
             group.cell[begin + lane] = cells[lane]
             group.to_mean[begin + lane] = logs[lane]
-            grid.means[g][cells[lane]] = grid.means[g][cells[lane]] + volumes[lane] * ti.Vector([logs[lane], 1.0])
+            share = volumes[lane] * ti.Vector([logs[lane], growths[0, lane], 1.0])
+            grid.means[g][cells[lane]] = grid.means[g][cells[lane]] + share
         begin += LANES
 
 
@@ -82,15 +88,19 @@ def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: i
     H = ti.Matrix.zero(float, group.dimension, group.dimension)
     for i, j in ti.static(ti.ndrange(group.dimension, group.dimension)):
         H[i, j] = group.displacement_gradient[p][i, j]
-    own = log_volume(H)
+    own, growth = log_volume(H), 0.0
+    if ti.static(group.evened):
+        growth = group.growth[p]
     group.to_mean[p] = own
     volume, cell = group.row(p)[VOLUME], cell_of(grid, group.on_grid(p))
     group.cell[p] = cell
     if ti.static(grid.deterministic):
-        grid.fixed.add_mean(g, cell, volume, own)
+        grid.fixed.add_mean(g, cell, volume, own, growth)
     else:
         ti.atomic_add(grid.means[g][cell][0], volume * own)
-        ti.atomic_add(grid.means[g][cell][1], volume)
+        if ti.static(group.evened):
+            ti.atomic_add(grid.means[g][cell][1], volume * growth)
+        ti.atomic_add(grid.means[g][cell][2], volume)
 
 
 @ti.func
@@ -110,11 +120,11 @@ def clear_cell(grid: ti.template(), g: ti.template(), cell: int):
     if ti.static(grid.deterministic):
         grid.fixed.means[g].clear(cell)
     else:
-        grid.means[g][cell] = ti.Vector.zero(float, 2)
+        grid.means[g][cell] = ti.Vector.zero(float, 3)
 
 
 @ti.func
-def sums_of_cell(grid: ti.template(), g: ti.template(), cell: int):
+def sums_at(grid: ti.template(), g: ti.template(), cell: int):
     if ti.static(grid.deterministic):
         return grid.fixed.mean(g, cell)
     else:
@@ -122,23 +132,44 @@ def sums_of_cell(grid: ti.template(), g: ti.template(), cell: int):
 
 
 @ti.func
-def missing_to_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
-    """Return the mean of ln J over the cell of particle p less its own, once all were added."""
-    sums = sums_of_cell(grid, g, group.cell[p])
+def sums_of_cell(grid: ti.template(), g: ti.template(), cell: int):
+    """Return the sums of a cell and its images, once all particles were added."""
+    sums = sums_at(grid, g, cell)
     if ti.static(len(grid.period.axes) > 0):
         for images in range(1, ti.static(2**grid.dimension)):
-            image, exists = grid.period.image(grid.place_of(group.cell[p]), images)
+            image, exists = grid.period.image(grid.place_of(cell), images)
             if exists:
-                more = sums_of_cell(grid, g, grid.linear_index(image))
-                for k in ti.static(range(2)):
+                more = sums_at(grid, g, grid.linear_index(image))
+                for k in ti.static(range(3)):
                     sums[k] += more[k]
-    return sums[0] / sums[1] - group.to_mean[p]
+    return sums
+
+
+@ti.func
+def missing_to_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
+    """Return the mean of ln J over the cell of particle p less its own."""
+    sums = sums_of_cell(grid, g, group.cell[p])
+    return sums[0] / sums[2] - group.to_mean[p]
+
+
+@ti.func
+def missing_growth(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
+    """Return the mean over the cell of particle p of what ln J grew by in the step before this one, less its own."""
+    sums = sums_of_cell(grid, g, group.cell[p])
+    return sums[1] / sums[2] - group.growth[p]
 
 
 @ti.func
 def stretch_to(missing: float, d: ti.template()):
     """Return the factor of F by which ln J grows by `missing`."""
     return exp(missing * ti.static(1.0 / d))
+
+
+@ti.func
+def even(H: ti.template(), missing: float):
+    """Return F - I from F - I before, once ln J has grown by `missing`."""
+    d = ti.static(H.n)
+    return H + exp_minus_1(missing * ti.static(1.0 / d)) * (H + ti.Matrix.identity(float, d))
 
 
 @ti.func
