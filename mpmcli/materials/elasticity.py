@@ -31,7 +31,7 @@ YoungsModulus = Annotated[
     Positive | Literal["auto"],
     Field(
         description='Young\'s modulus E, Pa; "auto" picks the softest that keeps the density variation under '
-        "`compressibility` in the deepest column and at the highest speed of the scene."
+        "`compressibility` in the deepest column and at the highest speed that can reach the body."
     ),
 ]
 
@@ -64,10 +64,11 @@ class HenckyParameters(ElasticParameters):
 
 
 def soft_youngs_modulus(parameters: HenckyParameters, bounds: SceneBounds) -> float:
-    """Return Young's modulus E, Pa, for which weight and speed in the scene strain the volume by `compressibility`.
+    """Return Young's modulus E, Pa, for which weight and speed in these bounds strain the volume by `compressibility`.
 
     The pressure of the deepest column and of the fastest flow is density (g H + v^2), where the density is the
-    largest of all bodies. The bulk modulus K = lambda + 2 mu / d (in 2D that of the plane) is proportional to E.
+    largest of what can reach the body. The bulk modulus K = lambda + 2 mu / d (in 2D that of the plane) is
+    proportional to E.
     """
     speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
     pressure = max(parameters.density, bounds.density) * (bounds.gravity * bounds.height + speed**2)

@@ -20,6 +20,8 @@ SMALL = 2e-3, 2e-6
 class FixedCorotatedParameters(ElasticParameters):
     """Parameters of the fixed corotated solid."""
 
+    solid = True
+
     law: Literal["fixed_corotated"] = "fixed_corotated"
 
 

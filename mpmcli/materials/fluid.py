@@ -63,7 +63,7 @@ class WeaklyCompressibleParameters(MaterialParameters):
     bulk_modulus: Positive | Literal["auto"] = Field(
         "auto",
         description='Bulk modulus K = density c^2, Pa; "auto" picks the softest that keeps the density '
-        "variation under `compressibility` at the highest speed the scene can reach.",
+        "variation under `compressibility` at the highest speed that can reach the body.",
     )
     compressibility: compressibility_of("bulk_modulus") = 0.01
 
@@ -104,7 +104,7 @@ class FluidParameters(WeaklyCompressibleParameters):
         return self.tension_cutoff and self.volume_correction
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
-        """Replace "auto" by K = density v^2 / compressibility, where v is the highest speed of the scene."""
+        """Replace "auto" by K = density v^2 / compressibility, where v is the highest speed that can reach the body."""
         if self.bulk_modulus != "auto":
             return self, []
         modulus, note = soft_bulk_modulus(self.density, self.compressibility, bounds)
@@ -125,9 +125,9 @@ class FluidParameters(WeaklyCompressibleParameters):
 
 
 def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBounds) -> tuple[float, str]:
-    """Return K = density v^2 / compressibility, Pa, and a sentence that states it; v is the highest speed of the scene.
+    """Return K = density v^2 / compressibility, Pa, and a sentence that states it; v is the highest speed.
 
-    The density is the largest of all bodies, because a denser one may press on the fluid.
+    The density is the largest of what can reach the body: something denser may press on the fluid.
 
     The density of weakly compressible flow varies by v^2/c^2 (Monaghan 1994). A column released without
     compression reaches a pressure of 2 density g H = density v^2, the same bound. In a head-on impact on fluid or a

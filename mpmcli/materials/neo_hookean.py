@@ -18,6 +18,8 @@ MU, LAMBDA = range(2)
 class NeoHookeanParameters(ElasticParameters):
     """Parameters of the neo-Hookean solid."""
 
+    solid = True
+
     law: Literal["neo_hookean"] = "neo_hookean"
 
 

@@ -135,7 +135,7 @@ class Snow(Law):
 
         By the balance of momentum, the stress behind a wave that stops the speed v and compacts by the strain e is
         density (v^2/e + g H). It compacts to the strain e for which h(e) times the yield stress in confined compression
-        equals it. The density is the largest of all bodies, because a denser one may fall on the snow.
+        equals it. The density is the largest of what can reach the snow: something denser may fall on it.
         """
         low, high = 1 - parameters.critical_compression, 1 + parameters.critical_stretch
         modulus = 2 * parameters.shear_modulus + parameters.lame_lambda

@@ -28,6 +28,8 @@ MU, LAMBDA, YIELD_STRESS, HARDENING_MODULUS = range(4)
 class VonMisesParameters(HenckyParameters):
     """Parameters of the elastic-plastic solid."""
 
+    solid = True
+
     law: Literal["von_mises"] = "von_mises"
     yield_stress: Annotated[
         Positive,

@@ -1,6 +1,6 @@
 """What a scene can reach, from its initial state alone: the highest speed, the deepest column, the densest body."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -195,8 +195,34 @@ MOST_LOOKED_AT = 500_000
 SQUARED = (1e-150, 1e150)
 
 
-def scene_bounds(scene: Scene) -> SceneBounds:
-    """Return bounds on the speed, the depth and the density of a scene.
+def reaching(source: Body | Emitter, scene: Scene) -> list[Body | Emitter]:
+    """Return what can fall on a source of particles, press on it or flow around it, and the source itself.
+
+    A solid that stands at rest on the lowest point that it could fall to does none of that, whatever it is made of.
+    """
+    impelled = {force.body for force in scene.pushes}
+    return [
+        other
+        for other in scene.sources
+        if other is source
+        or not (isinstance(other, Body) and other.material.solid)
+        or impelled & {None, other.name}
+        or highest_speed(other) > 0
+        or not _stands(other, scene)
+    ]
+
+
+def _stands(body: Body, scene: Scene) -> bool:
+    """Return whether a body lies less than a cell above the lowest point of the domain, or nothing pulls."""
+    gravity, periodic = scene.domain.gravity_at(0.0), np.array(scene.domain.periodic)
+    if not scene.domain.steady or gravity[periodic].any():
+        return False
+    corners = _corners(*body.shape.form.bounds())
+    return not gravity.any() or float(np.min(_falls(scene, corners, gravity))) < scene.domain.spacing
+
+
+def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) -> SceneBounds:
+    """Return bounds on the speed, the depth and the density of a scene, or of some of its sources.
 
     speed = sqrt(v0^2 + 2 g H), with v0 the highest initial speed of any body and H the height of the
     highest matter above the lowest point of the domain, both measured against gravity; v0 alone where
@@ -210,19 +236,23 @@ def scene_bounds(scene: Scene) -> SceneBounds:
     and I their impulse over the run, and a to the gravity that presses. See `force_drive` for where they are looked at.
     Impulses add their strength to the speed.
     """
+    sources = scene.sources if sources is None else sources
     pull, gravities = gravity_drive(scene)
     push = Drive()
     if scene.forces:
         drives = [
             force_drive(scene, body, body_places(body, index, scene.domain.spacing), highest_speed(body), pull)
             for index, body in enumerate(scene.bodies)
+            if body in sources
         ]
-        push = Drive(max(one.largest for one in drives), max(one.impulse for one in drives))
+        push = Drive(
+            max((one.largest for one in drives), default=0.0), max((one.impulse for one in drives), default=0.0)
+        )
     g = pull.largest
     pushed_by = [collider.fastest(scene.domain, scene.time.end) for collider in scene.colliders]
-    initial = max(scene.domain.wall_speed, *pushed_by, *(highest_speed(body) for body in scene.sources))
+    initial = max(scene.domain.wall_speed, *pushed_by, *(highest_speed(body) for body in sources))
     closed = ~np.array(scene.domain.periodic)
-    corners = np.concatenate([_corners(*body.shape.form.bounds()) for body in scene.sources])
+    corners = np.concatenate([_corners(*body.shape.form.bounds()) for body in sources])
     if any((gravity * closed).any() for gravity in gravities):
         height = max(_height(scene, corners, gravity * closed) for gravity in gravities if (gravity * closed).any())
     else:
@@ -239,7 +269,7 @@ def scene_bounds(scene: Scene) -> SceneBounds:
         gravity=g + push.largest,
         speed=float(np.sqrt(initial * initial + fallen + pushed)) + sum(abs(one.strength) for one in scene.impulses),
         height=height,
-        density=max(body.material.density for body in scene.sources),
+        density=max(body.material.density for body in sources),
     )
 
 
@@ -288,13 +318,19 @@ def body_places(body: Body, index: int, h: float) -> np.ndarray:
 
 
 def _height(scene: Scene, corners: np.ndarray, gravity: np.ndarray) -> float:
+    """Return how far the highest of some points lies above the lowest point of the domain, m, against gravity."""
+    return max(0.0, float(np.max(_falls(scene, corners, gravity))))
+
+
+def _falls(scene: Scene, corners: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+    """Return how far each point lies above the lowest point of the domain, m, against gravity."""
     largest = float(np.max(np.abs(gravity)))
     if not SQUARED[0] < largest < SQUARED[1]:
         # Only its direction counts, and its squares would leave the range of numbers.
         gravity = gravity / largest
     down = gravity / float(np.linalg.norm(gravity))
     floor = np.max(_corners(np.array(scene.domain.origin), np.array(scene.domain.upper)) @ down)
-    return max(0.0, float(floor - np.min(corners @ down)))
+    return floor - corners @ down
 
 
 def _corners(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from mpmcli.errors import InputError
-from mpmcli.scene.bounds import scene_bounds
+from mpmcli.scene.bounds import reaching, scene_bounds
 from mpmcli.scene.checks import problems_in
 from mpmcli.scene.entry import definitions
 from mpmcli.scene.expand import expand_materials
@@ -180,16 +180,18 @@ def _validate(
 
 
 def _resolve(scene: Scene, knobs: dict[tuple[str, int], list[str]], source: str) -> LoadedScene:
-    """Set the "auto" parameters of every material from the speeds and pressures that the scene can reach."""
-    bounds = scene_bounds(scene)
+    """Set the "auto" parameters of every material from the speeds and pressures that can reach its body."""
+    whole = scene_bounds(scene)
     resolved, notes = {}, []
     for table in ("bodies", "emitters"):
         found = []
         for i, body in enumerate(getattr(scene, table)):
+            others = reaching(body, scene)
+            bounds = whole if len(others) == len(scene.sources) else scene_bounds(scene, others)
             material, sentences = body.material.resolve(bounds)
             changes: dict[str, object] = {"material": material}
             if table == "bodies":
-                changes["particles_per_cell"] = points_per_cell(body, bounds.spacing)
+                changes["particles_per_cell"] = points_per_cell(body, scene.domain.spacing)
             found.append(body.model_copy(update=changes))
             notes += [f"{body.name}: {sentence}" for sentence in (*knobs.get((table, i), []), *sentences)]
         resolved[table] = tuple(found)

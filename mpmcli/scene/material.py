@@ -129,6 +129,7 @@ class MaterialParameters(BaseModel):
         stores: what it stores of its deformation, "J" or "F", as the law says that these parameters belong to.
         elastic: whether its stress is a function of F alone.
         hydrostatic: whether it is a fluid whose J follows from the pressure, by `volume_ratio_under`.
+        solid: whether a body of it keeps its shape, so that it stays where it stands.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
@@ -141,6 +142,7 @@ class MaterialParameters(BaseModel):
     stores: ClassVar[Literal["J", "F"]] = "F"
     elastic: ClassVar[bool] = False
     hydrostatic: ClassVar[bool] = False
+    solid: ClassVar[bool] = False
 
     @classmethod
     def internal_in(cls, dimension: int) -> tuple[Internal, ...]:
