@@ -122,15 +122,50 @@ def test_momenta_stay_and_energy_does_not_grow(backend_of: Callable, law: str) -
     assert (energy < 1.001 * energy[0]).all() and energy[-1] > 0.2 * energy[0]
 
 
-@pytest.mark.parametrize("ratio", [0.49, pytest.param(0.499, marks=pytest.mark.slow)])
-def test_a_disc_that_spins_across_the_cells_gains_no_energy(backend_of: Callable, ratio: float) -> None:
-    """Thirteen revolutions. Were F left to itself, what differs in a cell would grow, and feed the disc."""
+@pytest.mark.parametrize(
+    ("ratio", "spacing", "rate", "end", "least"),
+    [
+        (0.49, 0.05, 20.0, 4.0, 0.98),
+        pytest.param(0.499, 0.05, 20.0, 4.0, 0.98, marks=pytest.mark.slow),
+        # That of docs/theory.md, 4.4.
+        pytest.param(0.49, 0.02, 12.95, 10.0, 0.995, marks=pytest.mark.slow),
+    ],
+)
+def test_a_disc_that_spins_across_the_cells_gains_no_energy(
+    backend_of: Callable, ratio: float, spacing: float, rate: float, end: float, least: float
+) -> None:
+    """13 and 20 revolutions; its radius stays. With its own growth F gains 1.6 % in the first, and the last tears."""
     disc = {"ball": {"center": [0.503, 0.497], "radius": 0.2}}
-    spin = ["-20*(Y-0.497)", "20*(X-0.503)"]
-    scene = block(material={"poissons_ratio": ratio}, shape=disc, velocity=spin, end=4.0, spacing=0.05)
-    energy = np.array([row.energy for _, row in build_run(scene, backend_of("f64", 1)).frames()])
+    spin = [f"-{rate}*(Y-0.497)", f"{rate}*(X-0.503)"]
+    scene = block(material={"poissons_ratio": ratio}, shape=disc, velocity=spin, end=end, spacing=spacing)
+    frames = list(build_run(scene, backend_of("f64", 1)).frames())
+    energy = np.array([row.energy for _, row in frames])
     assert (np.diff(energy) < 1e-6 * energy[0]).all()
-    assert energy[-1] > 0.98 * energy[0]
+    assert energy[-1] > least * energy[0]
+    first, last = (
+        np.sqrt(((frame.position - frame.position.mean(axis=0)) ** 2).sum(axis=1).mean())
+        for frame in (frames[0][0], frames[-1][0])
+    )
+    assert last == pytest.approx(first, rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", [0.3, 0.49, 0.4999])
+@pytest.mark.parametrize("law", ["neo_hookean", "fixed_corotated", "von_mises"])
+def test_a_ball_that_bounces_gains_no_energy(backend_of: Callable, law: str, ratio: float) -> None:
+    """In flight and at the floor; frames count velocities half a step back, which may show 1e-4 of it."""
+    material = {"poissons_ratio": ratio} | ({"yield_stress": 2e3} if law == "von_mises" else {})
+    scene = block(
+        law=law,
+        material=material,
+        shape={"ball": {"center": [0.5, 0.6], "radius": 0.3}},
+        solver={"f_bar": True},
+        velocity=[0.1, -2.0],
+        end=1.0,
+    )
+    energy = np.array([row.energy for _, row in build_run(scene, backend_of("f64", 1)).frames()])
+    assert (np.diff(energy) < 2e-4 * energy[0]).all()
+    assert energy[-1] < 0.95 * energy[0]
 
 
 def test_a_uniform_change_of_volume_is_not_changed(backend_of: Callable) -> None:

@@ -198,7 +198,8 @@ SQUARED = (1e-150, 1e150)
 def reaching(source: Body | Emitter, scene: Scene) -> list[Body | Emitter]:
     """Return what can fall on a source of particles, press on it or flow around it, and the source itself.
 
-    A solid that stands at rest on the lowest point that it could fall to does none of that, whatever it is made of.
+    A solid that rests less than a cell above the lowest point of the domain does none of that, if no force acts on it.
+    Colliders and walls that move count by their speed alone (`scene_bounds`), whatever they push.
     """
     impelled = {force.body for force in scene.pushes}
     return [
@@ -243,7 +244,7 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
         drives = [
             force_drive(scene, body, body_places(body, index, scene.domain.spacing), highest_speed(body), pull)
             for index, body in enumerate(scene.bodies)
-            if body in sources
+            if any(body is one for one in sources)
         ]
         push = Drive(
             max((one.largest for one in drives), default=0.0), max((one.impulse for one in drives), default=0.0)

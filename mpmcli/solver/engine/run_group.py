@@ -105,6 +105,8 @@ class RunGroup:
                 self._assign(arrays.J_minus_1, deformation - 1)
             else:
                 self._assign(arrays.displacement_gradient, deformation - np.eye(d))
+            if arrays.evened:
+                self._assign(arrays.growth, np.zeros(self.count))
         for i, field in enumerate(arrays.internal if "internal" in state else ()):
             self._assign(field, np.asarray(state["internal"])[:, i])
         if "id" in state:

@@ -235,8 +235,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
     speeds, gradients, rates = zero_lanes(d), zero_lanes(ti.static(d * d)), ti.Vector.zero(float, LANES)
     moved, beyond, after = zero_lanes(d), ti.Vector.zero(float, LANES), zero_lanes(ti.static(stored_entries(group)))
     here = zero_lanes(ti.static(d if group.total else 1))
-    # What ln J misses of the mean growth, and then its growth, of groups that are `evened`.
-    remainders, growths = zero_lanes(d), zero_lanes(1)
+    remainders, missing, growths = zero_lanes(d), zero_lanes(1), zero_lanes(1)
     rows = zero_lanes(ti.static(group.table.n if group.law.grows_by_constants else CONSTANTS + 1))
     sharpest = NOTHING
     if ti.static(group.law.grows_by_constants and not group.several):
@@ -270,7 +269,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
 
         for lane in range(count):
             if ti.static(group.evened):
-                growths[0, lane] = missing_growth(grid, g, group, begin + lane)
+                missing[0, lane] = missing_growth(grid, g, group, begin + lane)
             w = weights_of(weights, nodes, d, lane)
             velocity, moment = gather_linear(near.nodes, near, first_node[lane], w)
             for c in ti.static(range(width)):
@@ -312,7 +311,7 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
             if ti.static(keeps_F and not group.total):
                 stored = matrix_of(deformation, d, lane)
                 if ti.static(group.evened):
-                    stored = even(stored, growths[0, lane])
+                    stored = even(stored, missing[0, lane])
                     growths[0, lane] = log_volume(dt * C)
                 deformed = deformed_gradient(stored, C, dt)
                 for i, j in ti.static(ti.ndrange(d, d)):

@@ -154,7 +154,7 @@ def missing_to_mean(grid: ti.template(), g: ti.template(), group: ti.template(),
 
 @ti.func
 def missing_growth(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
-    """Return the mean over the cell of particle p of what ln J grew by in the step before this one, less its own."""
+    """Return the mean over the cell of particle p of the growth of ln J in the last step, less its own."""
     sums = sums_of_cell(grid, g, group.cell[p])
     return sums[1] / sums[2] - group.growth[p]
 
