@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import taichi as ti
-from solver_state import scene_of, with_colliders
+from solver_state import bodies_of, scene_of, with_colliders
 
 from mpmcli.boundaries.colliders import ColliderKind, ColliderMotion, Colliders
 from mpmcli.frames.frame import Frame
@@ -204,6 +204,19 @@ def test_a_block_comes_to_rest(backend_of: Callable, tilt: float, offset: float,
     record_property("error", (x[-4:].mean() - x[0]) / expected - 1)
     assert x[-4:].mean() - x[0] == pytest.approx(expected, rel=0.01)
     assert abs(v[-4:].mean()) < 4e-3 * 2.0
+
+
+@pytest.mark.parametrize("parts", [1, 5, pytest.param(50, marks=pytest.mark.slow)])
+def test_a_sliding_block_slows_down_as_fast_at_any_step(backend_of: Callable, parts: int) -> None:
+    """At steps of 1, 1/5 and 1/50 its speed falls by mu (g t + v_y)."""
+    scene, _, _ = block_on_plane(0.0, 0.0, 0.3, 1.0, offset=0.3, speed=2.0)
+    solver = build_run(scene, backend_of("f64", 1))
+    step = solver.stable_step()[0] / parts
+    while solver.time < 0.1:
+        solver.step(step)
+    block = bodies_of(solver)["block"]
+    along, up = block.momentum() / block.mass.sum()
+    assert 2.0 - along == pytest.approx(0.3 * (G * solver.state.velocity_time + up), rel=1e-9)
 
 
 def test_momentum_goes_to_the_colliders(backend_of: Callable) -> None:

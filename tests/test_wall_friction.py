@@ -235,3 +235,16 @@ def test_slip_is_saved(backend_of: Callable) -> None:
     run.load(saved)
     assert ahead() == expected
     assert np.abs(run.groups[0].arrays.slip.to_numpy()).max() > 0
+
+
+@pytest.mark.parametrize("parts", [1, 5, pytest.param(50, marks=pytest.mark.slow)])
+def test_a_sliding_block_slows_down_as_fast_at_any_step(backend_of: Callable, parts: int) -> None:
+    """At steps of 1, 1/5 and 1/50 its speed falls by mu (g t + v_y); with nu = 0 sliding excites no waves."""
+    speed, friction = 2.0, 0.3
+    run = build_run(block_on_floor(0, friction, "separate", 1.0, speed=speed), backend_of("f64", 1))
+    step = run.stable_step()[0] / parts
+    while run.time < 0.1:
+        run.step(step)
+    block = bodies_of(run)["block"]
+    along, up = block.momentum() / block.mass.sum()
+    assert speed - along == pytest.approx(friction * (G * run.state.velocity_time + up), rel=1e-6)
