@@ -1,7 +1,7 @@
 """One MLS-MPM step in plain numpy, one particle and one node at a time, from the published formulas.
 
 It shares no code with the solver: Hu et al. (2018) for the scatter with A = m C - kick V0 tau / D, D = h^2/4 or h^2/3,
-Jiang et al. (2015) for the gather, Fei et al. (2021) for AFLIP, and the fold of ghost nodes at a wall
+Jiang et al. (2015) for the gather, relaxed APIC (docs/theory.md, 2.3), and the fold of ghost nodes at a wall
 (docs/theory.md, 3.1).
 """
 
@@ -19,7 +19,8 @@ MARGIN = 2
 class Particles:
     """Particles of one law: x, v (n, d), C (n, d, d), deformation J (n) or F (n, d, d), mass and volume (n).
 
-    `stress` returns tau (d, d) of one particle's deformation and its number.
+    `stress` returns tau (d, d) of one particle's deformation and its number; kept (n) is the share of its motion that
+    each keeps.
     """
 
     x: np.ndarray
@@ -29,6 +30,7 @@ class Particles:
     mass: np.ndarray
     volume: np.ndarray
     stress: Callable[[np.ndarray, int], np.ndarray]
+    kept: np.ndarray | float = 0.0
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,6 @@ class Box:
     faces: Sequence[tuple[str, str]]
     kernel: str = "quadratic"
     transfer: str = "apic"
-    flip: float = 0.0
     walls: str = "folded"
 
     @property
@@ -101,15 +102,20 @@ def scatter(groups: Sequence[Particles], box: Box, kick: float) -> tuple[np.ndar
     return momentum, mass
 
 
+def scatter_kept(groups: Sequence[Particles], box: Box) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same of the shares that particles keep, from before stress and forces."""
+    return scatter([replace(group, mass=group.kept * group.mass) for group in groups], box, 0.0)
+
+
 def update(momentum: np.ndarray, mass: np.ndarray, box: Box, kick: float) -> np.ndarray:
     """Return the velocity of every node, with gravity and the walls."""
-    return update_both(momentum, np.zeros_like(momentum), mass, box, kick)[0]
+    return update_both(momentum, mass, np.zeros_like(momentum), np.zeros_like(mass), box, kick)[0]
 
 
 def update_both(
-    momentum: np.ndarray, before: np.ndarray, mass: np.ndarray, box: Box, kick: float
+    momentum: np.ndarray, mass: np.ndarray, before: np.ndarray, kept_mass: np.ndarray, box: Box, kick: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the velocity of every node, with gravity and the walls, and that of the momentum from before the stress.
+    """Return the velocity of every node, with gravity and the walls, and that of what particles keep.
 
     The latter knows nothing of gravity, and of walls what mirror images do to it.
     A node and its images in the faces that act on it share their momenta, the images' mirrored; on the
@@ -118,7 +124,7 @@ def update_both(
     the images of that plane in the faces that never let go included.
     """
     if box.walls == "zeroed":
-        return update_zeroed(momentum, before, mass, box, kick)
+        return update_zeroed(momentum, mass, before, kept_mass, box, kick)
     d = len(box.cells)
     g = kick * box.gravity
     raw_momentum, raw_mass = momentum, mass
@@ -184,7 +190,8 @@ def update_both(
         weight = sum(raw_mass[at] for at, _ in images)
         if weight <= 0:
             continue
-        v, u = total / weight, sum(flip * before[at] for at, flip in images) / weight
+        kept = sum(kept_mass[at] for at, _ in images)
+        v, u = total / weight, sum(flip * before[at] for at, flip in images) / (kept or 1.0)
         for axis, side, depth in faces:
             if depth == 0:
                 v, u = (np.where(sign(axis, side) < 0, 0.0, w) for w in (v, u))
@@ -200,7 +207,7 @@ def update_both(
 
 
 def update_zeroed(
-    momentum: np.ndarray, before: np.ndarray, mass: np.ndarray, box: Box, kick: float
+    momentum: np.ndarray, mass: np.ndarray, before: np.ndarray, kept_mass: np.ndarray, box: Box, kick: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the same where walls set the velocity of nodes on and behind them to zero, whatever that is before."""
     weight = np.where(mass > 0, mass, 1.0)[..., None]
@@ -215,33 +222,47 @@ def update_zeroed(
             else:
                 normal = nodes[beyond][..., a]
                 nodes[beyond, ..., a] = 0.0 if word == "slip" else np.where(out * normal > 0, 0.0, normal)
-    return velocity, before / weight
+    return velocity, before / np.where(kept_mass > 0, kept_mass, 1.0)[..., None]
 
 
 def gather(
-    groups: Sequence[Particles], velocity: np.ndarray, box: Box, dt: float, before: np.ndarray | None = None
+    groups: Sequence[Particles],
+    velocity: np.ndarray,
+    box: Box,
+    dt: float,
+    before: np.ndarray | None = None,
+    kick: float = 0.0,
 ) -> list[Particles]:
     """Return the particles after the step: v, C, x + dt v, and J det(I + dt C) or (I + dt C) F.
 
-    With the velocity from before the stress the particles keep the share `flip` of what the nodes do not see of them.
+    With the velocity from before the stress they keep a share of what nodes do not see of v and C, and C takes what
+    keeps angular momentum; what gravity did in `kick` turns nothing.
     """
     moved = []
     for group in groups:
-        v, C, unseen = np.zeros_like(group.v), np.zeros_like(group.C), np.zeros_like(group.v)
+        v, C, u, H = (np.zeros_like(field) for field in (group.v, group.C, group.v, group.C))
         for p, x in enumerate(group.x):
-            unseen[p] = group.v[p] if before is not None else 0.0
             for node, w, lever in stencil_of(x, box):
                 at = tuple(i + MARGIN for i in node)
                 v_i = velocity[at]
                 v[p] += w * v_i
                 C[p] += box.inverse_moment * w * np.outer(v_i, lever)
-                unseen[p] -= 0.0 if before is None else w * before[at]
+                if before is not None:
+                    u[p] += w * before[at]
+                    H[p] += box.inverse_moment * w * np.outer(before[at], lever)
         if group.deformation.ndim == 1:
             deformation = group.deformation * np.linalg.det(np.eye(C.shape[1]) + dt * C)
         else:
             deformation = group.deformation + dt * C @ group.deformation
         x = np.clip(group.x + dt * v, 0, np.array(box.cells) * box.spacing)
-        moved.append(replace(group, x=x, v=v + box.flip * unseen, C=C, deformation=deformation))
+        kept = np.broadcast_to(group.kept, len(v))
+        k = kept[:, None] * (group.v - u)
+        unseen = kept[:, None, None] * (group.C - H)
+        turned = box.inverse_moment * np.einsum("pc,pa->pca", v - u - kick * box.gravity, k) + np.einsum(
+            "pcb,pab->pca", unseen, H
+        )
+        C = C + unseen + 0.5 * dt * (turned - turned.transpose(0, 2, 1))
+        moved.append(replace(group, x=x, v=v + k, C=C, deformation=deformation))
     return moved
 
 

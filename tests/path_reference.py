@@ -35,7 +35,8 @@ def reference_groups(scene: Scene, arrays: Arrays, k: int) -> list[reference.Par
             )
         mass = per_particle([sample.mass for _, sample in bodies])
         volume = per_particle([sample.volume for _, sample in bodies])
-        groups.append(reference.Particles(x, v, C, deformation, mass, volume, stress))
+        kept = per_particle(arrays[f"{k}_{law}_kept"].tolist())
+        groups.append(reference.Particles(x, v, C, deformation, mass, volume, stress, kept))
     return groups
 
 

@@ -142,6 +142,8 @@ def record_steps(run: Run) -> dict[str, np.ndarray]:
     for k in range(RECORDED):
         run.step(STEP)
         arrays[f"{k}_nodes"] = nodes_of(run)
+        for law, group in zip(run.laws, run.groups, strict=True):
+            arrays[f"{k}_{law}_kept"] = group.arrays.kept.to_numpy()[group.row :][: len(group.bodies)]
         arrays |= {f"{k + 1}_{name}": value for name, value in state(run).items()}
     return arrays
 

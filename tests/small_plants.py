@@ -38,6 +38,9 @@ TRANSFERS = (
         ("(mass * grid.spacing) * C[c, a] - stress", "(0.95 * mass * grid.spacing) * C[c, a] - stress", "taylor_green"),
         ("(distance[a] - 1.0)) * grid", "(distance[a] - 1.0)) * 1.05 * grid", "bar_fixed_fixed"),
         ("middle[d] = mass", "middle[d] = 1.05 * mass", "bar_fixed_fixed"),
+        ("middle[kept + d] = mass", "middle[kept + d] = 1.05 * mass", "conservation_contact"),
+        ("scale * (gained", "0.95 * scale * (gained", "conservation_contact"),
+        ("0.5 * dt * (sheared", "0.475 * dt * (sheared", "conservation_contact"),
     ),
     *_of(
         "solver/transfer/splines.py",

@@ -71,7 +71,8 @@ def step_matrix(near: Coupling, choice: Choice, lam: float, mu: float, dt: float
         return slice(index * n, (index + 1) * n)
 
     size = (d + d * d + len(pairs)) * n
-    kick = dt * INVERSE_MOMENT[choice.kernel]
+    kick, kept = dt * INVERSE_MOMENT[choice.kernel], choice.flip
+    gradients = {}
     M = np.zeros((size, size), near.value.dtype)
     for c in range(d):
         before = np.zeros((len(near.value), size), near.value.dtype)
@@ -83,12 +84,15 @@ def step_matrix(near: Coupling, choice: Choice, lam: float, mu: float, dt: float
         for a in range(d):
             after[:, block(place[c, a])] -= kick * 2 * mu * near.lever[a]
             after[:, block(place[a, a])] -= kick * lam * near.lever[c]
-        M[block(c)] = near.back @ (after - choice.flip * before)
-        M[block(c), block(c)] += choice.flip * np.eye(n)
+        M[block(c)] = near.back @ (after - kept * before)
+        M[block(c), block(c)] += kept * np.eye(n)
         for b in range(d):
-            M[block(d + c * d + b)] = INVERSE_MOMENT[choice.kernel] * near.back_lever[b] @ after
+            own, back = block(d + c * d + b), INVERSE_MOMENT[choice.kernel] * near.back_lever[b]
+            gradients[c, b] = back @ after
+            M[own] = back @ (after - kept * before)
+            M[own, own] += kept * np.eye(n)
     for a, b in pairs:
-        M[block(place[a, b])] = 0.5 * dt * (M[block(d + a * d + b)] + M[block(d + b * d + a)])
+        M[block(place[a, b])] = 0.5 * dt * (gradients[a, b] + gradients[b, a])
         M[block(place[a, b]), block(place[a, b])] += np.eye(n)
     return M
 

@@ -15,7 +15,7 @@ from mpmcli.check.forecast import expected_steps
 from mpmcli.check.scene_check import check_scene
 from mpmcli.check.step_rules import NOTED_SHARE, chord, flow_width
 from mpmcli.scene import LoadedScene, Scene
-from mpmcli.scene.schema import SolverSettings
+from mpmcli.scene.schema import USUAL_FLIP, SolverSettings
 from mpmcli.scene.shapes import Ball, Box, Polygon
 from mpmcli.solver.engine.build import build_run
 from mpmcli.stability.transfer_factors import impact_loss
@@ -80,12 +80,15 @@ def driven(y: np.ndarray, time: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("cells", "safety"), [(10, 0.8), (10, 0.3)])
 def test_a_viscous_flow_is_as_slow_as_foretold(backend_of: Callable, cells: int, safety: float) -> None:
-    """nu_num = loss per step / (dt k^2), k = pi / W: the flow is slower by nu_num / (nu + nu_num), within a half."""
+    """nu_num = loss per step / (dt k^2), k = pi / W: the flow is slower by nu_num / (nu + nu_num), within a half.
+
+    dt is the step of safety 0.8, whatever the safety.
+    """
     scene = channel(cells, safety)
     (finding,) = told(scene, "numerical-viscosity")
-    step = scene.time.end / expected_steps(SceneFacts(scene))
+    step = scene.time.end / expected_steps(SceneFacts(channel(cells, 0.8)))
     k = math.pi
-    assert finding.value == pytest.approx(0.024 * (k / cells) ** 4 / (step * k**2) / NU)
+    assert finding.value == pytest.approx(0.024 * (k / cells) ** 4 / (step * k**2) / NU, rel=2e-3)
     assert finding.severity == "note"
     *_, (frame, _) = build_run(scene, backend_of("f64", 1)).frames()
     middle = np.abs(frame.position[:, 0] - np.median(frame.position[:, 0])) < 0.5
@@ -95,17 +98,23 @@ def test_a_viscous_flow_is_as_slow_as_foretold(backend_of: Callable, cells: int,
 
 
 def test_what_lowers_the_viscosity_of_the_transfers() -> None:
-    """An eighth with half the spacing where waves bind; 1 - flip with AFLIP; below 2 % nothing is said."""
+    """An eighth with half the spacing where waves bind; 1 - flip with AFLIP; below 2 % nothing is said.
+
+    The step matters with PIC alone.
+    """
     (one,), (slow,) = (told(channel(10, safety), "numerical-viscosity") for safety in (0.8, 0.3))
-    assert f"{100 * one.value / 8:.2g} %" in one.fix and f"{100 * 0.05 * one.value:.2g} %" in one.fix
+    assert f"{100 * one.value / 8:.2g} %" in one.fix and f"{100 * (1 - USUAL_FLIP) * one.value:.2g} %" in one.fix
+    assert "time.safety" not in one.fix + slow.fix
+    assert slow.value == pytest.approx(one.value, rel=2e-3)
+    (one,), (slow,) = (told(channel(10, safety, transfer="pic"), "numerical-viscosity") for safety in (0.8, 0.3))
     assert "time.safety" in slow.fix and "time.safety" not in one.fix
-    (asked,) = told(
-        channel(10, 0.8).model_copy(update={"time": channel(10, 0.8).time.model_copy(update={"step": 1e-4})}),
-        "numerical-viscosity",
-    )
+    assert slow.value > 2 * one.value
+    short = channel(10, 0.8, transfer="pic")
+    short = short.model_copy(update={"time": short.time.model_copy(update={"step": 1e-4})})
+    (asked,) = told(short, "numerical-viscosity")
     assert "time.step" in asked.fix
     assert told(channel(20, 0.8), "numerical-viscosity") == []
-    assert told(channel(10, 0.8, transfer="aflip"), "numerical-viscosity") == []
+    assert told(channel(10, 0.8, transfer="aflip", flip=0.95), "numerical-viscosity") == []
     # Water: in the run its own viscosity does nothing.
     assert found("numerical-viscosity", material=FLUID | {"viscosity": 1e-3}) == []
 
@@ -158,8 +167,8 @@ def test_no_impact_is_told_where_there_is_none() -> None:
     flying = {"shape": box([0.25, 0.0], [0.5, 0.25]), "material": SOLID, "domain": {"gravity": [0.0, 0.0]}}
     assert found("impact-loss", velocity=[1.0, 0.0], time={"end": 0.4}, **flying) == []
     assert len(found("impact-loss", velocity=[1.0, 0.0], time={"end": 0.6}, **flying)) == 1
-    # AFLIP loses an eighth of it, and fluid is not looked at.
-    assert told(bars(32, 0.8, 0.01, transfer="aflip"), "impact-loss") == []
+    # AFLIP loses an eighth of it at least, and fluid is not looked at.
+    assert told(bars(32, 0.8, 0.01, transfer="aflip", flip=0.95), "impact-loss") == []
     assert found("impact-loss", material=FLUID, shape=box([0.25, 0.5], [0.5, 0.75])) == []
 
 
@@ -171,7 +180,7 @@ def test_the_law_of_the_loss_in_an_impact() -> None:
     assert impact_loss(usual, 1000, 0.01, 0.4) == pytest.approx(2 * small, rel=1e-2)
     assert impact_loss(usual, 1000, 0.0025, 0.8) == pytest.approx(2 * small, rel=1e-2)
     assert impact_loss(usual, 1000, 1e-9, 0.8) == impact_loss(usual, 1000, 0.0, 0.8) < 12 * small
-    assert impact_loss(SolverSettings(transfer="aflip"), 1000, 0.01, 0.8) < 0.13 * small
+    assert impact_loss(SolverSettings(transfer="aflip", flip=0.95), 1000, 0.01, 0.8) < 0.13 * small
     assert small < NOTED_SHARE
 
 

@@ -54,7 +54,6 @@ def check_steps(scene: Scene, arrays: Arrays, tolerance: float) -> None:
         scene.domain.spacing,
         np.array(scene.domain.gravity),
         scene.domain.walls.faces(scene.dimension),
-        flip=scene.solver.flip or 0.0,
         **knobs,
     )
     laws = sorted({body.material.law for body in scene.bodies})
@@ -63,10 +62,9 @@ def check_steps(scene: Scene, arrays: Arrays, tolerance: float) -> None:
         groups = reference_groups(scene, arrays, k)
         kick = path_run.STEP * (0.5 if k == 0 else 1.0)
         momentum, mass = reference.scatter(groups, box, kick)
-        # What the particles bring without a kick is what nodes hold before it.
-        before, _ = reference.scatter(groups, box, 0.0)
-        velocity, velocity_before = reference.update_both(momentum, before, mass, box, kick)
-        expected = reference.gather(groups, velocity, box, path_run.STEP, velocity_before if box.flip else None)
+        before = reference.scatter_kept(groups, box)
+        velocity, velocity_before = reference.update_both(momentum, mass, *before, box, kick)
+        expected = reference.gather(groups, velocity, box, path_run.STEP, velocity_before, kick)
         fastest = np.abs(velocity).max()
         for law, group in zip(laws, expected, strict=True):
             scales = {"x": group.x.max(), "v": fastest, "C": 4 / box.spacing * fastest, "deformation": 1.0}

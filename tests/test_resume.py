@@ -64,7 +64,7 @@ CHANGING = {
             "name": "jet",
             "shape": {"box": {"min": [0.75, 0.7], "max": [0.9, 0.75]}},
             "velocity": [0.0, -1.5],
-            "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5, "volume_correction": True},
+            "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4, "volume_correction": True},
         }
     ],
     "colliders": [

@@ -69,11 +69,11 @@ def reference_step(
     groups: list[reference.Particles], box: reference.Box, dt: float, kick: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[reference.Particles]]:
     """Return node momentum, mass and velocity, and the particles after the step."""
-    key = b"".join(a.tobytes() for g in groups for a in (g.x, g.v, g.C, g.deformation))
+    key = b"".join(a.tobytes() for g in groups for a in (g.x, g.v, g.C, g.deformation, np.asarray(g.kept)))
     if key not in _answers:
         momentum, mass = reference.scatter(groups, box, kick)
-        velocity = reference.update(momentum, mass, box, kick)
-        _answers[key] = (momentum, mass, velocity, reference.gather(groups, velocity, box, dt))
+        velocity, before = reference.update_both(momentum, mass, *reference.scatter_kept(groups, box), box, kick)
+        _answers[key] = (momentum, mass, velocity, reference.gather(groups, velocity, box, dt, before, kick))
     return _answers[key]
 
 

@@ -12,6 +12,7 @@ from mpmcli.solver.engine.run import Run
 from mpmcli.solver.engine.run_numbers import HELD, Layout, Row
 from mpmcli.solver.engine.step_control import HOLD, RISE, HeldBound
 from mpmcli.solver.engine.step_size import StepSize
+from mpmcli.solver.transfer.splines import SPLINES, TransferScheme
 
 # So soft that nothing but gravity moves it.
 CLOUD = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e-6, "poissons_ratio": 0.3}
@@ -71,7 +72,7 @@ def test_a_bound_rises_late_and_never_with_an_oscillation() -> None:
     numbers = np.zeros((1, layout.reals))
     row = Row(layout, numbers[0], np.zeros(layout.counts, np.int32))
     row.set(**dict(zip(HELD, HeldBound(), strict=True)), hold=HOLD, rise=RISE, infinity=np.inf)
-    step_size = StepSize(layout, [], None, drifts=True)
+    step_size = StepSize(layout, [], None, TransferScheme(SPLINES["quadratic"]), drifts=True)
 
     def after(bound: float) -> float:
         """Return the bound that is held after a step whose own bound was this one."""

@@ -72,8 +72,8 @@ PLANTS = (
     Plant(
         "gradient transposed",
         "solver/transfer/cpu_transfers.py",
-        "C = gradient.transpose()",
-        "C = gradient",
+        "distance, velocity, moment).transpose()",
+        "distance, velocity, moment)",
         ("homogeneous",),
     ),
     Plant(

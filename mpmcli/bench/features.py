@@ -57,6 +57,8 @@ FEATURES = (
     Feature("force", "plain"),
     Feature("force with exp", "plain"),
     Feature("sparse grid", "plain", 1.30),
+    # As where steps are shorter than a body's own.
+    Feature("aflip", "plain", 1.30),
     Feature("jet", None),
     Feature("emitter", "jet", 1.03),
     Feature("jelly", None),
@@ -112,6 +114,8 @@ def scene_of(name: str, case: BenchCase, precision: str) -> dict:
             data["bodies"].append(body | {"name": "jet", "shape": form, "velocity": down})
     elif name == "sparse grid":
         data["solver"]["grid"] = "sparse"
+    elif name == "aflip":
+        data["solver"]["transfer"] = "aflip"
     elif law != "fluid":
         data["solver"]["f_bar"] = name == "f_bar"
     if displaced:

@@ -72,7 +72,7 @@ class MirrorImages:
     def fold(
         self,
         grid: ti.template(),
-        field: ti.template(),
+        first: ti.template(),
         node: ti.template(),
         place: ti.template(),
         gravity_step: ti.template(),
@@ -84,7 +84,7 @@ class MirrorImages:
         inside takes, the result is zero.
 
         Args:
-            field: of the nodes: momentum and mass, or momentum alone, which gravity does not pull.
+            first: of `Grid.parts`: of which numbers.
             place: depth, mirror and upper as `Walls.place` returns them, the walls that act, and those that hold, see
                 `Walls.holding` with the same `rubbed`, whether friction acts.
             gravity_step: change of velocity by gravity in this step, m/s.
@@ -94,9 +94,9 @@ class MirrorImages:
         for a in ti.static(self.walls.axes):
             if acts[a] == 1 and depth[a] < 0:
                 owned = False
-        total = ti.Vector.zero(float, grid.width)
+        total = ti.Vector.zero(float, grid.kept)
         if owned:
-            total = self.image_sum(grid, field, node, mirror, acts, depth, holds, upper, gravity_step)
+            total = self.image_sum(grid, first, node, mirror, acts, depth, holds, upper, gravity_step)
             if ti.static(rubbed):
                 for r, _number, axis, side in ti.static(self.walls.rough):
                     if ti.static(axis in self.walls.axes):
@@ -114,7 +114,7 @@ class MirrorImages:
 
     @ti.func
     def unfold(
-        self, grid: ti.template(), field: ti.template(), node: ti.template(), place: ti.template(), value: ti.template()
+        self, grid: ti.template(), first: ti.template(), node: ti.template(), place: ti.template(), value: ti.template()
     ):
         """Write a velocity to a node near a wall, and mirrored to its images; `place` as of `fold`."""
         depth, mirror, upper, acts, holds = ti.static(place)
@@ -122,13 +122,13 @@ class MirrorImages:
         for images in range(self.image_sets(every)):
             if images & every == images:
                 mirrored = self.mirrored_value(value, images, holds, upper, 1.0)
-                field[self.image(grid, node, mirror, images)] = mirrored
+                grid.set_part(self.image(grid, node, mirror, images), first, mirrored)
 
     @ti.func
     def image_sum(
         self,
         grid: ti.template(),
-        field: ti.template(),
+        first: ti.template(),
         node: ti.template(),
         mirror: ti.template(),
         acts: ti.template(),
@@ -142,11 +142,11 @@ class MirrorImages:
         Gravity acts before the fold and is mirrored with the momentum: after it, the weight of the material on a floor
         would exceed what its stress balances.
         """
-        total = ti.Vector.zero(float, grid.width)
+        total = ti.Vector.zero(float, grid.kept)
         every = self.every_image(acts, depth)
         for images in range(self.image_sets(every)):
             if images & every == images:
-                value = pulled(field[self.image(grid, node, mirror, images)], self.dimension, gravity_step)
+                value = pulled(grid.part(self.image(grid, node, mirror, images), first), self.dimension, gravity_step)
                 total += self.mirrored_value(value, images, holds, upper, value[self.dimension])
         return total
 
@@ -261,7 +261,7 @@ class MirrorImages:
             upper = ti.static(self.walls.separating[f][1])
             node, inside = self.plane_node(grid, q, axis, upper)
             if inside:
-                value = pulled(grid.nodes[grid.linear_index(node)], self.dimension, gravity_step)
+                value = pulled(grid.part(grid.linear_index(node), 0), self.dimension, gravity_step)
                 if ti.static(self.crossed[axis]):
                     # What other walls fold onto this node is pressed or pulled with it.
                     depth, mirror, upper_side = self.walls.place(node)
@@ -270,7 +270,7 @@ class MirrorImages:
                         separates = self.walls.face_is("separate", b, upper_side[b])
                         acts[b] = ti.cast(depth[b] <= REACH and not separates, int)
                     holds = self.walls.holding(node, depth, upper_side, False)
-                    value = self.image_sum(grid, grid.nodes, node, mirror, acts, depth, holds, upper_side, gravity_step)
+                    value = self.image_sum(grid, 0, node, mirror, acts, depth, holds, upper_side, gravity_step)
                 outward = value[axis]
                 if ti.static(not upper):
                     outward = -outward
@@ -380,11 +380,11 @@ def column_friction(
                     inner[a] += j
                     outer[a] -= j
             # Which of them lies inside does not matter.
-            here = pulled(grid.nodes[grid.linear_index(inner)], d, gravity_step)
-            there = pulled(grid.nodes[grid.linear_index(outer)], d, gravity_step)
+            here = pulled(grid.part(grid.linear_index(inner), 0), d, gravity_step)
+            there = pulled(grid.part(grid.linear_index(outer), 0), d, gravity_step)
             if others > 0:
-                here = images.image_sum(grid, grid.nodes, inner, mirror, acts, depth, holds, upper, gravity_step)
-                there = images.image_sum(grid, grid.nodes, outer, mirror, acts, depth, holds, upper, gravity_step)
+                here = images.image_sum(grid, 0, inner, mirror, acts, depth, holds, upper, gravity_step)
+                there = images.image_sum(grid, 0, outer, mirror, acts, depth, holds, upper, gravity_step)
             if ti.static(images.walls.moves):
                 # Momentum and slip relative to the wall.
                 for c in ti.static(range(d)):

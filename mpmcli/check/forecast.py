@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mpmcli.check.facts import SceneFacts
+from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.probe import Probe
 from mpmcli.errors import InputError
@@ -20,6 +20,7 @@ from mpmcli.scene import Scene, scene_to_toml
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.frames.builder import POSITION_ERROR
 from mpmcli.solver.machine.plan import Plan, require_room
+from mpmcli.solver.transfer.kept_motion import OWN_STEP, own_limit
 from mpmcli.stability.transfer_factors import loss_per_step
 
 # Bytes of a packed file without particles, measured on files of 51 to 151 frames in 2D and 3D: headers of the data
@@ -90,7 +91,8 @@ def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
             + min(frames, 1 + computing / HOLD) * SEAL_SECONDS
             + DISK_PASSES * file_bytes / DISK_BYTES_PER_SECOND
         )
-    thinnest = min(body.thickness for body in facts.bodies)
+    thinnest = min(facts.bodies, key=lambda body: body.thickness)
+    step = damped_step(facts, thinnest, facts.taken(facts.step_at_start))
     return Forecast(
         steps=steps,
         steps_range=(steps_at(facts, facts.step_at_start), steps_at(facts, facts.step)),
@@ -102,7 +104,7 @@ def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
         host_bytes=plan.host_bytes,
         file_bytes=file_bytes,
         vtk_bytes=series_bytes(scene, plan.particles),
-        dissipation=wave_loss(thinnest, scene.domain.spacing, facts.taken(facts.step_at_start), scene.solver),
+        dissipation=wave_loss(thinnest.thickness, scene.domain.spacing, step, scene.solver),
     )
 
 
@@ -125,10 +127,17 @@ def expected_steps(facts: SceneFacts) -> int:
     return round(whole * before + mixed + max(0, frames - whole - 1) * after)
 
 
+def damped_step(facts: SceneFacts, body: BodyFacts, step: float) -> float:
+    """Return the step (s) of which a body loses in steps of `step`: of its own, if longer, but with PIC."""
+    if facts.scene.solver.transfer == "pic":
+        return step
+    return max(step, OWN_STEP * own_limit(body.body, body.law, facts.scene))
+
+
 def wave_loss(thickness: float, spacing: float, step: float, settings: SolverSettings = USUAL) -> float:
     """Return the share of energy per second that the longest wave across a body loses at a step (s), 1/s.
 
-    Its wave number is k = pi / thickness. The transfers damp per step, not per second (docs/theory.md, 2.4).
+    Its wave number is k = pi / thickness. A step of a body's own length is damped (docs/theory.md, 2.4).
     """
     return loss_per_step(settings, math.pi * spacing / thickness) / step
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
-from mpmcli.check.forecast import expected_steps, steps_at, wave_loss
+from mpmcli.check.forecast import damped_step, expected_steps, steps_at, wave_loss
 from mpmcli.check.geometry import spanned_axes, touched_walls
 from mpmcli.scene.bounds import highest_speed
 from mpmcli.scene.schema import USUAL_FLIP, SolverSettings, Time
@@ -70,9 +70,10 @@ def step_findings(facts: SceneFacts) -> Iterator[Finding]:
     if step < SMALL_STEP * facts.step:
         what = (
             f"{asked} {facts.step / step:.3g} times smaller than the stable step, {facts.step:.4g} s: the run takes as "
-            f"many times longer and loses as many times the energy, as {facts.scene.solver.transfer.upper()} damps per "
-            "step."
+            "many times longer"
         )
+        pic = " and loses as many times the energy, as PIC damps per step"
+        what += pic * (facts.scene.solver.transfer == "pic") + "."
         fix = f'Set time.step to {facts.step:.4g} s, or to "auto".'
         yield Finding("warning", "small-step", what, fix, step / facts.step)
 
@@ -92,7 +93,7 @@ def loss_findings(facts: SceneFacts) -> Iterator[Finding]:
 
 def _dissipation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     """Yield the loss of a wave in the run, unless plastic flow or viscosity of the body dissipates more."""
-    step = facts.taken(facts.step_at_start)
+    step = damped_step(facts, body, facts.taken(facts.step_at_start))
     h, end = facts.scene.domain.spacing, facts.scene.time.end
     # The loss per step is of order (k h)^4, with PIC (k h)^2, in twice as many steps.
     part = "a half" if facts.scene.solver.transfer == "pic" else "an eighth"
@@ -118,7 +119,7 @@ def _viscosity(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     k, own = math.pi / width, viscosity / body.body.material.density
     if facts.bounds.speed == 0 or -math.expm1(-2 * own * k * k * scene.time.end) < NOTED_LOSS:
         return
-    step = scene.time.end / expected_steps(facts)
+    step = damped_step(facts, body, scene.time.end / expected_steps(facts))
 
     def share(settings: SolverSettings, spacing: float, step: float) -> float:
         """nu_num / nu: a wave of a free transfer loses its amplitude as an elastic one its energy."""
@@ -147,7 +148,7 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         return
     waves = math.sqrt(body.stiffness / body.body.material.density)
     h, mach = scene.domain.spacing, speed / waves
-    courant = waves * scene.time.end / steps_at(facts, facts.step_expected) / h
+    courant = waves * damped_step(facts, body, scene.time.end / steps_at(facts, facts.step_expected)) / h
     if not (courant > 0 and math.isfinite(speed)):
         return
     length, share = chord(body.body.shape.form, velocity / speed), _flat_share(body.body.shape.form, h, mach)
@@ -173,6 +174,8 @@ def _cure(facts: SceneFacts, finer: float, aflip: float) -> str:
     if facts.scene.solver.transfer != "aflip":
         ways.append(f'solver.transfer = "aflip" {_percent(aflip)}')
     time, usual = facts.scene.time, Time.model_fields["safety"].default
+    if facts.scene.solver.transfer != "pic":
+        return ", ".join(ways) + "."
     if time.step != "auto" and time.step < facts.step_expected:
         ways.append('time.step = "auto" less, as the loss is per step')
     elif time.safety < usual:

@@ -179,7 +179,7 @@ class Impulse(Table):
 # Poisson's ratio above which bodies lock without `f_bar`: a beam of four cells is 5 % too stiff at 0.45, 13 % at 0.49.
 NEARLY_INCOMPRESSIBLE = 0.45
 # Default of FLIP's share in AFLIP: a twentieth of the loss of APIC.
-USUAL_FLIP = 0.95
+USUAL_FLIP = 0.5
 
 
 def _only_with_aflip(flip: float | None, info: ValidationInfo) -> float | None:
@@ -205,8 +205,8 @@ class SolverSettings(Table):
         "apic",
         description='What particles hand to the nodes and take back. "apic": velocity and its gradient, which '
         'keeps angular momentum exactly. "pic": the velocity alone; the dissipative reference, at 0.71 of the '
-        'step. "aflip": APIC with FLIP\'s velocities: waves and splashes lose far less, fast rotation more, and '
-        "angular momentum is kept to first order in the step only; twice the memory of the grid, and some noise.",
+        'step. "aflip": APIC that damps only a share of what the grid does not see: waves, splashes and spin lose far '
+        "less; twice the memory of the grid, and some noise.",
     )
     flip: Annotated[
         float | None,
@@ -214,9 +214,8 @@ class SolverSettings(Table):
             strict=True,
             ge=0,
             le=1,
-            description='With transfer = "aflip": share of a particle\'s velocity that is its own, changed by what '
-            "changes the nodes; the rest is APIC's, which damps what the grid does not see. 0 is APIC, 1 damps "
-            f"nothing. Default: {USUAL_FLIP:g}.",
+            description='With transfer = "aflip": share of what the grid does not see of a particle\'s motion that it '
+            f"keeps in a step of its own. 0 is APIC, 1 damps nothing. Default: {USUAL_FLIP:g}.",
         ),
         AfterValidator(_only_with_aflip),
         Field(validate_default=True),

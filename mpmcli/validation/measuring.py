@@ -8,6 +8,7 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene
+from mpmcli.solver.transfer.kept_motion import OWN_STEP
 from mpmcli.validation.case import Frames
 
 STEPS = 50
@@ -19,6 +20,11 @@ STARTS = np.linspace(0.5, 2.0, 61)
 def field(frame: Frame, name: str) -> np.ndarray:
     """Return a field of a frame in double precision."""
     return frame.fields[name].astype(np.float64)
+
+
+def damped_step(scene: Scene, step: float) -> float:
+    """Return the step, s, whose damping a lone body has at steps of `step`: its own where that is shorter."""
+    return step * max(1.0, OWN_STEP / scene.time.safety)
 
 
 def in_middle(frame: Frame, scene: Scene, number: int, width: float) -> np.ndarray:

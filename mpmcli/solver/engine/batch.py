@@ -84,7 +84,7 @@ class Batch:
             )
         # Many small runs on a GPU are in its cache, and use all nodes of their domains.
         sorts = on_cpu or runs == 1 or kind.inflow.any
-        scheme = scheme_of(kind.settings)
+        scheme = scheme_of(kind.settings, keeps_before=kind.keeps_motion)
         averaged = [averages_volume(kind.settings, law) for law in kind.members]
         period = Period(kind.faces, runs, at_once=not on_cpu)
         deterministic = kind.settings.deterministic and not on_cpu
@@ -159,7 +159,8 @@ class Batch:
             ti.field(int, shape=(2 * runs, d)) if on_cpu else None,
             sorts,
         )
-        self.layout = Layout(d, [len(law.internal) for law in kind.members], len(kind.inflow.groups))
+        internal = [len(law.internal) for law in kind.members]
+        self.layout = Layout(d, internal, len(kind.inflow.groups), kind.bodies)
         self.numbers = np.zeros((runs, self.layout.reals))
         self.counts = np.zeros((runs, self.layout.counts), np.int32)
         constants = {"drift_allowed": self._drift_allowed(grid, contact is not None)}
@@ -189,7 +190,7 @@ class Batch:
     def _make_grid(self, period: Period, blocks: int, *, deterministic: bool = False) -> Grid:
         """Return the grid; on a sparse one there is room for so many blocks."""
         kind, on_cpu = self.kind, self.backend.on_cpu
-        scheme = scheme_of(kind.settings)
+        scheme = scheme_of(kind.settings, keeps_before=kind.keeps_motion)
         tile = tile_edge(scheme.spline.nodes, kind.dimension, on_cpu=on_cpu)
         sparse = {"blocks": blocks, "threads": self.backend.threads} if kind.sparse and on_cpu else {}
         grid = (SparseGrid if sparse else Grid)(
@@ -203,7 +204,6 @@ class Batch:
             keeps_filling=kind.keeps_filling,
             averaged=[averages_volume(kind.settings, law) for law in kind.members],
             period=period,
-            walls_move=len(kind.moving) > 0,
             opens=kind.inflow.opens,
             deterministic=deterministic,
             **sparse,

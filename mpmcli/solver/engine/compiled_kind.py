@@ -14,6 +14,7 @@ from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.plan import members_of
 from mpmcli.solver.machine.room import in_steps, power_of_two, roomy_cells, roomy_colliders
 from mpmcli.solver.particles.inflow import Inflow
+from mpmcli.solver.transfer.kept_motion import keeps_motion
 from mpmcli.solver.transfer.redistribution import fine_nodes
 from mpmcli.solver.transfer.volume_relaxation import needs_filling
 
@@ -29,6 +30,7 @@ class CompiledKind:
         flags: of each law in the order of their names, the name and the terms that it has.
         cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
         keeps_filling: whether nodes keep the volume scattered to them; fine: fine nodes per cell and axis, or 0.
+        keeps_motion: whether bodies keep shares of what they do, see `kept_motion`.
         sparse: whether nodes are there where particles are alone, on the CPU, where such runs share nothing.
         colliders: their forms, and which of them move.
         drives: gravity that varies, forces, and motions of colliders.
@@ -48,6 +50,7 @@ class CompiledKind:
     bodies: tuple[int, ...]
     keeps_filling: bool
     fine: int
+    keeps_motion: bool
     sparse: bool
     colliders: ColliderKind
     drives: Drives
@@ -76,6 +79,7 @@ class CompiledKind:
             tuple(len(own) for own in places),
             needs_filling(scene, members),
             fine_nodes(scene, members),
+            keeps_motion(scene, members),
             wants_sparse(scene),
             ColliderKind.of(scene),
             Drives.of(scene, places)[0],

@@ -41,8 +41,8 @@ class CpuLaunch:
         self.dimension, self.room = device.grid.dimension, tuple(device.room)
         self.members, self.stencils = tuple(enumerate(device.groups)), device.stencils
         drifts = device.particles.touches or not all(group.total for group in device.groups)
-        laws, shift = [group.law for group in device.groups], farthest_shift(device.grid.fine)
-        self.steps = StepSize(layout, laws, device.values, drifts=drifts, shift=shift)
+        shift = farthest_shift(device.grid.fine)
+        self.steps = StepSize(layout, device.groups, device.values, device.grid.scheme, drifts=drifts, shift=shift)
         self.phases = CpuPhases(device, layout)
         self.team = CpuThreads(self.phases, device.runs)
         self.emission = CpuEmission(device, layout, device.stencils)

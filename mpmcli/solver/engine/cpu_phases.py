@@ -410,18 +410,17 @@ class CpuPhases:
     @ti.func
     def advance(self, at: ti.template()):
         """Gather and move particles of the g-th group."""
-        dt, rate = self.values[at.w, MOVED], self.rates + 2 * at.g
+        dt, rate, gravity_step = self.values[at.w, MOVED], self.rates + 2 * at.g, self.gravity_step(at.w)
         if ti.static(at.grid.sparse):
             first, after = self.places.pencils_of(at.g, at.region)
             first, after = self.share(first, after, at.part)
             begin, end = at.order.first_tile_of(first), at.order.first_tile_of(after)
-            ti.atomic_max(self.values[at.w, rate], advance_tiles(at, begin, end, dt))
+            ti.atomic_max(self.values[at.w, rate], advance_tiles(at, begin, end, dt, gravity_step))
         else:
             first, after = self.places.particles_of(at.g, at.w, at.region, at.counts[at.w, self.count.particles[at.g]])
             first, after = self.share(first, after, at.part)
-            ti.atomic_max(
-                self.values[at.w, rate], advance_range(at.particles, at.g, self.device.groups[at.g], first, after, dt)
-            )
+            sharpest = advance_range(at.particles, at.g, self.device.groups[at.g], first, after, dt, gravity_step)
+            ti.atomic_max(self.values[at.w, rate], sharpest)
 
     @ti.func
     def forget(self, at: ti.template()):

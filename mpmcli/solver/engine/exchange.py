@@ -94,6 +94,8 @@ class Exchange:
             self._numbers[self._real.change[g]] = counters.change[g]
             self._numbers[self._real.hardened[g]] = counters.hardened[g]
             self._counts[self._count.unwatched[g]] = counters.unwatched[g]
+        for first, own in zip(self._real.own, state.step_control.own_limits(), strict=True):
+            self._numbers[first : first + len(own)] = own
 
     def counters(self, control: StepControl) -> StepCounters:
         """Return the counters of a run as the kernel has advanced them."""

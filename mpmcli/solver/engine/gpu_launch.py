@@ -56,7 +56,7 @@ class GpuLaunch:
         drifts = device.particles.touches or not all(group.total for group in groups)
         values = device.values if doubles else HostValues(device.values)
         shift = farthest_shift(device.grid.fine)
-        self.steps = StepSize(layout, [group.law for group in groups], values, drifts=drifts, shift=shift)
+        self.steps = StepSize(layout, groups, values, device.grid.scheme, drifts=drifts, shift=shift)
         self.sorts, self.moved = device.sorts, sorted_fields(groups)
         self.averages, self.moves = any(group.averaged for group in groups), device.motion is not None
         self.loads = device.nodes.colliders.rows * device.nodes.colliders.room if device.nodes.collides else 0

@@ -161,7 +161,7 @@ class GpuPhases:
     @ti.func
     def advance(self, at: ti.template()):
         """Gather and move a particle."""
-        rate = at.particles.advance(at.g, self.device.groups[at.g], at.q, self.step[at.w][STEP])
+        rate = at.particles.advance(at.g, self.device.groups[at.g], at.q, self.step[at.w][STEP], self.pull(at.w))
         if rate > self.rates[at.w, at.g]:
             ti.atomic_max(self.rates[at.w, at.g], rate)
 

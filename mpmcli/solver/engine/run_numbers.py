@@ -62,16 +62,17 @@ class Layout:
     """Columns of a batch of runs in d dimensions with some laws.
 
     Attributes:
+        bodies: of each law.
         real: column of each number by name: those of REALS; `gravity` and `extent`, per axis; `rate`, `change`,
-            `hardened`, `sensitivity`, `hardening` and (the first of) `maxima`, per group; `due_of`, `period` and
-            `until`, per emitter.
+            `hardened`, `sensitivity`, `hardening` and (the first of) `maxima`, per group; (the first of) `own`, per
+            group, the bounds that each body sets itself; `due_of`, `period` and `until`, per emitter.
         count: column of each count by name: those of COUNTS; `cells`, per axis; `particles`, those that take part,
             `capacity`, all of them, and `unwatched`, per group; `entered`, `sheets` and `waits`, per emitter.
         reals, counts: number of columns.
     """
 
-    def __init__(self, dimension: int, internal: Sequence[int], emitters: int = 0) -> None:
-        """Assign columns; `internal` are the numbers of internal variables of the laws."""
+    def __init__(self, dimension: int, internal: Sequence[int], emitters: int = 0, bodies: Sequence[int] = ()) -> None:
+        """Assign columns; `internal` are the numbers of internal variables of the laws, `bodies` of bodies."""
         columns: dict[str, object] = _columns(0, REALS)
         end, groups = len(REALS), [1] * len(internal)
         for name in ("gravity", "extent"):
@@ -80,6 +81,8 @@ class Layout:
             columns[name], end = _blocks(end, groups)
         for name in ("due_of", "period", "until"):
             columns[name], end = _blocks(end, [1] * emitters)
+        self.bodies = tuple(bodies)
+        columns["own"], end = _blocks(end, self.bodies)
         columns["maxima"], self.reals = _blocks(end, [ENTRIES + 2 * n for n in internal])
         self.real = SimpleNamespace(**columns)
         columns = _columns(0, COUNTS)

@@ -10,7 +10,7 @@ from mpmcli.materials.law import StateBound
 from mpmcli.scene import Scene
 from mpmcli.solver.particles.state_bounds import StateBounds
 from mpmcli.solver.transfer.particle_update import SMALLEST_J
-from mpmcli.stability.limits import Limit, deformation_limit, mode_limit
+from mpmcli.stability.limits import Limit, deformation_limit, mode_limit, speed_limit
 from mpmcli.stability.transfer_factors import step_inertia
 
 # A bound falls at once, and rises only to the smallest of the last HOLD to 2 HOLD steps, and only where that is RISE
@@ -133,6 +133,19 @@ class StepControl:
     def limits(self) -> list[Limit]:
         """Return every bound as last measured."""
         return [limit for limits in self._limits for limit in limits] + [self._deformation_limit]
+
+    def own_limits(self) -> list[list[float]]:
+        """Return the step that each body of each group allows by its stiffness, and by the speed of its group, s."""
+        return [
+            [
+                min(
+                    speed_limit(self._spacing, bounds.speed, 0.0),
+                    *(limit.value for limit in limits if limit.body == self._names[place]),
+                )
+                for place in group.bodies
+            ]
+            for group, bounds, limits in zip(self._groups, self._bounds, self._limits, strict=True)
+        ]
 
     def limits_now(self) -> list[Limit]:
         """Return every bound by the state as it is, without storing it."""

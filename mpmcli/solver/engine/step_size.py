@@ -7,10 +7,11 @@ from collections.abc import Sequence
 
 from taichi.lang.impl import inside_kernel
 
-from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.drive.forces import DriveValues
 from mpmcli.solver.engine.run_numbers import ATTEND, BEYOND, COLLAPSED, LIMITS, LOST, Layout
+from mpmcli.solver.transfer.kept_motion import kept_share
+from mpmcli.solver.transfer.splines import TransferScheme
 from mpmcli.stability.limits import COURANT, DEFORMATION
 from mpmcli.stability.transfer_factors import INTERVAL
 
@@ -28,18 +29,34 @@ def as_double(number: ti.template()):
         return float(number)
 
 
+@ti.pyfunc
+def as_real(number: ti.template()):
+    """Return a number in the precision of particles."""
+    if ti.static(inside_kernel()):
+        return ti.cast(number, float)
+    else:
+        return number
+
+
 @ti.data_oriented
 class StepSize:
     """The steps of the runs of a batch, w being the number of a run; numbers and counts as of `run_numbers`."""
 
     def __init__(
-        self, layout: Layout, laws: Sequence[Law], values: DriveValues, *, drifts: bool, shift: float = 0.0
+        self,
+        layout: Layout,
+        groups: Sequence,
+        values: DriveValues,
+        scheme: TransferScheme,
+        *,
+        drifts: bool,
+        shift: float = 0.0,
     ) -> None:
         """Prepare; `drifts`: whether particles move on the grid; shift: cells by which some steps shift them."""
         self.drifts, self.shift = drifts, shift
         self.real, self.count = layout.real, layout.count
         self.values = values
-        self.laws = tuple(laws)
+        self.groups, self.bodies, self.scheme = tuple(groups), layout.bodies, scheme
 
     @ti.pyfunc
     def begin(self, w: int, numbers: ti.template(), counts: ti.template()):
@@ -73,7 +90,20 @@ class StepSize:
         else:
             numbers[w, self.real.owed] = due_kick - kick
             self.values.set_means(w, since, since + kick)
+            if ti.static(self.scheme.keeps_before):
+                self.keep(w, dt, numbers)
         return dt, kick, splits, limit, deformation, ti.min(largest, numbers[w, self.real.end])
+
+    @ti.pyfunc
+    def keep(self, w: int, dt: ti.f64, numbers: ti.template()):
+        """Find the share of its motion that each body keeps in a step."""
+        for g, group in ti.static(enumerate(self.groups)):
+            slowest = numbers[w, self.real.infinity]
+            if numbers[w, self.real.rate[g]] > 0:
+                slowest = DEFORMATION / numbers[w, self.real.rate[g]]
+            for i in range(self.bodies[g]):
+                bound = ti.min(numbers[w, self.real.own[g] + i], slowest)
+                group.kept[w * self.bodies[g] + i] = as_real(kept_share(dt / bound, self.scheme.damped))
 
     @ti.pyfunc
     def velocity_time(self, w: int, numbers: ti.template()):
@@ -122,7 +152,7 @@ class StepSize:
         value = numbers[w, self.real.stiffness]
         limit = counts[w, self.count.stiffness_limit]
         sharpest = numbers[w, self.real.rate[0]]
-        for g in ti.static(range(1, len(self.laws))):
+        for g in ti.static(range(1, len(self.groups))):
             sharpest = ti.max(sharpest, numbers[w, self.real.rate[g]])
         deformation = numbers[w, self.real.infinity]
         if sharpest > 0:
@@ -216,7 +246,7 @@ class StepSize:
     def control(self, w: int, dt: ti.f64, numbers: ti.template(), counts: ti.template()):
         """Count a step; return whether the host must measure."""
         due = False
-        for g in ti.static(range(len(self.laws))):
+        for g in ti.static(range(len(self.groups))):
             counts[w, self.count.unwatched[g]] += 1
             strain = dt * numbers[w, self.real.rate[g]]
             numbers[w, self.real.change[g]] = (

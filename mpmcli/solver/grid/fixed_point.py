@@ -90,9 +90,10 @@ OF_MASS, OF_VOLUME, OF_CELL, OF_LOG, HEAVIEST, PER_STEP, SCALES = range(7)
 
 @ti.data_oriented
 class FixedPoint:
-    """The sums of a grid: nodes, before, filling, means, of its fields of that name, None where it has none.
+    """The sums of a grid: nodes, filling, means, of its fields of that name, None where it has none.
 
     Attributes:
+        parts: as of the grid.
         fine: of the fraction of fine cells that particles fill, None where they are not shifted; of_fine: their scale.
         reach: cells from the middle node of a stencil to its farthest one; run: that a view is for.
         scales: of each run, see OF_MASS; pace: scale of momenta, its inverse, and the speed that has room.
@@ -105,13 +106,13 @@ class FixedPoint:
         self.dimension = grid.dimension
         sums = partial(FixedSums, count=grid.runs * grid.node_count, wide=arch in WIDE)
         self.nodes = sums(grid.width)
-        self.before = sums(grid.width) if grid.scheme.keeps_before else None
-        self.filling = sums(grid.width) if grid.keeps_filling else None
+        self.filling = sums(grid.kept) if grid.keeps_filling else None
         self.means = tuple(sums(3) if group.averaged else None for group in groups)
         wide, fine = arch in WIDE, grid.fine
         self.fine = FixedSums(1, grid.runs * fine.node_count, wide=wide) if fine else None
         self.of_fine = self.fine.scale(CROWDED) if fine else 0.0
-        self.kept = tuple(sums for sums in (self.nodes, self.before, self.filling, *self.means) if sums is not None)
+        self.kept = tuple(sums for sums in (self.nodes, self.filling, *self.means) if sums is not None)
+        self.parts = grid.parts
         self.stencil, self.reach = grid.scheme.spline.nodes, grid.scheme.spline.nodes - 2
         self.run, self._node_count = 0, grid.node_count
         self.scales = ti.Vector.field(SCALES, float, shape=grid.runs)
@@ -134,9 +135,9 @@ class FixedPoint:
         self.forget(run)
 
     @staticmethod
-    def bytes_needed(width: int, *, before: bool, filling: bool, averaged: int) -> int:
-        """Return the bytes of the sums of a node, of `averaged` groups that average volumes."""
-        return 8 * (width * (1 + before + filling) + 3 * averaged)
+    def bytes_needed(numbers: int, averaged: int) -> int:
+        """Return the bytes of so many sums of a node, and of those of `averaged` groups that average volumes."""
+        return 8 * (numbers + 3 * averaged)
 
     @ti.func
     def set_step(self, run: int, step: float):
@@ -167,15 +168,16 @@ class FixedPoint:
         d = ti.static(self.dimension)
         scale, most = self.pace[self.run][0], mass * self.pace[self.run][2]
         fits = True
-        for c in ti.static(range(d)):
-            largest = ti.abs(middle[c])
-            middle[c] *= scale
-            for a in ti.static(range(d)):
-                largest += ti.static(float(self.reach)) * ti.abs(change[a, c])
-                change[a, c] *= scale
-            # Written so that a NaN does not fit.
-            fits = fits and largest <= most
-        middle[d] *= self.scales[self.run][OF_MASS]
+        for first in ti.static(self.parts):
+            for c in ti.static(range(first, first + d)):
+                largest = ti.abs(middle[c])
+                middle[c] *= scale
+                for a in ti.static(range(d)):
+                    largest += ti.static(float(self.reach)) * ti.abs(change[a, c])
+                    change[a, c] *= scale
+                # Written so that a NaN does not fit.
+                fits = fits and largest <= most
+            middle[first + d] *= self.scales[self.run][OF_MASS]
         return fits
 
     @ti.func
@@ -194,14 +196,10 @@ class FixedPoint:
         value, inverse = self.nodes.value(node), self.pace[self.run][1]
         if not (value[d] >= 0.0 and value[d] <= ti.static(self.nodes.largest)):
             ti.atomic_min(self.beyond[2 * self.run + 1], node)
-        for c in ti.static(range(d)):
-            grid.nodes[node][c] = value[c] * inverse
-        grid.nodes[node][d] = value[d] / self.scales[self.run][OF_MASS]
-        if ti.static(grid.scheme.keeps_before):
-            before = self.before.value(node)
-            for c in ti.static(range(d)):
-                grid.before[node][c] = before[c] * inverse
-            grid.before[node][d] = before[d] / self.scales[self.run][OF_MASS]
+        for first in ti.static(self.parts):
+            for c in ti.static(range(first, first + d)):
+                grid.nodes[node][c] = value[c] * inverse
+            grid.nodes[node][first + d] = value[first + d] / self.scales[self.run][OF_MASS]
         if ti.static(grid.keeps_filling):
             if relaxed > 0.0:
                 grid.filling[node][d] = self.filling.value(node)[d] / self.scales[self.run][OF_VOLUME]

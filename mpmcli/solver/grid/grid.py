@@ -74,17 +74,16 @@ class Grid(LinearNodes):
         tile: edge of a tile, cells; tiles: per axis; tile_count: of all of them.
         shape: nodes per axis, margins included, a multiple of `tile`.
         planes: of a stencil, normal to the first axis, 1 in 2D; runs: whose nodes it has, one after the other.
-        width: numbers per node, at least d + 1.
-        nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update.
-        before: Vector(width) field: momentum, later velocity, without stress and forces of this step; None in schemes
-            that do not keep it.
-        filling: Vector(width) field: where the mass is in `nodes` it has the volume of particles at rest, m^3, in the
+        width: numbers per node.
+        nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update; from number `kept`
+            on the same of the shares that bodies keep, without stress and forces of this step, in schemes that do so.
+        parts: the first number of each of the two.
+        filling: Vector(kept) field: where the mass is in `nodes` it has the volume of particles at rest, m^3, in the
             steps that relax volumes; None where the mass says as much. keeps_filling: whether it is there.
         holding: `filling`, or else `nodes`.
         means: Vector(3) field per group: of the particles in the cell behind a node the volume at rest times ln J, and
             times what that grew by, and the volume at rest, m^3; None of groups that do not average them
             (`volume_average`). kept_means: the others.
-        weighs_before: whether `before` holds masses too, of which walls that move ask for.
         opens: (axis, side) of every face that material may leave through: nodes beyond it are like all others.
         fixed: sums in fixed point, from which `FixedPoint.settle` sets the fields; None where P2G adds to these itself.
             deterministic: whether there are such sums; then there are no `means`.
@@ -105,12 +104,13 @@ class Grid(LinearNodes):
         keeps_filling: bool,
         averaged: Sequence[bool],
         period: Period,
-        walls_move: bool,
         opens: Sequence[tuple[int, int]],
         deterministic: bool,
     ) -> None:
         """Allocate nodes for a number of runs; `averaged` says of each group whether it averages volumes over cells."""
-        self.dimension, self.width = dimension, width
+        self.dimension, self.kept = dimension, width
+        self.parts = (0, width) if scheme.keeps_before else (0,)
+        self.width = width * len(self.parts)
         self.spacing, self.inverse_spacing = spacing, 1 / spacing
         self.gradient_scale = scheme.spline.inverse_moment / spacing
         self.cells, self.scheme, self.tile = tuple(cells), scheme, tile
@@ -122,8 +122,7 @@ class Grid(LinearNodes):
         self.runs, self.opens, self.first_node = runs, tuple(opens), 0
         self.node_count = self.stored_nodes()
         count = runs * self.node_count
-        self.nodes = ti.Vector.field(width, float, shape=count)
-        self.before = ti.Vector.field(width, float, shape=count) if scheme.keeps_before else None
+        self.nodes = ti.Vector.field(self.width, float, shape=count)
         self.keeps_filling = keeps_filling
         self.filling = ti.Vector.field(width, float, shape=count) if keeps_filling else None
         self.holding = self.filling if keeps_filling else self.nodes
@@ -131,7 +130,7 @@ class Grid(LinearNodes):
             ti.Vector.field(3, float, shape=count) if wanted and not deterministic else None for wanted in averaged
         )
         self.kept_means = tuple(means for means in self.means if means is not None)
-        self.period, self.weighs_before = period, walls_move and scheme.keeps_before
+        self.period = period
         self.deterministic, self.fixed, self.fine = deterministic, None, None
         self.box = ti.field(int, shape=(2 * runs, dimension))
 
@@ -154,12 +153,29 @@ class Grid(LinearNodes):
             self.fixed.clear(node)
         else:
             self.nodes[node] = ti.Vector.zero(float, self.width)
-            if ti.static(self.scheme.keeps_before):
-                self.before[node] = ti.Vector.zero(float, self.width)
             if ti.static(self.keeps_filling):
-                self.filling[node] = ti.Vector.zero(float, self.width)
+                self.filling[node] = ti.Vector.zero(float, self.kept)
             for means in ti.static(self.kept_means):
                 means[node] = ti.Vector.zero(float, 3)
+
+    @ti.func
+    def part(self, index: int, first: ti.template()):
+        """Return what a node holds of one of `parts`."""
+        if ti.static(len(self.parts) == 1):
+            return self.nodes[index]
+        else:
+            result = ti.Vector.zero(float, self.kept)
+            for c in ti.static(range(self.kept)):
+                result[c] = self.nodes[index][first + c]
+            return result
+
+    @ti.func
+    def set_part(self, index: int, first: ti.template(), value: ti.template()):
+        if ti.static(len(self.parts) == 1):
+            self.nodes[index] = value
+        else:
+            for c in ti.static(range(self.kept)):
+                self.nodes[index][first + c] = value[c]
 
     @ti.func
     def tile_number(self, node: ti.template()):

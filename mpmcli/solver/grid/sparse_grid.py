@@ -45,16 +45,15 @@ class TileWindow(LinearNodes):
         self.strides = tuple(edge ** (d - 1 - a) for a in range(d))
         self.size = edge**d
         self.node_count, self.first_node = threads * self.size, 0
-        for name in ("width", "planes", "scheme", "weighs_before", "deterministic"):
+        for name in ("width", "kept", "planes", "scheme", "deterministic"):
             setattr(self, name, getattr(grid, name))
-        self.nodes, self.before, self.filling = (
-            None if field is None else ti.Vector.field(grid.width, float, shape=self.node_count)
-            for field in (grid.nodes, grid.before, grid.filling)
+        self.nodes, self.filling = (
+            None if field is None else ti.Vector.field(field.n, float, shape=self.node_count)
+            for field in (grid.nodes, grid.filling)
         )
         # What P2G adds to, with the fields of the grid: in every step, and in those that relax volumes.
-        pairs = ((self.nodes, grid.nodes), (self.before, grid.before), (self.filling, grid.filling))
-        self.summed = tuple(pair for pair in pairs[:2] if pair[0] is not None)
-        self.relaxing = tuple(pair for pair in pairs[2:] if pair[0] is not None)
+        self.summed = ((self.nodes, grid.nodes),)
+        self.relaxing = () if grid.filling is None else ((self.filling, grid.filling),)
 
     def seen_from(self, grid: Grid, first_node: object) -> "TileWindow":
         """Return the window of a view of the grid, with a linear index of node 0, a variable of the kernel."""
@@ -84,7 +83,7 @@ class TileWindow(LinearNodes):
     @ti.func
     def zero(self, field: ti.template(), t: int):
         for k in range(t * ti.static(self.size), (t + 1) * ti.static(self.size)):
-            field[k] = ti.Vector.zero(float, self.width)
+            field[k] = ti.Vector.zero(float, field.n)
 
     @ti.func
     def load(self, grid: ti.template(), t: int, place: ti.template()):
@@ -155,9 +154,8 @@ def room_for_blocks(particles: int) -> int:
 
 def most_blocks(grid: "SparseGrid") -> int:
     """Return the number of blocks that a larger grid may have in what memory is free, and indices reach."""
-    fields = [field for field in (grid.nodes, grid.before, grid.filling) if field is not None]
     fine, free = grid.fine.in_cell if grid.fine else 0, psutil.virtual_memory().available
-    numbers = grid.width * len(fields) + 3 * len(grid.kept_means) + fine
+    numbers = grid.width + grid.kept * grid.keeps_filling + 3 * len(grid.kept_means) + fine
     # And of the tables of a sort on some threads.
     block = (4 if grid.nodes.dtype == ti.f32 else 8) * numbers * grid.block + 4 * 16
     return int(min(MEMORY_SHARE * free // block, LARGEST_INDEX // (grid.block * max(fine, 1))))

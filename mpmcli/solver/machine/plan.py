@@ -30,6 +30,7 @@ from mpmcli.solver.particles.arrays import particle_fields
 from mpmcli.solver.particles.sort import TileOrder
 from mpmcli.solver.solids.contact import ParticleContact, bins_along
 from mpmcli.solver.solids.reference_grid import slips_in
+from mpmcli.solver.transfer.kept_motion import keeps_motion
 from mpmcli.solver.transfer.redistribution import fine_nodes
 from mpmcli.solver.transfer.splines import scheme_of
 from mpmcli.solver.transfer.volume_average import averages_volume
@@ -214,7 +215,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     )
     # The widest field is a matrix; sources and keys are integers.
     widest = max(size for group in groups for size in group.fields.values())
-    scheme = scheme_of(scene.solver)
+    scheme = scheme_of(scene.solver, keeps_before=keeps_motion(scene, members))
     tile = tile_edge(scheme.spline.nodes, dimension, on_cpu=backend.on_cpu)
     all_nodes = nodes = Grid.nodes_needed(cells, tile)
     require_cpu_if_sparse(scene.solver, backend)
@@ -222,14 +223,14 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         blocks = room_for_blocks(sum(map(in_steps, counts.values())))
         nodes = blocks * tile**dimension
     filling, deterministic = needs_filling(scene, members), scene.solver.deterministic and not backend.on_cpu
-    node_bytes = real * (width * (1 + scheme.keeps_before + filling) + 3 * sum(averaged))
+    numbers = width * (1 + scheme.keeps_before + filling)
+    node_bytes = real * (numbers + 3 * sum(averaged))
     # Nothing where that is 0.
     fine = fine_nodes(scene, members) ** dimension
     node_bytes += real * fine
     if deterministic:
         shared = sum(averaged)
-        node_bytes += FixedPoint.bytes_needed(width, before=scheme.keeps_before, filling=filling, averaged=shared)
-        node_bytes += FixedPoint.bytes_needed(1, before=False, filling=False, averaged=0) * fine
+        node_bytes += FixedPoint.bytes_needed(numbers, shared) + FixedPoint.bytes_needed(1, 0) * fine
         # In their place.
         node_bytes -= real * 3 * shared
     all_tiles, bins = all_nodes // tile**dimension, 0

@@ -89,7 +89,8 @@ class ParticleArrays:
         activity: (n) int, whether each waits, takes part or has left (`particles.sort`); None where all take part
             always (`comes_and_goes` is false).
         force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
-        table: per body a row of particle mass, particle volume and the constants of the law; real: numpy's type.
+        table: per body a row of particle mass, particle volume and the constants of the law; kept: per body the share
+            that it keeps of its motion in this step, see `kept_motion`; real: numpy's type.
     """
 
     def __init__(
@@ -138,6 +139,7 @@ class ParticleArrays:
         self.repeats = False
         self.period: Period | None = None
         self.table = ti.Vector.field(table[1], float, shape=table[0])
+        self.kept = ti.field(float, shape=table[0])
         # Taichi lays fields out one after the other: what is read beyond the last particle lies in the next ones.
         self.spare = ti.field(float, shape=SPARE)
 
@@ -375,7 +377,11 @@ class ParticleArrays:
 
     @ti.func
     def row(self, p: int):
+        return self.table[self.row_number(p)]
+
+    @ti.func
+    def row_number(self, p: int):
         row = 0
         if ti.static(self.several):
             row = self.body[p]
-        return self.table[row]
+        return row

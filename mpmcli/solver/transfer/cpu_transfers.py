@@ -20,6 +20,7 @@ from mpmcli.solver.transfer.lanes import (
     load_vectors,
     matrix_of,
     node_rows_of,
+    node_values_of,
     repeat_first,
     store_lanes,
     stored_entries,
@@ -30,11 +31,12 @@ from mpmcli.solver.transfer.lanes import (
 )
 from mpmcli.solver.transfer.particle_update import (
     SMALLEST_J,
+    add_kept,
     centred,
     deformed_gradient,
     momentum,
-    scatter_before,
     scatter_volume,
+    turned,
 )
 from mpmcli.solver.transfer.splines import bounded
 from mpmcli.solver.transfer.stencils import add_linear, gather_linear
@@ -71,6 +73,8 @@ def scatter_range(
     missing = ti.Vector.zero(float, LANES)
     first_node, weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(nodes * d))
     middles, slopes = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
+    keeps = ti.static(grid.scheme.keeps_before)
+    shares = ti.Vector.zero(float, LANES)
     if ti.static(not group.several):
         load_rows(group, first, 1, rows)
     begin = first
@@ -88,12 +92,14 @@ def scatter_range(
             repeat_first(x, count)
             repeat_first(v, count)
             repeat_first(here, count)
-        more = ti.static(group.averaged or particles.touches or group.slips or group.pushed)
+        more = ti.static(group.averaged or particles.touches or group.slips or group.pushed or keeps)
         for lane in range(ti.static(LANES * more)):
             # What reads more than arrays: lanes beyond the last particle repeat it.
             p = begin + ti.min(lane, count - 1)
             if ti.static(group.averaged):
                 missing[lane] = missing_to_mean(grid, g, group, p)
+            if ti.static(keeps):
+                shares[lane] = group.kept[group.row_number(p)]
             if ti.static(particles.touches):
                 push = particles.contact.push(group, p, grid.spacing, particles.run)
                 for c in ti.static(range(d)):
@@ -154,6 +160,13 @@ def scatter_range(
                 for a in ti.static(range(d)):
                     weights[k * d + a, lane] = w[k, a]
             middle, slope = momentum(grid, distance, rows[MASS, lane], rows[VOLUME, lane], own, C, stress, kick)
+            if ti.static(keeps):
+                kept_C = matrix_of(affine, d, lane)
+                if ti.static(group.total):
+                    kept_C = kept_C @ state
+                add_kept(
+                    grid, distance, shares[lane] * rows[MASS, lane], vector_of(v, 0, d, lane), kept_C, middle, slope
+                )
             for c in ti.static(range(width)):
                 middles[lane, c] = middle[c]
                 for a in ti.static(range(d)):
@@ -166,14 +179,9 @@ def scatter_range(
             # The stress of a particle that is crushed or inverted would spread NaN over the grid.
             if ratios[lane] > SMALLEST_J:
                 w = weights_of(weights, nodes, d, lane)
-                middle = ti.Vector.zero(float, width)
-                for c in ti.static(range(width)):
-                    middle[c] = middles[lane, c]
-                slope = node_rows_of(slopes, d, width, width, lane)
+                middle = node_values_of(middles, 0, width, lane)
+                slope = node_rows_of(slopes, d, width, 0, width, lane)
                 add_linear(near.nodes, near, first_node[lane], w, middle, slope, False)
-                if ti.static(grid.scheme.keeps_before):
-                    own_v, own_C = group.motion_on_grid(p)
-                    scatter_before(group.on_grid(p), group.row(p)[MASS], own_v, own_C, near, False)
             else:
                 ti.atomic_min(particles.lost[particles.first_lost + g], p)
             if ti.static(grid.keeps_filling):
@@ -221,7 +229,15 @@ def store_projected(
 
 
 @ti.func
-def advance_range(particles: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int, dt: float):
+def advance_range(
+    particles: ti.template(),
+    g: ti.template(),
+    group: ti.template(),
+    first: int,
+    last: int,
+    dt: float,
+    gravity_step: ti.template(),
+):
     """Gather and move particles first to last - 1 of the g-th group; return their largest rate of deformation, 1/s."""
     grid, near = ti.static((particles.grid, particles.near))
     d = ti.static(group.dimension)
@@ -230,7 +246,11 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
     keeps_F = ti.static(group.law.deformation == "F")
     x, distances, deformation = zero_lanes(d), zero_lanes(d), zero_lanes(ti.static(stored_entries(group)))
     first_node, weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(nodes * d))
-    velocities, kept = ti.Matrix.zero(float, LANES, width), zero_lanes(ti.static(d if grid.scheme.keeps_before else 1))
+    velocities = ti.Matrix.zero(float, LANES, width)
+    # Of particles whose body keeps a share of its motion.
+    keeps, kept = ti.static((grid.scheme.keeps_before, grid.kept))
+    v, affine = zero_lanes(ti.static(d if keeps else 1)), zero_lanes(ti.static(d * d if keeps else 1))
+    shares = ti.Vector.zero(float, LANES)
     moments = ti.Matrix.zero(float, LANES, ti.static(d * width))
     speeds, gradients, rates = zero_lanes(d), zero_lanes(ti.static(d * d)), ti.Vector.zero(float, LANES)
     moved, beyond, after = zero_lanes(d), ti.Vector.zero(float, LANES), zero_lanes(ti.static(stored_entries(group)))
@@ -251,6 +271,10 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
             for c in ti.static(range(d)):
                 load_entry(remainders, c, group.gradient, (c, d), origin)
         load_deformation(group, origin, deformation)
+        if ti.static(keeps):
+            load_vectors(v, group.v, origin)
+            for c, a in ti.static(ti.ndrange(d, d)):
+                load_entry(affine, c * d + a, group.gradient, (a, c), origin)
         if ti.static(group.law.grows_by_constants and group.several):
             load_rows(group, begin, count, rows)
         if count < LANES:
@@ -276,18 +300,14 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 velocities[lane, c] = velocity[c]
                 for a in ti.static(range(d)):
                     moments[lane, a * width + c] = moment[a, c]
-            if ti.static(grid.scheme.keeps_before):
-                unseen = particles.unseen_velocity(group, begin + lane)
-                for c in ti.static(range(d)):
-                    kept[c, lane] = unseen[c]
+            if ti.static(keeps):
+                shares[lane] = group.kept[group.row_number(begin + lane)]
 
         for lane in range(LANES):
-            velocity = ti.Vector.zero(float, d)
-            for c in ti.static(range(d)):
-                velocity[c] = velocities[lane, c]
-            moment = node_rows_of(moments, d, width, d, lane)
-            gradient = centred(grid, vector_of(distances, 0, d, lane), velocity, moment)
-            C = gradient.transpose()
+            velocity = node_values_of(velocities, 0, d, lane)
+            moment = node_rows_of(moments, d, width, 0, d, lane)
+            distance = vector_of(distances, 0, d, lane)
+            C = centred(grid, distance, velocity, moment).transpose()
             place = vector_of(x, 0, d, lane)
             if ti.static(group.total):
                 place = vector_of(here, 0, d, lane)
@@ -299,8 +319,21 @@ def advance_range(particles: ti.template(), g: ti.template(), group: ti.template
                 gradients[a * d + c, lane] = C[c, a]
             for c in ti.static(range(d)):
                 speeds[c, lane] = velocity[c]
-                if ti.static(grid.scheme.keeps_before):
-                    speeds[c, lane] += kept[c, lane]
+            if ti.static(keeps):
+                before = node_values_of(velocities, kept, d, lane)
+                slope = node_rows_of(moments, d, width, kept, d, lane)
+                before_C = centred(grid, distance, before, slope).transpose()
+                own_C = matrix_of(affine, d, lane)
+                if ti.static(group.total):
+                    own_C = own_C @ stored_of(group, deformation, lane)
+                unseen, unseen_C = shares[lane] * (vector_of(v, 0, d, lane) - before), shares[lane] * (own_C - before_C)
+                turn = turned(grid, velocity - before - gravity_step, unseen, unseen_C, before_C, dt)
+                if ti.static(group.total):
+                    unseen_C = unseen_C @ (matrix_of(after, d, lane) + ti.Matrix.identity(float, d)).inverse()
+                for c in ti.static(range(d)):
+                    speeds[c, lane] += unseen[c]
+                    for a in ti.static(range(d)):
+                        gradients[a * d + c, lane] += unseen_C[c, a] + turn[c, a]
             inside, left, outside = particles.moved(group, place, vector_of(remainders, 0, d, lane), velocity, dt)
             for c in ti.static(range(d)):
                 moved[c, lane] = inside[c]
@@ -414,7 +447,7 @@ def scatter_tiles(at: ti.template(), first: int, after: int, kick: float, relaxe
 
 
 @ti.func
-def advance_tiles(at: ti.template(), first: int, after: int, dt: float):
+def advance_tiles(at: ti.template(), first: int, after: int, dt: float, gravity_step: ti.template()):
     """Gather and move the particles in tiles; return their largest rate of deformation, 1/s."""
     (window,) = ti.static((at.grid.window,))
     sharpest = NOTHING
@@ -425,7 +458,7 @@ def advance_tiles(at: ti.template(), first: int, after: int, dt: float):
             first_node = window.first_of(at.t, place)
             (near,) = ti.static((at.particles.beside(window.seen_from(at.grid, first_node)),))
             window.load(at.grid, at.t, place)
-            sharpest = ti.max(sharpest, advance_range(near, at.g, at.group, begin, end, dt))
+            sharpest = ti.max(sharpest, advance_range(near, at.g, at.group, begin, end, dt, gravity_step))
     return sharpest
 
 

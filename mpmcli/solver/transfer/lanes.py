@@ -142,12 +142,28 @@ def constants_of(rows: ti.template(), lane: int):
 
 
 @ti.func
-def node_rows_of(lanes: ti.template(), d: ti.template(), width: ti.template(), columns: ti.template(), lane: int):
-    """Return the d rows, each as wide as a node, that a lane has one after another; of each the first `columns`."""
+def node_values_of(lanes: ti.template(), first: ti.template(), count: ti.template(), lane: int):
+    """Return `count` numbers, from `first` on, of those of a node that a lane has."""
+    result = ti.Vector.zero(float, count)
+    for c in ti.static(range(count)):
+        result[c] = lanes[lane, first + c]
+    return result
+
+
+@ti.func
+def node_rows_of(
+    lanes: ti.template(),
+    d: ti.template(),
+    width: ti.template(),
+    first: ti.template(),
+    columns: ti.template(),
+    lane: int,
+):
+    """Return the d rows, each as wide as a node, that a lane has one after another; of each `columns` from `first`."""
     result = ti.Matrix.zero(float, d, columns)
     for c in ti.static(range(columns)):
         for a in ti.static(range(d)):
-            result[a, c] = lanes[lane, a * width + c]
+            result[a, c] = lanes[lane, a * width + first + c]
     return result
 
 

@@ -52,7 +52,7 @@ class NodeUpdate:
     @ti.func
     def update_massive(self, node: ti.template(), index: int, gravity_step: ti.template()):
         d = ti.static(self.dimension)
-        value = self.grid.nodes[index]
+        value = self.grid.part(index, 0)
         pull = gravity_step
         kind = -1
         speed_squared = 0.0
@@ -72,9 +72,9 @@ class NodeUpdate:
                     for a in ti.static(images.walls.axes):
                         depth[a], mirror[a], upper[a] = found_depth[a], found_mirror[a], found_upper[a]
                         acts[a], holds[a] = found_acts[a], found_holds[a]
-                    total = images.fold(self.grid, self.grid.nodes, node, place, gravity_step, True)
+                    total = images.fold(self.grid, 0, node, place, gravity_step, True)
                     # Entry by entry here and below: Taichi loses vectors that are assigned as a whole in static blocks.
-                    for c in ti.static(range(self.grid.width)):
+                    for c in ti.static(range(self.grid.kept)):
                         value[c] = total[c]
                     for a in ti.static(range(d)):
                         pull[a] = 0.0
@@ -103,20 +103,24 @@ class NodeUpdate:
                     velocity[c] = met[c]
 
             # Unfold.
-            self.write(self.grid.nodes, node, index, kind, place, velocity)
+            self.write(0, node, index, kind, place, velocity)
             if ti.static(self.grid.scheme.keeps_before):
-                self.update_before(node, index, kind, place, value[d])
+                self.update_before(node, index, kind, place)
             for a in ti.static(range(d)):
                 speed_squared += velocity[a] ** 2
         return speed_squared
 
     @ti.func
-    def update_before(self, node: ti.template(), index: int, kind: int, place: ti.template(), mass: float):
+    def update_before(self, node: ti.template(), index: int, kind: int, place: ti.template()):
         """Turn the momentum from before stress and forces into velocity: fold and unfold, without any boundary.
+
+        It is that of the shares that bodies keep, and is divided by their mass: bodies that touch give each other
+        nothing, whatever their shares are.
 
         Mirror images have it too, so that a wall changes only what stress does; friction changes a change of velocity.
         """
-        before = self.grid.before[index]
+        first = ti.static(self.grid.kept)
+        before = self.grid.part(index, first)
         if ti.static(self.mirrors):
             depth, _mirror, upper, _acts, holds = ti.static(place)
             for k, images in ti.static(enumerate(self.images.kinds)):
@@ -125,23 +129,24 @@ class NodeUpdate:
                     for a in ti.static(images.walls.axes):
                         holds[a] = by_word[a]
                     pull = ti.Vector.zero(float, ti.static(self.dimension))
-                    total = images.fold(self.grid, self.grid.before, node, place, pull, False)
-                    for c in ti.static(range(self.grid.width)):
+                    total = images.fold(self.grid, first, node, place, pull, False)
+                    for c in ti.static(range(self.grid.kept)):
                         before[c] = total[c]
+        mass = before[ti.static(self.dimension)]
         for a in ti.static(range(self.dimension)):
-            before[a] /= mass
-        self.write(self.grid.before, node, index, kind, place, before)
+            before[a] = ti.select(mass > 0.0, before[a] / mass, 0.0)
+        self.write(first, node, index, kind, place, before)
 
     @ti.func
     def write(
-        self, field: ti.template(), node: ti.template(), index: int, kind: int, place: ti.template(), new: ti.template()
+        self, first: ti.template(), node: ti.template(), index: int, kind: int, place: ti.template(), new: ti.template()
     ):
         """Write the velocity of a node, and of its images."""
         if ti.static(self.mirrors):
             if kind < 0:
-                field[index] = new
+                self.grid.set_part(index, first, new)
             for k, images in ti.static(enumerate(self.images.kinds)):
                 if kind == k:
-                    images.unfold(self.grid, field, node, place, new)
+                    images.unfold(self.grid, first, node, place, new)
         else:
-            field[index] = new
+            self.grid.set_part(index, first, new)

@@ -60,16 +60,16 @@ def scatter(g: ti.template(), group: ti.template(), particles: ti.template(), p:
     base, distance = grid.scheme.spline.stencil(group.on_grid(p), grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
     middle, change = momentum(grid, distance, mass, row[VOLUME], v, C, stress, kick)
+    if ti.static(grid.scheme.keeps_before):
+        # Last, and with a copy: before it, Taichi 1.7.4 loses what a force with branches adds to v and C.
+        own_v, own_C = group.motion_on_grid(p)
+        add_kept(grid, distance, group.kept[group.row_number(p)] * mass, own_v, own_C, middle, change)
     first = grid.linear_index(base)
     if ti.static(grid.deterministic):
         if not add_fixed(grid.fixed.nodes, grid, first, w, mass, middle, change):
             grid.fixed.note(group.id[p])
     else:
         add_linear(grid.nodes, grid, first, w, middle, change, True)
-    if ti.static(grid.scheme.keeps_before):
-        # Last, and with a copy: before it, Taichi 1.7.4 loses what a force with branches adds to v and C.
-        own_v, own_C = group.motion_on_grid(p)
-        scatter_before(group.on_grid(p), mass, own_v, own_C, grid, True)
 
 
 @ti.func
@@ -101,27 +101,23 @@ def momentum(
 
 
 @ti.func
-def scatter_before(
-    x: ti.template(), mass: float, v: ti.template(), C: ti.template(), grid: ti.template(), atomic: ti.template()
+def add_kept(
+    grid: ti.template(),
+    distance: ti.template(),
+    mass: float,
+    v: ti.template(),
+    C: ti.template(),
+    middle: ti.template(),
+    change: ti.template(),
 ):
-    """Add the momentum of a particle, without this step's stress and forces, to `grid.before`."""
-    d = ti.static(grid.dimension)
-    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
-    w = grid.scheme.spline.weights(distance)
-    middle = ti.Vector.zero(float, grid.width)
-    change = ti.Matrix.zero(float, d, grid.width)
+    """Set what a stencil takes of the share, of that mass, that a body keeps of its motion, see `momentum`."""
+    d, kept = ti.static((grid.dimension, grid.kept))
     for c in ti.static(range(d)):
-        middle[c] = mass * v[c]
+        middle[kept + c] = mass * v[c]
         for a in ti.static(range(d)):
-            change[a, c] = (mass * grid.spacing) * C[c, a]
-            middle[c] -= change[a, c] * (distance[a] - 1.0)
-    if ti.static(grid.weighs_before):
-        middle[grid.dimension] = mass
-    if ti.static(grid.deterministic):
-        # With stress and forces it was noted where there is no room.
-        add_fixed(grid.fixed.before, grid, grid.linear_index(base), w, mass, middle, change)
-    else:
-        add_linear(grid.before, grid, grid.linear_index(base), w, middle, change, atomic)
+            change[a, kept + c] = (mass * grid.spacing) * C[c, a]
+            middle[kept + c] -= change[a, kept + c] * (distance[a] - 1.0)
+    middle[kept + d] = mass
 
 
 @ti.func
@@ -129,9 +125,9 @@ def scatter_volume(x: ti.template(), volume: float, grid: ti.template(), atomic:
     """Add the volume of a particle at rest, m^3, to `grid.filling`."""
     base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
-    middle = ti.Vector.zero(float, grid.width)
+    middle = ti.Vector.zero(float, grid.filling.n)
     middle[ti.static(grid.dimension)] = volume
-    change = ti.Matrix.zero(float, ti.static(grid.dimension), grid.width)
+    change = ti.Matrix.zero(float, ti.static(grid.dimension), grid.filling.n)
     if ti.static(grid.deterministic):
         middle[ti.static(grid.dimension)] = volume * grid.fixed.volume_scale()
         add_linear(grid.fixed.filling, grid, grid.linear_index(base), w, middle, change, atomic)
@@ -249,7 +245,7 @@ class ParticleUpdate:
         return change
 
     @ti.func
-    def advance(self, g: ti.template(), group: ti.template(), p: int, dt: float):
+    def advance(self, g: ti.template(), group: ti.template(), p: int, dt: float, gravity_step: ti.template()):
         """Gather and move one particle; return its rate of deformation, 1/s (see `deformation_rate`).
 
         x += dt v, and F <- (I + dt C) F or J *= det(I + dt C); on the grid of the state at rest F += dt dv/dX.
@@ -267,14 +263,13 @@ class ParticleUpdate:
             for c in ti.static(range(d)):
                 remainder[c] = group.gradient[p][c, d]
         inside, after, beyond = self.moved(group, x, remainder, v, dt)
-        if ti.static(self.grid.scheme.keeps_before):
-            kept = self.unseen_velocity(group, p)
-            for c in ti.static(range(d)):
-                v[c] += kept[c]
+        own_v, own_C, turn = self.kept_motion(group, p, v, gradient, dt, gravity_step)
 
         # Motion.
         for c in ti.static(range(group.v.n)):
             group.v[p][c] = v[c]
+            if ti.static(self.grid.scheme.keeps_before):
+                group.v[p][c] += own_v[c]
         if ti.static(group.total):
             for c, a in ti.static(ti.ndrange(d, d)):
                 group.displacement_gradient[p][c, a] += dt * C[c, a]
@@ -283,6 +278,11 @@ class ParticleUpdate:
             for c, a in ti.static(ti.ndrange(d, d)):
                 C[c, a] = in_space[c, a]
                 gradient[a, c] = in_space[c, a]
+        if ti.static(self.grid.scheme.keeps_before):
+            if ti.static(group.total):
+                own_C = own_C @ group.stored(p).inverse()
+            for c, a in ti.static(ti.ndrange(d, d)):
+                gradient[a, c] += own_C[c, a] + turn[c, a]
         for a in ti.static(range(d)):
             for c in ti.static(range(group.v.n)):
                 group.gradient[p][a, c] = gradient[a, c]
@@ -357,17 +357,51 @@ class ParticleUpdate:
         return inside, after, beyond
 
     @ti.func
-    def unseen_velocity(self, group: ti.template(), p: int):
-        """Return the velocity that particle p keeps of its own, which the nodes do not see.
+    def kept_motion(
+        self,
+        group: ti.template(),
+        p: int,
+        seen: ti.template(),
+        slope: ti.template(),
+        dt: float,
+        gravity_step: ti.template(),
+    ):
+        """Return what particle p keeps of its velocity and of its gradient on the grid, and what turns with it.
 
-        AFLIP adds it to APIC's: v <- sum w v_i + flip (v - sum w v_i^before) (Fei et al. 2021; docs/theory.md, 2.3).
-        As positions follow the nodes, angular momentum is kept to first order in the step only.
+        Args:
+            seen, slope: what the stencil of the particle holds, as `gather` returns it.
         """
-        before, _ = gather(group.on_grid(p), self.near, self.near.before)
-        kept = ti.Vector.zero(float, self.dimension)
-        for c in ti.static(range(self.dimension)):
-            kept[c] = self.grid.scheme.flip * (group.v[p][c] - before[c])
-        return kept
+        d, kept = ti.static((self.dimension, self.grid.kept))
+        velocity, gradient, turn = ti.Vector.zero(float, d), ti.Matrix.zero(float, d, d), ti.Matrix.zero(float, d, d)
+        if ti.static(self.grid.scheme.keeps_before):
+            share = group.kept[group.row_number(p)]
+            v, C = group.motion_on_grid(p)
+            gained, H = ti.Vector.zero(float, d), ti.Matrix.zero(float, d, d)
+            for c in ti.static(range(d)):
+                velocity[c] = share * (v[c] - seen[kept + c])
+                gained[c] = seen[c] - seen[kept + c] - gravity_step[c]
+                for a in ti.static(range(d)):
+                    H[c, a] = slope[a, kept + c]
+                    gradient[c, a] = share * (C[c, a] - H[c, a])
+            found = turned(self.grid, gained, velocity, gradient, H, dt)
+            for c, a in ti.static(ti.ndrange(d, d)):
+                turn[c, a] = found[c, a]
+        return velocity, gradient, turn
+
+
+@ti.func
+def turned(grid: ti.template(), gained: ti.template(), v: ti.template(), C: ti.template(), H: ti.template(), dt: float):
+    """Return what C takes so that a velocity v that a particle keeps, and C with it, turn no angular momentum.
+
+    It is dt (g v^T - v g^T) / (2 D) + dt (C H^T - H C^T) / 2: g is what the nodes gained since, but from
+    gravity, and H the gradient of the share that is kept, both without what was lost (docs/theory.md, 2.3).
+    """
+    d = ti.static(grid.dimension)
+    result, scale = ti.Matrix.zero(float, d, d), 0.5 * dt * grid.gradient_scale * grid.inverse_spacing
+    sheared = C @ H.transpose()
+    for c, a in ti.static(ti.ndrange(d, d)):
+        result[c, a] = scale * (gained[c] * v[a] - v[c] * gained[a]) + 0.5 * dt * (sheared[c, a] - sheared[a, c])
+    return result
 
 
 @ti.func

@@ -79,18 +79,15 @@ SPLINES = {"quadratic": QuadraticSpline(), "cubic": CubicSpline()}
 class TransferScheme:
     """Constants of the transfers between particles and nodes.
 
-    affine: whether P2G includes the affine velocity C, as in APIC; flip: AFLIP's share: how much of a particle's
-    velocity is its own plus the nodes' change, 0 for none.
+    affine: whether P2G includes the affine velocity C, as in APIC; keeps_before: whether nodes also store mass and
+    momentum, without this step's stress and forces, of the shares that bodies keep (`kept_motion`); damped: share of
+    what nodes do not see that a body loses in a step of its own, less than 1 with AFLIP.
     """
 
     spline: QuadraticSpline | CubicSpline
     affine: bool = True
-    flip: float = 0.0
-
-    @property
-    def keeps_before(self) -> bool:
-        """Whether nodes also store the momentum without this step's stress and forces."""
-        return self.flip > 0
+    keeps_before: bool = False
+    damped: float = 1.0
 
     @property
     def plain(self) -> bool:
@@ -98,5 +95,6 @@ class TransferScheme:
         return self.spline.nodes == 3 and not self.keeps_before
 
 
-def scheme_of(settings: SolverSettings) -> TransferScheme:
-    return TransferScheme(SPLINES[settings.kernel], settings.transfer != "pic", settings.flip or 0.0)
+def scheme_of(settings: SolverSettings, *, keeps_before: bool) -> TransferScheme:
+    damped = 1 - (settings.flip or 0.0)
+    return TransferScheme(SPLINES[settings.kernel], settings.transfer != "pic", keeps_before, damped)

@@ -26,14 +26,14 @@ def add_linear(
     field: of the nodes, or sums in fixed point, to which the rest is scaled; first: `stencil_at` the first node;
     middle: the quantity at the middle node; change: its change per cell, a row per axis.
     """
-    d = ti.static(grid.dimension)
+    d, width = ti.static((grid.dimension, middle.n))
     origin = origin_of(first, grid)
     for i in ti.static(range(grid.planes)):
         # At the middle of a plane, weighted along the first axis, and the changes along the others.
-        plane, across, along = middle, ti.Vector.zero(float, grid.width), ti.Vector.zero(float, grid.width)
+        plane, across, along = middle, ti.Vector.zero(float, width), ti.Vector.zero(float, width)
         if ti.static(d == 3):
-            add_multiple(plane, ti.static(i - 1), row_of(change, 0, grid.width))
-        for c in ti.static(range(grid.width)):
+            add_multiple(plane, ti.static(i - 1), row_of(change, 0, width))
+        for c in ti.static(range(width)):
             across[c], along[c] = change[d - 2, c], change[d - 1, c]
             if ti.static(d == 3):
                 plane[c] *= w[i, 0]
@@ -103,15 +103,15 @@ def add(field: ti.template(), node: int, share: ti.template(), atomic: ti.templa
 @ti.func
 def gather_linear(field: ti.template(), grid: ti.template(), first: ti.template(), w: ti.template()):
     """Return the weighted sums over a stencil of what nodes hold, and of that times the cells from the middle node."""
-    d = ti.static(grid.dimension)
+    d, width = ti.static((grid.dimension, field.n))
     origin = origin_of(first, grid)
-    velocity = ti.Vector.zero(float, grid.width)
-    moment = ti.Matrix.zero(float, d, grid.width)
+    velocity = ti.Vector.zero(float, width)
+    moment = ti.Matrix.zero(float, d, width)
     for i in ti.static(range(grid.planes)):
         # Sums over a plane, and of these times the cells from its middle along its axes.
-        plane = ti.Vector.zero(float, grid.width)
-        across = ti.Vector.zero(float, grid.width)
-        along = ti.Vector.zero(float, grid.width)
+        plane = ti.Vector.zero(float, width)
+        across = ti.Vector.zero(float, width)
+        along = ti.Vector.zero(float, width)
         for j in ti.static(range(grid.scheme.spline.nodes)):
             low = field[node_of(origin, grid, i, j, 0)] * w[0, d - 1]
             mid = field[node_of(origin, grid, i, j, 1)] * w[1, d - 1]
@@ -130,7 +130,7 @@ def gather_linear(field: ti.template(), grid: ti.template(), first: ti.template(
             across *= w[i, 0]
             along *= w[i, 0]
         velocity += plane
-        for c in ti.static(range(grid.width)):
+        for c in ti.static(range(width)):
             if ti.static(d == 3):
                 if ti.static(i == 0):
                     moment[0, c] -= plane[c]

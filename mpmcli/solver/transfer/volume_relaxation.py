@@ -84,7 +84,7 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
             least = ti.min(least, held)
     else:
         # All numbers of a node at once, which the compiler turns into vector instructions.
-        total = ti.Vector.zero(float, grid.width)
+        total = ti.Vector.zero(float, grid.holding.n)
         smallest = grid.holding[first]
         # Lines of nodes in a loop: few steps relax, and copies would take a tenth of the compile time of a 3D scene.
         for line in range(ti.static(grid.scheme.spline.nodes ** (d - 1))):

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmcli.scene import Scene
 from mpmcli.validation.case import Case, Frames, case_text
-from mpmcli.validation.measuring import field, fit_oscillation
+from mpmcli.validation.measuring import damped_step, field, fit_oscillation
 from mpmcli.validation.tables import Tables, body, box, elastic, problem
 
 LENGTH, YOUNG, DENSITY, SPEED = 25.0, 100.0, 1.0, 0.01
@@ -141,7 +141,7 @@ class Bar(Case):
         return {
             "period error": error,
             "period error against theory": error / theory.period_error - 1,
-            "dissipation against theory": -math.expm1(-2 * wave.decay * dt) / loss - 1,
+            "dissipation against theory": -math.expm1(-2 * wave.decay * damped_step(scene, dt)) / loss - 1,
             "amplitude error": wave.amplitude * self.frequency / SPEED - 1,
             "energy loss": wave.energy_loss(),
         }

@@ -49,6 +49,8 @@ class Conservation(Case):
         )
         # Some thousand steps.
         self.end = 20.0 if dimension == 2 else 10.0
+        volume = math.pi * RADIUS**2 if dimension == 2 else 4 / 3 * math.pi * RADIUS**3
+        self.mass = DENSITY * (EDGE**dimension + volume)
 
     def tables(self, n: int) -> Tables:
         d = self.dimension
@@ -80,16 +82,43 @@ class Conservation(Case):
         def change(values: list[tuple[float, ...]]) -> float:
             return float(np.abs(np.array(values) - values[0]).max())
 
-        volume = math.pi * RADIUS**2 if self.dimension == 2 else 4 / 3 * math.pi * RADIUS**3
-        mass = DENSITY * (EDGE**self.dimension + volume)
         energy = np.array([row.energy for row in rows])
         return {
             "angular momentum drift": change([row.angular_momentum for row in rows]) / moment,
             "linear momentum drift": change([row.linear_momentum for row in rows]) / momentum,
-            "mass error": max(abs(row.mass / mass - 1) for row in rows),
+            "mass error": max(abs(row.mass / self.mass - 1) for row in rows),
             "energy gain": float(energy.max() / energy[0] - 1),
             "energy loss": float(1 - energy[-1] / energy[0]),
         }
+
+
+class Meeting(Conservation):
+    """A soft ball that spins, and one a hundred times stiffer, which meet off centre: their steps are not the same."""
+
+    text = case_text("conservation_contact")
+    varies = ("precision", "transfer", "safety")
+
+    def __init__(self) -> None:
+        levels: Levels = {"coarse": (8, 16), "default": (8, 16, 32), "fine": (8, 16, 32)}
+        super().__init__("conservation_contact", "A soft and a stiff ball that meet", 2, levels)
+        self.measures = (
+            self.text.measure("angular momentum drift", 5e-14),
+            self.text.measure("linear momentum drift", 5e-14),
+            *self.measures[2:4],
+            self.text.measure("energy loss", lambda n: 4 / n, order=0.9, expected=1.0),
+        )
+        self.end, self.mass = 1.6, DENSITY * 2 * math.pi * RADIUS**2
+
+    def tables(self, n: int) -> Tables:
+        balls = [
+            body(name, elastic("neo_hookean", DENSITY, young, POISSON), ball(centre, RADIUS), **start)
+            for name, young, centre, start in (
+                ("soft", YOUNG, [0.6, 1.0], {"velocity": [0.5, 0.0], "velocity_gradient": started(SPIN, 0.0, 2)}),
+                ("stiff", 100 * YOUNG, [1.6, 1.2], {"velocity": [-0.5, 0.0]}),
+            )
+        ]
+        domain = {"size": [6 * EDGE, 4 * EDGE], "cells": [6 * n, 4 * n]}
+        return problem(domain, (self.end, FRAMES), "velocity mass", balls)
 
 
 PLANE: Levels = {"coarse": (8,), "default": (8, 16), "fine": (8, 16, 32)}
@@ -97,4 +126,5 @@ SPACE: Levels = {"coarse": (6,), "default": (6, 9), "fine": (6, 9, 12)}
 CASES = (
     Conservation("conservation", "Momenta and energy of free bodies", 2, PLANE),
     Conservation("conservation_3d", "Momenta and energy of free bodies in 3D", 3, SPACE),
+    Meeting(),
 )
