@@ -10,6 +10,9 @@ from mpmcli.scene import Scene
 from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.transfer.kept_motion import kept_share
+from mpmcli.validation.carry_out import scene_of as scene_of_case
+from mpmcli.validation.case import Setting
+from mpmcli.validation.cases import all_cases
 
 SOFT = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e4, "poissons_ratio": 0.3}
 
@@ -82,9 +85,12 @@ def test_deformation_bounds_a_bodys_own_step(backend_of: Callable) -> None:
 
 
 def lost(scene: Scene, backend: Backend) -> float:
-    """Return the share of its energy that a scene has lost at its end; no frame has more than the one before."""
+    """Return the share of its energy that a scene has lost at its end; no frame has more than the one before.
+
+    The ledger does not have what the contact of `total` bodies stores.
+    """
     energy = np.array([row.energy for _, row in build_run(scene, backend).frames()])
-    assert np.diff(energy).max() < 1e-3 * energy[0]
+    assert np.diff(energy).max() < (0.1 if scene.solver.solids == "total" else 1e-3) * energy[0]
     return 1 - energy[-1] / energy[0]
 
 
@@ -111,8 +117,38 @@ def test_a_free_bar_loses_as_much_in_a_second_at_any_step(backend_of: Callable) 
     assert lost(ringing(0.16, transfer="pic"), backend_of("f64", 1)) > 4 * whole
 
 
-@pytest.mark.parametrize("f_bar", [False, True])
-def test_bodies_that_meet_lose_as_much_at_any_step(backend_of: Callable, f_bar: bool) -> None:
-    """The loss of two balls that meet off centre and fly on, at a tenth of the step; averaged volumes gain nothing."""
-    whole, tenth = (lost(meeting(1.0, safety=safety, f_bar=f_bar), backend_of("f64", 1)) for safety in (0.8, 0.08))
-    assert tenth == pytest.approx(whole, rel=0.2)
+@pytest.mark.parametrize(
+    ("solver", "tolerance"),
+    [
+        ({"f_bar": False}, 0.1),
+        ({"f_bar": True}, 0.1),
+        pytest.param({"solids": "total"}, 0.2, marks=pytest.mark.slow),
+    ],
+    ids=str,
+)
+def test_bodies_that_meet_lose_as_much_at_any_step(backend_of: Callable, solver: dict, tolerance: float) -> None:
+    """Two balls that meet off centre, in steps of 1, 1/5 and 1/50; averaged volumes and contact are as they were."""
+    whole, *parts = (lost(meeting(1.0, safety=0.8 / n, **solver), backend_of("f64", 1)) for n in (1, 5, 50))
+    assert parts == pytest.approx([whole] * 2, rel=tolerance)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["metal_blocks", *(pytest.param(f"{name}_blocks", marks=pytest.mark.slow) for name in ("paste", "snow", "sand"))],
+)
+def test_plastic_flow_is_as_far_at_any_step(backend_of: Callable, name: str) -> None:
+    """The known stress of blocks in homogeneous motion, in steps of 1, 1/5 and 1/50: waves from faces disturb it."""
+    case = all_cases()[name]
+    for n in (1, 5, 50):
+        scene = scene_of_case(case, 8, Setting(safety=0.8 / n))
+        found = case.measure(8, scene, build_run(scene, backend_of("f64", 1)).frames())
+        assert max(map(abs, found.values())) < 4e-3, n
+
+
+def test_volumes_relax_as_far_at_any_step(backend_of: Callable) -> None:
+    """Water that is thrown and falls back has its volume again, to 2 %, in steps of 1 and 1/5; 1/50 take 10 s more."""
+    case = all_cases()["toss"]
+    for n in (1, 5):
+        scene = scene_of_case(case, 1, Setting(safety=0.8 / n))
+        found = case.measure(1, scene, build_run(scene, backend_of("f64", 1)).frames())
+        assert abs(found["volume error"]) < 0.02, n
