@@ -191,8 +191,8 @@ def test_runs_of_a_batch_on_the_path_of_a_gpu_follow_those_on_the_cpu(backend_of
         expected = list(build_run(scene, backend).frames())
         for (frame, row), (other, other_row) in zip(output, expected, strict=True):
             assert (row.emitted, row.blocked) == (other_row.emitted, other_row.blocked)
-            assert abs(row.steps - other_row.steps) <= 1
-            # When a sort retires what is beyond a face differs.
+            # When a sort retires what is beyond a face differs, in double precision too; it bounds steps until then.
+            assert abs(row.steps - other_row.steps) <= 0.01 * other_row.steps
             inside = [
                 (one.fields["status"] == 1) & (one.position[:, 0] <= 0.85) & (one.position[:, 1] >= 0.02)
                 for one in (frame, other)
