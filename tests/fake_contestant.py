@@ -39,22 +39,13 @@ class FakeWorker:
                 return {"seconds": 2.0 + self.step_seconds}
             case ["run", _]:
                 return self.steps(100)
-            case ["repeat", stretch, _]:
-                return self.steps(int(stretch))
-            case ["flowing"]:
-                return {"share": 0.25}
             case ["finish"]:
                 return self.end
         return {}
 
     def steps(self, count: int) -> dict:
         busy = count * self.step_seconds
-        return {
-            "steps": count,
-            "seconds": self.wall * busy,
-            "processor_seconds": busy,
-            "watch_seconds": 0.01 * self.wall * busy,
-        }
+        return {"steps": count, "seconds": self.wall * busy, "processor_seconds": busy}
 
     def __enter__(self) -> Self:
         return self

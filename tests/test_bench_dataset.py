@@ -114,7 +114,7 @@ def test_the_table_tells_what_was_refused() -> None:
     assert lines[-1] == "Beware: with 2 workers 1 of 80 trajectories were not accepted."
 
 
-@pytest.mark.parametrize("option", [["--materials"], ["--quick"], ["--case", "2d-64"]])
+@pytest.mark.parametrize("option", [["--profile"], ["--quick"], ["--case", "2d-64"]])
 def test_other_tables_are_refused(option: list[str]) -> None:
     outcome = run_here("bench", "--dataset", *option)
     assert outcome.status == 2

@@ -44,44 +44,24 @@ SHORTER = {
     "mpmcli bench --json > results/bench.json": (
         "mpmcli bench --case 2d-64 --seconds 0.1 --blocks 1 --json > results/bench.json"
     ),
-    "mpmcli bench --scaling --peers --json > results/scaling.json": (
-        "mpmcli bench --scaling --peers --case 2d --largest 1e4 --threads 1 --seconds 0.05 --blocks 1 --json"
-        " > results/scaling.json"
-    ),
     "mpmcli bench --profile --json > results/profile.json": (
         "mpmcli bench --profile --case 2d-128 --seconds 0.1 --blocks 1 --json > results/profile.json"
-    ),
-    "mpmcli bench --device --json > results/device.json": (
-        "mpmcli bench --device --arch cpu --seconds 0.01 --json > results/device.json"
     ),
     "mpmcli bench --dataset --json > results/dataset.json": (
         "mpmcli bench --dataset --threads 1 --seconds 0.1 --blocks 1 --json > results/dataset.json"
     ),
-    "mpmcli bench --features --json > results/features.json": (
-        "mpmcli bench --features --case 2d-128 --threads 1 --seconds 0.1 --blocks 1 --json > results/features.json"
-    ),
-    "mpmcli bench --materials --json > results/materials.json": (
-        "mpmcli bench --materials --case 2d-128 --seconds 0.1 --blocks 1 --json > results/materials.json"
-    ),
 }
 # scripts/test is what runs this test.
 NOT_RUN = {"scripts/test"}
-# These are run with -m slow: a minute of compiling each law, and more of features and of phases, the bar that
-# test_validate_cli.py validates, the benchmarks of test_bench_dataset.py and test_bench_device.py, and the parts that
-# test_docs_datasets.py computes and merges.
+# These are run with -m slow: a minute of compiling each law, the bar that test_validate_cli.py validates, the benchmark
+# of test_bench_dataset.py, and the parts that test_docs_datasets.py computes and merges.
 SLOW = {
-    "mpmcli bench --device --json > results/device.json",
-    ".venv/bin/python scripts/bench_table results/device.json",
     "mpmcli bench --dataset --json > results/dataset.json",
     ".venv/bin/python scripts/bench_table results/dataset.json",
-    "mpmcli bench --features --json > results/features.json",
-    ".venv/bin/python scripts/bench_table results/features.json",
     "mpmcli bench --profile --json > results/profile.json",
     ".venv/bin/python scripts/bench_table results/profile.json",
     "mpmcli sweep drops.toml --count 4 -o results/part-1 --shard 1/2",
     "mpmcli dataset merge results/part-1 -o results/merged",
-    "mpmcli bench --materials --json > results/materials.json",
-    ".venv/bin/python scripts/materials_table results/materials.json",
     "mpmcli validate bar_fixed_free --levels coarse -o results/bar",
     "mpmcli validate conservation --levels coarse",
 }

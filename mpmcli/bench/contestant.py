@@ -1,26 +1,19 @@
 """Process of one contestant, controlled by commands on stdin, one per line.
 
-    python -m mpmcli.bench.contestant ours|solid|deterministic|peer|mpm128|yardstick|LAW,LAW,...|profile:LAW|FEATURE
+    python -m mpmcli.bench.contestant ours|solid|deterministic|peer|mpm128|yardstick|profile:LAW
         --dimension 3 --cells 128 --particles 524288 --step 8e-5 [--threads 2] [--precision f32] [--arch cpu]
 
 It answers on stdout, one JSON object per line, and waits for commands on stdin without using the processor:
 
     (start)        {"particles": 524288, "bytes_per_particle": 88 or null, "threads": 2}     ready to step
     first          {"seconds": 2.9}                                            one step, kernels compiled
+    skip STEPS     {}                                                          takes steps that are not measured
     run SECONDS    {"steps": 31, "seconds": 1.02, "processor_seconds": 1.01}   steps for about that long
     phases         {"p2g": 0.4, "g2p": 0.5}                                    time in each since the last such command
     finish         {"sound": true, "smallest_step": 8e-5, "peak_memory": 219152384}    and ends
 
-For laws, the contestant is the column of `mpmcli.bench.materials`, which has three more commands:
-
-    keep STEPS              {}                       takes STEPS steps and saves the state
-    repeat STEPS SECONDS    {"steps": 400, "seconds": 1.1, "processor_seconds": 1.05}
-                                                     takes STEPS steps from that state, repeated until the time is up
-    flowing                 {"share": 0.93}          of the particles
-
-With "profile:" before the name of a law, the contestant is the column of `mpmcli.bench.profile`, which answers
-to `phases`, as the yardstick does. For a feature, a scene of `mpmcli.bench.features`, `repeat` goes on from where the
-scene is.
+With "profile:" before the name of a law, the contestant is the column of `mpmcli.bench.column`, which answers to
+`phases`, as the yardstick does.
 
 A failure is answered by {"error": "a sentence"} and ends the process with status 1.
 """
@@ -38,13 +31,12 @@ from mpmcli.processes.questions import answering
 
 
 class Contestant(Protocol):
-    """A simulation that can be measured; only those of mpmcli can repeat steps, and have `watch_seconds`."""
+    """A simulation that can be measured; only columns and the yardstick have phases."""
 
     particles: int
     bytes_per_particle: int | None
     threads: int
     smallest_step: float
-    watch_seconds: float
 
     def advance(self, count: int) -> int:
         """Take about `count` time steps and return how many; may return before the device is done."""
@@ -54,15 +46,6 @@ class Contestant(Protocol):
 
     def is_sound(self) -> bool:
         """Whether every particle is in the domain."""
-
-    def keep(self) -> None:
-        """Save the state."""
-
-    def rewind(self) -> None:
-        """Restore the saved state."""
-
-    def flowing(self) -> float:
-        """Return the share of particles that flow."""
 
     def phases(self) -> dict[str, float]:
         """Return the time in each phase of a step since the last call, s."""
@@ -80,21 +63,6 @@ def run_block(contestant: Contestant, seconds: float) -> tuple[int, float]:
         left = int(steps / elapsed * (seconds - elapsed)) + 1
         chunk = max(1, min(2 * chunk, left))
     return steps, elapsed
-
-
-def repeat_stretch(contestant: Contestant, stretch: int, seconds: float) -> dict[str, float]:
-    """Repeat `stretch` steps from the kept state for `seconds`, at least once; rewinding does not count."""
-    steps, elapsed, busy, watching = 0, 0.0, 0.0, 0.0
-    while not steps or elapsed < seconds:
-        contestant.rewind()
-        watching -= contestant.watch_seconds
-        start, busy_before = time.perf_counter(), time.process_time()
-        steps += contestant.advance(stretch)
-        contestant.sync()
-        elapsed += time.perf_counter() - start
-        busy += time.process_time() - busy_before
-        watching += contestant.watch_seconds
-    return {"steps": steps, "seconds": elapsed, "processor_seconds": busy, "watch_seconds": watching}
 
 
 def peak_memory() -> int:
@@ -130,15 +98,10 @@ def serve(start: Callable[[], Contestant], commands: Iterable[str], answer: Call
                     busy = time.process_time()
                     steps, elapsed = run_block(contestant, float(seconds))
                     answer(steps=steps, seconds=elapsed, processor_seconds=time.process_time() - busy)
-                case ["keep", steps]:
+                case ["skip", steps]:
                     contestant.advance(int(steps))
                     contestant.sync()
-                    contestant.keep()
                     answer()
-                case ["repeat", stretch, seconds]:
-                    answer(**repeat_stretch(contestant, int(stretch), float(seconds)))
-                case ["flowing"]:
-                    answer(share=contestant.flowing())
                 case ["phases"]:
                     answer(**contestant.phases())
                 case ["finish"]:
@@ -162,15 +125,9 @@ def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
         from mpmcli.bench.ours import falling_block
 
         return falling_block(case, who, **options)
-    from mpmcli.bench.features import FEATURES, Pool
-    from mpmcli.bench.materials import Column
     from mpmcli.bench.profile import PROFILE, ProfiledColumn
 
-    if who.startswith(PROFILE):
-        return ProfiledColumn(who.removeprefix(PROFILE), case, **options)
-    if who in {feature.name for feature in FEATURES}:
-        return Pool(who, case, **options)
-    return Column(who.split(","), case, **options)
+    return ProfiledColumn(who.removeprefix(PROFILE), case, **options)
 
 
 def main() -> int:

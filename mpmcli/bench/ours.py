@@ -90,11 +90,6 @@ class Ours:
         self.particles: int = self.run.particle_count
         self.bytes_per_particle: int = make_plan(usual, backend).bytes_per_particle
 
-    @property
-    def watch_seconds(self) -> float:
-        """Wall time of the measurements of the state, s."""
-        return self.run.measure_seconds
-
     def advance(self, count: int) -> int:
         """Take about `count` steps and return how many."""
         steps, smallest = self.run.advance(count)

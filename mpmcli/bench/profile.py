@@ -6,7 +6,8 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 
 from mpmcli.bench.cases import EDGE, BenchCase
-from mpmcli.bench.materials import Column, steps_of
+from mpmcli.bench.column import SETTLING, column_of
+from mpmcli.bench.ours import Ours
 from mpmcli.bench.report import head, heading, number, page, rows_text
 from mpmcli.bench.side import BenchOptions, Setting, Side, Turns
 from mpmcli.materials.registry import laws
@@ -29,11 +30,11 @@ COLUMN_OF = {
 }
 
 
-class ProfiledColumn(Column):
+class ProfiledColumn(Ours):
     """The column of a law, whose phases are launched one by one, and timed."""
 
-    def __init__(self, law: str, case: BenchCase, **options: int | str) -> None:
-        super().__init__([law], case, **options)
+    def __init__(self, law: str, case: BenchCase, *, precision: str, **options: int | str) -> None:
+        super().__init__(column_of(law, case, precision), case.step, precision=precision, **options)
         self.run.batch.profile = Counter()
 
     def phases(self) -> dict[str, float]:
@@ -121,7 +122,7 @@ def _measure(side: Side, options: BenchOptions) -> dict:
     with ExitStack() as stack:
         side.begin(stack, options.start)
         if side.who.startswith(PROFILE):
-            side.worker.ask(f"keep {steps_of(side.case)[0]}")
+            side.worker.ask(f"skip {round(SETTLING / side.case.step)}")
         side.worker.ask(f"run {options.seconds}")
         side.worker.ask("phases")
         phases: dict[str, list[float]] = {}

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from mpmcli.cli.options import COUNT, json_option, thread_counts, time_option
+from mpmcli.cli.options import COUNT, json_option, thread_counts
 from mpmcli.cli.streams import print_json, print_text
 from mpmcli.errors import InputError
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 # What --quick still takes.
 QUICK_PARTICLES = 10_000
-# Length of a block, s: of most tables, of --dataset, and of --device; and the wall time of --scaling, s.
-SECONDS, DATASET_SECONDS, DEVICE_SECONDS, BUDGET = 2.0, 20.0, 0.05, 1200.0
+# Length of a block, s: of most tables, and of --dataset.
+SECONDS, DATASET_SECONDS = 2.0, 20.0
 # What a table makes: its record for JSON, and what writes that as text.
 Outcome = tuple[dict, Callable[[dict], str]]
 # What has a table of its own.
-TABLES = ("materials", "features", "dataset", "scaling", "profile", "device")
+TABLES = ("dataset", "profile")
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,6 @@ class Choice:
     arch: str | None
     seconds: float | None
     blocks: int | None
-    budget: float | None
-    largest: float | None
 
     def refuse(self, *options: str, why: str) -> None:
         """Raise InputError if one of these options was given."""
@@ -74,34 +72,20 @@ class Choice:
 
 
 @click.command("bench")
-@click.option("--materials", is_flag=True, help="Measure instead what each law costs, and mixes of two in one scene.")
 @click.option("--dataset", is_flag=True, help="Measure instead how many trajectories an hour a sweep makes.")
-@click.option("--features", is_flag=True, help="Measure instead what colliders, friction, emitters and the like cost.")
-@click.option("--scaling", is_flag=True, help="Measure instead blocks of 1e4 to 1e7 particles.")
 @click.option("--profile", is_flag=True, help="Measure instead what sort, P2G, grid and G2P take, for each law.")
-@click.option("--device", is_flag=True, help="Measure instead what the device can do: copies, launches, atomics.")
-@click.option(
-    "--case", "names", multiple=True, metavar="NAME", help="Only this case, e.g. 3d-128; --scaling 3d. May be repeated."
-)
+@click.option("--case", "names", multiple=True, metavar="NAME", help="Only this case, e.g. 3d-128. May be repeated.")
 @click.option("--quick", is_flag=True, help="Only the cases of up to 10,000 particles.")
-@click.option(
-    "--peers", is_flag=True, help="Every example of the taichi package that computes a fluid; with --scaling too."
-)
+@click.option("--peers", is_flag=True, help="Every example of the taichi package that computes a fluid.")
 @click.option(
     "--threads",
     type=thread_counts,
     metavar="NUMBERS",
     help="CPU threads, all of them by default; 1,2 measures with one and with two.",
 )
-@click.option(
-    "--arch", type=click.Choice(["cpu", "cuda", "vulkan", "metal"]), help="Device of the comparison, or of --device."
-)
-@click.option(
-    "--seconds", type=click.FloatRange(min=0.01), help="Length of a block, by default 2; --dataset 20, --features 0.5."
-)
-@click.option("--blocks", type=COUNT, help="Blocks of each side, by default 5; --dataset 2, --features 15.")
-@time_option("--budget", "Time for --scaling, such as 20m, the default: larger sizes are left out.")
-@click.option("--largest", type=click.FloatRange(min=1e4), help="Most particles of --scaling, such as 1e6.")
+@click.option("--arch", type=click.Choice(["cpu", "cuda", "vulkan", "metal"]), help="Device of the comparison.")
+@click.option("--seconds", type=click.FloatRange(min=0.01), help="Length of a block, by default 2; --dataset 20.")
+@click.option("--blocks", type=COUNT, help="Blocks of each side, by default 5; --dataset 2.")
 @json_option
 def bench_command(as_json: bool, **options: Any) -> int:
     """Compare speed with the MPM examples that the taichi package ships.
@@ -112,22 +96,10 @@ def bench_command(as_json: bool, **options: Any) -> int:
     tells how far the limit of the processor is. With --threads 1,2 each case is measured with one thread and with two:
     speed-up and efficiency.
 
-    With --materials, every law in turn takes the same column of particles, which lands, leans and collapses, through
-    the same steps, on one thread unless --threads says more: time per particle and step, memory per particle, compile
-    time.
-
-    With --features, a pool of water runs in turn as it is and with one feature more, as a ball that moves in it, or
-    friction: ratios of their times, on one thread and on two unless --threads says how many.
-
     With --dataset, a sweep of 1,444 particles of sand and 350 frames is computed and stored, by one worker and by one
     on each of --threads cores in turn: trajectories per hour, and their ratio to the generator of the GNS project.
 
-    With --scaling, blocks of 1e4 to 1e7 particles: ns per particle and step beside those in C, and the exponent of the
-    time in the number of particles, on one thread and on two.
-
     With --profile, each law: ns per particle and step of the sort, P2G, the grid, G2P, and measuring the state.
-
-    With --device, what the device can do whatever runs on it: bandwidth, launches, scattered reads and additions.
     """
     asked = [name for name in TABLES if options.pop(name)]
     choice = Choice(table=asked[0] if asked else None, **options)
@@ -135,11 +107,8 @@ def bench_command(as_json: bool, **options: Any) -> int:
         raise InputError("--dataset has one scene and one table: leave out the other benchmarks, --case and --quick.")
     if len(asked) > 1:
         raise InputError(f"--{asked[0]} and --{asked[1]} make a table each: give one of them.")
-    if choice.table != "scaling":
-        choice.refuse("budget", "largest", why="Only --scaling has sizes of its own:")
-    if choice.table not in (None, "device"):
+    if choice.table:
         choice.refuse("arch", why=f"--{choice.table} runs on the CPU:")
-    if choice.table not in (None, "scaling"):
         choice.refuse("peers", why=f"--{choice.table} has no peers:")
     record, table = _RUN[choice.table](choice)
     if as_json:
@@ -176,22 +145,6 @@ def _comparison(choice: Choice) -> Outcome:
     return run_bench(cases, options), bench_table
 
 
-def _materials(choice: Choice) -> Outcome:
-    from mpmcli.bench.materials import MATERIAL_CASES, cost_table, run_costs
-
-    if choice.quick:
-        raise InputError("--quick is about the comparison; with --materials, --case takes one size.")
-    return run_costs(choice.chosen(MATERIAL_CASES), choice.options((choice.one_count(1),))), cost_table
-
-
-def _features(choice: Choice) -> Outcome:
-    from mpmcli.bench.features import BLOCK, FEATURE_CASES, ROUNDS, feature_table, run_features
-
-    if choice.quick:
-        raise InputError("--features has one table: leave out --quick; --case takes one size.")
-    return run_features(choice.chosen(FEATURE_CASES), choice.options((1, 2), BLOCK, ROUNDS)), feature_table
-
-
 def _dataset(choice: Choice) -> Outcome:
     from mpmcli.bench.throughput import ROUNDS, run_throughput, throughput_table
     from mpmcli.cores import available_cores
@@ -200,44 +153,17 @@ def _dataset(choice: Choice) -> Outcome:
     return run_throughput(options), throughput_table
 
 
-def _scaling(choice: Choice) -> Outcome:
-    from mpmcli.bench.compare import COUNTS, SCALING_BLOCKS, run_scaling, scaling_table
-
-    choice.refuse("quick", why="--scaling takes --largest:")
-    choice.check_names(["2d", "3d"])
-    record = run_scaling(
-        tuple(int(name[0]) for name in sorted(set(choice.names)) or ("2d", "3d")),
-        choice.options((1, 2), blocks=SCALING_BLOCKS, yardstick=_yardstick(), peers=choice.peers),
-        budget=choice.budget or BUDGET,
-        counts=[count for count in COUNTS if count <= (choice.largest or COUNTS[-1])],
-    )
-    return record, scaling_table
-
-
 def _profile(choice: Choice) -> Outcome:
-    from mpmcli.bench.materials import MATERIAL_CASES
+    from mpmcli.bench.column import COLUMN_CASES
     from mpmcli.bench.profile import profile_table, run_profile
 
     choice.refuse("quick", why="--profile takes --case:")
-    cases, threads = choice.chosen(MATERIAL_CASES), (choice.one_count(1),)
+    cases, threads = choice.chosen(COLUMN_CASES), (choice.one_count(1),)
     return run_profile(cases, choice.options(threads, yardstick=_yardstick())), profile_table
-
-
-def _device(choice: Choice) -> Outcome:
-    from mpmcli.bench.device import device_record, device_table, measure_device
-    from mpmcli.solver.machine.backend import start_backend
-
-    choice.refuse("case", "quick", "blocks", why="--device has one table:")
-    backend = start_backend(choice.arch or "auto", choice.one_count(0) or None)
-    return device_record(measure_device(backend, choice.seconds or DEVICE_SECONDS)), device_table
 
 
 _RUN = {
     None: _comparison,
-    "materials": _materials,
-    "features": _features,
     "dataset": _dataset,
-    "scaling": _scaling,
     "profile": _profile,
-    "device": _device,
 }

@@ -13,13 +13,13 @@ from page_section import markdown_table
 from gpu_parts.parts import Setup, Task
 from gpu_parts.report import measured
 from mpmcli.bench.cases import BenchCase
-from mpmcli.bench.materials import SPEED, scene_of
+from mpmcli.bench.column import SPEED, column_of
 from mpmcli.cores import available_cores
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import parse_scene
 
 LAWS = ("fluid", "neo_hookean", "snow", "sand")
-# The column of `mpmcli bench --materials` falls to the floor within 31 ms, and lands. In these steps an elastic wave
+# The column of `mpmcli bench --profile` falls to the floor within 31 ms, and lands. In these steps an elastic wave
 # crosses a ninth of a cell.
 CELLS, SECONDS = {2: 48, 3: 24}, 0.045
 STEP = {2: 1.0e-4, 3: 2.0e-4}
@@ -112,7 +112,7 @@ def run(arch: str, case: Case) -> dict[str, np.ndarray | float]:
     from mpmcli.solver.machine.backend import choose_backend, start
 
     size = BenchCase(dimension=case.dimension, cells=CELLS[case.dimension], particles=0, step=STEP[case.dimension])
-    data = scene_of([case.law], size, case.precision)
+    data = column_of(case.law, size, case.precision)
     scene = parse_scene(data, laws=parameter_models(), source=data["title"]).scene
     # On the CPU the bytes are the same, and compiled sooner.
     backend = choose_backend(arch, 1, case.precision, optimisation="few" if arch == "cpu" else None)
