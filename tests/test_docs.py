@@ -26,7 +26,7 @@ PAGES = {"README.md": README} | {
     f"docs/{path.name}": path.read_text(encoding="utf-8") for path in sorted((ROOT / "docs").glob("*.md"))
 }
 # Figures of studies, without commands.
-STUDIES = {"docs/hard-cases.md", "docs/performance.md", "docs/shading.md", "docs/stable-step.md"}
+STUDIES = {"docs/hard-cases.md", "docs/performance.md"}
 
 # Commands that are run in a shorter form. The README gives the one of the demo itself.
 SHORTER = {

@@ -1,18 +1,15 @@
 """The page on datasets: its tables are complete, its code runs, and its workflow for CI makes a dataset."""
 
-import importlib.util
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 import yaml
 from command import ROOT
-from made_dataset import made_dataset
 from made_sweep import made_workers, make_dataset  # noqa: F401
 
 import mpmcli.dataset
@@ -119,41 +116,6 @@ def test_the_commands_of_the_workflow_make_a_dataset(tmp_path):
     assert run_steps(jobs["merge"], None) == ["dataset"]
     assert mpmcli.dataset.open(tmp_path / "dataset").numbers == tuple(range(8))
     assert (tmp_path / "dataset" / "README.md").exists()
-
-
-@pytest.fixture
-def example(monkeypatch) -> ModuleType:
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    path = ROOT / "scripts" / "train_one_layer.py"
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_windows_of_the_example_are_displacements(example, tmp_path):
-    dataset = mpmcli.dataset.open(made_dataset(tmp_path / "set"))
-    windows = example.Windows(dataset, dataset.splits["train"])
-    # 11 frames of each of two trajectories, in windows of 7.
-    assert len(windows) == 2 * 5
-    past, following = windows[6]
-    position = dataset[1].position.astype(np.float64)
-    assert past.shape == (24, 5, 2) and following.shape == (24, 2)
-    np.testing.assert_allclose(past[:, 2], position[4] - position[3], atol=1e-7)
-    np.testing.assert_allclose(following, position[7] - position[6], atol=1e-7)
-
-
-def test_the_example_trains_or_says_why_not(example, tmp_path, monkeypatch, capsys):
-    path = made_dataset(tmp_path / "set")
-    monkeypatch.setattr(sys, "argv", ["train_one_layer.py", str(path), "--steps", "40"])
-    example.main()
-    said = capsys.readouterr().out
-    assert said.startswith("10 windows of 7 frames\n")
-    if importlib.util.find_spec("torch") is None:
-        assert "PyTorch is not installed here" in said
-    else:
-        first, last = map(float, re.findall(r"([\d.e-]+) (?:at first|after)", said))
-        assert last < first
 
 
 def test_the_page_names_no_machine():

@@ -15,8 +15,7 @@ from mpmcli.scene.schema import NEARLY_INCOMPRESSIBLE
 # In bulk the pressure itself adds stiffness, because particles carry it with them: pressure waves see the sum of the
 # tangent modulus and the pressure (docs/theory.md, 6.6). For a fluid of p = K (1/J - 1) that is K at any J. At J = 0.5
 # and 0.3, where the sum exceeds the tangent modulus of a lone particle, one particle per cell at a random position
-# becomes unstable at 0.956 and 0.969 of h/c, c = sqrt(K / density). The factor covers that
-# (`scripts/stable_step_study`).
+# becomes unstable at 0.956 and 0.969 of h/c, c = sqrt(K / density). The factor covers that.
 CARRIED = 1.2
 # Lower bound on J and on stretches, which keeps their logarithms finite.
 SMALLEST = 1e-6

@@ -149,7 +149,7 @@ def depth_shaded(
 ) -> np.ndarray:
     """Darken what lies deeper than its surroundings (eye-dome lighting, C. Boucheny, PhD thesis, Grenoble 2009).
 
-    VTK's eye-dome lighting and SSAO were compared with it, and take three to five times as long (docs/shading.md).
+    VTK's eye-dome lighting and SSAO were compared with it, and take three to five times as long.
     The picture is (h, w, 3) uint8, the depth (h * samples, w * samples), m, inf where there is nothing; `dots` is the
     depth of what is compared, where there is more in the picture: the rest is not darkened.
     """

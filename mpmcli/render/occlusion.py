@@ -1,6 +1,6 @@
 """Occlusion: the fraction of the lamp's and of the sky's light that reaches a point past the particles.
 
-Found on a coarse grid over the domain. VTK's SSAO was compared with it (docs/shading.md): it casts no
+Found on a coarse grid over the domain. VTK's SSAO was compared with it: it casts no
 shadows, takes six times as long or more, and is not reproducible.
 """
 

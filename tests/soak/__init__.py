@@ -1,1 +1,0 @@
-"""A soak: scenes computed again and again in one process, with their laws, their bytes and the memory watched."""
