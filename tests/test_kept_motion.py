@@ -1,6 +1,6 @@
 """What bodies keep of their motion in steps shorter than their own (docs/theory.md, 2.3)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from mpmcli.validation.cases import all_cases
 SOFT = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e4, "poissons_ratio": 0.3}
 
 
-def meeting(stiffer: float, *, safety: float = 0.8, **solver: object) -> Scene:
+def meeting(stiffer: float, *, safety: float = 0.8, beside: Sequence[dict] = (), **solver: object) -> Scene:
     """Return two free balls that meet off centre, the second of a modulus that is `stiffer` times as large."""
     balls = (("soft", [0.7, 0.9], 1.0, 1.0), ("stiff", [1.35, 1.05], -1.0, stiffer))
     return scene_of(
@@ -32,7 +32,8 @@ def meeting(stiffer: float, *, safety: float = 0.8, **solver: object) -> Scene:
                 "velocity": [speed, 0.0],
             }
             for name, center, speed, factor in balls
-        ],
+        ]
+        + [*beside],
     )
 
 
@@ -143,6 +144,36 @@ def test_plastic_flow_is_as_far_at_any_step(backend_of: Callable, name: str) -> 
         scene = scene_of_case(case, 8, Setting(safety=0.8 / n))
         found = case.measure(8, scene, build_run(scene, backend_of("f64", 1)).frames())
         assert max(map(abs, found.values())) < 4e-3, n
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "measure", "tolerance"),
+    [
+        ("two_disks", 20, "energy loss", 0.05),
+        pytest.param("conservation_contact", 8, "energy loss", 0.02, marks=pytest.mark.slow),
+        pytest.param("conservation", 8, "energy loss", 0.02, marks=pytest.mark.slow),
+        pytest.param("taylor_green", 16, "decay error", 0.05, marks=pytest.mark.slow),
+        pytest.param("dam_break", 16, "front error", 0.05, marks=pytest.mark.slow),
+        pytest.param("bar_fixed_fixed", 13, "energy loss", 0.05, marks=pytest.mark.slow),
+        pytest.param("bar_fixed_free", 13, "energy loss", 0.2, marks=pytest.mark.slow),
+        pytest.param("spinning_disc", 4, "energy loss", 0.35, marks=pytest.mark.slow),
+    ],
+)
+def test_the_table_of_what_steps_lose(backend_of: Callable, name: str, n: int, measure: str, tolerance: float) -> None:
+    """Of docs/theory.md, 2.3: what validation cases lose in steps of 1, 1/5 and 1/50."""
+    case, lost = all_cases()[name], []
+    for part in (1, 5, 50):
+        scene = scene_of_case(case, n, Setting(safety=0.8 / part))
+        lost.append(case.measure(n, scene, build_run(scene, backend_of("f64", 1)).frames())[measure])
+    assert lost[1:] == pytest.approx([lost[0]] * 2, rel=tolerance)
+
+
+def test_a_stiff_bystander_takes_nothing(backend_of: Callable) -> None:
+    """Two balls that meet lose as much energy beside a body at rest whose steps are a tenth as long."""
+    shape = {"box": {"min": [0.9, 1.5], "max": [1.1, 1.7]}}
+    stiff = {"name": "bystander", "material": SOFT | {"youngs_modulus": 1e6}, "shape": shape}
+    backend = backend_of("f64", 1)
+    assert lost(meeting(1.0, beside=[stiff]), backend) == pytest.approx(lost(meeting(1.0), backend), rel=0.1)
 
 
 def test_volumes_relax_as_far_at_any_step(backend_of: Callable) -> None:

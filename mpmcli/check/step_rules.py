@@ -68,12 +68,12 @@ def step_findings(facts: SceneFacts) -> Iterator[Finding]:
             yield Finding("warning", "step-above-safety", what, fix, step / limit.value, limit.body)
             return
     if step < SMALL_STEP * facts.step:
+        pic = facts.scene.solver.transfer == "pic"
+        damps = " and loses as many times the energy, as PIC damps per step" if pic else ""
         what = (
             f"{asked} {facts.step / step:.3g} times smaller than the stable step, {facts.step:.4g} s: the run takes as "
-            "many times longer"
+            f"many times longer{damps}."
         )
-        pic = " and loses as many times the energy, as PIC damps per step"
-        what += pic * (facts.scene.solver.transfer == "pic") + "."
         fix = f'Set time.step to {facts.step:.4g} s, or to "auto".'
         yield Finding("warning", "small-step", what, fix, step / facts.step)
 

@@ -60,15 +60,11 @@ class Choice:
         return BenchOptions(self.threads or threads, progress=_progress, **times, **others)
 
     def chosen(self, known: "tuple[BenchCase, ...]") -> "list[BenchCase]":
-        """Return the cases that were asked for."""
-        self.check_names([case.name for case in known])
+        """Return the cases that were asked for; InputError: one is not among them."""
+        names = [case.name for case in known]
+        if unknown := [name for name in self.names if name not in names]:
+            raise InputError(f'there is no case "{unknown[0]}"; the cases are {", ".join(names)}.')
         return [case for case in known if not self.names or case.name in self.names]
-
-    def check_names(self, known: list[str]) -> None:
-        """Refuse a --case that is not among these."""
-        unknown = [name for name in self.names if name not in known]
-        if unknown:
-            raise InputError(f'there is no case "{unknown[0]}"; the cases are {", ".join(known)}.')
 
 
 @click.command("bench")
@@ -105,8 +101,6 @@ def bench_command(as_json: bool, **options: Any) -> int:
     choice = Choice(table=asked[0] if asked else None, **options)
     if "dataset" in asked and (len(asked) > 1 or choice.names or choice.quick):
         raise InputError("--dataset has one scene and one table: leave out the other benchmarks, --case and --quick.")
-    if len(asked) > 1:
-        raise InputError(f"--{asked[0]} and --{asked[1]} make a table each: give one of them.")
     if choice.table:
         choice.refuse("arch", why=f"--{choice.table} runs on the CPU:")
         choice.refuse("peers", why=f"--{choice.table} has no peers:")

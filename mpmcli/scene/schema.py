@@ -178,7 +178,7 @@ class Impulse(Table):
 
 # Poisson's ratio above which bodies lock without `f_bar`: a beam of four cells is 5 % too stiff at 0.45, 13 % at 0.49.
 NEARLY_INCOMPRESSIBLE = 0.45
-# Default of FLIP's share in AFLIP: a twentieth of the loss of APIC.
+# Default share of AFLIP: half of the loss of APIC.
 USUAL_FLIP = 0.5
 
 
