@@ -127,17 +127,6 @@ def few_optimisations() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def stored_as_text() -> Iterator[None]:
-    """Let all commands and processes share compiled kernels, without machine code, which takes longer than it saves.
-
-    A test that changes what kernels are made from, other than in files, asks for `own_kernels`.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("MPMCLI_KERNEL_STORE", "text")
-        yield
-
-
 @pytest.fixture
 def own_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let runs of a test neither take stored kernels nor store theirs."""

@@ -1,13 +1,13 @@
 """Stored kernels are those that would be compiled, and whatever happens to their files, no other code runs."""
 
+import ast
 import errno
-import hashlib
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,7 +19,6 @@ from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.engine import batch, kernel_store
 from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.engine.compiled_kind import CompiledKind
-from mpmcli.solver.machine import machine_code
 from mpmcli.solver.machine.backend import Backend, choose_backend, start, stop_backend
 
 
@@ -56,7 +55,6 @@ def outcome(scene: Scene, threads: int = 1, *, compile_cache: bool = True) -> Ou
         return Outcome(frame.position.tobytes() + frame.velocity.tobytes(), run.batch.launch_cpu.stored)
     finally:
         stop_backend()
-        kernel_store.finish()
 
 
 @pytest.fixture
@@ -64,7 +62,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder of Taichi's files of its own, with the store."""
     stop_backend()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.delenv(kernel_store.SWITCH)
     yield tmp_path / "taichi" / "ticache"
     stop_backend()
 
@@ -122,7 +119,7 @@ HARMS = {
     ],
 )
 def test_a_file_that_is_harmed_is_not_run(folder: Path, harm: str, which: str) -> None:
-    """Of the two files that hold the kernel one is harmed, or both: it is compiled anew, and stored in two runs."""
+    """Of the two files that hold the kernel one is harmed, or both: it is compiled anew."""
     scene = drop()
     fresh = outcome(scene)
     for path in kernels_in(folder)[{"first": slice(0, 1), "second": slice(1, 2), "all": slice(None)}[which]]:
@@ -133,69 +130,7 @@ def test_a_file_that_is_harmed_is_not_run(folder: Path, harm: str, which: str) -
             path.write_bytes(content)
     found = [outcome(scene) for _ in range(3)]
     assert {one.frame for one in found} == {fresh.frame}
-    assert found[-1].stored and (which != "all" or not found[0].stored)
-
-
-def solids() -> Scene:
-    """Return a scene with two laws in 3D and a collider."""
-    balls = {
-        name: {"name": name, "material": material, "shape": {"ball": {"center": [x, 0.5, 0.5], "radius": 0.15}}}
-        for name, x, material in (
-            ("snow", 0.3, {"law": "snow", "density": 400.0, "youngs_modulus": 1e5}),
-            ("sand", 0.7, {"law": "sand", "density": 1600.0, "youngs_modulus": 1e5, "friction_angle": 30.0}),
-        )
-    }
-    return drop(
-        domain={"size": [1.0, 1.0, 1.0], "spacing": 0.1, "gravity": [0.0, -9.81, 0.0], "walls": "slip"},
-        bodies=[*balls.values()],
-        colliders=[{"name": "stone", "shape": {"ball": {"center": [0.5, 0.2, 0.5], "radius": 0.1}}}],
-    )
-
-
-@pytest.mark.skipif(not machine_code.can_be_made(), reason="needs Linux and llvmlite, the extra quick")
-@pytest.mark.parametrize(
-    ("scene", "threads"),
-    [
-        pytest.param(drop, 1, id="fluid-1"),
-        pytest.param(drop, 2, id="fluid-2", marks=pytest.mark.slow),
-        pytest.param(solids, 2, id="solids-2", marks=pytest.mark.slow),
-    ],
-)
-def test_machine_code_has_the_bytes_of_the_kernel(
-    folder: Path, usual_optimisations: None, scene: Callable[[], Scene], threads: int
-) -> None:
-    """One of the two files has machine code, and the other LLVM's text; with either, the bytes are the same."""
-    fresh = outcome(scene(), threads, compile_cache=False)
-    assert outcome(scene(), threads) == fresh
-    text, code = sorted(kernels_in(folder), key=lambda path: b"module asm" in path.read_bytes())
-    assert b"module asm" not in text.read_bytes() and b"module asm" in code.read_bytes()
-    assert code.stat().st_size < text.stat().st_size
-    assert outcome(scene(), threads) == replace(fresh, stored=True)
-    code.write_bytes(text.read_bytes())
-    assert outcome(scene(), threads) == replace(fresh, stored=True)
-
-
-@pytest.mark.skipif(not machine_code.can_be_made(), reason="needs Linux and llvmlite, the extra quick")
-def test_no_machine_code_is_made_of_what_is_not_a_kernel(tmp_path: Path) -> None:
-    """Not of a file that is cut, of text that LLVM does not read, or that may mean another sum; they stay."""
-    name = "launch_0"
-    kernel = f"define void @{name}_a({{ i8* }}* %context) {{\n  ret void\n}}\n"
-    sum_of = f"declare float @llvm.fmuladd.f32(float, float, float)\n{kernel}"
-
-    def file_of(text: str) -> bytes:
-        body = b"{}" + text.encode()
-        digest = hashlib.sha256(body).hexdigest().encode()
-        return machine_code.HEAD.pack(b"0000", 0, 2, len(text)) + body + digest
-
-    path = tmp_path / "a.tic"
-    for content in (file_of(kernel)[:-1], file_of(kernel.replace("ret", "rot")), file_of(sum_of), file_of(""), b""):
-        path.write_bytes(content)
-        _, status = os.waitpid(machine_code.make_in_background(path, name), 0)
-        assert path.read_bytes() == content
-        assert machine_code.is_sound(content) == (status != 0) or content == file_of("")
-    path.write_bytes(file_of(kernel))
-    os.waitpid(machine_code.make_in_background(path, name), 0)
-    assert machine_code.is_sound(path.read_bytes()) and b"module asm" in path.read_bytes()
+    assert which != "all" or not found[0].stored
 
 
 def test_a_file_that_cannot_be_written_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -206,9 +141,9 @@ def test_a_file_that_cannot_be_written_stays(tmp_path: Path, monkeypatch: pytest
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(machine_code.os, "replace", full)
+    monkeypatch.setattr(kernel_store.os, "replace", full)
     with pytest.raises(OSError, match="No space left"):
-        machine_code.write(path, b"other")
+        kernel_store._write(path, b"other")
     assert [*tmp_path.iterdir()] == [path] and path.read_bytes() == b"whole"
 
 
@@ -222,7 +157,7 @@ def test_the_key_has_all_that_a_kernel_is_made_from(folder: Path, monkeypatch: p
         run = build_run(scene, backend)
         kind = CompiledKind.of(scene, sample_bodies(scene)).roomy()
         assert kind == run.batch.kind
-        found, _ = kernel_store.kernel_key(kind, backend, runs)
+        found = kernel_store.kernel_key(kind, backend, runs)
         stop_backend()
         return found
 
@@ -267,14 +202,27 @@ def test_sources_are_all_that_kernels_import(tmp_path: Path, monkeypatch: pytest
         for name in ("solver/grid/grid.py", "materials/fluid.py", "scene/schema.py", "stability/transfer_factors.py"):
             path = tmp_path / name
             text = path.read_text(encoding="utf-8")
-            path.write_text(text + "\n# changed", encoding="utf-8")
+            path.write_text(text + "\nchanged = True\n", encoding="utf-8")
             assert digest() != usual, name
+            path.write_text(text.replace('"""', '"""Changed. ', 1) + "# changed\n", encoding="utf-8")
+            assert digest() == usual, name
             path.write_text(text, encoding="utf-8")
             assert digest() == usual
         (tmp_path / "cli" / "simulate.py").write_text("", encoding="utf-8")
         assert digest() == usual
     finally:
         kernel_store._sources.cache_clear()
+
+
+def test_prose_is_docstrings_and_comments() -> None:
+    """Of every module that kernels are made from, the digest leaves out the docstrings, and no more."""
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    for path in kernel_store._files():
+        source = path.read_bytes()
+        nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, documented)]
+        lines = sorted(node.body[0].lineno for node in nodes if ast.get_docstring(node) is not None)
+        prose = [match for match in kernel_store.PROSE.finditer(source) if match[0].lstrip().startswith(b'"""')]
+        assert [source.count(b"\n", 0, match.start()) + 1 for match in prose] == lines, path
 
 
 def test_what_is_not_known_is_not_stored(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -205,67 +205,27 @@ def repair_command(directory: Path, as_json: bool) -> int:
 
 
 @click.command("doctor")
-@click.option(
-    "--kernels",
-    type=PATH,
-    multiple=True,
-    metavar="SCENE",
-    help="Compare, in place of all that, the stored kernels of a scene with fresh ones. May be repeated.",
-)
 @json_option
-def doctor_command(kernels: tuple[Path, ...], as_json: bool) -> int:
+def doctor_command(as_json: bool) -> int:
     """Say whether everything that mpmcli needs works on this machine.
 
     Python, Taichi and its backends, VTK and its window, libraries, disk and memory are tried, each in a process of
     its own, and get one line each, with the remedy where something is wrong. The exit code is 1 where something
-    needed is missing or broken; a GPU that is not here is neither.
+    needed is broken; a GPU that is not here is not.
     """
-    from mpmcli.doctor.examination import EXAMINATIONS, examine
+    from mpmcli.doctor.examination import CHECKS, examine
 
-    if kernels:
-        return _compare_kernels(kernels, as_json)
-    width = max(len(each.name) for each in EXAMINATIONS)
-    checks, faults = [], []
-    for name, result in examine(EXAMINATIONS):
-        checks.append({"name": name, "status": result.status, "detail": result.detail, "remedy": result.remedy})
-        faults += [name] if result.is_fault else []
+    width = max(map(len, CHECKS))
+    checks = []
+    for name, found in examine():
+        checks.append({"name": name, "status": found.status, "detail": found.detail, "remedy": found.remedy})
         if not as_json:
-            remedy = f"; {result.remedy}" if result.remedy else ""
-            print_text(f"{result.status:<11}  {name:<{width}}  {result.detail}{remedy}")
+            remedy = f"; {found.remedy}" if found.remedy else ""
+            print_text(f"{found.status:<11}  {name:<{width}}  {found.detail}{remedy}")
+    faults = [check["name"] for check in checks if check["status"] == "broken"]
     if as_json:
         print_json({"ok": not faults, "checks": checks})
-    elif faults:
-        print_text(f"\nnot everything that mpmcli needs works: {', '.join(faults)}")
     else:
-        print_text("\neverything that mpmcli needs works")
+        verdict = f"not everything that mpmcli needs works: {', '.join(faults)}" if faults else "everything works"
+        print_text(f"\n{verdict}")
     return 1 if faults else 0
-
-
-def _compare_kernels(scenes: tuple[Path, ...], as_json: bool) -> int:
-    """Run scenes with stored kernels, which are made before where there are none, and with fresh ones."""
-    from mpmcli.cli.interrupt import interrupt_came
-    from mpmcli.materials.registry import parameter_models
-    from mpmcli.scene import load_scene
-    from mpmcli.simulation.warm import STEPS, Warmed, warm
-
-    def outcome(path: Path, steps: int = 0, *, fresh: bool = False) -> Warmed:
-        return next(iter(warm([path], 1, "cpu", steps=steps, fresh=fresh, stop=interrupt_came)))
-
-    for path in scenes:
-        load_scene(path, laws=parameter_models())
-    checks = []
-    for path in scenes:
-        made, stored, fresh = outcome(path), outcome(path, STEPS), outcome(path, STEPS, fresh=True)
-        detail = next((one.fault for one in (made, stored, fresh) if one.fault), "")
-        if not detail and not stored.stored:
-            detail = "no kernel is stored, as of a law of a plugin, or where the folder cannot be written"
-        same = stored.digest == fresh.digest
-        status = "broken" if (detail and not stored.digest) or not same else "information" if detail else "ok"
-        detail = detail or f"{STEPS} steps of the stored kernel have {'the' if same else 'other'} bytes of a fresh one"
-        checks.append({"name": str(path), "status": status, "detail": detail})
-        if not as_json:
-            print_text(f"{status:<11}  {path}  {detail}")
-    broken = any(check["status"] == "broken" for check in checks)
-    if as_json:
-        print_json({"ok": not broken, "checks": checks})
-    return 1 if broken else 0

@@ -1,7 +1,7 @@
-"""Tries every component that mpmcli needs in a separate process, so that a crash affects only one, in order."""
+"""Tries each component that mpmcli needs in a process of its own: `python -m mpmcli.doctor.examination NAME`."""
 
 import importlib.metadata
-import io
+import json
 import os
 import platform
 import re
@@ -9,393 +9,175 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from mpmcli import __version__
-from mpmcli.errors import MpmcliError
 from mpmcli.plain_text import counted, size_text
-from mpmcli.processes.questions import Question, Reply, answering, ask_each, module_command
+from mpmcli.processes.questions import answering
 
-# "missing" and "broken" are faults: a required component is absent or does not work.
-Status = Literal["ok", "information", "missing", "broken"]
-# System libraries that the wheels of required packages load, and their Debian and Ubuntu packages.
-SYSTEM_PACKAGES = {
-    "libX11.so.6": "libx11-6",
-    "libXrender.so.1": "libxrender1",
-    "libGL.so.1": "libgl1",
-    "libEGL.so.1": "libegl1",
-    "libstdc++.so.6": "libstdc++6",
-    "libgcc_s.so.1": "libgcc-s1",
-    "libz.so.1": "zlib1g",
-}
-STATUSES: tuple[Status, ...] = ("ok", "information", "missing", "broken")
 # As in pyproject.toml.
 OLDEST, NEWEST = (3, 11), (3, 13)
-# Bytes. Below this a run of the size of the demo may not fit.
-LITTLE_DISK = LITTLE_MEMORY = 1e9
-# Bytes. Below this nothing useful can be written.
+# Processes at once; they mostly load libraries. Their time limit, s, and that of ffmpeg.
+AT_ONCE, TIMEOUT, FFMPEG_TIMEOUT = 2, 120.0, 20.0
+# Less disk is a fault, bytes.
 NO_DISK = 1e7
-CGROUP = Path("/sys/fs/cgroup")
-# Time limit of ffmpeg, s. It usually takes 0.1 s.
-FFMPEG_TIMEOUT = 20.0
-# Number of concurrent processes. They mostly load libraries.
-AT_ONCE = 2
-# Time limit, s. Loading a large library from a cold disk may take most of it.
-TIMEOUT = 60.0
-# Time limit for three window types, s.
-WINDOW_TIMEOUT = 400.0
-# Maximum length of a detail, characters.
-LONGEST = 300
+# Packages, and what they are imported as.
+PACKAGES = {name: name for name in ("pyvista", "pysplashsurf", "matplotlib", "h5py", "meshio")} | {"pillow": "PIL"}
+# System libraries that packages load, and their Debian packages.
+SYSTEM_PACKAGES = {"libX11": "libx11-6", "libXrender": "libxrender1", "libGL": "libgl1", "libEGL": "libegl1"}
 
 
 @dataclass(frozen=True)
-class ProbeResult:
-    """One line of the report: a status, the detail, and what the user can do, "" if nothing is required."""
+class Check:
+    """One line of the report: `detail` is what was found, `remedy` what the user can do, "" for nothing."""
 
-    status: Status
+    status: Literal["ok", "information", "broken"]
     detail: str
     remedy: str = ""
 
-    @property
-    def is_fault(self) -> bool:
-        """Whether a required component is missing or broken."""
-        return self.status in ("missing", "broken")
 
-
-def package_remedy(package: str, *, again: bool = False) -> str:
-    """Return the command that installs, or reinstalls, a package in the version that mpmcli requires."""
-    return f"{'install it again' if again else 'install it'} by `python -m pip install {_requirement(package, again)}`"
-
-
-def library_remedy(complaint: str) -> str:
-    """Return how to install the system library that the dynamic linker did not find; "" if none is named."""
-    missed = re.search(r"(lib[\w.+-]*\.so[\d.]*): (?:cannot open shared object|file too short)", complaint)
-    if missed is None:
-        return ""
-    library = missed[1]
-    package = SYSTEM_PACKAGES.get(library)
-    by = f", on Debian and Ubuntu by `apt-get install {package}`" if package else ""
-    return f"install the system's package of {library}{by}"
-
-
-def _requirement(package: str, again: bool) -> str:
-    try:
-        listed = importlib.metadata.requires("mpmcli") or []
-    except importlib.metadata.PackageNotFoundError:
-        listed = []
-    # Without extras such as "; extra == 'test'".
-    found = [line for line in listed if re.split(r"[^\w.-]", line)[0].lower() == package.lower() and ";" not in line]
-    return ("--force-reinstall " if again else "") + f'"{found[0] if found else package}"'
-
-
-def python(version: tuple[int, int] = sys.version_info[:2]) -> ProbeResult:
+def python(version: tuple[int, int] = sys.version_info[:2]) -> Check:
     """Examine the version of the interpreter."""
-    kind = "virtual environment" if sys.prefix != sys.base_prefix else "no virtual environment,"
-    detail = f"{platform.python_version()}, {kind} {sys.prefix}"
+    detail = f"{platform.python_version()}, {sys.prefix}"
     if OLDEST <= version <= NEWEST:
-        return ProbeResult("ok", detail)
+        return Check("ok", detail)
     oldest, newest = (".".join(map(str, numbers)) for numbers in (OLDEST, NEWEST))
-    return ProbeResult("broken", detail, f"install mpmcli into an environment of Python {oldest} to {newest}")
+    return Check("broken", detail, f"install mpmcli into an environment of Python {oldest} to {newest}")
 
 
-def mpmcli() -> ProbeResult:
+def mpmcli() -> Check:
     """Examine the package."""
-    return ProbeResult("ok", f"{__version__}, {Path(__file__).resolve().parent.parent}")
+    return Check("ok", f"{__version__}, {Path(__file__).resolve().parent.parent}")
 
 
-def cpu() -> ProbeResult:
-    """Examine the CPU backend, which is required."""
-    from mpmcli.solver.machine.backend import try_backend
-
-    started = try_backend("cpu")
-    version = importlib.metadata.version("taichi")
-    return ProbeResult("ok", f"Taichi {version}, {counted(started.threads, 'thread')}")
-
-
-def gpu(arch: str) -> ProbeResult:
-    """Examine a backend of GPUs: CUDA, Metal, or Vulkan, whose device may be a software renderer."""
-    try:
-        from mpmcli.solver.machine.backend import backend_is_here, try_backend
-    except ImportError as error:
-        return ProbeResult("information", f"not tried, since Taichi cannot be loaded ({error})")
-    if not backend_is_here(arch):
-        return ProbeResult("information", "not here")
-    try_backend(arch)
+def taichi(arch: str) -> Check:
+    """Examine a backend by starting it. A GPU that is not here is no fault."""
     from mpmcli.doctor.devices import device_names
+    from mpmcli.solver.machine.backend import backend_is_here, try_backend
 
+    if arch == "cpu":
+        threads = try_backend("cpu").threads
+        return Check("ok", f"Taichi {importlib.metadata.version('taichi')}, {counted(threads, 'thread')}")
+    if not backend_is_here(arch):
+        return Check("information", "not here")
+    try_backend(arch)
     devices = device_names(arch)
     names = ", ".join(device.name for device in devices) or "device of unknown name"
     if devices and all(device.is_software for device in devices):
-        return ProbeResult("information", f"software only: {names}", "--arch cpu uses the processor directly")
-    return ProbeResult("ok", names)
+        return Check("information", f"software only: {names}", "--arch cpu uses the processor directly")
+    return Check("ok", names)
 
 
-def vtk() -> ProbeResult:
-    """Examine VTK by drawing. A missing window may abort the process, so each window is tried in a separate one."""
+def vtk() -> Check:
+    """Examine VTK by drawing a picture off screen."""
+    from mpmcli.render.window import choose_window
+
+    name = choose_window()
     from vtkmodules.vtkCommonCore import vtkVersion
+    from vtkmodules.vtkRenderingCore import vtkRenderWindow
 
-    from mpmcli.render.window import remedy, try_windows, why_none
-
-    version = vtkVersion.GetVTKVersion()
-    attempts = list(try_windows())
-    window = attempts[-1].window
-    if window is None:
-        return ProbeResult("missing", f"{version}, no OpenGL window opens ({why_none(attempts)})", remedy(attempts))
-    return ProbeResult("ok", f"{version}, {window.name} on {window.renderer}, OpenGL {window.version}")
+    window = vtkRenderWindow()
+    window.SetOffScreenRendering(True)
+    window.Render()
+    facts = dict(line.split(" string:", 1) for line in window.ReportCapabilities().splitlines() if " string:" in line)
+    words = [vtkVersion.GetVTKVersion(), name, *(facts.get(f"OpenGL {fact}", "") for fact in ("renderer", "version"))]
+    return Check("ok", ", ".join(word.strip() for word in words if word))
 
 
-def importable(package: str) -> ProbeResult:
+def package(name: str, module: str) -> Check:
     """Examine a package by importing it."""
-    return ProbeResult("ok", importlib.import_module(package).__version__)
+    importlib.import_module(module)
+    return Check("ok", importlib.metadata.version(name))
 
 
-def pysplashsurf() -> ProbeResult:
-    """Examine pysplashsurf by reconstructing the surface of a cube of particles."""
-    import numpy as np
-    import pysplashsurf
-
-    axis = np.arange(4, dtype=np.float32)
-    cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    surface, _ = pysplashsurf.reconstruction_pipeline(
-        cube, particle_radius=0.5, smoothing_length=2.0, cube_size=1.0, iso_surface_threshold=0.6
-    )
-    version = importlib.metadata.version("pysplashsurf")
-    if not surface.ncells:
-        return ProbeResult("broken", f"{version}, finds no surface around a cube of particles")
-    return ProbeResult("ok", version)
-
-
-def pillow() -> ProbeResult:
-    """Examine Pillow by drawing a letter."""
-    import PIL
-    from PIL import Image, ImageDraw
-
-    ImageDraw.Draw(Image.new("RGB", (16, 16))).text((0, 0), "a")
-    return ProbeResult("ok", PIL.__version__)
-
-
-def hdf5() -> ProbeResult:
-    """Examine h5py by writing and reading back a file in memory, with the filters of results."""
-    import h5py
-    import numpy as np
-
-    versions = f"h5py {h5py.version.version}, HDF5 {h5py.version.hdf5_version}"
-    values = np.arange(3000, dtype=np.float32).reshape(1000, 3)
-    with io.BytesIO() as memory:
-        with h5py.File(memory, "w", libver=("v110", "v110")) as file:
-            file.create_dataset("values", data=values, chunks=(100, 3), compression="gzip", shuffle=True)
-        with h5py.File(memory, "r") as file:
-            stored = file["values"]
-            filters = [name for name, on in (("gzip", stored.compression == "gzip"), ("shuffle", stored.shuffle)) if on]
-            intact = np.array_equal(stored[:], values)
-    if not intact or len(filters) < 2:
-        return ProbeResult("broken", f"{versions}, gzip and shuffle do not give back what was written")
-    return ProbeResult("ok", f"{versions}, filters gzip and shuffle")
-
-
-def ffmpeg() -> ProbeResult:
-    """Examine ffmpeg, which encodes films, by encoding one image."""
+def ffmpeg() -> Check:
+    """Examine ffmpeg by encoding one image as films are."""
     import imageio_ffmpeg
 
-    try:
-        program = imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
-        return ProbeResult("missing", str(error).partition("\n")[0], package_remedy("imageio-ffmpeg", again=True))
-    remedy = "unset IMAGEIO_FFMPEG_EXE if it is set, or " + package_remedy("imageio-ffmpeg", again=True)
-    try:
-        version = imageio_ffmpeg.get_ffmpeg_version()
-    except (OSError, subprocess.CalledProcessError, ValueError) as error:
-        reason = f"exited with {error.returncode}" if isinstance(error, subprocess.CalledProcessError) else error
-        return ProbeResult("broken", f"{program} is no ffmpeg that runs ({reason})", remedy)
-    source = ["-f", "lavfi", "-i", "color=s=16x16", "-frames:v", "1"]
-    done = subprocess.run(
-        [program, "-v", "error", *source, "-c:v", "libx264", "-f", "null", "-"],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        errors="replace",
-        timeout=FFMPEG_TIMEOUT,
-    )
-    if done.returncode:
-        first = (done.stderr.strip().splitlines() or [f"exited with {done.returncode}"])[0]
-        return ProbeResult("broken", f"{version}, libx264 does not encode ({first}): {program}", remedy)
-    return ProbeResult("ok", f"{version}, encoder libx264")
+    program = imageio_ffmpeg.get_ffmpeg_exe()
+    source = ["-f", "lavfi", "-i", "color=s=16x16", "-frames:v", "1", "-c:v", "libx264", "-f", "null", "-"]
+    subprocess.run([program, "-v", "error", *source], check=True, timeout=FFMPEG_TIMEOUT, stdin=subprocess.DEVNULL)
+    return Check("ok", f"{program}, encoder libx264")
 
 
-def current_directory() -> ProbeResult:
-    """Examine the current directory, the default place of results."""
-    place = Path.cwd()
-    try:
-        free = _writable_bytes(place)
-    except OSError as error:
-        remedy = "go to a directory of your own, or name one by -o"
-        return ProbeResult("broken", f"{place} cannot be written ({error.strerror})", remedy)
-    detail = f"{place}, writable, {size_text(free)} free"
-    if free >= LITTLE_DISK:
-        return ProbeResult("ok", detail)
-    status = "broken" if free < NO_DISK else "information"
-    return ProbeResult(status, detail, "free some space, or name another disk by -o")
+def writable(place: Path) -> Check:
+    """Examine a directory by making a file in it."""
+    place.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=place):
+        free = shutil.disk_usage(place).free
+    status = "ok" if free >= NO_DISK else "broken"
+    return Check(status, f"{place}, writable, {size_text(free)} free", "" if status == "ok" else "free some space")
 
 
-def kernel_cache() -> ProbeResult:
-    """Examine the cache of compiled kernels, which is optional."""
-    place = Path(os.environ.get("XDG_CACHE_HOME") or Path(os.path.expanduser("~")) / ".cache") / "taichi"
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-        free = _writable_bytes(place)
-    except OSError as error:
-        detail = f"{place} cannot be written ({error.strerror}), so kernels are kept among temporary files"
-        return ProbeResult("information", detail, "make it writable, or let XDG_CACHE_HOME name a directory that is")
-    detail = f"{place}, writable, {size_text(free)} free"
-    return ProbeResult("ok", detail) if free >= NO_DISK else ProbeResult("information", detail, "free some space")
+def kernel_cache() -> Path:
+    """Return the directory of compiled kernels."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
 
 
-def memory() -> ProbeResult:
-    """Examine the memory available to a run."""
+def memory() -> Check:
+    """Examine the memory of this machine."""
     import psutil
 
-    whole = psutil.virtual_memory()
-    free, detail = whole.available, f"{size_text(whole.total)}, {size_text(whole.available)} free"
-    limit = memory_limit()
-    if limit is not None and limit < whole.total:
-        free = min(free, limit)
-        detail += f", the container may take {size_text(limit)}"
-    if free < LITTLE_MEMORY:
-        return ProbeResult("information", detail, "end other programs, or simulate fewer particles")
-    return ProbeResult("ok", detail)
+    found = psutil.virtual_memory()
+    return Check("ok", f"{size_text(found.total)}, {size_text(found.available)} free")
 
 
-def cores() -> ProbeResult:
-    """Examine the number of cores available to a run."""
-    there = os.cpu_count() or 1
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else there
-    detail = f"{usable} of {there} usable"
-    limit = processor_limit()
-    if limit is None or limit >= usable:
-        return ProbeResult("ok", detail)
-    detail += f", the container may take the time of {limit:.3g}"
-    return ProbeResult("information", detail, f"simulate with --threads {max(1, int(limit))}")
+# In the order of the report; a driver, or a cache, that is broken is no fault of what runs without it.
+CHECKS: dict[str, Callable[[], Check]] = {
+    "python": python,
+    "mpmcli": mpmcli,
+    **{f"taichi {arch}": partial(taichi, arch) for arch in ("cpu", "cuda", "vulkan", "metal")},
+    "vtk": vtk,
+    **{name: partial(package, name, module) for name, module in PACKAGES.items()},
+    "ffmpeg": ffmpeg,
+    "directory": lambda: writable(Path.cwd()),
+    "kernel cache": lambda: writable(kernel_cache()),
+    "memory": memory,
+}
+OPTIONAL = ("taichi vulkan", "kernel cache")
 
 
-def memory_limit(root: Path = CGROUP) -> int | None:
-    """Return the memory limit of the container, bytes, from Linux control groups v2 or v1; None without a limit."""
-    words = _words(root / "memory.max") or _words(root / "memory" / "memory.limit_in_bytes")
-    return int(words[0]) if words and words[0].isdigit() else None
+def examine() -> Iterator[tuple[str, Check]]:
+    """Yield (name, result) of every check, in order."""
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        yield from zip(CHECKS, pool.map(_asked, CHECKS), strict=True)
 
 
-def processor_limit(root: Path = CGROUP) -> float | None:
-    """Return the processor limit of the container, in cores; None without a limit."""
-    words = _words(root / "cpu.max") or [
-        word for name in ("cpu.cfs_quota_us", "cpu.cfs_period_us") for word in _words(root / "cpu" / name)
-    ]
-    if len(words) != 2 or not all(word.isdigit() for word in words) or not int(words[1]):
-        return None  # "max" or -1
-    return int(words[0]) / int(words[1])
-
-
-def _writable_bytes(place: Path) -> int:
-    """Return the free bytes of a directory in which a file can be made."""
-    with tempfile.TemporaryFile(dir=place):
-        return shutil.disk_usage(place).free
-
-
-def _words(path: Path) -> list[str]:
+def _asked(name: str) -> Check:
+    """Return the result of a check in a process of its own, which may crash."""
+    command = [sys.executable, "-P", "-m", "mpmcli.doctor.examination", name]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
     try:
-        return path.read_text().split()
-    except OSError:
-        return []
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, env=environment)
+        return Check(**json.loads(done.stdout.splitlines()[-1]))
+    except subprocess.TimeoutExpired:
+        return _fault(name, f"took longer than {TIMEOUT:g} s")
+    except (ValueError, IndexError, TypeError):
+        return _fault(name, f"its process ended with {done.returncode}. {done.stderr.strip()[-200:]}")
 
 
-@dataclass(frozen=True)
-class Examination:
-    """One component to examine.
-
-    `examine` imports the libraries it needs. A broken `package` (a distribution, "" for none) is reinstalled, unless
-    there is another `remedy`. mpmcli requires what is `needed`. The time limit is in s.
-    """
-
-    name: str
-    examine: Callable[[], ProbeResult]
-    package: str = ""
-    remedy: str = ""
-    needed: bool = True
-    timeout: float = TIMEOUT
-
-
-DRIVER = "mend or remove the driver; --arch cpu runs without it"
-EXAMINATIONS = (
-    Examination("python", python),
-    Examination("mpmcli", mpmcli, "mpmcli"),
-    Examination("taichi cpu", cpu, "taichi"),
-    # --arch auto selects CUDA if it is available.
-    Examination("taichi cuda", partial(gpu, "cuda"), "taichi", DRIVER),
-    Examination("taichi vulkan", partial(gpu, "vulkan"), "taichi", DRIVER, needed=False),
-    Examination("taichi metal", partial(gpu, "metal"), "taichi", DRIVER),
-    Examination("vtk", vtk, "vtk", timeout=WINDOW_TIMEOUT),
-    Examination("pyvista", partial(importable, "pyvista"), "pyvista"),
-    Examination("pysplashsurf", pysplashsurf, "pysplashsurf"),
-    Examination("matplotlib", partial(importable, "matplotlib"), "matplotlib"),
-    Examination("pillow", pillow, "pillow"),
-    Examination("hdf5", hdf5, "h5py"),
-    Examination("ffmpeg", ffmpeg, "imageio-ffmpeg"),
-    Examination("directory", current_directory, remedy="go to a directory that exists"),
-    Examination("kernel cache", kernel_cache, needed=False),
-    Examination("memory", memory, "psutil"),
-    Examination("cores", cores, needed=False),
-)
-
-
-def examine(examinations: Sequence[Examination] = EXAMINATIONS) -> Iterator[tuple[str, ProbeResult]]:
-    """Yield (name, result) of every examination, in order."""
-    command = module_command("mpmcli.doctor.examination")
-    questions = [Question([*command, each.name], each.timeout, leads_a_group=True) for each in examinations]
-    for each, reply in zip(examinations, ask_each(questions, AT_ONCE), strict=True):
-        yield each.name, judge(each, reply)
-
-
-def attempt(each: Examination) -> ProbeResult:
-    """Examine in this process. Exceptions become faults."""
-    try:
-        return each.examine()
-    except ModuleNotFoundError as error:
-        # A package that lacks one of its own modules is broken.
-        if error.name and "." not in error.name:
-            return _fault(each, "missing", f"the package {error.name} is not installed")
-        return _fault(each, "broken", f"{type(error).__name__}: {error}")
-    except MpmcliError as error:
-        return _fault(each, "broken", str(error).rstrip("."))
-    except Exception as error:
-        return _fault(each, "broken", f"{type(error).__name__}: {error}")
-
-
-def judge(each: Examination, reply: Reply) -> ProbeResult:
-    """Return the result from the reply of the process of an examination."""
-    if reply.answer.get("status") not in STATUSES:
-        return _fault(each, "broken", f"its trial {reply.fault or 'gave no answer'}")
-    result = ProbeResult(**reply.answer)
-    result = replace(result, detail=_line(result.detail))
-    if reply.fault and not result.is_fault:
-        return _fault(each, "broken", f"{result.detail}; then its trial {reply.fault}")
-    return result
-
-
-def _fault(each: Examination, status: str, detail: str) -> ProbeResult:
-    remedy = library_remedy(detail) or each.remedy
-    if each.package and not (remedy and status == "broken"):
-        remedy = package_remedy(each.package, again=status == "broken")
-    return ProbeResult(status if each.needed else "information", _line(detail), remedy)
-
-
-def _line(detail: str) -> str:
-    """Return a detail as one line. A long one is shortened in the middle."""
-    line = " ".join(detail.split())
-    return line if len(line) <= LONGEST else f"{line[: LONGEST // 3]} ... {line[-2 * LONGEST // 3 :]}"
+def _fault(name: str, detail: str) -> Check:
+    """Return a fault, with the system library to install where one is missing."""
+    missed = re.search(r"(lib\w+)[\w.+-]*: cannot open shared object", detail)
+    remedy = "install mpmcli again"
+    if missed:
+        remedy = f"install the system's package of {missed[1]}"
+        if missed[1] in SYSTEM_PACKAGES:
+            remedy += f", on Debian and Ubuntu by `apt-get install {SYSTEM_PACKAGES[missed[1]]}`"
+    elif name.startswith("taichi ") and name != "taichi cpu":
+        remedy = "mend or remove the driver; --arch cpu runs without it"
+    return Check("information" if name in OPTIONAL else "broken", " ".join(detail.split())[-300:], remedy)
 
 
 if __name__ == "__main__":
     with answering() as answer:
-        answer(**asdict(attempt(next(each for each in EXAMINATIONS if each.name == sys.argv[1]))))
+        try:
+            result = CHECKS[sys.argv[1]]()
+        except Exception as error:
+            result = _fault(sys.argv[1], f"{type(error).__name__}: {error}")
+        answer(**asdict(result))

@@ -1,11 +1,10 @@
-"""Compiles the kernels of scenes ahead, and compares stored kernels with fresh ones, each in a process of its own.
+"""Compiles the kernels of scenes ahead, each in a process of its own.
 
-    python -m mpmcli.simulation.warm SCENE '{"arch": "cpu", "threads": null, "steps": 0, "fresh": false}'
+    python -m mpmcli.simulation.warm SCENE '{"arch": "cpu", "threads": null}'
 
 is such a process; it ends with its parent.
 """
 
-import hashlib
 import json
 import sys
 import time
@@ -17,8 +16,6 @@ from mpmcli.processes.questions import Question, answering, ask_as_ended, end_wi
 
 # Time limit of a process, s.
 TIMEOUT = 1800.0
-# Steps over which kernels are compared, at least.
-STEPS = 50
 # No step of a scene is as small, s: it compiles, and computes nothing worth keeping.
 NO_STEP = 1e-12
 
@@ -29,14 +26,12 @@ class Warmed:
 
     Attributes:
         stored: whether a stored kernel was found; seconds: of wall time.
-        digest: of positions and velocities after the steps, "" without steps.
         fault: why there is no outcome, "" if there is one.
     """
 
     scene: Path
     stored: bool = False
     seconds: float = 0.0
-    digest: str = ""
     fault: str = ""
 
 
@@ -45,23 +40,12 @@ def warm(
     at_once: int,
     arch: str = "auto",
     threads: int | None = None,
-    *,
-    steps: int = 0,
-    fresh: bool = False,
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Warmed]:
-    """Run each scene in a process of its own, as far as its kernels are compiled, and yield outcomes as they end.
-
-    Args:
-        steps: to take at least, after which the state is compared.
-        fresh: compile all kernels, and store none.
-    """
-    asked = json.dumps({"arch": arch, "threads": threads, "steps": steps, "fresh": fresh})
-    environment = {"MPMCLI_KERNEL_STORE": "off"} if fresh else {}
-    questions = (
-        Question(module_command("mpmcli.simulation.warm", str(path), asked), TIMEOUT, environment, follows=True)
-        for path in scenes
-    )
+    """Take a step of each scene in a process of its own, and yield outcomes as they end."""
+    asked = json.dumps({"arch": arch, "threads": threads})
+    command = module_command("mpmcli.simulation.warm")
+    questions = (Question([*command, str(path), asked], TIMEOUT, follows=True) for path in scenes)
     for number, reply in ask_as_ended(questions, at_once, stop):
         if reply.fault:
             last = (reply.complaint.splitlines() or [""])[-1]
@@ -75,7 +59,6 @@ def main() -> None:
     from mpmcli.scene import load_scene
     from mpmcli.simulation.engine import backend_for
     from mpmcli.solver.engine.build import build_run
-    from mpmcli.solver.engine.kernel_store import finish
     from mpmcli.solver.machine.backend import start, stop_backend
 
     began = time.perf_counter()
@@ -83,24 +66,13 @@ def main() -> None:
     end_with_parent()
     with answering() as answer:
         scene = load_scene(path, laws=parameter_models()).scene
-        backend = backend_for(scene, asked["arch"], asked["threads"], compile_cache=not asked["fresh"])
+        backend = backend_for(scene, asked["arch"], asked["threads"])
         start(backend)
         run = build_run(scene, backend)
-        digest = hashlib.sha256()
-        if asked["steps"]:
-            taken = 0
-            for frame, row in run.frames():
-                digest.update(frame.position.tobytes() + frame.velocity.tobytes())
-                taken += row.steps
-                if taken >= asked["steps"]:
-                    break
-        else:
-            run.step(NO_STEP)
+        run.step(NO_STEP)
         stored = backend.on_cpu and run.batch.launch_cpu.stored
         stop_backend()
-        finish()
-        seconds = time.perf_counter() - began
-        answer(stored=stored, seconds=seconds, digest=digest.hexdigest() if asked["steps"] else "")
+        answer(stored=stored, seconds=time.perf_counter() - began)
 
 
 if __name__ == "__main__":

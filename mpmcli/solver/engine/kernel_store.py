@@ -4,14 +4,15 @@ Taichi keeps compiled kernels in files, by a key of their intermediate form, whi
 store has a key of all that a kernel is made from. A stub, a kernel of a few lines that Taichi finds in a millisecond,
 holds that key in its source; the file that Taichi keeps for the stub is replaced, once both have been written, by that
 of the kernel, and from then on the stub is the kernel. Taichi compares the checksum of a file: where it is damaged or
-gone, the stub is compiled as what it is, and leaves a mark; then the kernel itself is launched. A process beside that
-makes machine code of the text of LLVM in the stub's file.
+gone, the stub is compiled as what it is, and leaves a mark; then the kernel itself is launched.
 """
 
 import contextlib
 import hashlib
 import os
 import platform
+import re
+import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -26,25 +27,25 @@ from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.cpu_launch import CpuLaunch, Notes
 from mpmcli.solver.engine.cpu_phases import RunInts, RunReals, Shown
 from mpmcli.solver.machine.backend import Backend, after_stop
-from mpmcli.solver.machine.machine_code import can_be_made, is_sound, make_in_background, write
 
 # Versions of Taichi whose files test_kernel_store.py has been run with.
 KNOWN_VERSIONS = ((1, 7, 4),)
 PACKAGE = Path(__file__).resolve().parents[2]
+# A file of Taichi: magic, architecture, lengths of what follows; description, code; SHA-256 of both in hexadecimal.
+HEAD = struct.Struct("<4sIQQ")
+DIGEST = 64
 # Parts of the package that kernels are made from: what they import is among them, or a module beside them.
 SOURCES = ("scene", "frames", "stability", "materials", "boundaries", "solver")
+# What no kernel depends on: docstrings, which begin a line, and lines of comments.
+PROSE = re.compile(rb'^ *""".*?"""\n|^ *#[^\n]*\n', re.MULTILINE | re.DOTALL)
 # Clocks of a file system and of this machine differ by less, s.
 CLOCKS = 2.0
 # What the stub leaves in notes[0, 0, 0], which is never negative otherwise.
 MARK = -(2**30)
-# Where this variable is "off", kernels are neither stored nor found: for who changes modules while they run. Where it
-# is "text", no machine code is made.
+# Where this variable is "off", kernels are neither stored nor found: for who changes modules while they run.
 SWITCH = "MPMCLI_KERNEL_STORE"
-# Keys of kernels that this process has compiled; of each the file, among Taichi's own, that counts its losses, and when
-# its compilation began, s.
+# Keys of kernels that this process has compiled, the folder of Taichi's files, and when compilation began, s.
 _compiled: dict[str, tuple[Path, float]] = {}
-# Processes that make machine code.
-_processes: list[int] = []
 
 
 class StoredLaunch:
@@ -67,7 +68,7 @@ class StoredLaunch:
     def _first(self, numbers: np.ndarray, counts: np.ndarray, shown: np.ndarray, notes: np.ndarray) -> None:
         key = ""
         if self._may_store():
-            key, losses = kernel_key(self._kind, self._backend, self._launch.device.runs)
+            key = kernel_key(self._kind, self._backend, self._launch.device.runs)
             stub, noted = stub_kernel(key), notes[0, 0, 0]
             stub(numbers, counts, shown, notes)
             if notes[0, 0, 0] != MARK:
@@ -75,7 +76,7 @@ class StoredLaunch:
                 return
             notes[0, 0, 0] = noted
             self._launch.token = words_of(key)
-            _compiled[key] = losses, time.time()
+            _compiled[key] = Path(ti.lang.impl.current_cfg().offline_cache_file_path), time.time()
             after_stop(store_compiled)
         with _named(CpuLaunch.launch._primal.func, f"launch_{key}" if key else "launch"):
             self._launch.launch(numbers, counts, shown, notes)
@@ -116,24 +117,15 @@ def stub_kernel(key: str) -> Callable[..., None]:
     return ti.kernel(stub)
 
 
-def kernel_key(kind: CompiledKind, backend: Backend, runs: int) -> tuple[str, Path]:
-    """Return a key of all that the kernel of a batch is made from, with its fields in their places, and a file.
-
-    Taichi does not write a file again that is lost: the file that is returned counts such losses, and the key changes
-    with it.
-    """
+def kernel_key(kind: CompiledKind, backend: Backend, runs: int) -> str:
+    """Return a key of all that the kernel of a batch is made from, with its fields in their places."""
     ti.lang.impl.get_runtime().materialize()
     config = ti.lang.impl.current_cfg()
     # Those that no code depends on, of which Taichi leaves one as memory was.
     beside = ("_", "print_", "offline_cache")
     settings = [(name, str(getattr(config, name))) for name in dir(config) if not name.startswith(beside)]
-    base = _digest(repr((kind, backend, runs, settings, _layout(), _machine(), _sources())))
-    losses = Path(config.offline_cache_file_path) / f"mpmcli-{base}"
-    return _digest(f"{base} {_text(losses)}"), losses
-
-
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
+    facts = (kind, backend, runs, settings, _layout(), _machine(), _sources())
+    return hashlib.sha256(repr(facts).encode()).hexdigest()[:32]
 
 
 def _layout() -> list[tuple]:
@@ -173,53 +165,49 @@ def _unchanged_since(began: float) -> bool:
 
 @cache
 def _sources() -> str:
-    """Return a digest of the modules that kernels are made from."""
+    """Return a digest of the modules that kernels are made from, without their prose."""
     digest = hashlib.sha256()
     for path in _files():
-        digest.update(f"{path.relative_to(PACKAGE)}\0".encode() + path.read_bytes() + b"\0")
+        digest.update(f"{path.relative_to(PACKAGE)}\0".encode() + PROSE.sub(b"", path.read_bytes()) + b"\0")
     return digest.hexdigest()
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError:
-        return ""
 
 
 def store_compiled() -> None:
     """Let stubs be the kernels that this process has compiled; Taichi has written the files of both."""
     while _compiled:
-        key, (losses, began) = _compiled.popitem()
+        key, (folder, began) = _compiled.popitem()
         with contextlib.suppress(OSError):
-            # Their files are new, unless something went wrong earlier.
-            if not (_store(key, losses.parent, began - CLOCKS) or _store(key, losses.parent, 0.0)):
-                write(losses, f"{_text(losses)}+".encode())
+            # Their files are new, unless a process was killed here.
+            _store(key, folder, began - CLOCKS) or _store(key, folder, 0.0)
 
 
 def _store(key: str, folder: Path, since: float) -> bool:
     """Let the stub of a key be its kernel, if both are among the files that were written since then, s."""
-    stub_name, kernel_name = f"stub_{key}".encode(), f"launch_{key}".encode()
-    places, kernels = [], []
-    for path in folder.glob("*.tic"):
-        if path.stat().st_mtime < since:
-            continue
-        content = path.read_bytes()
-        if kernel_name in content and is_sound(content):
-            kernels.append(content)
-        elif kernel_name in content or stub_name in content:
-            places.append(path)
-    if len(kernels) == 1 and places:
-        write(places[0], kernels[0])
-        if can_be_made() and os.environ.get(SWITCH) != "text":
-            _processes.append(make_in_background(places[0], f"launch_{key}"))
-        return True
+    paths = [path for path in folder.glob("*.tic") if path.stat().st_mtime >= since]
+    contents = [(path, path.read_bytes()) for path in paths]
+    kernels = [one for _, one in contents if f"launch_{key}".encode() in one and _is_sound(one)]
+    stubs = [path for path, one in contents if f"stub_{key}".encode() in one]
+    if len(kernels) == 1 and stubs:
+        _write(stubs[0], kernels[0])
     # Two are a kernel and its stub, which another process has replaced.
-    return len(kernels) > 1
+    return bool(kernels and (stubs or kernels[1:]))
 
 
-def finish() -> None:
-    """Wait until machine code has been made of what was stored."""
-    while _processes:
-        with contextlib.suppress(ChildProcessError):
-            os.waitpid(_processes.pop(), 0)
+def _is_sound(content: bytes) -> bool:
+    """Return whether a file of Taichi has the checksum that it states."""
+    if len(content) < HEAD.size + DIGEST:
+        return False
+    _, _, described, code = HEAD.unpack_from(content)
+    body, digest = content[HEAD.size : -DIGEST], content[-DIGEST:]
+    return len(body) == described + code and hashlib.sha256(body).hexdigest().encode() == digest
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Replace a file, or make it, at once; OSError: it could not be written, and is as it was."""
+    part = path.parent / f"mpmcli-{os.getpid()}.part"
+    try:
+        part.write_bytes(content)
+        os.replace(part, path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
