@@ -12,7 +12,7 @@ from mpmcli.bench import peers
 from mpmcli.bench.cases import DENSITY, EDGE, BenchCase
 from mpmcli.errors import RunError
 
-needs_gcc = pytest.mark.skipif(not peers.is_here(), reason="gcc, which compiles the yardstick, is not here")
+needs_gcc = pytest.mark.skipif(not peers.has_compiler(), reason="gcc, which compiles the yardstick, is not here")
 # Cells enough that there are tiles of every colour, and steps enough that particles are sorted again.
 CASES = (
     BenchCase(dimension=2, cells=32, particles=1_500, step=8e-4),
@@ -80,14 +80,13 @@ def test_physics_is_that_of_mpmcli(states: Callable, case: BenchCase) -> None:
     expected, speeds = states(
         case,
         f"""
-from mpmcli.bench.ours import Ours, particles_of, scene_of
-data = scene_of(case, "f64")
+from mpmcli.bench.ours import Ours, falling_block
+data, (particles,) = falling_block(case, "f64")
 data["domain"]["walls"] = "slip"
 data["solver"]["walls"] = "zeroed"
 data["solver"]["redistribute"] = False
 data["bodies"][0]["material"]["tension_cutoff"] = False
-particles = [replace(particles_of(case), velocity=v)]
-side = Ours(data, case.step, particles, threads=1, precision="f64", arch="cpu", force=True)
+side = Ours(data, [replace(particles, velocity=v)], 1)
 # The yardstick's first step begins with a whole step of gravity, leapfrog with half a step.
 side.run.begin()
 side.run.state.last_step = case.step
@@ -117,7 +116,7 @@ def test_source_compiles_without_a_warning(tmp_path: Path, monkeypatch: pytest.M
 class TestWhereItCannotBe:
     def test_no_gcc_is_a_sentence(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("PATH", "/nowhere")
-        assert not peers.is_here()
+        assert not peers.has_compiler()
         with pytest.raises(RunError, match="needs gcc, which cannot be run"):
             peers.load_yardstick(2)
 
@@ -128,11 +127,6 @@ class TestWhereItCannotBe:
         monkeypatch.setattr(peers, "YARDSTICK", broken)
         with pytest.raises(RunError, match="cannot compile the yardstick in C"):
             peers.load_yardstick(2)
-
-    @pytest.mark.parametrize(("precision", "arch"), [("f64", "cpu"), ("f32", "cuda")])
-    def test_other_precisions_and_devices_are_refused(self, precision: str, arch: str) -> None:
-        with pytest.raises(RunError, match=f"not in {precision} on {arch}"):
-            peers.block_in_c(CASES[0], threads=1, precision=precision, arch=arch)
 
 
 @needs_gcc

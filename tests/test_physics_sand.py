@@ -1,4 +1,4 @@
-"""Sand that is tossed and lands (docs/hard-cases.md, H16), and what relaxes its volume (docs/theory.md, 5.11).
+"""Sand that is tossed and lands (tests/hard_cases, H16), and what relaxes its volume (docs/theory.md, 5.11).
 
 How it collapses and shears is in the validation cases.
 """

@@ -4,14 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# The fluid of both examples, in their units: a unit box, density 1, p = -E (J - 1).
+# The fluid of the examples, in their units: a unit box, density 1, p = -E (J - 1).
 DENSITY = 1.0
 BULK_MODULUS = 400.0
 GRAVITY = 9.8
 # Initial downward speed of mpm88, here of every block: particles change cells, and sorting is part of the step.
 SPEED = 1.0
-# Contestants of mpmcli: the fluid block, a solid in its place, and the fluid with sums in fixed point on a GPU.
-BLOCKS = ("ours", "solid", "deterministic")
 # Lower corner and edge of the block in the example mpm88; mpm3d starts at 0.15, with the same edge.
 CORNER = 0.2
 EDGE = 0.4
@@ -36,11 +34,6 @@ class BenchCase:
         """The example of the taichi package that solves the same problem."""
         return "mpm3d" if self.dimension == 3 else "mpm88"
 
-    @property
-    def other_peers(self) -> tuple[str, ...]:
-        """Other examples of the taichi package that can solve it."""
-        return () if self.dimension == 3 else ("mpm99", "mpm128")
-
     def positions(self) -> np.ndarray:
         """Return the initial positions, (particles, dimension) float64: uniform in the block."""
         return CORNER + EDGE * np.random.default_rng(0).random((self.particles, self.dimension))
@@ -49,16 +42,16 @@ class BenchCase:
         """Return the initial velocity, (dimension,) float64, m/s."""
         return np.array([0.0, -SPEED, 0.0][: self.dimension])
 
-    def scene(self, title: str, bodies: list[dict], gravity: float, end: float = 1.0, **solver: str | bool) -> dict:
-        """Return bodies in the unit box as the dictionary of a scene file."""
+    def scene(self, body: dict, gravity: float, precision: str) -> dict:
+        """Return a body in the unit box as the dictionary of a scene file."""
         d = self.dimension
         domain = {"size": [1.0] * d, "cells": [self.cells] * d, "gravity": [0.0, -gravity, 0.0][:d]}
         return {
-            "title": f"{title}, {self.name}",
+            "title": f"{body['name']}, {self.name}",
             "domain": domain | {"walls": "separate"},
-            "time": {"end": end, "frames": 1, "step": self.step},
-            "bodies": bodies,
-            "solver": solver,
+            "time": {"end": 1.0, "frames": 1, "step": self.step},
+            "bodies": [body],
+            "solver": {"precision": precision},
         }
 
 

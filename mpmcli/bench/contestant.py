@@ -1,42 +1,22 @@
-"""Process of one contestant, controlled by commands on stdin, one per line.
+"""A contestant of a benchmark: a simulation in a process of its own, that steps when it is asked to."""
 
-    python -m mpmcli.bench.contestant ours|solid|deterministic|peer|mpm128|yardstick|profile:LAW
-        --dimension 3 --cells 128 --particles 524288 --step 8e-5 [--threads 2] [--precision f32] [--arch cpu]
-
-It answers on stdout, one JSON object per line, and waits for commands on stdin without using the processor:
-
-    (start)        {"particles": 524288, "bytes_per_particle": 88 or null, "threads": 2}     ready to step
-    first          {"seconds": 2.9}                                            one step, kernels compiled
-    skip STEPS     {}                                                          takes steps that are not measured
-    run SECONDS    {"steps": 31, "seconds": 1.02, "processor_seconds": 1.01}   steps for about that long
-    phases         {"p2g": 0.4, "g2p": 0.5}                                    time in each since the last such command
-    finish         {"sound": true, "smallest_step": 8e-5, "peak_memory": 219152384}    and ends
-
-With "profile:" before the name of a law, the contestant is the column of `mpmcli.bench.column`, which answers to
-`phases`, as the yardstick does.
-
-A failure is answered by {"error": "a sentence"} and ends the process with status 1.
-"""
-
-import argparse
-import sys
+import multiprocessing
+import os
+import statistics
+import tempfile
 import time
-from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import Protocol, get_type_hints
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from typing import Any, Protocol, Self
 
-from mpmcli.bench.cases import BLOCKS, BenchCase
-from mpmcli.errors import MpmcliError
-from mpmcli.processes.questions import answering
+from mpmcli.errors import MpmcliError, RunError
 
 
 class Contestant(Protocol):
-    """A simulation that can be measured; only columns and the yardstick have phases."""
+    """A simulation that can be measured."""
 
     particles: int
-    bytes_per_particle: int | None
     threads: int
-    smallest_step: float
 
     def advance(self, count: int) -> int:
         """Take about `count` time steps and return how many; may return before the device is done."""
@@ -45,105 +25,119 @@ class Contestant(Protocol):
         """Wait until every requested step is done."""
 
     def is_sound(self) -> bool:
-        """Whether every particle is in the domain."""
-
-    def phases(self) -> dict[str, float]:
-        """Return the time in each phase of a step since the last call, s."""
+        """Whether every particle is in the domain, and every step was that of the case."""
 
 
-def run_block(contestant: Contestant, seconds: float) -> tuple[int, float]:
-    """Step for about `seconds` and return (steps, seconds taken), device included."""
+def run_block(contestant: Contestant, seconds: float) -> tuple[int, float, float]:
+    """Step once, and on for about `seconds`; return (steps, seconds taken, of processor time), device included."""
     steps, chunk, elapsed = 0, 1, 0.0
-    start = time.perf_counter()
-    while elapsed < seconds:
+    begin, busy = time.perf_counter(), time.process_time()
+    while steps == 0 or elapsed < seconds:
         steps += contestant.advance(chunk)
         contestant.sync()
-        elapsed = time.perf_counter() - start
+        elapsed = time.perf_counter() - begin
         # Few waits for the device, and no overshoot: grow until what is left limits the next chunk.
-        left = int(steps / elapsed * (seconds - elapsed)) + 1
-        chunk = max(1, min(2 * chunk, left))
-    return steps, elapsed
+        chunk = max(1, min(2 * chunk, int(steps / elapsed * (seconds - elapsed)) + 1))
+    return steps, elapsed, time.process_time() - busy
 
 
-def peak_memory() -> int:
-    """Return the largest resident memory that this process has had, in bytes."""
-    status = Path("/proc/self/status")
-    if status.exists():
-        # Not getrusage: on Linux its maximum includes that of the parent which started this process.
-        line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
-        return int(line.split()[1]) * 1024
-    import psutil
-
-    memory = psutil.Process().memory_info()
-    if hasattr(memory, "peak_wset"):
-        return memory.peak_wset
-    import resource
-
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # macOS: bytes
-
-
-def serve(start: Callable[[], Contestant], commands: Iterable[str], answer: Callable[..., None]) -> int:
-    """Start a contestant and obey the commands until `finish` or their end; return the exit status."""
+def serve(pipe: Connection, log: str, make: Callable[[], Contestant]) -> None:
+    """Make a contestant and apply what is asked of it, until that is None; an error is the answer, and the end."""
+    # What Taichi prints, and the last words of a crash; settings of Taichi from outside would reach only one side.
+    output = os.open(log, os.O_WRONLY)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
+    for name in [name for name in os.environ if name.startswith("TI_")]:
+        del os.environ[name]
     try:
-        contestant = start()
-        answer(**{name: getattr(contestant, name) for name in ("particles", "bytes_per_particle", "threads")})
-        for command in commands:
-            match command.split():
-                case ["first"]:
-                    begin = time.perf_counter()
-                    contestant.advance(1)
-                    contestant.sync()
-                    answer(seconds=time.perf_counter() - begin)
-                case ["run", seconds]:
-                    busy = time.process_time()
-                    steps, elapsed = run_block(contestant, float(seconds))
-                    answer(steps=steps, seconds=elapsed, processor_seconds=time.process_time() - busy)
-                case ["skip", steps]:
-                    contestant.advance(int(steps))
-                    contestant.sync()
-                    answer()
-                case ["phases"]:
-                    answer(**contestant.phases())
-                case ["finish"]:
-                    end = {"sound": contestant.is_sound(), "smallest_step": contestant.smallest_step}
-                    answer(**end, peak_memory=peak_memory())
-                    break
+        contestant = make()
+        pipe.send((contestant.particles, contestant.threads))
+        while (asked := pipe.recv()) is not None:
+            act, *arguments = asked
+            pipe.send(act(contestant, *arguments))
     except MpmcliError as error:
-        answer(error=str(error))
-        return 1
-    return 0
+        pipe.send(error)
 
 
-def _contestant(who: str, case: BenchCase, **options: str | int) -> Contestant:
-    if who in ("peer", "yardstick", *case.other_peers):
-        from mpmcli.bench.peers import Peer, block_in_c
+class Side:
+    """The process of a contestant, and what its blocks have cost."""
 
-        if who == "yardstick":
-            return block_in_c(case, **options)
-        return Peer(case, None if who == "peer" else who, **options)
-    if who in BLOCKS:
-        from mpmcli.bench.ours import falling_block
+    def __init__(self, name: str, make: Callable[[], Contestant], *, by_processor: bool) -> None:
+        """Start, and compile the kernels by a first step; RunError: it cannot.
 
-        return falling_block(case, who, **options)
-    from mpmcli.bench.profile import PROFILE, ProfiledColumn
+        Args:
+            make: makes the contestant, in its process.
+            by_processor: whether costs are processor time, which excludes other processes, or wall time.
+        """
+        self.name, self._by_processor = name, by_processor
+        self.blocks: list[float] = []
+        self._log = tempfile.NamedTemporaryFile(mode="r", errors="replace")  # noqa: SIM115
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=serve, args=(theirs, self._log.name, make), daemon=True)
+        begin = time.perf_counter()
+        self._process.start()
+        theirs.close()
+        try:
+            self.particles, self.threads = self._answer()
+            self.start_seconds = time.perf_counter() - begin
+            self.compile_seconds = self.ask(run_block, 0.0)[1]
+        except BaseException:
+            self.close()
+            raise
 
-    return ProfiledColumn(who.removeprefix(PROFILE), case, **options)
+    def ask(self, act: Callable[..., Any], *arguments: object) -> Any:
+        """Return act(contestant, *arguments), as its process computes it; RunError: it has failed."""
+        self._pipe.send((act, *arguments))
+        return self._answer()
+
+    def measure(self, seconds: float) -> int:
+        """Measure a block, and return the number of steps; its cost, ns per particle and step, is in `blocks`."""
+        steps, wall, processor = self.ask(run_block, seconds)
+        self.blocks.append(1e9 * (processor if self._by_processor else wall) / steps / self.particles)
+        return steps
+
+    @property
+    def cost(self) -> float:
+        """Median of the blocks, ns per particle and step."""
+        return statistics.median(self.blocks)
+
+    def facts(self) -> dict[str, Any]:
+        """Return what was measured, for JSON."""
+        return {
+            "threads": self.threads,
+            "ns_per_particle_step": self.cost,
+            "ns_per_particle_step_blocks": self.blocks,
+            "start_s": self.start_seconds,
+            "compile_s": self.compile_seconds,
+            "sound": self.ask(is_sound),
+        }
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.join()
+        self._pipe.close()
+        self._log.close()
+
+    def _answer(self) -> Any:
+        try:
+            answer = self._pipe.recv()
+        except EOFError:
+            self._process.join()
+            words = " ".join(self._log.read().strip().splitlines()[-3:])
+            answer = RunError(f"its process ended with {self._process.exitcode}. {words}")
+        if isinstance(answer, MpmcliError):
+            raise RunError(f"{self.name} cannot be measured: {answer}")
+        return answer
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
-def main() -> int:
-    """Run one contestant."""
-    parser = argparse.ArgumentParser(prog="python -m mpmcli.bench.contestant")
-    parser.add_argument("who", help="see above")
-    for name, kind in get_type_hints(BenchCase).items():
-        parser.add_argument(f"--{name}", type=kind, required=True)
-    parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--precision", choices=["f32", "f64"], default="f32")
-    parser.add_argument("--arch", default="cpu")
-    options = vars(parser.parse_args())
-    who, case = options.pop("who"), BenchCase(*(options.pop(name) for name in get_type_hints(BenchCase)))
-    with answering() as answer:
-        return serve(lambda: _contestant(who, case, **options), sys.stdin, answer)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def is_sound(contestant: Contestant) -> bool:
+    """Ask a contestant whether it is sound."""
+    return contestant.is_sound()

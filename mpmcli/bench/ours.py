@@ -1,34 +1,52 @@
-"""The contestants of mpmcli: the same block, as a scene, and a solid in its place."""
+"""The contestants of mpmcli: the falling block, and the column of a law."""
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 
 from mpmcli.bench.cases import BULK_MODULUS, CORNER, DENSITY, EDGE, GRAVITY, BenchCase
-from mpmcli.materials.registry import parameter_models
+from mpmcli.errors import RunError
+from mpmcli.materials.registry import laws, parameter_models
 from mpmcli.scene import BodyParticles, estimate_particles, parse_scene, sample_bodies
+from mpmcli.scene.material import Knob, MaterialParameters
 
-# Of the solid block, whose waves are as fast as those of the fluid.
-POISSONS_RATIO = 0.2
+# Of a step that results from the division of an interval into equal steps.
+ROUND_OFF = 1e-6
+# The column: parameters by the names that laws share, so that a new law needs no entry. Strengths are well below the
+# stress of the weight (up to 7 kPa) and of the impact (about 20 kPa), so that plastic laws flow.
+VALUES = {
+    "density": 1000.0,
+    "youngs_modulus": 4e5,
+    "poissons_ratio": 0.3,
+    "bulk_modulus": 4e5,
+    "yield_stress": 1e3,
+    "consistency": 10.0,
+    "friction_angle": 35.0,
+}
+# Gravity, m/s^2; downward speed at the start, m/s; dv_x/dy, 1/s; edges, and height above the floor, in a unit box.
+COLUMN_GRAVITY, COLUMN_SPEED, SHEAR = 9.81, 1.0, 10.0
+EDGES = {2: (0.75, 0.75), 3: (0.25, 0.5, 0.25)}
+CLEARANCE = 1 / 32
+# A fifth or less of the step that the stiffness at rest allows leaves room for hardening and impact. The particles are
+# 4 (2D) and 8 (3D) per cell, as scenes have by default.
+COLUMNS = (
+    BenchCase(dimension=2, cells=128, particles=36_864, step=4e-5),
+    BenchCase(dimension=3, cells=64, particles=65_536, step=1e-4),
+)
 
 
-def scene_of(case: BenchCase, precision: str, block: str = "ours") -> dict:
-    """Return a case as the dictionary of a scene file; `block` is one of BLOCKS."""
-    material = {"law": "fluid", "density": DENSITY, "bulk_modulus": BULK_MODULUS}
-    if block == "solid":
-        nu = POISSONS_RATIO
-        modulus = BULK_MODULUS * (1 + nu) * (1 - 2 * nu) / (1 - nu)
-        material = {"law": "neo_hookean", "density": DENSITY, "youngs_modulus": modulus, "poissons_ratio": nu}
-    corners = {"min": [CORNER] * case.dimension, "max": [CORNER + EDGE] * case.dimension}
-    body = {"name": "block", "material": material, "shape": {"box": corners}, "velocity": case.velocity().tolist()}
-    return case.scene("Falling block", [body], GRAVITY, precision=precision, deterministic=block == "deterministic")
-
-
-def particles_of(case: BenchCase) -> BodyParticles:
-    """Return the initial particles of the peer, with equal shares of the block."""
+def falling_block(case: BenchCase, precision: str = "f32") -> tuple[dict, list[BodyParticles]]:
+    """Return the block of the peer as the dictionary of a scene file, and its particles, with equal shares of it."""
     d = case.dimension
+    body = {
+        "name": "block",
+        "material": {"law": "fluid", "density": DENSITY, "bulk_modulus": BULK_MODULUS},
+        "shape": {"box": {"min": [CORNER] * d, "max": [CORNER + EDGE] * d}},
+        "velocity": case.velocity().tolist(),
+    }
     volume = EDGE**d / case.particles
-    return BodyParticles(
+    particles = BodyParticles(
         name="block",
         position=case.positions(),
         velocity=np.tile(case.velocity(), (case.particles, 1)),
@@ -36,64 +54,68 @@ def particles_of(case: BenchCase) -> BodyParticles:
         volume=volume,
         mass=DENSITY * volume,
     )
+    return case.scene(body, GRAVITY, precision), [particles]
+
+
+def column(law: str, case: BenchCase) -> dict:
+    """Return the column of a law, which lands, shears and collapses, as the dictionary of a scene file."""
+    d, edges = case.dimension, EDGES[case.dimension]
+    lower = [CLEARANCE if axis == 1 else (1 - edge) / 2 for axis, edge in enumerate(edges)]
+    body = {
+        "name": law,
+        "material": material_of(laws()[law].parameters),
+        "shape": {"box": {"min": lower, "max": [c + s for c, s in zip(lower, edges, strict=True)]}},
+        "velocity": [0.0, -COLUMN_SPEED, 0.0][:d],
+        "velocity_gradient": [[SHEAR if (row, k) == (0, 1) else 0.0 for k in range(d)] for row in range(d)],
+        "particles_per_cell": 2**d,
+    }
+    return case.scene(body, COLUMN_GRAVITY, "f32")
+
+
+def material_of(model: type[MaterialParameters]) -> dict[str, object]:
+    """Return the material of a law: VALUES, then the middle of knobs, then defaults; RunError: there is none."""
+    law = model.model_fields["law"].default
+    material: dict[str, object] = {"law": law}
+    for name, field in model.model_fields.items():
+        if name in VALUES:
+            material[name] = VALUES[name]
+        elif field.is_required() and name != "law":
+            knob = next((entry for entry in field.metadata if isinstance(entry, Knob)), None)
+            if knob is None:
+                raise RunError(f'the law "{law}" needs {name}, which has no knob and no value in the benchmark')
+            material[name] = knob.value(0.5)
+    return material
 
 
 class Ours:
-    """A run of a scene in this process; Taichi starts only once per process.
+    """A run of a scene as `mpmcli simulate` computes it."""
 
-    Attributes:
-        run: what computes it.
-        threads: of the processor, that it uses.
-    """
-
-    def __init__(
-        self,
-        data: dict,
-        step: float,
-        particles: list[BodyParticles] | None = None,
-        *,
-        threads: int,
-        precision: str,
-        arch: str,
-        force: bool = False,
-        directory: str = ".",
-    ) -> None:
-        """Put the scene on the device.
-
-        Args:
-            data: the scene; step: its time.step, s.
-            particles: one entry per body, in place of the scene's own sampling.
-            force: take time.step above the stable step too.
-            directory: of the files that the scene names.
-        """
-        # Imported here, so that a scene can be described without importing Taichi.
+    def __init__(self, data: dict, particles: list[BodyParticles] | None, threads: int, arch: str = "cpu") -> None:
+        """Put the scene on the device, with these particles, one entry per body, in place of its own sampling."""
         from mpmcli.solver.engine.batch import Batch
         from mpmcli.solver.engine.build import useful_threads
         from mpmcli.solver.engine.compiled_kind import CompiledKind
         from mpmcli.solver.engine.run import Run
         from mpmcli.solver.machine.backend import choose_backend, start
-        from mpmcli.solver.machine.plan import make_plan
 
-        scene = parse_scene(data, laws=parameter_models(), source=data["title"], directory=directory).scene
-        backend = choose_backend(arch, threads, precision, compile_cache=False)
-        count = sum(body.count for body in particles) if particles else estimate_particles(scene)
+        scene = parse_scene(data, laws=parameter_models(), source=data["title"]).scene
+        backend = choose_backend(arch, threads, scene.solver.precision, compile_cache=False)
         if backend.on_cpu:
+            count = particles[0].count if particles else estimate_particles(scene)
             backend = replace(backend, threads=useful_threads(count, threads))
         start(backend)
-        particles = particles or sample_bodies(scene)
+        bodies = particles or sample_bodies(scene)
         # Kernels of steps that bodies set themselves: those of a benchmark are short, and would keep motion.
         usual = scene.model_copy(update={"time": scene.time.model_copy(update={"step": "auto"})})
-        batch = Batch(CompiledKind.of(usual, particles).roomy(), backend)
-        self.run = Run(batch, 0, scene, particles, force=force)
-        self.threads = backend.threads
-        self.smallest_step = step
-        self.particles: int = self.run.particle_count
-        self.bytes_per_particle: int = make_plan(usual, backend).bytes_per_particle
+        batch = Batch(CompiledKind.of(usual, bodies).roomy(), backend)
+        self.run = Run(batch, 0, scene, bodies, force=particles is not None)
+        self.threads, self.particles = backend.threads, self.run.particle_count
+        self.step = self._smallest = data["time"]["step"]
 
     def advance(self, count: int) -> int:
         """Take about `count` steps and return how many."""
         steps, smallest = self.run.advance(count)
-        self.smallest_step = min(self.smallest_step, smallest)
+        self._smallest = min(self._smallest, smallest)
         return steps
 
     def sync(self) -> None:
@@ -104,13 +126,26 @@ class Ours:
         return self.run.frame()[0].position
 
     def is_sound(self) -> bool:
-        """Whether every particle is in the domain, a unit square or cube whose origin is 0."""
-        # A frame of 1e8 particles takes minutes.
+        """Whether every particle is in the domain, and every step was that of the case."""
         places = [group.arrays.x.to_numpy() for group in self.run.groups]
-        return all(bool(((position >= 0) & (position <= 1)).all()) for position in places)
+        inside = all(bool(((position >= 0) & (position <= 1)).all()) for position in places)
+        return inside and self._smallest > (1 - ROUND_OFF) * self.step
 
 
-def falling_block(case: BenchCase, block: str = "ours", *, threads: int, precision: str, arch: str) -> Ours:
-    """Return what `mpmcli simulate` computes with, on the block of the peer or another one of BLOCKS."""
-    data, particles = scene_of(case, precision, block), [particles_of(case)]
-    return Ours(data, case.step, particles, threads=threads, precision=precision, arch=arch, force=True)
+def block_of_ours(case: BenchCase, threads: int, arch: str = "cpu", precision: str = "f32") -> Ours:
+    """Return mpmcli on the block of the peer."""
+    return Ours(*falling_block(case, precision), threads, arch)
+
+
+class ProfiledColumn(Ours):
+    """The column of a law, whose phases are launched one by one, and timed."""
+
+    def __init__(self, law: str, case: BenchCase, threads: int) -> None:
+        super().__init__(column(law, case), None, threads)
+        self.run.batch.profile = Counter()
+
+    def phases(self) -> dict[str, float]:
+        """Return the time in each phase of the solver since the last call, s."""
+        found = dict(self.run.batch.profile)
+        self.run.batch.profile.clear()
+        return found

@@ -23,25 +23,13 @@ import numpy as np
 from mpmcli.bench.cases import BULK_MODULUS, DENSITY, EDGE, GRAVITY, BenchCase
 from mpmcli.errors import RunError
 
-_SHAPE = "n_particles, n_grid = 9000 * quality**2, 128 * quality"
-_QUALITY_STEP = "dt = 1e-4 / quality"
-_STIFFNESS = ", 0.2  # Young's modulus and Poisson's ratio"
-_HINT = (
-    'print("[Hint] Use WSAD/arrow keys to control gravity. Use left/right mouse buttons to attract/repel. '
-    'Press R to reset.")'
-)
-# Poisson's ratio of both examples with several laws, and Young's modulus with which lambda is that of the fluid.
-_NU = 0.2
-_YOUNGS = BULK_MODULUS * (1 + _NU) * (1 - 2 * _NU) / _NU
-
 
 @dataclass(frozen=True)
 class Example:
-    """How an example is adapted: changed lines, where `drawing` begins, and names; `begin` places the particles."""
+    """How an example is adapted: changed lines, where `drawing` begins, and names of its fields."""
 
     changes: dict[str, str]
     drawing: str
-    begin: str = "init"
     position: str = "x"
     velocity: str = "v"
 
@@ -64,32 +52,8 @@ EXAMPLES = {
         },
         "init()",
     ),
-    "mpm99": Example(
-        {
-            _SHAPE: "n_particles, n_grid = {particles}, {cells}",
-            _QUALITY_STEP: "dt = {step!r}",
-            f"E, nu = 0.1e4{_STIFFNESS}": f"E, nu = {_YOUNGS}, {_NU}",
-            "            grid_v[i, j][1] -= dt * 50  # gravity": f"            grid_v[i, j][1] -= dt * {GRAVITY}",
-        },
-        "def main():",
-        begin="initialize",
-    ),
-    "mpm128": Example(
-        {
-            _SHAPE: "n_particles, n_grid = {particles}, {cells}",
-            _QUALITY_STEP: "dt = {step!r}",
-            f"E, nu = 5e3{_STIFFNESS}": f"E, nu = {_YOUNGS}, {_NU}",
-            "            grid_v[i, j] += dt * gravity[None] * 30  # gravity": (
-                f"            grid_v[i, j] += dt * ti.Vector([0, -{GRAVITY}])"
-            ),
-        },
-        _HINT,
-        begin="reset",
-    ),
 }
 _INIT = "ti.init(arch=ti.gpu)"
-# The same line with a comment, as two examples have it.
-_INITS = (_INIT, f"{_INIT}  # Try to run on GPU")
 YARDSTICK = Path(__file__).with_name("yardstick.c")
 # Those of -ffast-math but without it: a library linked with that flushes denormal numbers of its process to zero.
 FAST_MATH = (
@@ -101,7 +65,6 @@ FLAGS = ("-O3", "-march=native", *FAST_MATH, "-fopenmp", "-std=gnu11", "-shared"
 PHASES = ("sort", "p2g", "grid", "g2p")
 # Share of a cell by which a particle may be behind a wall: velocities are zero on nodes alone.
 BEHIND = 0.5
-ABSENT = "gcc is not here: the table has no column of the yardstick in C."
 
 
 def example_path(name: str) -> Path:
@@ -115,15 +78,14 @@ def example_path(name: str) -> Path:
     return path
 
 
-def adapted_source(text: str, case: BenchCase, name: str, *, threads: int, precision: str, arch: str) -> str:
+def adapted_source(text: str, case: BenchCase, threads: int, arch: str, precision: str) -> str:
     """Return an example with its settings and without its drawing; RunError: a line is not there exactly once."""
-    example = EXAMPLES[name]
+    example = EXAMPLES[case.peer]
     options = f"arch=ti.{arch}, default_fp=ti.{precision}, cpu_max_num_threads={threads}, offline_cache=False"
     lines = text.splitlines()
-    init = next((line for line in _INITS if line in lines), _INIT)
-    for old, new in {init: f"ti.init({options})", **example.changes}.items():
-        lines[_only_line(lines, old, name)] = new if old == init else new.format(**vars(case))
-    return "\n".join(lines[: _only_line(lines, example.drawing, name)]) + "\n"
+    for old, new in {_INIT: f"ti.init({options})", **example.changes}.items():
+        lines[_only_line(lines, old, case.peer)] = new if old == _INIT else new.format(**vars(case))
+    return "\n".join(lines[: _only_line(lines, example.drawing, case.peer)]) + "\n"
 
 
 def _only_line(lines: list[str], wanted: str, name: str) -> int:
@@ -137,30 +99,21 @@ def _only_line(lines: list[str], wanted: str, name: str) -> int:
 
 
 class Peer:
-    """An example of the taichi package in this process; Taichi starts only once per process."""
+    """An example of the taichi package with the block of a case."""
 
-    bytes_per_particle = None
-
-    def __init__(self, case: BenchCase, name: str | None = None, *, threads: int, precision: str, arch: str) -> None:
-        """Load an example; by default the one that the case is compared with."""
-        name = name or case.peer
-        text = example_path(name).read_text(encoding="utf-8")
-        source = adapted_source(text, case, name, threads=threads, precision=precision, arch=arch)
-        module = _run_source(source, f"<{name} of taichi, adapted>")
-        example = EXAMPLES[name]
+    def __init__(self, case: BenchCase, threads: int, arch: str = "cpu", precision: str = "f32") -> None:
+        path = example_path(case.peer)
+        text = path.read_text(encoding="utf-8")
+        module = _run_source(adapted_source(text, case, threads, arch, precision), f"<{path.name} of bench>")
+        example = EXAMPLES[case.peer]
         self.particles: int = module.n_particles
-        self.smallest_step = case.step
         self.threads = threads
         self._step: Callable[[], None] = module.substep
         self._sync: Callable[[], None] = module.ti.sync
         self._position = getattr(module, example.position)
-        getattr(module, example.begin)()
+        module.init()
         self._position.from_numpy(case.positions().astype(np.float32 if precision == "f32" else np.float64))
-        self._velocity = getattr(module, example.velocity)
-        self._velocity.fill(module.ti.Vector(case.velocity().tolist()))
-        if hasattr(module, "material"):
-            # Of several laws the fluid.
-            module.material.fill(0)
+        getattr(module, example.velocity).fill(module.ti.Vector(case.velocity().tolist()))
         self._sync()
 
     def advance(self, count: int) -> int:
@@ -191,7 +144,7 @@ def _run_source(source: str, filename: str) -> ModuleType:
     return module
 
 
-def is_here() -> bool:
+def has_compiler() -> bool:
     """Return whether gcc is on the PATH."""
     return shutil.which("gcc") is not None
 
@@ -213,11 +166,11 @@ def load_yardstick(dimension: int) -> ctypes.CDLL:
         except OSError as error:
             raise RunError(f"The yardstick in C cannot be loaded: {error}") from error
     whole, real, pointer = ctypes.c_int, ctypes.c_float, ctypes.c_void_p
-    arguments = {"advance": [whole], "read": [pointer, pointer], "seconds": [pointer], "bytes": [], "free": []}
+    arguments = {"advance": [whole], "read": [pointer, pointer], "seconds": [pointer], "free": []}
     for name, others in arguments.items():
         getattr(loaded, f"yardstick_{name}").argtypes = [pointer, *others]
     loaded.yardstick_new.argtypes = [*[whole] * 4, *[real] * 6, pointer, pointer]
-    loaded.yardstick_new.restype, loaded.yardstick_bytes.restype = pointer, ctypes.c_long
+    loaded.yardstick_new.restype = pointer
     return loaded
 
 
@@ -225,11 +178,21 @@ class Yardstick:
     """A block of fluid, in f32, between walls that slip."""
 
     def __init__(
-        self, case: BenchCase, *, threads: int, position: np.ndarray, velocity: np.ndarray, tension: bool = False
+        self,
+        case: BenchCase,
+        threads: int,
+        position: np.ndarray | None = None,
+        velocity: np.ndarray | None = None,
+        tension: bool = False,
     ) -> None:
-        """Compile, and put particles, (particles, dimension), into a unit box; the fluid may take tension."""
+        """Compile, and put particles, (particles, dimension), by default those of the case, into a unit box.
+
+        The fluid may take tension. RunError: gcc fails, or the memory does not suffice.
+        """
+        position = case.positions() if position is None else position
+        velocity = np.tile(case.velocity(), (case.particles, 1)) if velocity is None else velocity
         self._library = load_yardstick(case.dimension)
-        self.particles, self.threads, self.smallest_step = case.particles, threads, case.step
+        self.particles, self.threads = case.particles, threads
         volume = EDGE**case.dimension / case.particles
         self._before = np.zeros(len(PHASES))
         self._spacing = 1 / case.cells
@@ -241,7 +204,6 @@ class Yardstick:
         )
         if not self._handle:
             raise RunError(f"The memory does not suffice for {case.particles} particles in the yardstick.")
-        self.bytes_per_particle: int = self._library.yardstick_bytes(self._handle)
 
     def advance(self, count: int) -> int:
         """Take `count` steps."""
@@ -272,11 +234,3 @@ class Yardstick:
     def close(self) -> None:
         """Give the memory back."""
         self._library.yardstick_free(self._handle)
-
-
-def block_in_c(case: BenchCase, *, threads: int, precision: str, arch: str) -> Yardstick:
-    """Return the falling block in the yardstick, which has one precision and one device."""
-    if (precision, arch) != ("f32", "cpu"):
-        raise RunError(f"The yardstick computes in f32 on the CPU, not in {precision} on {arch}.")
-    velocity = np.tile(case.velocity(), (case.particles, 1))
-    return Yardstick(case, threads=threads, position=case.positions(), velocity=velocity)

@@ -6,21 +6,19 @@ cells, 1,444 particles, and 350 frames of 2.5 ms.
 
 import statistics
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from mpmcli.bench.cases import CASES
-from mpmcli.bench.report import PRECISION, describe_machine, page, rows_text, span
-from mpmcli.bench.side import BenchOptions, Setting
+from mpmcli.bench.contestant import Side
+from mpmcli.bench.peers import Peer
+from mpmcli.bench.report import describe_machine, markdown_table, page
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.dataset.sweep_run import SweepSettings, SweepState, run_sweep
 from mpmcli.materials.registry import parameter_models
-from mpmcli.plain_text import counted
-from mpmcli.scene import estimate_particles, parse_scene
 
-# Blocks of each number of workers.
-ROUNDS = 2
 # Trajectories of the first sweep, which is not measured: it compiles the kernels, and gives the time of a trajectory.
 WARM_UP = 4
 # Length of a block of the peer, s.
@@ -69,88 +67,34 @@ def sand_sweep(directory: Path, count: int, frames: int = FRAMES) -> Sweep:
     return load_sweep(path, laws=parameter_models())
 
 
-def throughput_table(record: dict) -> str:
-    """Return the record of the sweeps as text: one line per number of workers, then what the columns mean."""
-    columns = [
-        ("workers", lambda row: f"{row['workers']}"),
-        ("trajectories", lambda row: f"{row['trajectories']:,}"),
-        ("steps of each", lambda row: f"{row['steps']:,.0f}"),
-        ("per hour", lambda row: f"{row['trajectories_per_hour']:,.0f}"),
-        ("range", lambda row: "{:,.0f}-{:,.0f}".format(*span(row["trajectories_per_hour_blocks"]))),
-        ("s per core", lambda row: f"{3600 * row['workers'] / row['trajectories_per_hour']:.2f}"),
-        ("ratio", lambda row: f"{row['ratio']:.1f}"),
-        ("range", lambda row: f"{row['ratio_min']:.1f}-{row['ratio_max']:.1f}"),
-    ]
-    notes = (
-        "per hour: trajectories computed and stored, median of the blocks, once every worker has ended a task.",
-        "s per core: time of a trajectory on each core.",
-        "ratio: to the GNS project's generator, one process on each core, with"
-        f" {record['generator_s']:.1f} s for a trajectory. It took {GENERATOR_SECONDS} s",
-        f"where mpm88 at 2d-64 on {PEER_THREADS} threads made {GENERATOR_PEER_RATE / 1e6:.1f} million"
-        f" particle-steps/s; here mpm88 makes {record['peer_particle_steps_per_s'] / 1e6:.2f}.",
-    )
-    refused = [
-        f"with {counted(row['workers'], 'worker')} {row['trajectories'] - row['accepted']} of "
-        f"{counted(row['trajectories'], 'trajectory')} were not accepted."
-        for row in record["results"]
-        if row["accepted"] < row["trajectories"]
-    ]
-    machine, frames = record["machine"], counted(record["frames"], "frame")
-    scene = f"A block of sand: {record['particles']:,} particles, 64 x 64 cells, {frames}."
-    top = f"{machine['processor']}, cpu, {PRECISION}, taichi {machine['taichi']}\n{scene}"
-    return page(top, [rows_text(record["results"], columns, left=set())], notes, refused)
-
-
-def throughput_record(
-    results: Sequence[dict], peer_rates: Sequence[float], particles: int, frames: int, seconds: float | None
+def run_throughput(
+    workers: int, seconds: float, blocks: int, tell: Callable[[str], None], *, frames: int = FRAMES
 ) -> dict:
-    """Return sweeps for JSON; ratios are to a generator process for each worker, by mpm88's `peer_rates`."""
-    peer_rate = statistics.median(peer_rates)
-    # What the generator would take for a trajectory on one core of this machine.
-    generator = GENERATOR_SECONDS * GENERATOR_PEER_RATE / peer_rate
-    rows = []
-    for result in results:
-        low, high = span(result["trajectories_per_hour_blocks"])
-        rates = {"ratio": result["trajectories_per_hour"], "ratio_min": low, "ratio_max": high}
-        rows.append(result | {key: rate * generator / 3600 / result["workers"] for key, rate in rates.items()})
-    return {
-        "machine": describe_machine(),
-        "particles": particles,
-        "frames": frames,
-        "block_s": seconds,
-        "peer_name": "mpm88",
-        "peer_case": "2d-64",
-        "peer_threads": PEER_THREADS,
-        "peer_particle_steps_per_s": peer_rate,
-        "peer_particle_steps_per_s_blocks": list(peer_rates),
-        "generator_s": generator,
-        "results": rows,
-    }
+    """Compute sweeps with one worker and with all in turn, mpm88 between, and return the record for JSON.
 
+    Args:
+        seconds: length of a block.
 
-def run_throughput(options: BenchOptions, *, trajectories: int | None = None, frames: int = FRAMES) -> dict:
-    """Compute sweeps with one worker and all in turn, mpm88 between; RunError: the peer or a sweep failed."""
-    tell, case = options.progress, CASES[0]
-    peer_rates: list[float] = []
-    blocks: dict[int, list[SweepState]] = {count: [] for count in sorted({1, *options.threads})}
-    with options.start("peer", case, Setting(PEER_THREADS)) as peer:
-        peer.ask("first")
-        peer.ask("run 0.3")
+    Raises:
+        RunError: the peer or a sweep failed.
+    """
+    found: dict[int, list[SweepState]] = {count: [] for count in sorted({1, workers})}
+    with Side("mpm88", partial(Peer, CASES[0], PEER_THREADS), by_processor=False) as peer:
+        peer.measure(0.3)
+        peer.blocks.clear()
         tell(f"first block, not measured: {WARM_UP} trajectories")
-        each = _warm_up(frames)
-        share = trajectories or max(1, round(options.seconds / each))
-        for number in range(options.blocks):
-            answer = peer.ask(f"run {PEER_SECONDS}")
-            peer_rates.append(case.particles * answer["steps"] / answer["seconds"])
-            for count, states in blocks.items():
+        share = max(1, round(seconds / _warm_up(frames)))
+        for number in range(blocks):
+            peer.measure(PEER_SECONDS)
+            for count, states in found.items():
                 states.append(_block(count, count * share, frames))
-                rate = f"{states[-1].per_hour:,.0f} trajectories per hour"
-                tell(f"round {number + 1} of {options.blocks}, workers: {count}: {rate}")
-    with tempfile.TemporaryDirectory() as folder:
-        base = sand_sweep(Path(folder), 1, frames).base_data
-    particles = estimate_particles(parse_scene(base, laws=parameter_models(), source=base["title"]).scene)
-    results = [_result(count, states, particles) for count, states in blocks.items()]
-    return throughput_record(results, peer_rates, particles, frames, None if trajectories else options.seconds)
+                tell(f"round {number + 1} of {blocks}, workers: {count}: {states[-1].per_hour:,.0f} per hour")
+        rate = 1e9 / peer.cost
+    # What the generator would take for a trajectory on one core of this machine.
+    generator = GENERATOR_SECONDS * GENERATOR_PEER_RATE / rate
+    facts = {"frames": frames, "peer_particle_steps_per_s": rate, "generator_s": generator}
+    results = [_result(count, states, generator) for count, states in found.items()]
+    return {"machine": describe_machine(), **facts, "results": results}
 
 
 def _block(
@@ -170,16 +114,34 @@ def _warm_up(frames: int) -> float:
     return (end - begin) / max(1, last - first)
 
 
-def _result(workers: int, states: list[SweepState], particles: int) -> dict:
-    """Return what the blocks of one number of workers tell, for JSON; steps: mean number of a trajectory."""
-    done = sum(state.done for state in states)
+def _result(workers: int, states: list[SweepState], generator: float) -> dict:
+    """Return what the blocks of one number of workers tell; ratios are to a generator process for each."""
     rates = [state.per_hour for state in states]
     return {
         "workers": workers,
         "trajectories_per_hour": statistics.median(rates),
         "trajectories_per_hour_blocks": rates,
-        "blocks_s": [state.seconds for state in states],
-        "trajectories": done,
+        "ratio": statistics.median(rates) * generator / 3600 / workers,
+        "ratio_blocks": [rate * generator / 3600 / workers for rate in rates],
+        "trajectories": sum(state.done for state in states),
         "accepted": sum(state.accepted for state in states),
-        "steps": sum(state.particle_steps for state in states) / (particles * done),
     }
+
+
+def throughput_table(record: dict) -> str:
+    """Return the record of the sweeps as text: one line per number of workers, then what the columns mean."""
+    rows = []
+    for row in record["results"]:
+        low, high = min(row["ratio_blocks"]), max(row["ratio_blocks"])
+        each = f"{3600 * row['workers'] / row['trajectories_per_hour']:.2f}"
+        cells = [f"{row['workers']}", f"{row['accepted']:,} of {row['trajectories']:,}", each]
+        rows.append([*cells, f"{row['trajectories_per_hour']:,.0f}", f"{row['ratio']:.1f} ({low:.1f} to {high:.1f})"])
+    head = ["workers", "accepted", "s per core", "per hour", "ratio"]
+    notes = (
+        "per hour: trajectories computed and stored, once every worker has ended a task; median of the blocks.",
+        f"ratio: to the GNS project's generator on each core, {record['generator_s']:.1f} s for a trajectory: it took",
+        f"{GENERATOR_SECONDS} s where mpm88 at 2d-64 on {PEER_THREADS} threads made {GENERATOR_PEER_RATE / 1e6:.1f}",
+        f"million particle-steps/s; here mpm88 makes {record['peer_particle_steps_per_s'] / 1e6:.2f}.",
+    )
+    what = f"cpu, a block of sand: 1,444 particles, 64 x 64 cells, {record['frames']} frames"
+    return page(record["machine"], what, markdown_table(head, rows, left=0), notes)

@@ -116,11 +116,6 @@ void yardstick_read(const yardstick *s, float *x, float *v) {
         }
 }
 
-/* Bytes of all arrays but the grid, of a particle. */
-long yardstick_bytes(const yardstick *s) {
-    return 2 * (sizeof *s->p + sizeof *s->id) + sizeof *s->key;
-}
-
 /* Seconds so far in sorts, P2G with clearing, the update of nodes, and G2P. */
 void yardstick_seconds(const yardstick *s, double *seconds) { memcpy(seconds, s->seconds, sizeof s->seconds); }
 

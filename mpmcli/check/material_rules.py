@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
 
-# Poisson's ratio above which displacement fields of four particles per cell lock (docs/hard-cases.md, H10).
+# Poisson's ratio above which displacement fields of four particles per cell lock (tests/hard_cases, H10).
 LOCKING = 0.49
-# Ratio of densities above which the light body follows the heavy one within a step (docs/hard-cases.md, H4).
+# Ratio of densities above which the light body follows the heavy one within a step (tests/hard_cases, H4).
 DENSITY_RATIO = 100.0
 # Ratios of speed to wave speed. The density of a fluid varies by the square, and "auto" allows at most 0.1. A block of
 # linear fluid that hits a wall at five times its speed of sound collapses.

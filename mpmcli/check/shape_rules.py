@@ -14,7 +14,7 @@ from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sampling import initial_deformation, initial_motion, moves_unevenly
 
 # Cells across a body below which internal motion is not resolved. The stencil is three nodes wide, so that with three
-# cells one row of particles is not affected by the surface (docs/hard-cases.md, H12).
+# cells one row of particles is not affected by the surface (tests/hard_cases, H12).
 FEWEST_CELLS = 3.0
 # Distance, in cells, below which two particles always share a node, by kernel.
 REACH = {"quadratic": 2.0, "cubic": 3.0}

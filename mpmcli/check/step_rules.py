@@ -14,7 +14,7 @@ from mpmcli.scene.schema import USUAL_FLIP, SolverSettings, Time
 from mpmcli.scene.shapes import Ball, Box, Form, Points
 from mpmcli.stability.transfer_factors import impact_loss, loss_per_step, step_inertia
 
-# Ratio to the stable step below which a step is reported: four times the cost and loss of energy (docs/hard-cases.md,
+# Ratio to the stable step below which a step is reported: four times the cost and loss of energy (tests/hard_cases,
 # H19).
 SMALL_STEP = 0.25
 # Consequence of a step above each limit.
@@ -35,7 +35,7 @@ HALF_ULP = 2.0**-24
 # Rounding of a position in a frame over the way of its body in the run. A step loses nothing: particles carry what
 # rounding takes from their positions (docs/theory.md, 8.3).
 LOST_MOTION = 0.1
-# Ratio of the stress from rounding of F to the stress from gravity or speed (docs/hard-cases.md, H9).
+# Ratio of the stress from rounding of F to the stress from gravity or speed (tests/hard_cases, H9).
 STRESS_NOISE = 0.01
 
 
