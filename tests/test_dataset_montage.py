@@ -11,7 +11,7 @@ from made_sweep import made_workers, make_dataset  # noqa: F401
 from PIL import Image
 
 import mpmcli.dataset
-from mpmcli.dataset.montage import TrajectoryCells, plan_montage, write_montage
+from mpmcli.dataset.montage import TrajectoryCells, plan_montage
 from mpmcli.errors import InputError
 from mpmcli.render.pictures import set_up
 from mpmcli.render.render_scene import render_scene_of
@@ -79,12 +79,13 @@ def test_a_montage_has_no_empty_rows(dataset):
 
 
 def test_the_montage_is_drawn_again_only_when_it_changed(dataset, drawing):
-    path = write_montage(dataset, "2x2")
+    (path,) = plan_montage(dataset, Request(montage="2x2")).carry_out().pictures
     before = path.read_bytes()
     assert plan_montage(dataset, Request(montage="2x2")).due == 0
     assert plan_montage(dataset, Request(montage="2x2", frames="2")).due == 4
     path.unlink()
-    assert write_montage(dataset, "2x2").read_bytes() == before
+    plan_montage(dataset, Request(montage="2x2")).carry_out()
+    assert path.read_bytes() == before
     with Image.open(path) as picture:
         assert picture.size[0] == 1280 and len(picture.getcolors(10**6)) > 10
 
@@ -95,29 +96,12 @@ def test_the_commands_draw_a_montage_and_write_the_card(drawing):
     drawn = run_here("render", dataset, "--montage", "2x2", "--color-by", "speed", "-o", "picture.png", "--quiet")
     assert (drawn.status, drawn.stderr) == (0, "") and Path("picture.png").stat().st_size > 1000
     text = (dataset / "README.md").read_text(encoding="utf-8")
-    done = run_here("dataset", "card", dataset, "--montage", "2x2")
+    assert run_here("render", dataset, "--montage", "2x2", "--quiet").status == 0
+    done = run_here("dataset", "card", dataset)
     assert (done.status, done.stdout, done.stderr) == (0, f"{dataset / 'README.md'}\n", "")
-    assert "](montage.png)" in (dataset / "README.md").read_text(encoding="utf-8")
-    (dataset / "montage.png").unlink()
-    (dataset / "montage.png").write_bytes(b"mine")
-    refused = run_here("dataset", "card", dataset)
-    assert refused.status == 0 and "no new picture" in refused.stderr
-    (dataset / "montage.png").unlink()
     assert text == (dataset / "README.md").read_text(encoding="utf-8").replace(
         "![Some of the trajectories](montage.png)\n\n", ""
     )
-
-
-@pytest.mark.usefixtures("made_workers")
-def test_a_card_without_a_window_has_no_picture(monkeypatch):
-    def none_opens() -> str:
-        raise InputError("no OpenGL window opens.")
-
-    monkeypatch.setattr("mpmcli.render.pictures.choose_window", none_opens)
-    dataset = make_dataset("whole")
-    done = run_here("dataset", "card", dataset)
-    assert done.status == 0 and "no OpenGL window" in done.stderr
-    assert "montage.png" not in (dataset / "README.md").read_text(encoding="utf-8")
 
 
 def test_what_is_refused(dataset):

@@ -11,7 +11,6 @@ from mpmcli.cli import options
 from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
 from mpmcli.cli.options import COUNT, PATH, json_option, quiet_option
 from mpmcli.cli.streams import print_answer, print_json, print_note, print_text
-from mpmcli.errors import InputError
 
 # Time in which the workers of a sweep end, and this process, s.
 RESERVE = 5.0
@@ -133,21 +132,12 @@ def verify(dataset: Path, quiet: bool, as_json: bool) -> int:
 
 @dataset_command.command("card")
 @click.argument("dataset", type=PATH)
-@click.option("--montage", metavar="CxR", default="4x4", show_default=True, help="Trajectories of the picture.")
-def card(dataset: Path, montage: str) -> None:
-    """Write README.md of DATASET again, with a picture of some trajectories, montage.png, where one can be drawn.
-
-    The text is the one that a finished sweep has, without the picture, on its own.
-    """
+def card(dataset: Path) -> None:
+    """Write README.md of DATASET again, with the picture montage.png if `mpmcli render` has drawn it."""
     from mpmcli.dataset.card import write_card
-    from mpmcli.dataset.montage import write_montage
     from mpmcli.dataset.report import status_of
 
     status_of(dataset)
-    try:
-        write_montage(dataset, montage)
-    except InputError as error:
-        print_note(f"note: the card has no new picture: {error}")
     print_text(str(write_card(dataset)))
 
 

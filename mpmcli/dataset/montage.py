@@ -42,11 +42,6 @@ def plan_montage(path: Path, request: Request) -> RenderPlan:
     return plan_render(cells, replace(request, frames=None, montage=grid, output=output), cells.captions)
 
 
-def write_montage(path: Path, grid: str = "4x4") -> Path:
-    """Draw montage.png of a dataset, return its path; InputError: nothing draws here, or a foreign file is there."""
-    return plan_montage(path, Request(montage=grid)).carry_out().pictures[0]
-
-
 class TrajectoryCells(Result):
     """One frame of each of some trajectories, as the frames of one run that has the bodies of all of them.
 
