@@ -17,7 +17,7 @@ RUNS = {
     "large": ("configs/dam_break_3d.toml", ("domain.spacing=0.00375", "time.end=0.1", "time.frames=5")),
 }
 # On a device that the processor emulates.
-EMULATED = ("time.end=0.05", "time.frames=2")
+EMULATED = ("time.end=0.01", "time.frames=1")
 MPMCLI = (sys.executable, "-m", "mpmcli")
 
 

@@ -42,8 +42,6 @@ class Box:
     gravity: np.ndarray
     faces: Sequence[tuple[str, str]]
     kernel: str = "quadratic"
-    transfer: str = "apic"
-    walls: str = "folded"
 
     @property
     def inverse_moment(self) -> float:
@@ -93,8 +91,7 @@ def scatter(groups: Sequence[Particles], box: Box, kick: float) -> tuple[np.ndar
         for p, x in enumerate(group.x):
             tau = group.stress(group.deformation[p], p)
             A = -kick * group.volume[p] * box.inverse_moment * tau
-            if box.transfer != "pic":
-                A = A + group.mass[p] * group.C[p]
+            A = A + group.mass[p] * group.C[p]
             for node, w, lever in stencil_of(x, box):
                 at = tuple(i + MARGIN for i in node)
                 momentum[at] += w * (group.mass[p] * group.v[p] + A @ lever)
@@ -123,8 +120,6 @@ def update_both(
     the velocity back, mirrored. A separating face acts where the material on its plane moves towards it,
     the images of that plane in the faces that never let go included.
     """
-    if box.walls == "zeroed":
-        return update_zeroed(momentum, mass, before, kept_mass, box, kick)
     d = len(box.cells)
     g = kick * box.gravity
     raw_momentum, raw_mass = momentum, mass
@@ -204,25 +199,6 @@ def update_both(
         for at, flip in images:
             velocity[at], velocity_before[at] = flip * v, flip * u
     return velocity, velocity_before
-
-
-def update_zeroed(
-    momentum: np.ndarray, mass: np.ndarray, before: np.ndarray, kept_mass: np.ndarray, box: Box, kick: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same where walls set the velocity of nodes on and behind them to zero, whatever that is before."""
-    weight = np.where(mass > 0, mass, 1.0)[..., None]
-    velocity = np.where(mass[..., None] > 0, momentum / weight + kick * box.gravity, 0.0)
-    for a, n in enumerate(box.cells):
-        place = np.arange(-MARGIN, n + 1 + MARGIN)
-        for side, beyond in ((0, place <= 0), (1, place >= n)):
-            nodes = np.moveaxis(velocity, a, 0)
-            word, out = box.faces[a][side], 2 * side - 1
-            if word == "stick":
-                nodes[beyond] = 0.0
-            else:
-                normal = nodes[beyond][..., a]
-                nodes[beyond, ..., a] = 0.0 if word == "slip" else np.where(out * normal > 0, 0.0, normal)
-    return velocity, before / np.where(kept_mass > 0, kept_mass, 1.0)[..., None]
 
 
 def gather(

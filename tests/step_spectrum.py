@@ -77,9 +77,8 @@ def step_matrix(near: Coupling, choice: Choice, lam: float, mu: float, dt: float
     for c in range(d):
         before = np.zeros((len(near.value), size), near.value.dtype)
         before[:, block(c)] = near.value
-        if choice.transfer != "pic":
-            for a in range(d):
-                before[:, block(d + c * d + a)] = near.lever[a]
+        for a in range(d):
+            before[:, block(d + c * d + a)] = near.lever[a]
         after = before.copy()
         for a in range(d):
             after[:, block(place[c, a])] -= kick * 2 * mu * near.lever[a]

@@ -33,9 +33,9 @@ def row(index: int, spin: float) -> LedgerRow:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("transfer", "found"), [("apic", True), ("pic", False), ("aflip", False)])
+@pytest.mark.parametrize(("transfer", "found"), [("apic", True), ("aflip", False)])
 def test_spin_that_is_lost_is_a_fault_of_apic_alone(transfer: str, found: bool) -> None:
-    """A twentieth of sqrt(2 M E) times the diagonal is gone: PIC damps spin, and AFLIP keeps it to first order."""
+    """A twentieth of sqrt(2 M E) times the diagonal is gone; AFLIP keeps spin to first order."""
     position = np.array([[0.9, 0.5], [1.1, 0.5]])
     velocity = np.array([[0.0, -0.4], [0.0, 0.4]])
     label = np.zeros(2, dtype=np.int32)

@@ -159,8 +159,6 @@ BAD = [
     ("start = 0.5", "start = 0.5\nend = 0.4", "impulses[0].end: must be after start, 0.5 s; found 0.4"),
     ("start = 0.5", 'start = 0.5\nbody = "colum"',
      'impulses[0].body: no body has the name "colum"; did you mean "column"?'),
-    ("[time]", 'walls = "open"\n[solver]\nwalls = "zeroed"\n[time]',
-     'domain.walls: solver.walls = "zeroed" knows no open faces: give walls = "folded"'),
     ("[time]", 'walls = { y_max = "open" }\nfriction = { y_max = 0.5 }\n[time]',
      'domain.friction.y_max: is for a wall that can slip, and domain.walls has "open" for y_max; leave it out, or give '
      '"slip" or "separate" there'),

@@ -18,8 +18,6 @@ BLOCKS = {
     "rough": ("separate", 0.3, {}),
     "rough, slip": ("slip", 0.3, {}),
     "stick, aflip": ("stick", 0.0, {"transfer": "aflip"}),
-    "stick, zeroed": ("stick", 0.0, {"walls": "zeroed"}),
-    "rough, zeroed": ("separate", 0.3, {"walls": "zeroed"}),
 }
 
 

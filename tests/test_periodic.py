@@ -19,7 +19,6 @@ BALLS = {
     "liquid": (LIQUID, {}),
     "cubic": (SOLID, {"solver": {"kernel": "cubic"}}),
     "aflip": (SOLID, {"solver": {"transfer": "aflip"}}),
-    "zeroed": (SOLID, {"solver": {"walls": "zeroed"}}),
     "f_bar": (SOLID | {"poissons_ratio": 0.45}, {"solver": {"f_bar": True}}),
     # Of the period of the domain, or half of it: its slope, too, is that on the other side.
     "forced": (SOLID, {"forces": [{"acceleration": ["2 * sin(2 * pi * x)", "cos(2 * pi * y)"]}]}),

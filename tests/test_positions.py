@@ -104,12 +104,10 @@ def test_remainders(backend_of: Callable) -> None:
     ("walls", "settings", "holds"),
     [
         ("slip", {}, False),
-        pytest.param("separate", {"walls": "zeroed"}, True, marks=pytest.mark.slow),
         pytest.param("separate", {}, False, marks=pytest.mark.slow),
         pytest.param("stick", {}, False, marks=pytest.mark.slow),
         pytest.param("slip", {"transfer": "aflip"}, False, marks=pytest.mark.slow),
         pytest.param("slip", {"kernel": "cubic"}, False, marks=pytest.mark.slow),
-        pytest.param("slip", {"walls": "zeroed"}, True, marks=pytest.mark.slow),
     ],
 )
 def test_folded_walls_hold_no_particle(backend_of: Callable, walls: str, settings: dict, holds: bool) -> None:

@@ -278,7 +278,6 @@ def test_threads_change_no_byte(backend_of: Callable) -> None:
         ({"deformation": [[1.1, 0.0], [0.0, 1.0]]}, "must be left out with solver.solids"),
         ({"low": 0.05}, "begins 0.05 m from the wall y_min, which never lets go"),
         ({"low": 0.3, "word": "stick"}, '"body" begins 0.3 m away, and would not stick to it later'),
-        ({"walls": "zeroed"}, 'needs walls = "folded"'),
     ],
 )
 def test_what_cannot_be_on_that_grid_is_refused(changes: dict, said: str) -> None:

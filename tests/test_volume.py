@@ -48,10 +48,8 @@ def pool(*densities: float, precision: str = "f64", walls: object = "slip", d: i
 
 
 def unshifted(start: Scene) -> Scene:
-    """Return a scene whose particles are moved by steps alone, and keep nothing that nodes do not see."""
-    return start.model_copy(
-        update={"solver": start.solver.model_copy(update={"redistribute": False, "transfer": "pic"})}
-    )
+    """Return a scene whose particles are moved by steps alone."""
+    return start.model_copy(update={"solver": start.solver.model_copy(update={"redistribute": False})})
 
 
 def seen_ratio(x: np.ndarray, volume: np.ndarray, cells: tuple[int, ...]) -> tuple[np.ndarray, ...]:

@@ -47,7 +47,6 @@ def stepped(backend: object, scene: Scene, velocity: list[float]) -> tuple[np.nd
     [
         (2, "slip", {}),
         (2, "separate", {"kernel": "cubic"}),
-        (2, "slip", {"walls": "zeroed"}),
         pytest.param(3, "separate", {}, marks=pytest.mark.slow),
     ],
 )

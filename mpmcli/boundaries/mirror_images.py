@@ -8,10 +8,8 @@ where setting node velocities to zero makes it first-order (docs/theory.md, 3.1)
 from collections.abc import Sequence
 from copy import copy
 
-from mpmcli.boundaries.walls import REACH, MovingFaces, RoughFaces, Walls, ZeroedWalls, faces_on_grid
+from mpmcli.boundaries.walls import REACH, Walls
 from mpmcli.quick_taichi import ti
-from mpmcli.scene import SolverSettings
-from mpmcli.scene.domain import PERIODIC
 
 
 @ti.data_oriented
@@ -423,35 +421,3 @@ def column_friction(
             elif sticks:
                 result[c] = 1.0
     return result
-
-
-def build_walls(
-    faces: Sequence[tuple[str, str]],
-    settings: SolverSettings,
-    first: int,
-    cells: Sequence[int],
-    shape: Sequence[int],
-    on_node: float,
-    friction: RoughFaces,
-    moving: MovingFaces,
-    runs: int = 1,
-    *,
-    on_cpu: bool,
-) -> tuple[Walls | ZeroedWalls, MirrorImages | None]:
-    """Return the boundary, and the images of nodes behind it, None where there are none.
-
-    Args:
-        faces: words of the walls, per axis.
-        first: index of the wall's node plane at the lower faces; cells, shape: of the domain and nodes of the grid.
-        on_node: weight of a node for a point on it.
-        friction, moving: coefficients and velocities of all runs.
-        on_cpu: whether nodes are updated on the CPU.
-    """
-    mirroring = faces_on_grid(faces, settings)
-    if settings.walls != "zeroed":
-        walls = Walls(mirroring, first, cells, shape, runs, friction, moving)
-        return walls, MirrorImages(walls, on_node, on_cpu=on_cpu)
-    zeroed = ZeroedWalls(faces, first, cells, friction, moving)
-    if not any(PERIODIC in pair for pair in faces):
-        return zeroed, None
-    return zeroed, MirrorImages(Walls(mirroring, first, cells, shape, runs), on_node, on_cpu=on_cpu)

@@ -1,8 +1,7 @@
 """The faces of the domain: walls that slip, stick or separate, with or without friction, and move along themselves.
 
 A wall lies on a plane of nodes. `Walls` holds where the walls are, which of them act on a node, and what they do to its
-velocity; what particles scatter beyond them is folded back by `mirror_images` (docs/theory.md, 3). `ZeroedWalls` are
-walls in the usual way, for comparison.
+velocity; what particles scatter beyond them is folded back by `mirror_images` (docs/theory.md, 3).
 """
 
 import math
@@ -93,15 +92,9 @@ SMOOTH = RoughFaces(())
 
 
 def faces_on_grid(faces: Sequence[tuple[str, str]], settings: SolverSettings) -> tuple[tuple[str, str], ...]:
-    """Return the words of the walls that mirror nodes: on the grid of the state at rest those that never let go.
-
-    Where walls set velocities to zero instead, periodic faces have images all the same.
-    """
-    total, zeroed = settings.solids == "total", settings.walls == "zeroed"
-    return tuple(
-        tuple(OPEN if (total and word == "separate") or (zeroed and word != PERIODIC) else word for word in pair)
-        for pair in faces
-    )
+    """Return the words of the walls that mirror nodes: on the grid of the state at rest those that never let go."""
+    total = settings.solids == "total"
+    return tuple(tuple(OPEN if total and word == "separate" else word for word in pair) for pair in faces)
 
 
 @ti.data_oriented
@@ -347,77 +340,4 @@ class Walls:
                 if upper == ti.static(self.moving.faces[f][1]):
                     for c in ti.static(range(self.dimension)):
                         result[c] = self.moving.of(f)[c]
-        return result
-
-
-@ti.data_oriented
-class ZeroedWalls:
-    """All faces of the domain, as a boundary that sets velocities of nodes on and behind it to zero.
-
-    First-order accurate, where folded walls are second-order (docs/theory.md, 3.3). Slip and separate stop the normal
-    velocity, stick all. A separating face stops only what moves into it, a periodic one nothing. Nothing is mirrored.
-    What nodes hold from before stress and forces is not stopped: FLIP's change of velocity contains the wall's.
-    Friction takes from the velocity along a wall at most the coefficient times what the wall stops. Of a wall that
-    moves it is the velocity relative to it.
-    """
-
-    def __init__(
-        self,
-        faces: Sequence[tuple[str, str]],
-        first: int,
-        cells: Sequence[int],
-        friction: RoughFaces,
-        moving: MovingFaces = STILL,
-    ) -> None:
-        self.dimension = len(faces)
-        self.faces = tuple(tuple(pair) for pair in faces)
-        self.friction, self.moving = friction, moving
-        self.first = first
-        self.last = tuple(first + n for n in cells)
-
-    @ti.func
-    def constrain(self, node: ti.template(), velocity: ti.template()):
-        """Return the velocity of a node after the walls."""
-        result = velocity
-        for a in ti.static(range(self.dimension)):
-            if ti.static(self.faces[a][0] != PERIODIC):
-                if node[a] <= self.first:
-                    result = self.stopped(result, a, 0)
-                if node[a] >= self.last[a]:
-                    result = self.stopped(result, a, 1)
-        return result
-
-    @ti.func
-    def stopped(self, velocity: ti.template(), axis: ti.template(), side: ti.template()):
-        """Return the velocity at a node on or behind the lower (side 0) or the upper (1) face of an axis."""
-        result = velocity
-        along_wall = ti.Vector.zero(float, self.dimension)
-        for f in ti.static(range(len(self.moving.faces))):
-            if ti.static(self.moving.faces[f] == (axis, side)):
-                for c in ti.static(range(self.dimension)):
-                    along_wall[c] = self.moving.of(f)[c]
-                    result[c] -= along_wall[c]
-        for c in ti.static(range(self.dimension)):
-            if ti.static(self.faces[axis][side] == "stick" or (self.faces[axis][side] == "slip" and c == axis)):
-                result[c] = 0.0
-            elif ti.static(c == axis):
-                outward = velocity[c] if ti.static(side == 1) else -velocity[c]
-                if outward > 0:
-                    result[c] = 0.0
-        for f in ti.static(range(len(self.friction.faces))):
-            if ti.static(self.friction.faces[f] == (axis, side)):
-                along = 0.0
-                for c in ti.static(range(self.dimension)):
-                    if ti.static(c != axis):
-                        along += result[c] ** 2
-                push = velocity[axis] if ti.static(side == 1) else -velocity[axis]
-                if push > 0 and along > 0:
-                    kept = ti.max(1.0 - self.friction.of(f) * push / ti.sqrt(along), 0.0)
-                    for c in ti.static(range(self.dimension)):
-                        if ti.static(c != axis):
-                            result[c] *= kept
-        for f in ti.static(range(len(self.moving.faces))):
-            if ti.static(self.moving.faces[f] == (axis, side)):
-                for c in ti.static(range(self.dimension)):
-                    result[c] += along_wall[c]
         return result

@@ -128,9 +128,7 @@ def expected_steps(facts: SceneFacts) -> int:
 
 
 def damped_step(facts: SceneFacts, body: BodyFacts, step: float) -> float:
-    """Return the step (s) whose damping a body has in steps of `step`: its own if that is longer, but with PIC."""
-    if facts.scene.solver.transfer == "pic":
-        return step
+    """Return the step (s) whose damping a body has in steps of `step`: its own if that is longer."""
     return max(step, OWN_STEP * own_limit(body.body, body.law, facts.scene))
 
 

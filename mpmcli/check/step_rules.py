@@ -10,7 +10,7 @@ from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import damped_step, expected_steps, steps_at, wave_loss
 from mpmcli.check.geometry import spanned_axes, touched_walls
 from mpmcli.scene.bounds import highest_speed
-from mpmcli.scene.schema import USUAL_FLIP, SolverSettings, Time
+from mpmcli.scene.schema import USUAL_FLIP, SolverSettings
 from mpmcli.scene.shapes import Ball, Box, Form, Points
 from mpmcli.stability.transfer_factors import impact_loss, loss_per_step, step_inertia
 
@@ -68,11 +68,9 @@ def step_findings(facts: SceneFacts) -> Iterator[Finding]:
             yield Finding("warning", "step-above-safety", what, fix, step / limit.value, limit.body)
             return
     if step < SMALL_STEP * facts.step:
-        pic = facts.scene.solver.transfer == "pic"
-        damps = " and loses as many times the energy, as PIC damps per step" if pic else ""
         what = (
             f"{asked} {facts.step / step:.3g} times smaller than the stable step, {facts.step:.4g} s: the run takes as "
-            f"many times longer{damps}."
+            "many times longer."
         )
         fix = f'Set time.step to {facts.step:.4g} s, or to "auto".'
         yield Finding("warning", "small-step", what, fix, step / facts.step)
@@ -95,8 +93,6 @@ def _dissipation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     """Yield the loss of a wave in the run, unless plastic flow or viscosity of the body dissipates more."""
     step = damped_step(facts, body, facts.taken(facts.step_at_start))
     h, end = facts.scene.domain.spacing, facts.scene.time.end
-    # The loss per step is of order (k h)^4, with PIC (k h)^2, in twice as many steps.
-    part = "a half" if facts.scene.solver.transfer == "pic" else "an eighth"
     rate = wave_loss(body.thickness, h, step, facts.scene.solver)
     lost = -math.expm1(-rate * end)
     if lost < NOTED_LOSS or body.own_loss > rate:
@@ -105,7 +101,7 @@ def _dissipation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         f"At a step of {step:.3g} s the transfers take {100 * -math.expm1(-rate):.2g} % of the energy of a wave across "
         f'body "{body.name}", {body.thickness / h:.3g} cells thick, in a second, and {100 * lost:.2g} % in the run.'
     )
-    fix = f"The largest stable step, {facts.step_at_start:.3g} s, loses least; half the spacing loses {part}."
+    fix = "Half the spacing loses an eighth."
     yield Finding("note", "dissipation", what, fix, rate, body.name)
 
 
@@ -173,13 +169,6 @@ def _cure(facts: SceneFacts, finer: float, aflip: float) -> str:
     ways = [f"Half the spacing leaves {_percent(finer)}"]
     if facts.scene.solver.transfer != "aflip":
         ways.append(f'solver.transfer = "aflip" {_percent(aflip)}')
-    time, usual = facts.scene.time, Time.model_fields["safety"].default
-    if facts.scene.solver.transfer != "pic":
-        return ", ".join(ways) + "."
-    if time.step != "auto" and time.step < facts.step_expected:
-        ways.append('time.step = "auto" less, as the loss is per step')
-    elif time.safety < usual:
-        ways.append(f"time.safety = {usual:g} about {time.safety / usual:.2g} of it, as the loss is per step")
     return ", ".join(ways) + "."
 
 

@@ -115,8 +115,6 @@ def _unsuited(scene: Scene) -> Iterator[Problem]:
         what = "emitters" if scene.emitters else "open faces"
         said = f'solver.solids = "total" knows no {what}: give solids = "updated", or leave them out'
         yield Problem(found[0], said)
-    if scene.solver.walls == "zeroed" and opens:
-        yield Problem(("domain", "walls"), 'solver.walls = "zeroed" knows no open faces: give walls = "folded"')
 
 
 # Cells that a particle may lie inside of a collider: of round-off, and of curved surfaces that are given by chords.
@@ -394,8 +392,6 @@ def _total(scene: Scene) -> Iterator[Problem]:
     if any(scene.domain.periodic):
         said = '"total" keeps bodies whole on a grid that does not repeat; give solids = "updated", or other walls'
         yield Problem(where, said)
-    if scene.solver.walls == "zeroed":
-        yield Problem(where, '"total" needs walls = "folded"')
 
 
 def _too_close(scene: Scene) -> Iterator[Problem]:

@@ -201,12 +201,11 @@ class SolverSettings(Table):
         "4: smoother, and stable at steps 1.15 times as long, but waves are 1.4 times further off and lose twice "
         "as much in a step, for 16/9 of the work on nodes in 2D, 64/27 in 3D.",
     )
-    transfer: Literal["apic", "pic", "aflip"] = Field(
+    transfer: Literal["apic", "aflip"] = Field(
         "apic",
         description='What particles hand to the nodes and take back. "apic": velocity and its gradient, which '
-        'keeps angular momentum exactly. "pic": the velocity alone; the dissipative reference, at 0.71 of the '
-        'step. "aflip": APIC that damps only a share of what the grid does not see: waves, splashes and spin lose far '
-        "less; twice the memory of the grid, and some noise.",
+        'keeps angular momentum exactly. "aflip": APIC that damps only a share of what the grid does not see: waves, '
+        "splashes and spin lose far less; twice the memory of the grid, and some noise.",
     )
     flip: Annotated[
         float | None,
@@ -230,11 +229,6 @@ class SolverSettings(Table):
         description="Whether particles of a cell share their change of volume (F-bar), so that material that "
         'hardly changes its volume does not lock. "auto": those of laws of which a body has a Poisson\'s ratio of '
         f"more than {NEARLY_INCOMPRESSIBLE:g}, and does not flow.",
-    )
-    walls: Literal["folded", "zeroed"] = Field(
-        "folded",
-        description='How walls act. "folded" mirrors what lies behind them: second-order accurate. "zeroed" sets '
-        "the velocity of nodes on and behind them to zero, as is usual: first-order, to compare with.",
     )
     grid: Literal["auto", "dense", "sparse"] = Field(
         "auto",

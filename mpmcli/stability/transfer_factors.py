@@ -21,35 +21,31 @@ FARTHEST = 0.2
 # (docs/theory.md, 2.5): -ln(1 - loss) = IMPACT_LOSS sqrt(min(1 / M, n / SLOW)) / (n C) in n cells, at the Mach number M
 # of a bar and the Courant number C of a step.
 IMPACT_LOSS, SLOW = 0.165, 1 / 14
-# The same with PIC over that with APIC, and the least that AFLIP leaves of it.
-IMPACT_OF_PIC, IMPACT_OF_AFLIP = 1.5, 0.12
+# The least that AFLIP leaves of it.
+IMPACT_OF_AFLIP = 0.12
 
 
 def affine_moment(settings: SolverSettings) -> float:
-    """Return D / h^2: m h^2 times it is the moment of inertia that the affine velocity C carries; none with PIC."""
-    return 0.0 if settings.transfer == "pic" else 1 / INVERSE_MOMENT[settings.kernel]
+    """Return D / h^2: m h^2 times it is the moment of inertia that the affine velocity C carries."""
+    return 1 / INVERSE_MOMENT[settings.kernel]
 
 
 def step_inertia(settings: SolverSettings) -> float:
     """Return the inertia that a particle's stiffness works against, over that of APIC with quadratic splines.
 
-    A lone particle obeys C' = s C - a tau with a = dt / (D density), tau = S e + V C and e' = e + dt C'. APIC keeps its
-    C, s = 1, which is stable while dt^2 S + 2 dt V <= 4 D density. With PIC
-    s = 0, and half of that is stable. AFLIP has the bound of APIC (docs/theory.md, 6.1).
+    A lone particle obeys C' = C - a tau with a = dt / (D density), tau = S e + V C and e' = e + dt C', which is stable
+    while dt^2 S + 2 dt V <= 4 D density. AFLIP has the bound of APIC (docs/theory.md, 6.1).
     """
-    return (4 / INVERSE_MOMENT[settings.kernel]) * (0.5 if settings.transfer == "pic" else 1.0)
+    return 4 / INVERSE_MOMENT[settings.kernel]
 
 
 def loss_per_step(settings: SolverSettings, kh: float) -> float:
     """Return the share of its energy that an elastic wave loses in a step, at wave number times spacing kh.
 
-    With PIC (D / h^2) (k h)^2: half of the loss of kinetic energy in a transfer, as half of a wave's energy is kinetic.
     AFLIP loses 1 - flip of what APIC loses (docs/theory.md, 2.4).
     """
     # Products overflow to infinity, where powers raise an error.
     square = kh * kh
-    if settings.transfer == "pic":
-        return square / INVERSE_MOMENT[settings.kernel]
     return (1 - (settings.flip or 0.0)) * APIC_LOSS[settings.kernel] * square * square
 
 
@@ -67,9 +63,7 @@ def impact_loss(settings: SolverSettings, cells: float, mach: float, courant: fl
         courant: wave speed times step over spacing.
     """
     factor = APIC_LOSS[settings.kernel] / APIC_LOSS["quadratic"]
-    if settings.transfer == "pic":
-        factor *= IMPACT_OF_PIC
-    elif settings.transfer == "aflip":
+    if settings.transfer == "aflip":
         factor *= max(1 - (settings.flip or 0.0), IMPACT_OF_AFLIP)
     slowness = min(1 / mach, cells / SLOW) if mach > 0 else cells / SLOW
     return -math.expm1(-factor * IMPACT_LOSS * math.sqrt(slowness) / (cells * courant))

@@ -24,14 +24,13 @@ DEFINITION = re.compile(r"(?P<name>[^(:]+?)(?: \((?P<unit>.+?)\))?: (?P<text>.+)
 KNOBS: dict[str, dict[object, str]] = {
     "precision": {"f64": "f64", "f32": "f32"},
     "kernel": {"quadratic": "quadratic kernel", "cubic": "cubic kernel"},
-    "transfer": {"apic": "APIC", "pic": "PIC", "aflip": "AFLIP"},
-    "walls": {"folded": "folded walls", "zeroed": "zeroed walls"},
+    "transfer": {"apic": "APIC", "aflip": "AFLIP"},
     "per_axis": {1: "1 particle per axis", 2: "2 particles per axis", 3: "3 particles per axis"},
     "safety": {value: f"Courant fraction {value:g}" for value in (0.1, 0.2, 0.4, 0.8, 0.95)},
 }
 DEFAULT = "default"
 # Defaults of a scene, omitted by `Setting.solver_table`.
-SCENE_DEFAULTS = {"precision": "f32", "kernel": "quadratic", "transfer": "apic", "walls": "folded"}
+SCENE_DEFAULTS = {"precision": "f32", "kernel": "quadratic", "transfer": "apic"}
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,6 @@ class Setting:
     precision: str = "f64"
     kernel: str = "quadratic"
     transfer: str = "apic"
-    walls: str = "folded"
     per_axis: int = 2
     safety: float = 0.8
 
@@ -146,7 +144,7 @@ class Case(ABC):
     levels: ClassVar[Levels]  # the resolutions of each level, from coarse to fine
     measures: ClassVar[tuple[Measure, ...]]  # the first one is the error of the case
     # The fields of `Setting` that are varied.
-    varies: ClassVar[tuple[str, ...]] = ("precision", "kernel", "transfer", "walls", "per_axis", "safety")
+    varies: ClassVar[tuple[str, ...]] = ("precision", "kernel", "transfer", "per_axis", "safety")
     finer: ClassVar[int] = 1  # factor on the particles per cell and axis of the setting
     solids: str = "updated"  # grid of elastic bodies, as in a scene
     f_bar: ClassVar[bool | str] = "auto"  # whether volumes are averaged over cells, as in a scene

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from mpmcli.boundaries.colliders import ColliderMotion, Colliders
-from mpmcli.boundaries.mirror_images import build_walls
-from mpmcli.boundaries.walls import MovingFaces, RoughFaces
+from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls, faces_on_grid
 from mpmcli.errors import InputError, RunError
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.drive.forces import DriveValues, Gravity, push_on
@@ -116,18 +116,9 @@ class Batch:
         for group in groups:
             group.repeat(period)
         friction, moving = RoughFaces(kind.rough, runs), MovingFaces(kind.moving, d, runs)
-        walls, images = build_walls(
-            kind.faces,
-            kind.settings,
-            PAD,
-            grid.cells,
-            grid.shape,
-            scheme.spline.on_node,
-            friction,
-            moving,
-            runs,
-            on_cpu=on_cpu,
-        )
+        faces = faces_on_grid(kind.faces, kind.settings)
+        walls = Walls(faces, PAD, grid.cells, grid.shape, runs, friction, moving)
+        images = MirrorImages(walls, scheme.spline.on_node, on_cpu=on_cpu)
         if deterministic:
             grid.fixed = FixedPoint(grid, groups, backend.arch)
         self._buffers = SortBuffers(groups, runs) if sorts else None
@@ -147,7 +138,7 @@ class Batch:
             walls,
             friction,
             moving,
-            NodeUpdate(grid, images, [walls], colliders),
+            NodeUpdate(grid, images, colliders),
             ParticleUpdate(
                 grid, kind.faces, runs * len(groups), contact, friction, moving, watches_box=sorts and not on_cpu
             ),

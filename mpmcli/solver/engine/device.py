@@ -5,7 +5,7 @@ from copy import copy
 from dataclasses import dataclass
 
 from mpmcli.boundaries.colliders import ColliderMotion, Colliders
-from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls, ZeroedWalls
+from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.drive.forces import DriveValues, Gravity
 from mpmcli.solver.engine.phases import Phase, step_phases
@@ -39,7 +39,7 @@ class Device:
     grid: Grid
     groups: Sequence[ParticleArrays]
     orders: Sequence[TileOrder]
-    walls: Walls | ZeroedWalls
+    walls: Walls
     friction: RoughFaces
     moving: MovingFaces
     nodes: NodeUpdate
@@ -101,18 +101,13 @@ def views(
     friction = _changed(device.friction, first=w * len(device.friction.faces))
     moving = _changed(device.moving, first=w * len(device.moving.faces))
     walls = _changed(device.walls, last=last, friction=friction, moving=moving)
-    images = device.nodes.images
-    if images is not None:
-        # Beside walls that set velocities to zero only periodic faces have images.
-        mirrors = walls if images.walls is device.walls else _changed(images.walls, last=last)
-        mirrors.first_plane = w * len(mirrors.separating)
-        mirrors.first_rough = w * len(mirrors.rough)
-        images = _changed(images, walls=mirrors)
+    walls.first_plane = w * len(walls.separating)
+    walls.first_rough = w * len(walls.rough)
+    images = _changed(device.nodes.images, walls=walls)
     colliders = device.colliders
     if colliders is not None:
         colliders = _changed(colliders, run=w, spacing=h)
-    boundaries = tuple(walls if each is device.walls else each for each in device.nodes.boundaries)
-    nodes = _changed(device.nodes, grid=grid, images=images, boundaries=boundaries, colliders=colliders)
+    nodes = _changed(device.nodes, grid=grid, images=images, colliders=colliders)
     particles = _changed(
         device.particles,
         grid=grid,

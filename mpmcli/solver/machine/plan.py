@@ -162,7 +162,7 @@ def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = Fal
         members,
         [averages_volume(scene.solver, law) for law in members],
         contact=bool(_separating_axes(scene)),
-        friction=scene.solver.walls != "zeroed" and bool(_rough_axes(scene)),
+        friction=bool(_rough_axes(scene)),
         deterministic=deterministic,
         loads=deterministic and bool(scene.colliders),
     )
@@ -256,17 +256,15 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
 
 
 def _separating_axes(scene: Scene) -> list[int]:
-    """Return the axis of every face that needs contact flags: separating ones of the grid, unless walls are zeroed."""
-    if scene.solver.walls == "zeroed" or scene.solver.solids == "total":
+    """Return the axis of every face that needs contact flags: separating ones of the grid."""
+    if scene.solver.solids == "total":
         return []
     faces = scene.domain.walls.faces(scene.dimension)
     return [axis for axis, pair in enumerate(faces) for wall in pair if wall == "separate"]
 
 
 def _rough_axes(scene: Scene) -> list[int]:
-    """Return the axis of every face of the grid that has friction, unless walls are zeroed."""
-    if scene.solver.walls == "zeroed":
-        return []
+    """Return the axis of every face of the grid that has friction."""
     total, faces = scene.solver.solids == "total", scene.domain.walls.faces(scene.dimension)
     return [axis for axis, side in rough_faces(scene) if not (total and faces[axis][side] == "separate")]
 

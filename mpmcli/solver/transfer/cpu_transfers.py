@@ -109,7 +109,7 @@ def scatter_range(
                 for c in ti.static(range(d)):
                     frictions[c, lane] = friction[c]
             if ti.static(group.pushed):
-                push, slope = group.force.acceleration(group, p, ti.static(group.force.spreads and grid.scheme.affine))
+                push, slope = group.force.acceleration(group, p, group.force.spreads)
                 for c in ti.static(range(d)):
                     pushes[c, lane] = push[c]
                     for a in ti.static(range(d)):

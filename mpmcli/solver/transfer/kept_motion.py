@@ -24,8 +24,6 @@ NEAR = 0.8
 def keeps_motion(scene: Scene, members: Sequence[Law]) -> bool:
     """Return whether any body of a scene keeps a share of its motion, by what is known before the run."""
     time, h = scene.time, scene.domain.spacing
-    if scene.solver.transfer == "pic":
-        return False
     if scene.solver.flip:
         return True
     of_name = {law.name: law for law in members}

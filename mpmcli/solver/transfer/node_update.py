@@ -1,7 +1,5 @@
 """What a step does at the nodes of the grid between P2G and G2P: fold, velocity, constrain, unfold."""
 
-from collections.abc import Sequence
-
 from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.mirror_images import MirrorImages
 from mpmcli.boundaries.walls import REACH
@@ -14,24 +12,14 @@ class NodeUpdate:
     """Turns momentum into velocity at every node.
 
     Attributes:
-        images: mirror images behind walls, None where walls do not mirror.
-        boundaries: what constrains the velocity, in turn, by a ti.func `constrain(node, velocity)`: of the integer
-            coordinates of a node, and its velocity, m/s, with the mass in entry d.
+        images: mirror images behind walls, which constrain the velocity.
         colliders: what does so after them, None where there are none.
     """
 
-    def __init__(
-        self, grid: Grid, images: MirrorImages | None, boundaries: Sequence, colliders: Colliders | None = None
-    ) -> None:
-        self.grid, self.dimension = grid, grid.dimension
-        self.images, self.mirrors = images, images is not None
-        self.needs_contact = images is not None and images.needs_contact
-        self.needs_friction = images is not None and images.needs_friction
-        self.boundaries = tuple(boundaries)
+    def __init__(self, grid: Grid, images: MirrorImages, colliders: Colliders | None = None) -> None:
+        self.grid, self.dimension, self.images = grid, grid.dimension, images
+        self.needs_contact, self.needs_friction = images.needs_contact, images.needs_friction
         self.collides, self.colliders = colliders is not None, colliders
-
-    def is_mirror(self, boundary: object) -> bool:
-        return self.mirrors and boundary is self.images.walls
 
     @ti.func
     def update(self, node: ti.template(), index: int, gravity_step: ti.template()):
@@ -54,7 +42,6 @@ class NodeUpdate:
         d = ti.static(self.dimension)
         value = self.grid.part(index, 0)
         pull = gravity_step
-        kind = -1
         speed_squared = 0.0
         # Asked for once: what follows from them is most of the code of this loop.
         depth, mirror, upper = ti.Vector([REACH + 1] * d), node, ti.Vector.zero(int, d)
@@ -62,22 +49,21 @@ class NodeUpdate:
         place = ti.static((depth, mirror, upper, acts, holds))
 
         # Fold.
-        if ti.static(self.mirrors):
-            kind = self.images.kind(node)
-            for k, images in ti.static(enumerate(self.images.kinds)):
-                if kind == k:
-                    found_depth, found_mirror, found_upper = images.walls.place(node)
-                    found_acts = images.walls.acting(node, found_depth, found_mirror, found_upper)
-                    found_holds = images.walls.holding(node, found_depth, found_upper, True)
-                    for a in ti.static(images.walls.axes):
-                        depth[a], mirror[a], upper[a] = found_depth[a], found_mirror[a], found_upper[a]
-                        acts[a], holds[a] = found_acts[a], found_holds[a]
-                    total = images.fold(self.grid, 0, node, place, gravity_step, True)
-                    # Entry by entry here and below: Taichi loses vectors that are assigned as a whole in static blocks.
-                    for c in ti.static(range(self.grid.kept)):
-                        value[c] = total[c]
-                    for a in ti.static(range(d)):
-                        pull[a] = 0.0
+        kind = self.images.kind(node)
+        for k, images in ti.static(enumerate(self.images.kinds)):
+            if kind == k:
+                found_depth, found_mirror, found_upper = images.walls.place(node)
+                found_acts = images.walls.acting(node, found_depth, found_mirror, found_upper)
+                found_holds = images.walls.holding(node, found_depth, found_upper, True)
+                for a in ti.static(images.walls.axes):
+                    depth[a], mirror[a], upper[a] = found_depth[a], found_mirror[a], found_upper[a]
+                    acts[a], holds[a] = found_acts[a], found_holds[a]
+                total = images.fold(self.grid, 0, node, place, gravity_step, True)
+                # Entry by entry here and below: Taichi loses vectors that are assigned as a whole in static blocks.
+                for c in ti.static(range(self.grid.kept)):
+                    value[c] = total[c]
+                for a in ti.static(range(d)):
+                    pull[a] = 0.0
 
         if value[d] > 0:
             # Velocity.
@@ -86,17 +72,10 @@ class NodeUpdate:
                 velocity[a] = value[a] / value[d] + pull[a]
 
             # Constrain.
-            for boundary in ti.static(self.boundaries):
-                if ti.static(self.is_mirror(boundary)):
-                    if kind >= 0:
-                        constrained = boundary.constrained(velocity, depth, upper, acts, holds)
-                        for c in ti.static(range(d)):
-                            velocity[c] = constrained[c]
-                else:
-                    constrained = boundary.constrain(node, velocity)
-                    for c in ti.static(range(d)):
-                        velocity[c] = constrained[c]
-
+            if kind >= 0:
+                constrained = self.images.walls.constrained(velocity, depth, upper, acts, holds)
+                for c in ti.static(range(d)):
+                    velocity[c] = constrained[c]
             if ti.static(self.collides):
                 met = self.colliders.constrain(node, velocity, value[d])
                 for c in ti.static(range(d)):
@@ -121,17 +100,16 @@ class NodeUpdate:
         """
         first = ti.static(self.grid.kept)
         before = self.grid.part(index, first)
-        if ti.static(self.mirrors):
-            depth, _mirror, upper, _acts, holds = ti.static(place)
-            for k, images in ti.static(enumerate(self.images.kinds)):
-                if kind == k:
-                    by_word = images.walls.holding(node, depth, upper, False)
-                    for a in ti.static(images.walls.axes):
-                        holds[a] = by_word[a]
-                    pull = ti.Vector.zero(float, ti.static(self.dimension))
-                    total = images.fold(self.grid, first, node, place, pull, False)
-                    for c in ti.static(range(self.grid.kept)):
-                        before[c] = total[c]
+        depth, _mirror, upper, _acts, holds = ti.static(place)
+        for k, images in ti.static(enumerate(self.images.kinds)):
+            if kind == k:
+                by_word = images.walls.holding(node, depth, upper, False)
+                for a in ti.static(images.walls.axes):
+                    holds[a] = by_word[a]
+                pull = ti.Vector.zero(float, ti.static(self.dimension))
+                total = images.fold(self.grid, first, node, place, pull, False)
+                for c in ti.static(range(self.grid.kept)):
+                    before[c] = total[c]
         mass = before[ti.static(self.dimension)]
         for a in ti.static(range(self.dimension)):
             before[a] = ti.select(mass > 0.0, before[a] / mass, 0.0)
@@ -142,11 +120,8 @@ class NodeUpdate:
         self, first: ti.template(), node: ti.template(), index: int, kind: int, place: ti.template(), new: ti.template()
     ):
         """Write the velocity of a node, and of its images."""
-        if ti.static(self.mirrors):
-            if kind < 0:
-                self.grid.set_part(index, first, new)
-            for k, images in ti.static(enumerate(self.images.kinds)):
-                if kind == k:
-                    images.unfold(self.grid, first, node, place, new)
-        else:
+        if kind < 0:
             self.grid.set_part(index, first, new)
+        for k, images in ti.static(enumerate(self.images.kinds)):
+            if kind == k:
+                images.unfold(self.grid, first, node, place, new)

@@ -25,10 +25,9 @@ def scatter(g: ti.template(), group: ti.template(), particles: ti.template(), p:
     """Add the mass and the momentum of particle p, stress included, to the nodes around it, with atomics.
 
     A law with plastic flow projects the particle's state first; forces change v by kick a, and C by kick da/dx. Node i
-    receives w_i (m v + A (x_i - x_p)) with A = m C - dt V0 tau / D (Hu et al. 2018, eq. 18), and w_i m; PIC has no m C.
+    receives w_i (m v + A (x_i - x_p)) with A = m C - dt V0 tau / D (Hu et al. 2018, eq. 18), and w_i m.
     """
     grid = particles.grid
-    affine = ti.static(grid.scheme.affine)
     row = group.row(p)
     mass = row[MASS]
     v, C = group.motion(p)
@@ -44,7 +43,7 @@ def scatter(g: ti.template(), group: ti.template(), particles: ti.template(), p:
         else:
             group.store(p, deformation, inner)
     if ti.static(group.pushed):
-        push, slope = group.force.acceleration(group, p, ti.static(group.force.spreads and affine))
+        push, slope = group.force.acceleration(group, p, group.force.spreads)
         v += kick * push
         C += kick * slope
     if ti.static(group.total):
@@ -91,10 +90,7 @@ def momentum(
     for c in ti.static(range(d)):
         middle[c] = mass * v[c]
         for a in ti.static(range(d)):
-            if ti.static(grid.scheme.affine):
-                change[a, c] = (mass * grid.spacing) * C[c, a] - stress_scale * stress[c, a]
-            else:
-                change[a, c] = -stress_scale * stress[c, a]
+            change[a, c] = (mass * grid.spacing) * C[c, a] - stress_scale * stress[c, a]
             middle[c] -= change[a, c] * (distance[a] - 1.0)
     middle[d] = mass
     return middle, change

@@ -79,13 +79,12 @@ SPLINES = {"quadratic": QuadraticSpline(), "cubic": CubicSpline()}
 class TransferScheme:
     """Constants of the transfers between particles and nodes.
 
-    affine: whether P2G includes the affine velocity C, as in APIC; keeps_before: whether nodes also store mass and
-    momentum, without this step's stress and forces, of the shares that bodies keep (`kept_motion`); damped: share of
-    what nodes do not see that a body loses in a step of its own, less than 1 with AFLIP.
+    keeps_before: whether nodes also store mass and momentum, without this step's stress and forces, of the shares that
+    bodies keep (`kept_motion`); damped: share of what nodes do not see that a body loses in a step of its own, less
+    than 1 with AFLIP.
     """
 
     spline: QuadraticSpline | CubicSpline
-    affine: bool = True
     keeps_before: bool = False
     damped: float = 1.0
 
@@ -97,4 +96,4 @@ class TransferScheme:
 
 def scheme_of(settings: SolverSettings, *, keeps_before: bool) -> TransferScheme:
     damped = 1 - (settings.flip or 0.0)
-    return TransferScheme(SPLINES[settings.kernel], settings.transfer != "pic", keeps_before, damped)
+    return TransferScheme(SPLINES[settings.kernel], keeps_before, damped)

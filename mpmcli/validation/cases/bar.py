@@ -92,7 +92,7 @@ class Bar(Case):
         self.frequency = b * WAVE_SPEED
         free = room > 0
         # What the other knobs do shows in the bar between two walls.
-        self.varies = ("precision", "walls") if free else Case.varies
+        self.varies = ("precision",) if free else Case.varies
         self.measures = (
             self.text.measure("period error", lambda n: 1.3 * 0.105 * (b * LENGTH / n) ** 2, order=1.9, expected=2.0),
             # Between walls: what a fit to a signal of finite amplitude cannot tell.

@@ -111,7 +111,7 @@ class Poiseuille(Channel):
     name, title, group = "poiseuille", "Start of a viscous flow between walls that stick", "fluids"
     levels = {"coarse": (8, 16), "default": (8, 16, 32), "fine": (8, 16, 32, 64)}  # noqa: RUF012
     end, length = 0.15 * WIDTH**2 / VISCOSITY, 6
-    varies = ("precision", "transfer", "walls")
+    varies = ("precision", "transfer")
     material = VISCOUS
     measures = channel_measures(lambda n: 1.5 * 1.6 / n**2, 1.9)
     known = staticmethod(started)
@@ -141,7 +141,7 @@ class Couette(Case):
     source = Poiseuille.source
     resolution = Channel.resolution
     levels = Poiseuille.levels
-    varies = ("precision", "transfer", "walls")
+    varies = ("precision", "transfer")
     measures = (
         text.measure("velocity error", lambda n: 1.5 * 0.25 / n**2, order=1.9, expected=2.0),
         text.measure("cross flow", 1e-4),

@@ -65,7 +65,7 @@ class HydrostaticDrop(Case):
 
     text = case_text("hydrostatic_drop")
     name, title, group = "hydrostatic_drop", "Column of water let go", "fluids"
-    varies = ("precision", "transfer", "walls")
+    varies = ("precision", "transfer")
     levels = {"coarse": (16, 32), "default": (16, 32, 64), "fine": (32, 64, 128)}  # noqa: RUF012
     # Stiff, so that the column is nearly linear: its weight at rest compresses it by 0.1 % at the base. Sound runs as
     # much faster as it is compressed, by half of that along each characteristic, whenever that starts.

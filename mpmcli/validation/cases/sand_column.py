@@ -40,7 +40,7 @@ class SandColumn(Case):
         self.name = f"sand_column_{aspect}"
         self.note = case_text(self.name).note
         # What the knobs do shows in one of them.
-        self.varies = ("precision", "kernel", "transfer", "walls") if aspect == 2 else ("precision",)
+        self.varies = ("precision", "kernel", "transfer") if aspect == 2 else ("precision",)
         self.title = f"Column of sand, height over width {aspect}"
         coarse, usual, fine = resolutions
         self.levels = {"coarse": (coarse,), "default": (coarse, usual), "fine": (coarse, usual, fine)}

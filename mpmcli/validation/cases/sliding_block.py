@@ -21,7 +21,7 @@ class SlidingBlock(Case):
     text = case_text("sliding_block")
     name, title, group = "sliding_block", "Block that slides along a rough floor and stops", "solids"
     levels = {"coarse": (4,), "default": (4, 8), "fine": (4, 8, 16)}  # noqa: RUF012
-    varies = ("precision", "kernel", "transfer", "walls")
+    varies = ("precision", "kernel", "transfer")
     measures = (
         Measure("distance error: How far it slides, relative to v0^2 / (2 mu g).", 7e-3),
         Measure("deceleration error: While it slides, relative to mu g.", 7e-3),

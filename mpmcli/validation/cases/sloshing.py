@@ -36,7 +36,7 @@ class Sloshing(Case):
 
     text = case_text("sloshing")
     name, title, group = "sloshing", "Sloshing in a tank", "fluids"
-    varies = ("precision", "kernel", "transfer", "walls", "safety")
+    varies = ("precision", "kernel", "transfer", "safety")
     levels = {"coarse": (24, 32), "default": (24, 32, 64), "fine": (32, 64, 128)}  # noqa: RUF012
     measures = (
         text.measure("period error", lambda n: 5e-3 * (32 / n) ** 1.5),
