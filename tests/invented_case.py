@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mpmcli.validation.case import Case, Measure, Setting
-from mpmcli.validation.runs import Run, RunResult, failure, runs_of
+from mpmcli.validation.runs import Run, RunResult, runs_of
 
 
 class Invented(Case):
@@ -33,7 +33,7 @@ Law = Callable[[Run], float | None]
 def result(error: float, particles: int = 100, steps: int = 11, seconds: float = 1.0) -> RunResult:
     """Return the result of a run that finished."""
     values = {"error": error, "drift": -1e-3}
-    return RunResult("finished", "", values, particles=particles, steps=steps, seconds=seconds, threads=1)
+    return RunResult("finished", "", values, particles=particles, steps=steps, seconds=seconds)
 
 
 def second_order(run: Run) -> float:
@@ -49,6 +49,6 @@ def results(law: Law = second_order, level: str = "default") -> dict[Run, RunRes
     found = {}
     for run in runs_of(CASE, level):
         error = law(run)
-        lost = failure("It was <lost>.", "unstable")
+        lost = RunResult("unstable", "It was <lost>.")
         found[run] = lost if error is None else result(error, run.n**2, run.n + 1, 1e-6 * run.n**3)
     return found

@@ -19,9 +19,9 @@ from mpmcli.scene.schema import USUAL_FLIP, SolverSettings
 from mpmcli.scene.shapes import Ball, Box, Polygon
 from mpmcli.solver.engine.build import build_run
 from mpmcli.stability.transfer_factors import impact_loss
-from mpmcli.validation.carry_out import scene_of as scene_of_case
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases.two_disks import CASES as TWO_DISKS
+from mpmcli.validation.runs import scene_of as scene_of_case
 
 DENSITY, SOUND, NU = 1000.0, 20.0, 0.1
 

@@ -10,9 +10,9 @@ from mpmcli.scene import Scene
 from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.transfer.kept_motion import kept_share
-from mpmcli.validation.carry_out import scene_of as scene_of_case
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases
+from mpmcli.validation.runs import scene_of as scene_of_case
 
 SOFT = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e4, "poissons_ratio": 0.3}
 

@@ -38,7 +38,7 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
         ([BAR, "--list", "--write-scene"], "give one of them"),
         ([BAR, "--levels", "finest"], "'finest' is not one of 'coarse', 'default', 'fine'"),
         ([BAR, "--workers", "0"], "0 is not in the range x>=1"),
-        ([BAR, "-o", "."], "exists and is not empty: --resume keeps"),
+        ([BAR, "-o", "."], "exists and is not empty: give another directory"),
     ],
 )
 def test_bad_usage_is_told_before_anything_runs(
@@ -87,20 +87,17 @@ def test_json_has_error_order_speed_and_verdict_of_each_run(ran: tuple[Path, Out
     directory, outcome = ran
     assert outcome.status == 0
     facts = json.loads(outcome.stdout)
-    assert facts == json.loads((directory / "report.json").read_text(encoding="utf-8"))
+    assert sorted(path.name for path in directory.iterdir()) == ["figures", "report.md", "results.json"]
     runs = facts["cases"][0]["runs"]
     assert [(run["setting"], run["n"], run["verdict"]) for run in runs] == [
         ("default", 13, "pass"),
         ("f32", 13, "pass"),
     ]
     for run in runs:
-        assert 0 < run["error"] == abs(run["values"]["period error"]) < 2e-3 and run["order"] is None
-        assert run["particle_steps"] == run["particles"] * run["steps"] and run["particles"] == 260
+        assert 0 < run["error"] == abs(run["values"]["period error"]) < 2e-3
+        assert run["particles"] == 260 and run["steps"] > 300 and run["status"] == "finished"
         assert run["seconds"] > 0 and run["compile_seconds"] > 0 and run["particle_steps_per_s"] > 0
-        assert (run["arch"], run["threads"], run["status"]) == ("cpu", 1, "finished")
-    assert [run["precision"] for run in runs] == ["f64", "f32"]
-    environment = facts["environment"]
-    assert environment["threads"] == 1 and environment["workers"] == 2 and environment["processor"]
+    assert facts["environment"]["workers"] == 2 and facts["environment"]["processor"]
 
 
 def test_people_see_each_run_and_a_table(ran: tuple[Path, Outcome], short: None) -> None:
@@ -110,22 +107,21 @@ def test_people_see_each_run_and_a_table(ran: tuple[Path, Outcome], short: None)
     assert [line.split()[0] for line in lines[1:3]] == ["1/2", "2/2"]
     assert all("bar_fixed_free, n = 13" in line and "period error 0.001" in line for line in lines[1:3])
     table = run_here("validate", BAR, "--levels", "coarse", "-o", directory, "--resume").stdout.splitlines()
-    assert "1 of 1 cases pass" in table[-2] and table[-1] == f"report: {directory / 'report.html'}"
+    assert "1 of 1 cases pass" in table[-2] and table[-1] == f"report: {directory / 'report.md'}"
 
 
 def test_what_is_done_is_not_done_again(ran: tuple[Path, Outcome], short: None) -> None:
-    """A run that is damaged, or of another program, is; nothing without --resume or --overwrite."""
-    directory, outcome = ran
-    (damaged, kept) = sorted((directory / "runs").iterdir())
-    before = kept.read_bytes()
-    damaged.write_text("{", encoding="utf-8")
+    """A run that is missing is; nothing without --resume or --overwrite."""
+    directory, _ = ran
+    results = json.loads((directory / "results.json").read_text(encoding="utf-8"))
+    (missing, kept) = results
+    (directory / "results.json").write_text(json.dumps({kept: results[kept]}), encoding="utf-8")
     again = run_here("validate", BAR, "--levels", "coarse", "-o", directory, "--resume", "--json")
-    assert again.status == 0 and kept.read_bytes() == before
-    assert "1 of 2 runs are done already, by the same program" in again.stderr.splitlines()
-    errors = [[run["error"] for run in json.loads(text)["cases"][0]["runs"]] for text in (outcome.stdout, again.stdout)]
-    assert errors[0] == errors[1]
+    assert again.status == 0 and "1 of 2 runs are done already, by the same program" in again.stderr.splitlines()
+    after = json.loads((directory / "results.json").read_text(encoding="utf-8"))
+    assert after[kept] == results[kept] and after[missing]["values"] == results[missing]["values"]
     refused = run_here("validate", BAR, "--levels", "coarse", "-o", directory)
-    assert refused.status == 2 and "--resume keeps the runs" in refused.stderr
+    assert refused.status == 2 and "--resume to go on" in refused.stderr
 
 
 def test_a_case_out_of_tolerance_is_exit_code_1(
@@ -143,21 +139,22 @@ def test_a_case_out_of_tolerance_is_exit_code_1(
 
 
 def test_an_interrupt_keeps_what_is_done_and_ends_the_rest(tmp_path: Path) -> None:
-    runs = tmp_path / "report" / "runs"
+    results = tmp_path / "report" / "results.json"
     words = ["validate", "bar", "--levels", "coarse", "-o", "report", "--workers", "1"]
-    with started(tmp_path, *words) as process:
+    with started(tmp_path, *words, own_group=True) as process:
         waited_until = time.monotonic() + PATIENCE
-        while not list(runs.glob("*.json")):
+        while not results.exists():
             assert process.poll() is None, process.communicate()
             assert time.monotonic() < waited_until, "no run ended"
             time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
+        # As a terminal does, to all processes.
+        os.killpg(process.pid, signal.SIGINT)
         stdout, stderr = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130 and stdout == "" and "Traceback" not in stderr
     assert stderr.splitlines()[-1] == "interrupted; the runs that are done are kept: --resume -o report goes on"
-    assert [path.name for path in (tmp_path / "report").iterdir()] == ["runs"]
-    for path in runs.iterdir():
-        assert json.loads(path.read_text(encoding="utf-8"))["result"]["status"] == "finished"
+    assert [path.name for path in (tmp_path / "report").iterdir()] == ["results.json"]
+    kept = json.loads(results.read_text(encoding="utf-8"))
+    assert [result["status"] for result in kept.values()] == ["finished"] * len(kept)
 
 
 CASE_FILE = '''\
@@ -205,6 +202,6 @@ def test_a_case_is_one_file_of_the_package(tmp_path: Path) -> None:
     assert {entry["case"] for entry in said("--list")} == {*all_cases(), "drift"}
     (case,) = said("drift", "-o", "report")["cases"]
     assert (case["verdict"], [run["n"] for run in case["runs"]]) == ("pass", [8, 8])
-    assert 0 <= case["error"] <= 1e-12
-    assert "### A block that drifts" in (tmp_path / "report" / "report.md").read_text(encoding="utf-8")
+    assert all(0 <= run["error"] <= 1e-12 for run in case["runs"])
+    assert "## A block that drifts" in (tmp_path / "report" / "report.md").read_text(encoding="utf-8")
     assert (tmp_path / "report" / "figures" / "drift.svg").exists()

@@ -13,10 +13,9 @@ from mpmcli.check.finding import passes
 from mpmcli.check.scene_check import check_scene
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import parse_scene, scene_to_toml
-from mpmcli.validation.carry_out import carry_out, scene_of
-from mpmcli.validation.case import Setting
+from mpmcli.validation.case import KNOBS, Setting
 from mpmcli.validation.cases import all_cases
-from mpmcli.validation.runs import KNOBS, Run, RunResult
+from mpmcli.validation.runs import Run, RunResult, carry_out, scene_of
 from mpmcli.validation.verdict import ROUND_OFF, judge
 
 CASES = all_cases()
@@ -49,7 +48,7 @@ PAIRS = [
 ]
 # Written by scripts/validation_report, perhaps on a machine whose sines and roots differ in the last digit. Steps
 # longer by 1e-13 change none of the five digits that are kept, not even of the dam break and the sand.
-COMMITTED = ROOT / "docs" / "validation" / "coarse.json"
+ERRORS = json.loads((ROOT / "tests" / "validation_errors.json").read_text(encoding="utf-8"))
 TOLERANCE = 1e-3
 
 
@@ -85,13 +84,14 @@ def test_a_case_converges_as_it_should(
 
 
 @pytest.mark.parametrize(("name", "n"), RUNS)
-def test_a_case_gives_the_committed_figures(run_of: Callable, name: str, n: int) -> None:
+def test_no_error_has_become_larger(run_of: Callable, name: str, n: int) -> None:
+    """Bounds leave room for a third; a change of the solver that takes it is to be seen, and to have a reason."""
     values = run_of(name, n).values
-    committed = json.loads(COMMITTED.read_text(encoding="utf-8")).get(name, {}).get(str(n))
-    assert committed is not None, f"{COMMITTED.name} has no {name} at {n}: run scripts/validation_report"
-    assert set(committed) == set(values)
+    before = ERRORS.get(name, {}).get(str(n))
+    assert before is not None, f"no errors of {name} at {n} are kept: run scripts/validation_report --coarse {name}"
+    assert set(before) == set(values)
     for measure, value in values.items():
-        assert value == pytest.approx(committed[measure], rel=TOLERANCE, abs=ROUND_OFF), measure
+        assert abs(value) <= abs(before[measure]) * (1 + TOLERANCE) + ROUND_OFF, measure
 
 
 @pytest.mark.parametrize("name", CASES)

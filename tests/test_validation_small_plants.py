@@ -1,6 +1,9 @@
 """Errors of about 5 % planted on purpose, of which validation at the level `coarse` must catch nine in ten."""
 
+import json
+import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from functools import cache
@@ -12,11 +15,19 @@ from small_plants import SMALL_PLANTS, SmallPlant
 
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases
-from mpmcli.validation.runner import carry_out_all
-from mpmcli.validation.runs import Run
+from mpmcli.validation.runs import Run, RunResult
 from mpmcli.validation.verdict import judge
 
 FEWEST = 40
+# Prints the result of a case at its coarsest resolution.
+FIRST_RUN = """
+import dataclasses, json, sys
+from mpmcli.validation.case import Setting
+from mpmcli.validation.cases import all_cases
+from mpmcli.validation.runs import carry_out
+case = all_cases()[sys.argv[1]]
+print(json.dumps(dataclasses.asdict(carry_out(case, min(case.levels["coarse"]), Setting()))))
+"""
 CASES = all_cases()
 
 
@@ -25,13 +36,15 @@ def first_run(package: Path, name: str) -> str:
 
     The level `coarse` has that run, so that what fails here fails there.
     """
-    run = Run(name, min(CASES[name].levels["coarse"]), Setting())
     # -P: without it the package in the present directory would be taken.
-    process = ["env", f"PYTHONPATH={package}", sys.executable, "-P", "-m", "mpmcli.validation.runner"]
-    ((_, result),) = carry_out_all([run], 1, command=lambda run: [*process, run.case, str(run.n), "{}"])
+    process = [sys.executable, "-P", "-c", FIRST_RUN, name]
+    done = subprocess.run(process, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(package)})
+    assert done.returncode == 0, done.stderr
+    result = RunResult(**json.loads(done.stdout.splitlines()[-1]))
     # A run may become unstable or give no number; any other failure would be a plant that does not even compile.
     assert result.status in ("finished", "unstable") or "came to its end" in result.message, result.message
-    return "; ".join(judge(CASES[name], {run: result}).reasons)
+    n = min(CASES[name].levels["coarse"])
+    return "; ".join(judge(CASES[name], {Run(name, n, Setting()): result}).reasons)
 
 
 @pytest.fixture(scope="module")

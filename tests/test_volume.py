@@ -19,9 +19,9 @@ from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.machine.plan import make_plan
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.stability.transfer_factors import INTERVAL
-from mpmcli.validation.carry_out import scene_of
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases
+from mpmcli.validation.runs import scene_of
 
 BULK, H = 4e4, 0.1
 

@@ -124,30 +124,25 @@ class SimulateProgress(ProgressBar):
 class ValidateProgress(ProgressBar):
     """Follows the runs of some cases, `workers` at a time: a bar on a terminal, else a line per run."""
 
-    def __init__(self, cases: "Sequence[Case]", total: int, workers: int, *, quiet: bool) -> None:
+    def __init__(self, cases: "Sequence[Case]", total: int, kept: int, workers: int, *, quiet: bool) -> None:
         super().__init__(total, "runs", quiet=quiet, pause=0.0, steady=False)
         self._measures = {case.name: case.measures[0] for case in cases}
+        self._kept = kept
         self._workers = workers
 
     def __enter__(self) -> Self:
         cases = counted(len(self._measures), "case")
         self.say(f"{cases}, {self._total} runs, {self._workers} at a time, one thread each")
+        if self._kept:
+            self.say(f"{self._kept} of {self._total} runs are done already, by the same program")
         return super().__enter__()
 
-    def resumed(self, kept: int, total: int) -> None:
-        """Print the number of runs taken from the journal."""
-        self.say(f"{kept} of {total} runs are done already, by the same program")
-        if self.drawn:
-            self.show(kept)
-
-    def advance(self, run: "Run", result: "RunResult", done: int, total: int) -> None:
+    def advance(self, run: "Run", result: "RunResult", done: int) -> None:
         """Show one more run that has ended."""
-
         what = f"{run.case}, n = {run.n}, {run.setting.label}"
         if result.finished:
             measure = self._measures[run.case]
-            unit = f" {measure.unit}" if measure.unit else ""
-            outcome = f"{measure.name} {result.values[measure.name]:.3g}{unit}, {result.seconds:.2g} s"
+            outcome = f"{measure.name} {result.values[measure.name]:.3g}{measure.unit_suffix}, {result.seconds:.2g} s"
         else:
             outcome = f"{result.status}: {result.message}"
         if self.drawn and not result.finished:

@@ -1,6 +1,7 @@
 """`mpmcli validate`."""
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,8 @@ from mpmcli.errors import InputError
 
 if TYPE_CHECKING:
     from mpmcli.validation.case import Case, Level
+    from mpmcli.validation.report import Report
+    from mpmcli.validation.study import Journal
 
 
 @click.command("validate")
@@ -23,7 +26,7 @@ if TYPE_CHECKING:
     "default",
     "Resolutions, and what is varied: coarse takes minutes, default up to an hour, fine more.",
 )
-@output_option("Where report.json, report.md, report.html, figures and every run go; without it nothing is written.")
+@output_option("Where report.md, its figures and the results go; without it nothing is written.")
 @click.option("--workers", type=COUNT, help="Runs at a time, one thread each; as many as cores by default.")
 @click.option(
     "--timeout", type=click.FloatRange(min=1.0), default=1800.0, show_default=True, help="Seconds that a run may take."
@@ -61,20 +64,14 @@ def validate_command(
     if asked["write_scene"]:
         _write_scene(cases, names, level, resolution)
         return 0
-    from mpmcli.cli.progress import ValidateProgress
     from mpmcli.cores import available_cores
-    from mpmcli.validation.journal import Journal
-    from mpmcli.validation.report_page import write_report
-    from mpmcli.validation.runs import matrix
-    from mpmcli.validation.study import study
+    from mpmcli.validation.report import write_report
+    from mpmcli.validation.study import Journal
 
     workers = asked["workers"] or available_cores()
     journal = None if output is None else Journal(output, resume=resume, overwrite=overwrite)
-    progress = ValidateProgress(cases, len(matrix(cases, level)), workers, quiet=quiet)
-    followed = {"on_run": progress.advance, "resumed": progress.resumed, "stop": interrupt_came}
     try:
-        with progress, interrupts_wait():
-            report = study(cases, level, workers, journal=journal, timeout=asked["timeout"], **followed)
+        report = _study(cases, level, workers, asked["timeout"], journal, quiet)
     except KeyboardInterrupt:
         if output is None:
             raise
@@ -85,10 +82,33 @@ def validate_command(
     if as_json:
         print_json(report.as_dict())
     elif not quiet:
-        print_text(report.table())
+        print_text(report.text())
         if output is not None:
-            print_text(f"report: {output / 'report.html'}")
+            print_text(f"report: {output / 'report.md'}")
     return 0 if report.passed else 1
+
+
+def _study(
+    cases: Sequence["Case"], level: "Level", workers: int, timeout: float, journal: "Journal | None", quiet: bool
+) -> "Report":
+    """Run what the journal does not have, and return the report; KeyboardInterrupt where it was interrupted."""
+    from mpmcli.bench.report import describe_machine
+    from mpmcli.cli.progress import ValidateProgress
+    from mpmcli.validation.report import Report
+    from mpmcli.validation.runs import matrix
+    from mpmcli.validation.study import carry_out_all
+
+    environment = {**describe_machine(), "workers": workers, "date": datetime.now(UTC).date().isoformat()}
+    runs = matrix(cases, level)
+    kept = {} if journal is None else {run: result for run in runs if (result := journal.find(run)) is not None}
+    left = [run for run in runs if run not in kept]
+    with ValidateProgress(cases, len(runs), len(kept), workers, quiet=quiet) as progress, interrupts_wait():
+        for run, result in carry_out_all(left, workers, timeout, interrupt_came):
+            kept[run] = result
+            if journal is not None:
+                journal.keep(run, result)
+            progress.advance(run, result, len(kept))
+    return Report(level, environment, cases, {run: kept[run] for run in runs})
 
 
 def _chosen(names: Sequence[str]) -> list["Case"]:
@@ -132,8 +152,8 @@ def _list(cases: Sequence["Case"], level: "Level", as_json: bool) -> None:
 
 def _write_scene(cases: Sequence["Case"], names: Sequence[str], level: "Level", resolution: int | None) -> None:
     from mpmcli.scene import scene_to_toml
-    from mpmcli.validation.carry_out import scene_of
     from mpmcli.validation.case import Setting
+    from mpmcli.validation.runs import scene_of
 
     if not names:
         raise InputError("--write-scene prints the scene of one case; name it.")

@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +26,7 @@ from mpmcli.dataset.sources import require_same_sources
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.materials.registry import load_plugins
+from mpmcli.processes.interrupts import interrupts_blocked
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.engine import Arch
 from mpmcli.simulation.recording import Recording
@@ -303,7 +303,7 @@ def _local_cluster(count: int) -> "LocalCluster":
 
     for left in reversed(range(STARTS)):
         try:
-            with _interrupts_blocked():
+            with interrupts_blocked():
                 return LocalCluster(
                     n_workers=count,
                     threads_per_worker=1,
@@ -317,21 +317,6 @@ def _local_cluster(count: int) -> "LocalCluster":
             if not left:
                 raise RunError(f"the workers do not start ({error}); --resume goes on with what is done.") from error
     raise AssertionError
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Block SIGINT for all that is started here: Ctrl-C reaches all processes, and this one ends the workers."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    # The first process starts this, which unblocks the signal.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

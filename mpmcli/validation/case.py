@@ -5,7 +5,7 @@ import re
 import tomllib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from typing import Any, ClassVar, Literal
@@ -29,8 +29,6 @@ KNOBS: dict[str, dict[object, str]] = {
     "safety": {value: f"Courant fraction {value:g}" for value in (0.1, 0.2, 0.4, 0.8, 0.95)},
 }
 DEFAULT = "default"
-# Defaults of a scene, omitted by `Setting.solver_table`.
-SCENE_DEFAULTS = {"precision": "f32", "kernel": "quadratic", "transfer": "apic"}
 
 
 @dataclass(frozen=True)
@@ -50,17 +48,12 @@ class Setting:
     @property
     def label(self) -> str:
         """The differences from the default setting."""
-        changed = self.changed_from(Setting())
-        return ", ".join(KNOBS[knob].get(value, f"{knob} {value}") for knob, value in changed.items()) or DEFAULT
+        changed = [(knob, value) for knob, value in asdict(self).items() if value != getattr(Setting(), knob)]
+        return ", ".join(KNOBS[knob].get(value, f"{knob} {value}") for knob, value in changed) or DEFAULT
 
     def solver_table(self) -> Tables:
-        """Return the table [solver] of a scene, without entries at their default."""
-        return {key: getattr(self, key) for key, usual in SCENE_DEFAULTS.items() if getattr(self, key) != usual}
-
-    def changed_from(self, other: "Setting") -> dict[str, Any]:
-        """Return the fields that differ from those of another setting, by name."""
-        names = [entry.name for entry in fields(self)]
-        return {name: getattr(self, name) for name in names if getattr(self, name) != getattr(other, name)}
+        """Return the table [solver] of a scene."""
+        return {name: getattr(self, name) for name in ("precision", "kernel", "transfer", "walls")}
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ from mpmcli.scene import Scene
 from mpmcli.solver.transfer.kept_motion import OWN_STEP
 from mpmcli.validation.case import Frames
 
-STEPS = 50
-LARGEST_EXPONENT = 200.0
 # Initial frequencies of the fit, over the guess.
 STARTS = np.linspace(0.5, 2.0, 61)
+# Relative tolerances of the fit.
+TIGHT = {"ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15}
 
 
 def field(frame: Frame, name: str) -> np.ndarray:
@@ -52,39 +52,37 @@ NOT_FOUND = Oscillation(math.nan, math.nan, math.nan, math.nan)
 
 
 def fit_oscillation(times: np.ndarray, signal: np.ndarray, frequency: float) -> Oscillation:
-    """Fit a damped oscillation to several periods of a signal, (n,), by least squares with the Gauss-Newton method.
+    """Fit a damped oscillation to several periods of a signal, (n,), by least squares.
 
     The initial frequency, 0.5 to 2 times the guess in rad/s, is that of the best undamped fit. All is NaN if the fit
     fails.
     """
+    from scipy.optimize import least_squares
+
     if not np.isfinite(signal).all():
         return NOT_FOUND
-    w, decay = min(STARTS * frequency, key=lambda start: _misfit(times, signal, start)), 0.0
-    scale = np.abs(signal).max()
-    basis = np.empty((len(times), 3))
-    for _ in range(STEPS):
-        envelope = np.exp(-decay * times)
-        cosine, sine = envelope * np.cos(w * times), envelope * np.sin(w * times)
-        basis[:] = np.stack([cosine, sine, np.ones_like(times)], axis=1)
-        (a, b, offset), *_ = np.linalg.lstsq(basis, signal, rcond=None)
-        model = a * cosine + b * sine
-        # Gauss-Newton step: derivatives with respect to w and the decay extend the linear basis.
-        slopes = np.stack([times * (b * cosine - a * sine), -times * model], axis=1)
-        change, *_ = np.linalg.lstsq(np.hstack([basis, slopes]), signal - basis @ [a, b, offset], rcond=None)
-        w, decay = w + change[3], decay + change[4]
-        # The fit has diverged, or the exponential would overflow.
-        if not (0.1 * frequency < w < 10 * frequency and abs(decay) < LARGEST_EXPONENT / np.ptp(times)):
-            return NOT_FOUND
-        if (abs(change[3]) <= 1e-14 * abs(w) and abs(change[4]) <= 1e-14 * abs(w)) or scale == 0:
-            break
-    return Oscillation(float(w), float(decay), math.hypot(a, b), float(offset))
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        w, decay, a, b, offset = x
+        return np.exp(-decay * times) * (a * np.cos(w * times) + b * np.sin(w * times)) + offset - signal
+
+    _, w, parts = min((_undamped(times, signal, w) for w in STARTS * frequency), key=lambda start: start[0])
+    a, b, offset = parts
+    try:
+        found = least_squares(residual, (w, 0.0, a, b, offset), "3-point", x_scale="jac", **TIGHT)
+    # The exponential overflows.
+    except ValueError:
+        return NOT_FOUND
+    w, decay, a, b, offset = map(float, found.x)
+    sound = found.success and 0.1 < w / frequency < 10
+    return Oscillation(w, decay, math.hypot(a, b), offset) if sound else NOT_FOUND
 
 
-def _misfit(times: np.ndarray, signal: np.ndarray, frequency: float) -> float:
-    """Return the residual norm of the best undamped oscillation of that frequency."""
+def _undamped(times: np.ndarray, signal: np.ndarray, frequency: float) -> tuple[float, float, np.ndarray]:
+    """Return residual norm, frequency and coefficients of the best undamped oscillation of that frequency."""
     basis = np.stack([np.cos(frequency * times), np.sin(frequency * times), np.ones_like(times)], axis=1)
     parts, *_ = np.linalg.lstsq(basis, signal, rcond=None)
-    return float(np.linalg.norm(signal - basis @ parts))
+    return float(np.linalg.norm(signal - basis @ parts)), frequency, parts
 
 
 def window_weights(count: int) -> np.ndarray:

@@ -1,46 +1,31 @@
-"""The report of a validation: cases, verdicts and costs, as JSON and as a table."""
+"""The report of a validation: cases, verdicts and costs, as JSON, as a table, and as a page with figures."""
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+import math
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
-from mpmcli.plain_text import text_table
+from mpmcli.errors import RunError
+from mpmcli.output.durable import sealed, write_text
+from mpmcli.plain_text import counted, text_table
 from mpmcli.validation.case import Case, Level, Setting
-from mpmcli.validation.comparison import Cheapest, Compared, Ratios, cheapest, compare_settings, points_of, series_of
-from mpmcli.validation.runs import Results, Run, RunResult
-from mpmcli.validation.verdict import Verdict, judge, observed_order, verdict_of_run
+from mpmcli.validation.figures import draw_case
+from mpmcli.validation.runs import Results
+from mpmcli.validation.study import FIGURES, PAGE
+from mpmcli.validation.verdict import ROUND_OFF, Verdict, judge, order_of
 
-
-@dataclass(frozen=True)
-class RunRow:
-    """One run: its error, order relative to the next coarser run of the setting, and "pass" or "fail", or None."""
-
-    run: Run
-    result: RunResult
-    error: float | None
-    order: float | None
-    verdict: str | None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return a dictionary for JSON."""
-        return {
-            "n": self.run.n,
-            "setting": self.run.setting.label,
-            "knobs": asdict(self.run.setting),
-            "error": self.error,
-            "order": self.order,
-            "seconds": self.result.seconds,
-            "particle_steps": self.result.particle_steps,
-            "particle_steps_per_s": self.result.rate,
-            "verdict": self.verdict,
-            **{key: value for key, value in self.result.as_dict().items() if key != "seconds"},
-        }
+TEMPLATE = Path(__file__).parent / "page" / "report.md"
+# Columns of the table of cases, of that of settings, and of that of runs around the measures.
+CASES = ("case", "problem", "verdict", "error", "at n", "order (expected)", "seconds")
+SETTINGS = ("setting", "error", "seconds", "runs that failed")
+RUN, COSTS = ("setting", "n"), ("particles", "steps", "seconds", "M particle-steps/s", "compile s", "outcome")
 
 
 @dataclass(frozen=True)
 class CaseReport:
-    """One case in the report: its runs, verdict and cheapest setting."""
+    """One case in the report: its runs and verdict; `order` is observed with the default setting, or None."""
 
     case: Case
     results: Results
@@ -50,149 +35,190 @@ class CaseReport:
         """The checks of the case."""
         return judge(self.case, self.results)
 
-    @cached_property
-    def cheapest(self) -> Cheapest | None:
-        """The setting that reaches 1 % in the least time."""
-        return cheapest(self.case, self.results)
-
-    @cached_property
-    def rows(self) -> tuple[RunRow, ...]:
-        """Every run, setting by setting, from coarse to fine."""
-        return tuple(row for runs in series_of(self.case, self.results).values() for row in self._rows(runs))
-
-    def _rows(self, runs: list[tuple[Run, RunResult]]) -> Iterator[RunRow]:
-        before: tuple[int, float] | None = None
-        for run, result in runs:
-            error = result.error(self.case.measures[0].name)
-            order = observed_order(before, (run.n, error)) if before is not None and error is not None else None
-            yield RunRow(run, result, error, order, verdict_of_run(self.verdict, run))
-            before = before if error is None else (run.n, error)
-
-    @property
-    def finest(self) -> tuple[int, float] | None:
-        """Resolution and error of the finest run of the default setting that finished."""
-        points = points_of(self.case, series_of(self.case, self.results).get(Setting(), []))
-        return (points[-1].n, points[-1].error) if points else None
-
     @property
     def order(self) -> float | None:
-        """Observed order between the two finest runs of the default setting that have one, None where there is none."""
-        counts = self.case.measures[0].has_order_at
-        rows = [row for row in self.rows if row.run.setting == Setting() and counts(row.run.n)]
-        orders = [row.order for row in rows if row.error is not None]
-        return orders[-1] if orders else None
+        """Observed order of the error with the default setting, between the two finest runs that have one."""
+        return order_of(self.case.measures[0], self.results)
+
+    def summary(self) -> tuple[str, ...]:
+        """Return the row of the case in the table of cases: its finest run with the default setting that finished."""
+        case, measure, order = self.case, self.case.measures[0], "" if self.order is None else f"{self.order:.2f}"
+        if measure.expected is not None:
+            order = f"{order or '-'} ({measure.expected:g})"
+        usual = [
+            (run.n, result) for run, result in self.results.items() if run.setting == Setting() and result.finished
+        ]
+        if not usual:
+            return case.name, case.title, self.verdict.word, "", "", order, ""
+        n, finest = usual[-1]
+        error = f"{finest.error(measure.name):.2e}{measure.unit_suffix}"
+        return case.name, case.title, self.verdict.word, error, str(n), order, f"{finest.seconds:.3g}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
-        case, best = self.case, self.cheapest
+        case = self.case
         return {
             "case": case.name,
-            "title": case.title,
-            "group": case.group,
-            "source": case.source,
-            "note": case.note,
-            "resolution": case.resolution,
-            "measures": [
-                {"name": m.name, "unit": m.unit, "text": m.text, "order": m.order, "expected_order": m.expected}
-                for m in case.measures
-            ],
+            **{name: getattr(case, name) for name in ("title", "group", "source", "note", "resolution")},
+            "measures": [{name: getattr(m, name) for name in ("name", "unit", "text")} for m in case.measures],
             "verdict": self.verdict.word,
-            "reasons": list(self.verdict.reasons),
-            "finest_n": self.finest and self.finest[0],
-            "error": self.finest and self.finest[1],
+            "reasons": self.verdict.reasons,
             "order": self.order,
             "expected_order": case.measures[0].expected,
-            "cheapest_to_1_percent": best and {"setting": best.setting.label, **asdict(best.cost)},
             "checks": [{**asdict(check), "setting": check.setting.label} for check in self.verdict.checks],
-            "runs": [row.as_dict() for row in self.rows],
+            "runs": [
+                {
+                    "n": run.n,
+                    "setting": run.setting.label,
+                    "error": result.error(case.measures[0].name),
+                    "particle_steps_per_s": result.rate,
+                    "verdict": self.verdict.of_run(run),
+                    **asdict(result),
+                }
+                for run, result in self.results.items()
+            ],
         }
+
+    def page(self) -> str:
+        """Return the section of the case as Markdown."""
+        case = self.case
+        rows = []
+        for run, result in self.results.items():
+            values = [f"{result.values[m.name]:.3e}{m.unit_suffix}" if result.finished else "" for m in case.measures]
+            costs = f"{result.particles:,}", f"{result.steps:,}", f"{result.seconds:.3g}"
+            speed = f"{result.rate / 1e6:.1f}", f"{result.compile_seconds:.1f}"
+            outcome = self.verdict.of_run(run) if result.finished else f"{result.status}: {result.message}"
+            rows.append((run.setting.label, str(run.n), *values, *costs, *speed, outcome))
+        head = (*RUN, *(measure.name for measure in case.measures), *COSTS)
+        blocks = [
+            f"## {case.title}",
+            f"`mpmcli validate {case.name}`; {self.verdict.word}. Source: {case.source}. n counts {case.resolution}.",
+            bullets(f"**{m.name}**{f' ({m.unit})' if m.unit else ''}: {m.text}" for m in case.measures),
+            case.note,
+            *self.verdict.reasons,
+            f"![{case.title}: error against resolution and time]({FIGURES}/{case.name}.svg)",
+            markdown_table(head, rows, left={0, len(head) - 1}),
+        ]
+        return "\n\n".join(filter(None, blocks))
 
 
 @dataclass(frozen=True)
 class Report:
-    """All cases of one run of the validation, with the environment as `describe_environment` has it."""
+    """All cases of one run of the validation. `environment` has the machine, its versions, the workers and the date."""
 
     level: Level
     environment: dict[str, Any]
-    cases: tuple[Case, ...]
+    cases: Sequence[Case]
     results: Results
 
     @cached_property
-    def case_reports(self) -> tuple[CaseReport, ...]:
+    def case_reports(self) -> list[CaseReport]:
         """One per case."""
-        return tuple(
+        return [
             CaseReport(case, {run: result for run, result in self.results.items() if run.case == case.name})
             for case in self.cases
-        )
-
-    @cached_property
-    def compared(self) -> list[Compared]:
-        """Every setting against the default one."""
-        return compare_settings(self.cases, self.results)
+        ]
 
     @property
     def passed(self) -> bool:
         """Whether every case came out as it should."""
-        return all(entry.verdict.passed for entry in self.case_reports)
+        return not self.reasons()
+
+    def reasons(self) -> list[str]:
+        """Return sentences of the failed checks, each after the name of its case."""
+        return [f"{entry.case.name}: {reason}" for entry in self.case_reports for reason in entry.verdict.reasons]
 
     def as_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
-        return {
-            "level": self.level,
-            "environment": self.environment,
-            "passed": self.passed,
-            "cases": [entry.as_dict() for entry in self.case_reports],
-            "settings": [
-                {
-                    "setting": entry.setting.label,
-                    "error_ratio": _ratios(entry.error),
-                    "seconds_ratio": _ratios(entry.seconds),
-                    "seconds_to_equal_error_ratio": _ratios(entry.to_equal),
-                    "failed": entry.failed,
-                    "runs": entry.runs,
-                }
-                for entry in self.compared
-            ],
-        }
+        cases = [entry.as_dict() for entry in self.case_reports]
+        return {"level": self.level, "environment": self.environment, "passed": self.passed, "cases": cases}
 
-    def table(self) -> str:
+    def outcome(self) -> str:
+        """Return a sentence on how many cases pass and how many runs did not finish."""
+        passed = sum(not entry.verdict.reasons for entry in self.case_reports)
+        unfinished = sum(not result.finished for result in self.results.values())
+        failed = f", of which {unfinished} did not finish" if unfinished else ""
+        return f"{passed} of {len(self.cases)} cases pass. {counted(len(self.results), 'run')}{failed}."
+
+    def machine(self) -> str:
+        """Return the line on program, level and machine."""
+        facts = self.environment
+        return (
+            f"mpmcli {facts['mpmcli']}, level {self.level}, {facts['date']}. {facts['processor']}, 1 thread per run, "
+            f"{counted(facts['workers'], 'run')} at a time; Python {facts['python']}, Taichi {facts['taichi']}, "
+            f"{facts['system']}."
+        )
+
+    def text(self) -> str:
         """Return a text table with a line per case, followed by the failed checks."""
-        rows = [summary_row(entry) for entry in self.case_reports]
-        failed = [f"{e.case.name}: {reason}" for e in self.case_reports for reason in e.verdict.reasons]
-        count = sum(entry.verdict.passed for entry in self.case_reports)
-        closing = f"{count} of {len(rows)} cases pass. Errors and orders are those of the default setting."
-        return "\n".join([text_table(SUMMARY, rows, left={0, 1, 5}), *(["", *failed] if failed else []), "", closing])
+        table = text_table(CASES, [entry.summary() for entry in self.case_reports], left={0, 1, 2})
+        failed = "\n".join(self.reasons())
+        closing = f"{self.outcome()} Errors, orders and seconds are those of the default setting."
+        return "\n\n".join(filter(None, [table, failed, closing]))
+
+    def summary(self) -> str:
+        """Return the table of cases as Markdown."""
+        return markdown_table(CASES, [entry.summary() for entry in self.case_reports], left={0, 1, 2})
+
+    def settings(self) -> str:
+        """Return a table of error and time of every setting over those of the default one at equal n, as Markdown."""
+        rows = []
+        for setting in dict.fromkeys(run.setting for run in self.results if run.setting != Setting()):
+            errors, seconds, failed = [], [], 0
+            for entry in self.case_reports:
+                for run, mine in entry.results.items():
+                    usual = entry.results.get(replace(run, setting=Setting()))
+                    if run.setting != setting:
+                        continue
+                    failed += not mine.finished
+                    if mine.finished and usual is not None and usual.finished:
+                        seconds.append((mine.seconds, usual.seconds))
+                        errors.append(tuple(result.error(entry.case.measures[0].name) for result in (mine, usual)))
+            # Ratios of round-off errors are meaningless.
+            rows.append((setting.label, _ratios(errors, ROUND_OFF), _ratios(seconds, 0.0), str(failed)))
+        return markdown_table(SETTINGS, rows, left={0})
+
+    def page(self) -> str:
+        """Return the page as Markdown, with links to figures in the directory FIGURES."""
+        failed = f"## What failed\n\n{bullets(self.reasons())}\n\n" if self.reasons() else ""
+        return TEMPLATE.read_text(encoding="utf-8").format(
+            machine=self.machine(),
+            outcome=self.outcome(),
+            summary=self.summary(),
+            failed=failed,
+            settings=self.settings(),
+            cases="\n\n".join(entry.page() for entry in self.case_reports),
+        )
 
 
-# Columns of the table of cases.
-SUMMARY = ("case", "verdict", "error", "at n", "order (expected)", "cheapest to 1 %", "seconds", "particle-steps")
+def write_report(report: Report, directory: Path) -> None:
+    """Write the page and its figures into an existing directory, each file atomically; RunError where that fails."""
+    try:
+        (directory / FIGURES).mkdir(exist_ok=True)
+        for entry in report.case_reports:
+            with sealed(directory / FIGURES / f"{entry.case.name}.svg") as temporary:
+                temporary.write_bytes(draw_case(entry.case, entry.results))
+        write_text(directory / PAGE, report.page())
+    except OSError as error:
+        raise RunError(f"The report could not be written to {directory} ({error.strerror or error}).") from error
 
 
-def summary_row(entry: CaseReport) -> tuple[str, ...]:
-    """Return the row of a case in the table of cases."""
-    measure, finest, best = entry.case.measures[0], entry.finest, entry.cheapest
-    order = "" if entry.order is None else f"{entry.order:.2f}"
-    if measure.expected is not None:
-        order = f"{order or '-'} ({measure.expected:g})"
-    most = "≤ " if best is not None and best.cost.at_most else ""
-    return (
-        entry.case.name,
-        entry.verdict.word,
-        "" if finest is None else f"{finest[1]:.2e}{measure.unit_suffix}",
-        "" if finest is None else str(finest[0]),
-        order,
-        best.setting.label if best is not None else "" if measure.unit else "none",
-        "" if best is None else f"{most}{seconds_text(best.cost.seconds)}",
-        "" if best is None else f"{most}{best.cost.particle_steps:.2g}",
-    )
+def _ratios(pairs: Iterable[tuple[float, float]], least: float) -> str:
+    """Return the geometric mean of the ratios of pairs, the smallest and the largest, where both are above `least`."""
+    ratios = [a / b for a, b in pairs if min(a, b) > least]
+    if not ratios:
+        return ""
+    mean = math.exp(sum(map(math.log, ratios)) / len(ratios))
+    return f"{mean:.2g} ({min(ratios):.2g} to {max(ratios):.2g})"
 
 
-def seconds_text(seconds: float) -> str:
-    """Return seconds as text with two digits and at most three decimals."""
-    return f"{seconds:.3f}" if seconds < 0.1 else f"{seconds:.2g}" if seconds < 100 else f"{seconds:.0f}"
+def bullets(lines: Iterable[str]) -> str:
+    """Return a list in Markdown."""
+    return "\n".join(f"* {line}" for line in lines)
 
 
-def _ratios(ratios: Ratios | None) -> dict[str, Any] | None:
-    if ratios is None:
-        return None
-    return {"mean": ratios.mean, "smallest": ratios.low, "largest": ratios.high, "cases": ratios.of_case}
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], left: Collection[int]) -> str:
+    """Return a table in Markdown; columns are aligned to the right but for those numbered in `left`."""
+    rule = ["---" if column in left else "---:" for column in range(len(head))]
+    lines = (" | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in row) for row in (head, rule, *rows))
+    return "\n".join(f"| {line} |" for line in lines)

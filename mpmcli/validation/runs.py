@@ -1,13 +1,21 @@
-"""The runs of a level, each case at its resolutions with the default setting and its variants, and their results."""
+"""The runs of a level, each case at its resolutions with the default setting and its variants; and one run."""
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
 
-from mpmcli.validation.case import DEFAULT, KNOBS, Case, Level, Setting
-
-Status = Literal["finished", "unstable", "failed"]
+from mpmcli.errors import MpmcliError
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import Scene, parse_scene
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import Run as SolverRun
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import Backend, start_backend
+from mpmcli.validation.case import KNOBS, Case, Level, Setting
 
 
 @dataclass(frozen=True)
@@ -18,12 +26,6 @@ class Run:
     n: int
     setting: Setting
 
-    @property
-    def name(self) -> str:
-        """File name of the result, without suffix."""
-        words = [f"{knob}-{value}" for knob, value in self.setting.changed_from(Setting()).items()]
-        return "_".join([self.case, f"n{self.n}", *(words or [DEFAULT])])
-
 
 def variants(knob: str) -> list[Setting]:
     """Return the settings that differ from the default one in one field."""
@@ -31,26 +33,19 @@ def variants(knob: str) -> list[Setting]:
     return [Setting(**{knob: value}) for value in KNOBS[knob] if value != usual]
 
 
-def sweep_resolution(case: Case, level: Level) -> int:
-    """Return the resolution at which the Courant fraction is varied, the (lower) median."""
-    resolutions = sorted(case.levels[level])
-    return resolutions[(len(resolutions) - 1) // 2]
-
-
 def runs_of(case: Case, level: Level) -> list[Run]:
     """Return the runs of a case at a level, the default setting first, each setting from coarse to fine.
 
     The level "coarse" has the default setting, and f32 at the finest resolution. Other levels vary every field in
-    `case.varies` at every resolution, except for the Courant fraction, which is varied at one resolution.
+    `case.varies` at every resolution, except for the Courant fraction, which is varied at the (lower) median.
     """
     resolutions = sorted(case.levels[level])
+    median, finest = resolutions[(len(resolutions) - 1) // 2], resolutions[-1]
     runs = [Run(case.name, n, Setting()) for n in resolutions]
-    knobs = [knob for knob in KNOBS if knob in case.varies]
-    if level == "coarse":
-        only = [variant for knob in knobs if knob == "precision" for variant in variants(knob)]
-        return runs + [Run(case.name, resolutions[-1], variant) for variant in only]
-    for knob in knobs:
-        at = [sweep_resolution(case, level)] if knob == "safety" else resolutions
+    for knob in KNOBS:
+        if knob not in case.varies or (level == "coarse" and knob != "precision"):
+            continue
+        at = [finest] if level == "coarse" else [median] if knob == "safety" else resolutions
         runs += [Run(case.name, n, variant) for variant in variants(knob) for n in at]
     return runs
 
@@ -64,31 +59,19 @@ def matrix(cases: Iterable[Case], level: Level) -> list[Run]:
 class RunResult:
     """Outcome, measures and cost of a run; times are in s."""
 
-    status: Status  # "unstable" if the solver stopped it, "failed" for any other error
+    status: Literal["finished", "unstable", "failed"]  # "unstable" if the solver stopped it
     message: str = ""
     values: dict[str, float] = field(default_factory=dict)  # the measures by name; empty if the run did not finish
     particles: int = 0
     steps: int = 0
     # Processor time of the time steps, without the first one, which compiles the kernels, and without frames and rows.
     seconds: float = 0.0
-    watch_seconds: float = 0.0  # part of `seconds` spent on measuring the state for the step limits
     compile_seconds: float = 0.0  # of the first step
-    frame_seconds: float = 0.0  # for building frames and ledger rows
-    start_seconds: float = 0.0  # for reading the scene, sampling and allocation
-    wall_seconds: float = 0.0  # wall-clock time of the process
-    arch: str = ""
-    precision: str = ""
-    threads: int = 0
 
     @property
     def finished(self) -> bool:
         """Whether the run finished; only then are there values."""
         return self.status == "finished"
-
-    @property
-    def particle_steps(self) -> int:
-        """Particles times steps."""
-        return self.particles * self.steps
 
     @property
     def rate(self) -> float:
@@ -99,25 +82,73 @@ class RunResult:
         """Return the absolute value of a measure; None if the run did not finish."""
         return abs(self.values[measure]) if self.finished else None
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the result as a dictionary for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> "RunResult":
-        """Return the result from the dictionary of `as_dict`; TypeError or KeyError where it is none."""
-        return cls(**{entry.name: data[entry.name] for entry in fields(cls)})
-
 
 Results = Mapping[Run, RunResult]
 
 
-def failure(message: str, status: Status = "failed", **facts: Any) -> RunResult:
-    """Return the result of a run without values."""
-    return RunResult(status, message, **facts)
+def scene_of(case: Case, n: int, setting: Setting) -> Scene:
+    """Return the scene of a case at resolution n.
+
+    Raises:
+        InputError: the scene is not valid.
+    """
+    return parse_scene(case.scene_tables(n, setting), laws=parameter_models(), source=f"<{case.name}>").scene
 
 
-def not_finite(values: dict[str, float]) -> str:
-    """Return a message that lists the non-finite measures; "" if all are finite."""
+def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = None) -> RunResult:
+    """Run a case and return its measures. Errors are reported in the result.
+
+    Args:
+        backend: the backend; None starts the CPU backend with one thread in the precision of the setting.
+    """
+    try:
+        scene = scene_of(case, n, setting)
+        run = build_run(scene, backend or start_backend("cpu", 1, scene.solver.precision))
+    except MpmcliError as error:
+        return RunResult("failed", str(error))
+    values, clock = {}, SteppingClock(run)
+    try:
+        values = {name: float(value) for name, value in case.measure(n, scene, clock.frames()).items()}
+        message = _fault(case, values)
+        status = "failed" if message else "finished"
+    except UnstableRunError as error:
+        status, message = "unstable", str(error)
+    except MpmcliError as error:
+        status, message = "failed", str(error)
+    except (ArithmeticError, ValueError) as error:
+        # The solver did not detect the instability, but the state cannot be evaluated.
+        status, message = "failed", f"The frames cannot be measured: {error}."
+    values = values if status == "finished" else {}
+    facts = run.particle_count, run.step_count, clock.seconds, run.first_step_seconds
+    return RunResult(status, message, values, *facts)
+
+
+def _fault(case: Case, values: dict[str, float]) -> str:
+    """Return a message on measures that are missing or not finite; "" if there are none."""
+    if missing := [measure.name for measure in case.measures if measure.name not in values]:
+        return f"The case returned no {' and no '.join(missing)}."
     odd = [f"{name} is {value}" for name, value in values.items() if not math.isfinite(value)]
     return f"The run finished, but {' and '.join(odd)}." if odd else ""
+
+
+class SteppingClock:
+    """Measures the processor time of the steps of a run, in s, which excludes the time of other programs."""
+
+    def __init__(self, run: SolverRun) -> None:
+        self.seconds = 0.0
+        self._run = run
+
+    def frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
+        """Yield the frames. Compiling, and what the caller does with frames, is not counted."""
+        self._run.begin()
+        frames = self._run.frames()
+        while True:
+            began, before = time.process_time(), self._run.frame_processor_seconds
+            try:
+                found = next(frames, None)
+            finally:
+                passed = time.process_time() - began - (self._run.frame_processor_seconds - before)
+                self.seconds = max(self.seconds + passed, 0.0)
+            if found is None:
+                return
+            yield found

@@ -1,95 +1,151 @@
-"""Runs the matrix of a level and returns its report. Results in the journal are reused."""
+"""Carries out the runs of a level, each in a process of its own, and keeps their results in the report's directory."""
 
-import subprocess
-from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
+import hashlib
+import importlib.metadata
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from functools import cache
+from multiprocessing import connection, get_context
+from pathlib import Path
 
 from mpmcli.bench.report import describe_machine
-from mpmcli.errors import InputError
-from mpmcli.validation.case import Case, Level
-from mpmcli.validation.journal import PACKAGE, Journal, run_key
-from mpmcli.validation.report import Report
-from mpmcli.validation.runner import TIMEOUT, carry_out_all, case_command
-from mpmcli.validation.runs import Run, RunResult, matrix
+from mpmcli.errors import InputError, RunError
+from mpmcli.output.directory import check_directory
+from mpmcli.output.durable import write_text
+from mpmcli.processes.interrupts import interrupts_blocked
+from mpmcli.validation.cases import all_cases
+from mpmcli.validation.runs import Run, RunResult, carry_out
 
-# Called with each finished run, its result, the number of finished runs and the number of all runs.
-OnRun = Callable[[Run, RunResult, int, int], None]
+PACKAGE = Path(__file__).resolve().parent.parent
+RESULTS, PAGE, FIGURES = "results.json", "report.md", "figures"
+# Default time limit of a run, and between two looks at what has ended, s.
+TIMEOUT, PAUSE = 1800.0, 0.1
+# Numpy in the process of a run takes one thread, so that concurrent runs do not compete for cores.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+# Taichi starts once in a process, in one precision.
+SPAWN = get_context("spawn")
 
 
-def study(
-    cases: Sequence[Case],
-    level: Level,
+def carry_out_run(run: Run) -> RunResult:
+    """Carry out a run in this process."""
+    return carry_out(all_cases()[run.case], run.n, run.setting)
+
+
+def carry_out_all(
+    runs: Sequence[Run],
     workers: int,
-    *,
-    journal: Journal | None = None,
     timeout: float = TIMEOUT,
-    on_run: OnRun = lambda run, result, done, total: None,
-    resumed: Callable[[int, int], None] = lambda kept, total: None,
-    stop: Callable[[], bool] = lambda: False,
-    command: Callable[[Run], list[str]] = case_command,
-) -> Report:
-    """Run the cases at a level and return the report.
+    stop: Callable[[], object] = lambda: False,
+    work: Callable[[Run], RunResult] = carry_out_run,
+) -> Iterator[tuple[Run, RunResult]]:
+    """Yield (run, result) as runs end, `workers` at a time. A crash, or being late, is reported in the result.
 
     Args:
-        workers: number of concurrent runs, of one thread each.
-        journal: stores every result, and provides results of earlier calls. None stores nothing.
         timeout: time limit of a run, s.
-        on_run: called after each run, see `OnRun`.
-        resumed: called once with the number of runs taken from the journal and the number of all runs.
-        stop: polled while runs are in progress; True ends them.
-        command: command line of a run, see `carry_out_all`.
-
-    Raises:
-        KeyboardInterrupt: `stop` returned True. The journal holds the results of finished runs.
+        stop: polled while runs are in progress: where it returns True, all are ended and KeyboardInterrupt is raised.
+        work: what a process does, a function of a module.
     """
-    environment = describe_environment(workers)
-    runs = matrix(cases, level)
-    named = {case.name: case for case in cases}
-    keys, done = {}, {}
-    for run in runs if journal is not None else ():
+    os.environ.update(ONE_THREAD)
+    waiting, going = list(reversed(runs)), {}
+    try:
+        while waiting or going:
+            while waiting and len(going) < workers:
+                run = waiting.pop()
+                answers, process = _started(work, run)
+                going[answers] = run, process, time.monotonic() + timeout
+            ready = connection.wait(going, PAUSE)
+            if stop():
+                raise KeyboardInterrupt
+            now = time.monotonic()
+            for answers in [answers for answers, (*_, end) in going.items() if answers in ready or now > end]:
+                run, process, _ = going.pop(answers)
+                try:
+                    result = answers.recv() if answers in ready else None
+                except EOFError:
+                    process.join()
+                    result = RunResult("failed", f"The process of the run ended with exit code {process.exitcode}.")
+                _end(answers, process)
+                yield run, result or RunResult("failed", f"The run took longer than {timeout:g} s.")
+    finally:
+        for answers, (_, process, _) in going.items():
+            _end(answers, process)
+
+
+def _started(work: Callable[[Run], RunResult], run: Run) -> tuple[connection.Connection, SPAWN.Process]:
+    answers, theirs = SPAWN.Pipe(duplex=False)
+    process = SPAWN.Process(target=_answer, args=(work, run, theirs), daemon=True)
+    with interrupts_blocked():
+        process.start()
+    theirs.close()
+    return answers, process
+
+
+def _end(answers: connection.Connection, process: SPAWN.Process) -> None:
+    process.kill()
+    process.join()
+    answers.close()
+
+
+def _answer(work: Callable[[Run], RunResult], run: Run, answers: connection.Connection) -> None:
+    """Send the result of a run; nothing that libraries print appears in the terminal."""
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1)
+    os.dup2(silent, 2)
+    try:
+        result = work(run)
+    except Exception as error:
+        result = RunResult("failed", f"{type(error).__name__}: {error}")
+    answers.send(result)
+
+
+class Journal:
+    """The results of earlier runs in the directory of a report, by the digest of all that a run depends on."""
+
+    def __init__(self, directory: Path, *, resume: bool = False, overwrite: bool = False) -> None:
+        """Make the directory, or read the results in it, or clear it; InputError where it cannot be used."""
+        check_directory(directory, overwrite, resume=resume)
+        self._file = directory / RESULTS
+        self._kept: dict[str, dict] = {}
         try:
-            keys[run] = run_key(named[run.case], run, environment["processor"])
-        except InputError:
-            # The run itself reports the error. Without a key its result is never reused.
-            keys[run] = ""
-        kept = journal.find(run, keys[run])
-        if kept is not None:
-            done[run] = kept
-    if done:
-        resumed(len(done), len(runs))
-    left = [run for run in runs if run not in done]
-    for run, result in carry_out_all(left, workers, timeout, stop, command):
-        done[run] = result
-        if journal is not None:
-            journal.keep(run, keys[run], result)
-        on_run(run, result, len(done), len(runs))
-    return Report(level, environment, tuple(cases), {run: done[run] for run in runs})
+            directory.mkdir(parents=True, exist_ok=True)
+            if overwrite:
+                for path in (self._file, directory / PAGE, *directory.glob(f"{FIGURES}/*.svg")):
+                    path.unlink(missing_ok=True)
+            elif self._file.exists():
+                self._kept = json.loads(self._file.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"{directory} cannot be used ({reason}): give another place with -o.") from error
 
+    def find(self, run: Run) -> RunResult | None:
+        """Return the result of a run by the same program on this processor; None for a failure, such as a late run."""
+        found = self._kept.get(run_key(run))
+        return None if found is None or found["status"] == "failed" else RunResult(**found)
 
-def describe_environment(workers: int) -> dict:
-    """Return the machine, versions, commit and date of a report of so many concurrent runs, of one thread each."""
-    return {
-        **describe_machine(),
-        "commit": commit(),
-        "arch": "cpu",
-        "threads": 1,
-        "workers": workers,
-        "date": datetime.now(UTC).date().isoformat(),
-    }
-
-
-def commit() -> str | None:
-    """Return the commit of the package, with "+" if files are modified; None outside a git repository of mpmcli."""
-
-    def git(*words: str) -> str | None:
+    def keep(self, run: Run, result: RunResult) -> None:
+        """Store the result of a run; RunError where that fails."""
+        self._kept[run_key(run)] = asdict(result)
         try:
-            done = subprocess.run(["git", "-C", str(PACKAGE), *words], capture_output=True, text=True)
-        except OSError:
-            return None
-        return done.stdout.strip() if done.returncode == 0 else None
+            write_text(self._file, json.dumps(self._kept, indent=1) + "\n")
+        except OSError as error:
+            raise RunError(f"{self._file} could not be written ({error.strerror or error}).") from error
 
-    # The package may be installed within another repository.
-    if git("ls-files", "--error-unmatch", "__init__.py") is None:
-        return None
-    head = git("rev-parse", "--short=12", "HEAD")
-    return head and head + ("+" if git("status", "--porcelain", "--", ".") else "")
+
+def run_key(run: Run) -> str:
+    """Return the digest of a run: its case, its scene, the program, and the processor, on which times depend."""
+    scene = all_cases()[run.case].scene_tables(run.n, run.setting)
+    return _digest(json.dumps([run.case, run.n, scene, *_program()]).encode())
+
+
+@cache
+def _program() -> tuple[str, ...]:
+    sources = sorted(path for path in PACKAGE.rglob("*") if path.suffix in (".py", ".toml"))
+    digest = _digest(b"\0".join(path.read_bytes() for path in sources))
+    return digest, importlib.metadata.version("taichi"), describe_machine()["processor"]
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
