@@ -180,7 +180,7 @@ def lost() -> dict:
             "failed",
             "The run finished, but period error is nan.",
         ),
-        (lambda: {"period error": 1.0}, "failed", "The case returned no energy loss."),
+        (lambda: {"period error": 1.0}, "failed", "The run finished, but there is no energy loss."),
         (lambda: {"period error": 1 / 0}, "failed", "The frames cannot be measured: division by zero."),
         (lost, "unstable", 'at step 12, t = 0.5 s: particle 3 of body "bar"'),
     ],

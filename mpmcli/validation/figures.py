@@ -18,16 +18,12 @@ STYLE = Path(__file__).parent / "page" / "figures.mplstyle"
 LOWEST = 1e-17
 COURANT = "Courant fraction"
 GREY = {"color": "#777777", "linewidth": 1.0, "linestyle": ":"}
+VARIANTS = [variant.label for knob in KNOBS if knob != "safety" for variant in variants(knob)]
 # Lines of the settings, the same in every figure; single precision usually coincides with double.
 LOOKS: dict[str, dict[str, Any]] = {Setting().label: {"color": "black", "marker": "o", "linewidth": 2.0, "zorder": 3}}
 LOOKS |= {
-    setting.label: {"color": color, "marker": marker, "linewidth": 1.2}
-    for setting, color, marker in zip(
-        (variant for knob in KNOBS if knob != "safety" for variant in variants(knob)),
-        LIGHT_SERIES,
-        "s^vDph<",
-        strict=True,
-    )
+    label: {"color": color, "marker": marker, "linewidth": 1.2}
+    for label, color, marker in zip(VARIANTS, LIGHT_SERIES, "s^vDph<", strict=False)
 }
 LOOKS["f32"] |= {"markersize": 9, "markerfacecolor": "none", "linestyle": "--"}
 LOOKS[COURANT] = {**GREY, "marker": "d"}

@@ -42,17 +42,16 @@ class CaseReport:
 
     def summary(self) -> tuple[str, ...]:
         """Return the row of the case in the table of cases: its finest run with the default setting that finished."""
-        case, measure, order = self.case, self.case.measures[0], "" if self.order is None else f"{self.order:.2f}"
+        measure = self.case.measures[0]
+        order = "" if self.order is None else f"{self.order:.2f}"
         if measure.expected is not None:
             order = f"{order or '-'} ({measure.expected:g})"
-        usual = [
-            (run.n, result) for run, result in self.results.items() if run.setting == Setting() and result.finished
-        ]
-        if not usual:
-            return case.name, case.title, self.verdict.word, "", "", order, ""
-        n, finest = usual[-1]
-        error = f"{finest.error(measure.name):.2e}{measure.unit_suffix}"
-        return case.name, case.title, self.verdict.word, error, str(n), order, f"{finest.seconds:.3g}"
+        error = n = seconds = ""
+        for run, result in self.results.items():
+            if run.setting == Setting() and result.finished:
+                error, n = f"{result.error(measure.name):.2e}{measure.unit_suffix}", str(run.n)
+                seconds = f"{result.seconds:.3g}"
+        return self.case.name, self.case.title, self.verdict.word, error, n, order, seconds
 
     def as_dict(self) -> dict[str, Any]:
         """Return a dictionary for JSON."""
@@ -163,19 +162,15 @@ class Report:
     def settings(self) -> str:
         """Return a table of error and time of every setting over those of the default one at equal n, as Markdown."""
         rows = []
+        measure = {case.name: case.measures[0].name for case in self.cases}
         for setting in dict.fromkeys(run.setting for run in self.results if run.setting != Setting()):
-            errors, seconds, failed = [], [], 0
-            for entry in self.case_reports:
-                for run, mine in entry.results.items():
-                    usual = entry.results.get(replace(run, setting=Setting()))
-                    if run.setting != setting:
-                        continue
-                    failed += not mine.finished
-                    if mine.finished and usual is not None and usual.finished:
-                        seconds.append((mine.seconds, usual.seconds))
-                        errors.append(tuple(result.error(entry.case.measures[0].name) for result in (mine, usual)))
+            mine = {run: result for run, result in self.results.items() if run.setting == setting}
+            pairs = [(run, result, self.results[replace(run, setting=Setting())]) for run, result in mine.items()]
+            both = [(measure[run.case], a, b) for run, a, b in pairs if a.finished and b.finished]
             # Ratios of round-off errors are meaningless.
-            rows.append((setting.label, _ratios(errors, ROUND_OFF), _ratios(seconds, 0.0), str(failed)))
+            errors = _ratios([(a.error(name), b.error(name)) for name, a, b in both], ROUND_OFF)
+            seconds = _ratios([(a.seconds, b.seconds) for _, a, b in both], 0.0)
+            rows.append((setting.label, errors, seconds, str(sum(not result.finished for result in mine.values()))))
         return markdown_table(SETTINGS, rows, left={0})
 
     def page(self) -> str:

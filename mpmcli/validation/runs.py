@@ -106,29 +106,23 @@ def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = No
         run = build_run(scene, backend or start_backend("cpu", 1, scene.solver.precision))
     except MpmcliError as error:
         return RunResult("failed", str(error))
-    values, clock = {}, SteppingClock(run)
+    status, values, clock = "failed", {}, SteppingClock(run)
     try:
         values = {name: float(value) for name, value in case.measure(n, scene, clock.frames()).items()}
-        message = _fault(case, values)
-        status = "failed" if message else "finished"
+        odd = [f"{name} is {value}" for name, value in values.items() if not math.isfinite(value)]
+        odd += [f"there is no {measure.name}" for measure in case.measures if measure.name not in values]
+        message = f"The run finished, but {' and '.join(odd)}." if odd else ""
+        status = "failed" if odd else "finished"
     except UnstableRunError as error:
         status, message = "unstable", str(error)
     except MpmcliError as error:
-        status, message = "failed", str(error)
+        message = str(error)
     except (ArithmeticError, ValueError) as error:
         # The solver did not detect the instability, but the state cannot be evaluated.
-        status, message = "failed", f"The frames cannot be measured: {error}."
+        message = f"The frames cannot be measured: {error}."
     values = values if status == "finished" else {}
     facts = run.particle_count, run.step_count, clock.seconds, run.first_step_seconds
     return RunResult(status, message, values, *facts)
-
-
-def _fault(case: Case, values: dict[str, float]) -> str:
-    """Return a message on measures that are missing or not finite; "" if there are none."""
-    if missing := [measure.name for measure in case.measures if measure.name not in values]:
-        return f"The case returned no {' and no '.join(missing)}."
-    odd = [f"{name} is {value}" for name, value in values.items() if not math.isfinite(value)]
-    return f"The run finished, but {' and '.join(odd)}." if odd else ""
 
 
 class SteppingClock:

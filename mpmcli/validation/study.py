@@ -1,7 +1,6 @@
 """Carries out the runs of a level, each in a process of its own, and keeps their results in the report's directory."""
 
 import hashlib
-import importlib.metadata
 import json
 import os
 import time
@@ -137,15 +136,12 @@ class Journal:
 def run_key(run: Run) -> str:
     """Return the digest of a run: its case, its scene, the program, and the processor, on which times depend."""
     scene = all_cases()[run.case].scene_tables(run.n, run.setting)
-    return _digest(json.dumps([run.case, run.n, scene, *_program()]).encode())
+    return hashlib.sha256(json.dumps([run.case, run.n, scene, *_program()]).encode()).hexdigest()
 
 
 @cache
 def _program() -> tuple[str, ...]:
     sources = sorted(path for path in PACKAGE.rglob("*") if path.suffix in (".py", ".toml"))
-    digest = _digest(b"\0".join(path.read_bytes() for path in sources))
-    return digest, importlib.metadata.version("taichi"), describe_machine()["processor"]
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
+    digest = hashlib.sha256(b"\0".join(path.read_bytes() for path in sources)).hexdigest()
+    machine = describe_machine()
+    return digest, machine["taichi"], machine["processor"]
