@@ -28,7 +28,6 @@ KNOBS: dict[str, dict[object, str]] = {
     "per_axis": {1: "1 particle per axis", 2: "2 particles per axis", 3: "3 particles per axis"},
     "safety": {value: f"Courant fraction {value:g}" for value in (0.1, 0.2, 0.4, 0.8, 0.95)},
 }
-DEFAULT = "default"
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class Setting:
     def label(self) -> str:
         """The differences from the default setting."""
         changed = [(knob, value) for knob, value in asdict(self).items() if value != getattr(Setting(), knob)]
-        return ", ".join(KNOBS[knob].get(value, f"{knob} {value}") for knob, value in changed) or DEFAULT
+        return ", ".join(KNOBS[knob].get(value, f"{knob} {value}") for knob, value in changed) or "default"
 
     def solver_table(self) -> Tables:
         """Return the table [solver] of a scene."""
@@ -162,9 +161,7 @@ class Case(ABC):
             "title": self.title,
             **tables,
             "time": {**tables["time"], "safety": setting.safety},
-            "solver": setting.solver_table()
-            | ({"solids": "total"} if self.solids == "total" else {})
-            | ({"f_bar": self.f_bar} if self.f_bar != "auto" else {}),
+            "solver": {**setting.solver_table(), "solids": self.solids, "f_bar": self.f_bar},
             "bodies": [{**body, "particles_per_cell": per_cell} for body in tables["bodies"]],
         }
 
