@@ -16,6 +16,7 @@ from command import SCENE, run_here
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_result import made_frame, made_header, made_row
+from test_checksums import flip, place_of
 from test_output_frames import make_frame
 from test_output_segments import fill
 
@@ -322,6 +323,36 @@ def test_a_damaged_segment_and_all_after_it_are_computed_again(whole, tmp_path):
     outcome = run_here("simulate", whole / "drop.toml", "-o", tmp_path / "killed", "--resume")
     assert outcome.status == 0 and "1 frame kept, computed again from the start" in outcome.stderr
     assert files_of(tmp_path / "killed") == files_of(whole / "packed")
+
+
+@pytest.mark.parametrize("damage", ["torn", "a particle", "a table"])
+def test_a_damaged_packed_file_is_computed_again(whole, tmp_path, damage):
+    """By the scene that lies beside it; the sentence on the damage names the way."""
+    shutil.copytree(whole / "packed", tmp_path / "run")
+    packed = tmp_path / "run" / "particles.vtkhdf"
+    if damage == "torn":
+        packed.write_bytes(packed.read_bytes()[:5000])
+    else:
+        flip(packed, place_of(packed, *(("VTKHDF/Points", 7) if damage == "a particle" else ("ledger/mass", 1))))
+    outcome = run_here("simulate", tmp_path / "run" / "scene.toml", "-o", tmp_path / "run", "--resume")
+    assert outcome.status == 0 and "0 frames kept, computed again from the start" in outcome.stderr
+    assert files_of(tmp_path / "run") == files_of(whole / "packed")
+
+
+def test_frames_that_were_packed_while_their_segments_stay_are_there_once(whole, tmp_path):
+    """As if the run was killed before it could remove them; then the packed file is damaged."""
+    shutil.copytree(whole / "packed", tmp_path / "run")
+    (tmp_path / "run" / "segments").mkdir()
+    packed, segment = (tmp_path / "run" / name for name in ("particles.vtkhdf", "segments/frame_000000.vtkhdf"))
+    shutil.copy(packed, segment)
+    resume = ("simulate", whole / "drop.toml", "-o", tmp_path / "run", "--resume")
+    for damaged in (packed, segment):
+        damaged.write_bytes(damaged.read_bytes()[:5000])
+        outcome = run_here(*resume)
+        assert outcome.status == 0 and "5 frames kept" in outcome.stderr
+        assert files_of(tmp_path / "run") == files_of(whole / "packed") and not segment.parent.exists()
+        segment.parent.mkdir()
+        shutil.copy(packed, segment)
 
 
 def invented(step: int) -> Checkpoint:

@@ -249,12 +249,18 @@ def _status(opened: OpenedResult, findings: FrameFindings) -> None:
         findings.add("error", "failed-run", count, f"The run failed after {far}{said}", "Run it again.")
     elif status == "interrupted":
         what = f"The run was interrupted after {far}"
-        findings.add("warning", "interrupted-run", count, what, "Run it again to have all frames.")
+        findings.add("warning", "interrupted-run", count, what, "mpmcli simulate --resume goes on with it.")
     elif status == "stopped":
-        findings.add("warning", "stopped-run", count, f"The run stopped after {far}{said}", "Run it again.")
+        findings.add(
+            "warning",
+            "stopped-run",
+            count,
+            f"The run stopped after {far}{said}",
+            "mpmcli simulate --resume goes on with it.",
+        )
     elif status == DIED:
         what = f"The run died after {far}: its process has ended and left no word"
-        findings.add("warning", "died-run", count, what, "Run it again to have all frames.")
+        findings.add("warning", "died-run", count, what, "mpmcli simulate --resume goes on with it.")
     elif status in ("running", ELSEWHERE):
         still = "and it goes on" if status == "running" else "and whether it goes on cannot be seen from here"
         what = f"The run has not ended; there are {far}, {still}"

@@ -1,4 +1,4 @@
-"""`mpmcli check`, `mpmcli info`, `mpmcli repair` and `mpmcli doctor`."""
+"""`mpmcli check`, `mpmcli info` and `mpmcli doctor`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -186,22 +186,6 @@ def _plain(value: object) -> str:
     if isinstance(value, list):
         return ", ".join(_plain(item) for item in value)
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-@click.command("repair")
-@click.argument("directory", type=PATH)
-@json_option
-def repair_command(directory: Path, as_json: bool) -> int:
-    """Make one readable file of the frames of a run in DIRECTORY that died, or whose files have been damaged.
-
-    The frames up to the first one that is damaged or missing are packed. What is damaged or lies beyond stays, and is
-    named. A sound result is left alone. The exit code is 1 if anything is lost.
-    """
-    from mpmcli.output.repair import repair
-
-    done = repair(directory)
-    print_answer(done, as_json)
-    return 1 if done.lost else 0
 
 
 @click.command("doctor")

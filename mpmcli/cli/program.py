@@ -23,7 +23,6 @@ COMMANDS = {
     "sweep": ("dataset", "Compute a dataset of many varied runs."),
     "dataset": ("dataset", "Count, verify and merge datasets."),
     "info": ("inspection", "Say what a result or a scene holds, and whether it has changed."),
-    "repair": ("inspection", "Make a readable file of a broken run."),
     "render": ("pictures", "Draw frames of a result: pictures, films, montages."),
     "plot": ("pictures", "Draw a result's ledger: energies, momentum, steps, volumes, reach."),
     "export": ("dataset", "Write a dataset or a result for learners, numpy or ParaView."),

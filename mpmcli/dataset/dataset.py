@@ -204,7 +204,7 @@ def _require_no_gap(result: Result) -> None:
     # A run that goes on may have sealed some after they were listed.
     count = result.frame_count if result.frame_count >= written else open_result(result.path).frame_count
     if not np.array_equal(result.numbers, np.arange(len(result.numbers))) or count < written:
-        raise InputError(f"{result.path} lacks some of its frames: mpmcli repair keeps those before the first gap.")
+        raise InputError(f"{result.path} lacks some of its frames: mpmcli simulate --resume computes them again.")
 
 
 class Dataset:

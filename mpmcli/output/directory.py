@@ -14,11 +14,11 @@ from mpmcli.output.collider_files import COLLIDER_FILES, MOVING_FRAME
 from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory, temporary_of, write_text
 from mpmcli.output.lock import LOCK, DirectoryLock, refuse_locked, refused, take_lock, time_now
 from mpmcli.output.run_record import RECORD, read_record
-from mpmcli.output.segments import DAMAGED, PACKED, REPAIRED, remove_segments, sealed_segments
+from mpmcli.output.segments import PACKED, remove_segments, sealed_segments
 from mpmcli.output.series import SERIES, SERIES_FRAME, SERIES_HEADER, SERIES_LEDGER
 
 SCENE = "scene.toml"
-NAMES = (PACKED, DAMAGED, REPAIRED, SCENE, SERIES, SERIES_HEADER, SERIES_LEDGER, RECORD, SUMS, *COLLIDER_FILES)
+NAMES = (PACKED, SCENE, SERIES, SERIES_HEADER, SERIES_LEDGER, RECORD, SUMS, *COLLIDER_FILES)
 
 
 @dataclass(frozen=True)

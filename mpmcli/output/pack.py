@@ -36,29 +36,25 @@ def pack_segments(
     target: Path,
     *,
     compress: bool = False,
-    frames: int | None = None,
-    header: Mapping[str, Any] | None = None,
-    known: bool = False,
+    header: Mapping[str, Any],
     begun: VtkhdfWriter | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> None:
     """Write all frames of sealed segments of one run into `target`, prove it equal, then give it its name.
 
-    Segments stay as they are; memory is that of a block of one array. Of the header, that of the segments by default,
-    "scene" may differ. `known` ones were written or verified here; `begun` has all arrays already (`PackedBeside`).
+    Segments stay as they are; memory is that of a block of one array. "scene" of the header may differ from that of the
+    segments. `begun` has all arrays already (`PackedBeside`).
     RunError, and no `target`: the disk is too small, segments are of several runs, or it does not read back.
     """
     try:
-        parts = [(segment, read_index_of(segment, known=known)) for segment in segments]
+        parts = [(segment, read_index_of(segment, known=True)) for segment in segments]
     except InputError as error:
         raise RunError(f"{error} The frames in {segments[0].parent} were left unpacked.") from error
     first = parts[0][1]
-    facts = first.header if header is None else dict(header)
+    facts = dict(header)
     for segment, index in parts:
         if index.layout != first.layout or any(index.header.get(key) != facts[key] for key in facts if key != "scene"):
             raise RunError(f"{segment} is of another run than {segments[0]}: the frames were left unpacked.")
-    if frames is not None:
-        parts = _first_frames(parts, frames)
     expected = replace(FrameIndex.joined([index for _, index in parts]), header=facts)
     counts = expected.counts.tolist()
     kept = f"the {len(counts)} frames written are kept in {segments[0].parent} and stay readable there"
@@ -106,15 +102,6 @@ def _require_unchanged(checksums: np.ndarray, segments: Segments) -> None:
             for frame, column in differing[:1]:
                 raise damaged(str(segment), f"{list(index.layout.arrays)[column]} of frame {index.frames[frame]}")
         k += len(index.counts)
-
-
-def _first_frames(segments: Segments, frames: int) -> Segments:
-    chosen = []
-    for segment, index in segments:
-        if frames > 0:
-            chosen.append((segment, index.first(frames)))
-        frames -= len(index.counts)
-    return chosen
 
 
 def find_difference(packed: Path, expected: FrameIndex, stop: Callable[[], bool] = lambda: False) -> str:

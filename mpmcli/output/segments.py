@@ -29,8 +29,6 @@ from mpmcli.output.store import ASIDE, MOST_WAITING, Store
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, read_index_of
 
 PACKED = "particles.vtkhdf"
-# What `mpmcli repair` calls a damaged one, and the new one before it takes its name.
-DAMAGED, REPAIRED = "particles.damaged.vtkhdf", "particles.repaired.vtkhdf"
 SEGMENTS = "segments"
 SEGMENT_NAME = re.compile(r"frame_\d{6,}\.vtkhdf")
 
@@ -153,9 +151,7 @@ class SegmentStore(Store):
             os.replace(segments[0], packed)
             sync_directory(self._directory)
         else:
-            # Those of an earlier process were verified when the run was resumed.
-            options = {"compress": self._compress, "header": self._header, "known": True, "begun": begun}
-            pack_segments(segments, packed, **options, stop=stop)
+            pack_segments(segments, packed, compress=self._compress, header=self._header, begun=begun, stop=stop)
         if self._colliders:
             times = read_index_of(packed, known=True).times.tolist()
             write_collider_files(self._directory, self._header, times, self._colliders)

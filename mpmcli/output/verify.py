@@ -88,17 +88,11 @@ def verify_result(path: Path) -> Verification:
 
 @dataclass
 class FileVerdict:
-    """What a comparison of a file with its checksums has found; `prefix` frames come before the first damaged one."""
+    """What a comparison of a file with its checksums has found: its frames, and a sentence for each fault."""
 
     frames: int = 0
-    prefix: int = 0
     faults: list[str] = field(default_factory=list)
     checked: bool = True
-
-    @property
-    def whole(self) -> bool:
-        """Whether all its frames are as they were written, whatever else is wrong."""
-        return 0 < self.frames == self.prefix
 
     @property
     def sound(self) -> bool:
@@ -114,7 +108,7 @@ def verify_file(path: Path, *, frames: bool = True) -> FileVerdict:
             found.checked = held(file, "mpmcli").attrs.get("format", 1) != 1
             if frames:
                 index = read_index(file)
-                found.prefix = found.frames = len(index.times)
+                found.frames = len(index.times)
             if found.checked:
                 checksums = load_checksums(file, "mpmcli")
                 items = item_checksums(file, checksums.arrays, f"mpmcli/{NAME}")
@@ -122,7 +116,6 @@ def verify_file(path: Path, *, frames: bool = True) -> FileVerdict:
             for k in range(found.frames):
                 for name in _damaged_arrays(file, index, k):
                     found.faults.append(f"{path} is damaged: {name} of frame {index.frames[k]} has changed.")
-                    found.prefix = min(found.prefix, k)
             gaps = gaps_of([held(file, key) for key in checksums.arrays]) if found.checked and found.sound else []
         if found.checked and found.sound and not checksum_is_right(path, gaps):
             found.faults.append(f"{path} is damaged: it has changed between its data sets, or at its end.")

@@ -16,7 +16,7 @@ from mpmcli.output import read_record
 from mpmcli.output.checkpoints import Checkpoint, read_checkpoints
 from mpmcli.output.checksums import path_digest
 from mpmcli.output.directory import SCENE
-from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory
+from mpmcli.output.durable import TEMPORARY_SUFFIX, number_of, sync_directory
 from mpmcli.output.layout import FrameIndex
 from mpmcli.output.lock import LOCK
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments, segment_name
@@ -36,12 +36,16 @@ _NONE = object()
 
 @dataclass(frozen=True)
 class Resumption:
-    """Sound frames, the newest checkpoint among them, and the record of a run that goes on, unless `complete`."""
+    """Sound frames, the newest checkpoint among them, and the record of a run that goes on, unless `complete`.
+
+    The packed file has `packed` of the frames.
+    """
 
     index: FrameIndex | None
     checkpoint: Checkpoint | None
     complete: bool
     record: Mapping[str, Any]
+    packed: int = 0
 
     @property
     def step(self) -> int:
@@ -81,16 +85,17 @@ def find_resumption(loaded: LoadedScene, directory: Path, form: Literal["vtkhdf"
         raise InputError(f"{directory} holds a run with another --format: leave --format as it was.")
     _require_same_scene(loaded, directory)
     _require_same_files(loaded, record, directory)
+    packed = 0
     if form == "vtk":
         series = directory / SERIES
         index = read_sound_series(series) if series.exists() else None
         if index is None and series.exists():
             raise InputError(f"{directory}: the first frame is damaged, so nothing goes on; --overwrite begins anew.")
     else:
-        index = _sound_index(directory)
+        index, packed = _sound_index(directory)
     frames = 0 if index is None else len(index.times)
     found = (point for point in read_checkpoints(directory) if point.frame <= frames)
-    return Resumption(index, next(found, None), frames == loaded.scene.time.frames + 1, record)
+    return Resumption(index, next(found, None), frames == loaded.scene.time.frames + 1, record, packed)
 
 
 def go_on(run: Run, resumption: Resumption, backend: Backend, *, forced: bool) -> None:
@@ -124,16 +129,16 @@ def require_same_run(resumption: Resumption, header: Mapping[str, Any], director
 
 
 def take_over(directory: Path, resumption: Resumption) -> None:
-    """Make the frames that are there the first segments of the run, and remove what follows a damaged one."""
+    """Make the frames that are there the first segments of the run, and remove a damaged file and what follows it."""
     packed, folder = directory / PACKED, directory / SEGMENTS
-    count = 0
-    if packed.exists():
-        count = len(read_index_of(packed).times)
+    if resumption.packed:
         folder.mkdir(exist_ok=True)
+    else:
+        packed.unlink(missing_ok=True)
     for path in sealed_segments(directory):
-        if not count <= int(path.stem.split("_")[1]) < resumption.frames:
+        if not resumption.packed <= number_of(path) < resumption.frames:
             path.unlink()
-    if count:
+    if resumption.packed:
         # Before: a segment whose frames the packed file has must not come back beside it.
         sync_directory(folder)
         os.replace(packed, folder / segment_name(0))
@@ -158,18 +163,15 @@ def _has_frames(directory: Path) -> bool:
     return (directory / PACKED).exists() or bool(sealed_segments(directory))
 
 
-def _sound_index(directory: Path) -> FrameIndex | None:
-    """Return the index of the sound frames from the first one on."""
+def _sound_index(directory: Path) -> tuple[FrameIndex | None, int]:
+    """Return the index of the sound frames from the first one on, and how many of them the packed file has."""
     found: list[FrameIndex] = []
-    count = 0
-    for path in [*([directory / PACKED] if (directory / PACKED).exists() else []), *sealed_segments(directory)]:
-        verdict = verify_file(path)
-        if not verdict.whole:
-            if path.name == PACKED:
-                faults = " ".join(verdict.faults)
-                raise InputError(
-                    f"{faults} `mpmcli repair {directory}` keeps the frames before that; then resume the run."
-                )
+    packed = directory / PACKED
+    if packed.exists() and verify_file(packed).sound:
+        found.append(read_index_of(packed))
+    count = of_packed = len(found[0].times) if found else 0
+    for path in sealed_segments(directory):
+        if not verify_file(path).sound:
             break
         index = read_index_of(path)
         first = int(index.frames[0])
@@ -180,7 +182,7 @@ def _sound_index(directory: Path) -> FrameIndex | None:
             break
         found.append(index)
         count += len(index.frames)
-    return FrameIndex.joined(found) if found else None
+    return FrameIndex.joined(found) if found else None, of_packed
 
 
 def _require_same_scene(loaded: LoadedScene, directory: Path) -> None:
