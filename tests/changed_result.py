@@ -8,24 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from mpmcli.output.checksums import (
-    NAME,
-    SUMS,
-    append_checksum,
-    checksum,
-    gaps_of,
-    path_digest,
-    read_sums,
-    store_checksums,
-    write_sums,
-)
-
-
-def accept_changes(directory: Path) -> None:
-    """Give the files of a series the checksums of what they hold now; of those that are gone none."""
-    found = [directory / name for name in read_sums(directory)]
-    (directory / SUMS).unlink()
-    write_sums(directory, {path.name: [path_digest(path)] for path in found if path.exists()})
+from mpmcli.output.checksums import NAME, append_checksum, checksum, gaps_of, store_checksums
 
 
 @contextmanager

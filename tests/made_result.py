@@ -7,7 +7,7 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output import SegmentStore, VtkSeriesStore
+from mpmcli.output import SegmentStore
 
 GRAVITY = 9.81
 MASS, STEP, PAUSE = 2.0, 0.002, 0.02
@@ -91,9 +91,9 @@ def write_made(
     driven: bool = False,
     changes: dict[int, dict[str, object]] | None = None,
 ) -> Path:
-    """Store the run as "packed", "segments" or "series", with other values in some rows, and return the directory."""
+    """Store the run as "packed" or "segments", with other values in some rows, and return the directory."""
     header, hold = made_header(dimension, driven=driven), np.inf if form == "packed" else 0.0
-    store = (VtkSeriesStore if form == "series" else SegmentStore)(directory, header, hold=hold)
+    store = SegmentStore(directory, header, hold=hold)
     # Nothing of it needs to outlive a power cut.
     with mock.patch("os.fsync"):
         for k in range(frames):

@@ -14,11 +14,11 @@ from command import run_here
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output import SegmentStore, VtkSeriesStore, open_result
+from mpmcli.output import SegmentStore, open_result
 from mpmcli.output.run_record import RECORD
 from mpmcli.output.segments import PACKED
 
-FORMS = ("packed", "segments", "series")
+FORMS = ("packed", "segments")
 # A drop falls on the floor and splashes, and a jelly ball falls freely; it starts in no time.
 SCENE = """\
 title = "A drop and a ball"
@@ -85,7 +85,7 @@ class StoredRun:
     def _store(self, directory: Path, form: str, frames: Sequence[Frame], rows: Sequence[LedgerRow]) -> None:
         # Frames that are packed in the end are sealed at once: a segment of each takes most of the time.
         hold = np.inf if form == "packed" else 0.0
-        store = (VtkSeriesStore if form == "series" else SegmentStore)(directory, self.header, hold=hold)
+        store = SegmentStore(directory, self.header, hold=hold)
         for frame, row in zip(frames, rows, strict=True):
             store.write(frame, row)
         if form != "segments":

@@ -3,12 +3,11 @@
 import json
 import shutil
 from pathlib import Path
-from xml.etree import ElementTree
 
 import h5py
 import numpy as np
 import pytest
-from changed_result import accept_changes, changed
+from changed_result import changed
 from result_copies import StoredRun, real_run
 from test_check_result import rules, the
 
@@ -17,7 +16,6 @@ from mpmcli.check.result_check import check_result
 from mpmcli.errors import InputError
 from mpmcli.output.run_record import RECORD
 from mpmcli.output.segments import PACKED, SEGMENTS, segment_name
-from mpmcli.output.series import SERIES, SERIES_HEADER, SERIES_LEDGER, series_frame_name
 
 K = 6
 
@@ -37,21 +35,10 @@ def segments(run: StoredRun, tmp_path: Path) -> Path:
     return run.write(tmp_path / "segments_copy", "segments")
 
 
-@pytest.fixture
-def series(run: StoredRun, tmp_path: Path) -> Path:
-    return run.write(tmp_path / "series_copy", "series")
-
-
 def cut(path: Path, part: float) -> None:
     """Cut a file off behind this part of it."""
     content = path.read_bytes()
     path.write_bytes(content[: int(part * len(content))])
-
-
-def entries_of(series: Path) -> tuple[ElementTree.ElementTree, ElementTree.Element, list[ElementTree.Element]]:
-    tree = ElementTree.parse(series / SERIES)
-    collection = tree.getroot().find("Collection")
-    return tree, collection, list(collection)
 
 
 @pytest.mark.parametrize("part", [0.0, 0.001, 0.5, 0.999])
@@ -184,62 +171,6 @@ def test_a_damaged_chunk_of_a_compressed_file_is_one_frame_and_not_the_whole(run
     assert rules(check) == {"unreadable"} and (check.first_bad_frame, check.frames) == (K, 10)
 
 
-@pytest.mark.parametrize("part", [0.0, 0.5, 0.99])
-def test_a_frame_of_a_series_that_is_cut_off(series, part):
-    cut(series / series_frame_name(K), part)
-    check = check_result(series / SERIES)
-    assert rules(check) == {"unreadable"} and (check.first_bad_frame, check.frames) == (K, 10)
-
-
-def test_a_frame_of_a_series_that_is_gone(series):
-    (series / series_frame_name(K)).unlink()
-    check = check_result(series)
-    assert rules(check) == {"unreadable"} and (check.first_bad_frame, check.frames) == (K, 10)
-
-
-def test_frames_of_a_series_that_changed_places(series):
-    """Each file is whole, and the ledger of its place belongs to another one."""
-    one, two = series / series_frame_name(K), series / series_frame_name(K + 1)
-    content = one.read_bytes()
-    one.write_bytes(two.read_bytes())
-    two.write_bytes(content)
-    accept_changes(series)
-    check = check_result(series)
-    assert the(check, "ledger").frame == check.first_bad_frame == K and check.verdict == "unstable"
-
-
-@pytest.mark.parametrize("change", ["left out", "twice", "swapped"])
-def test_a_list_of_a_series_that_was_changed(series, change):
-    tree, collection, entries = entries_of(series)
-    if change == "left out":
-        collection.remove(entries[K])
-    elif change == "twice":
-        collection.insert(K, entries[K - 1])
-        collection.remove(entries[-1])
-    else:
-        collection[K], collection[K + 1] = entries[K + 1], entries[K]
-    tree.write(series / SERIES)
-    accept_changes(series)
-    check = check_result(series)
-    assert the(check, "frame-time").frame == check.first_bad_frame == K and check.verdict == "unstable"
-
-
-@pytest.mark.parametrize("name", [SERIES, SERIES_HEADER, SERIES_LEDGER])
-def test_a_table_of_a_series_that_is_cut_off(series, name):
-    cut(series / name, 0.5)
-    check = check_result(series)
-    assert check.verdict == "unstable" and check.findings[0].rule in ("unreadable", "ledger-missing")
-    assert check.first_bad_frame is not None
-
-
-def test_a_row_of_the_ledger_that_is_gone(series):
-    lines = (series / SERIES_LEDGER).read_text(encoding="utf-8").splitlines(keepends=True)
-    (series / SERIES_LEDGER).write_text("".join(lines[:-1]), encoding="utf-8")
-    accept_changes(series)
-    check = check_result(series)
-    assert the(check, "ledger-missing").frame == 10 and check.verdict == "unstable"
-
-
 @pytest.mark.parametrize(
     ("status", "rule", "verdict"),
     [
@@ -269,22 +200,15 @@ def test_a_run_that_wrote_no_frame(run, tmp_path):
     assert check.verdict == "unstable" and check.frames == 0 and check.first_bad_frame == 0
 
 
-def test_what_is_no_result_is_bad_input(run, packed, series, tmp_path):
+def test_what_is_no_result_is_bad_input(packed, tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.vtkhdf").write_text("notes")
-    (tmp_path / "other.pvd").write_text("<VTKFile/>")
     with h5py.File(tmp_path / "foreign.vtkhdf", "w") as file:
         file["x"] = np.zeros(3)
-    for name in ("missing", "empty", "notes.vtkhdf", "other.pvd", "foreign.vtkhdf"):
+    for name in ("missing", "empty", "notes.vtkhdf", "foreign.vtkhdf"):
         with pytest.raises(InputError):
             check_result(tmp_path / name)
-    with pytest.raises(InputError, match=r"one frame of a series"):
-        check_result(series / series_frame_name(0))
     with changed(packed / PACKED) as file:
         file["mpmcli"].attrs["format"] = 99
     with pytest.raises(InputError, match="newer version"):
         check_result(packed)
-    facts = json.loads((series / SERIES_HEADER).read_text(encoding="utf-8"))
-    (series / SERIES_HEADER).write_text(json.dumps(facts | {"format": 99}), encoding="utf-8")
-    with pytest.raises(InputError, match="newer version"):
-        check_result(series)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command import run_here
 from made_dataset import made_dataset
-from made_result import made_frame, made_header, made_row, write_made
+from made_result import made_frame, made_header, write_made
 from test_output_frames import make_frame
 from test_output_frames import make_row as any_row
 
@@ -78,24 +78,19 @@ def test_checksums_are_those_of_zlib(tmp_path):
     assert end == b"\nmpmcli crc32 %08x\n" % zlib.crc32(body)
 
 
-@pytest.mark.parametrize("form", ["packed", "segments", "series"])
+@pytest.mark.parametrize("form", ["packed", "segments"])
 def test_a_flipped_bit_is_named_and_never_read(tmp_path, form):
     """It would move a particle by 2e-9 m, which no physics notices."""
     write_made(tmp_path, form)
-    path = {
-        "packed": tmp_path / PACKED,
-        "segments": tmp_path / "segments/frame_000002.vtkhdf",
-        "series": tmp_path / "particles_000002.vtu",
-    }[form]
-    place = 700 if form == "series" else place_of(path, "VTKHDF/Points", 8 if form == "packed" else 0) - 11
+    path = tmp_path / (PACKED if form == "packed" else "segments/frame_000002.vtkhdf")
+    place = place_of(path, "VTKHDF/Points", 8 if form == "packed" else 0) - 11
     sound = run_here("info", tmp_path, "--verify")
     assert sound.status == 0 and sound.stdout.rstrip().endswith(": ok")
     flip(path, place)
     outcome = run_here("info", tmp_path, "--verify", "--json")
     found = json.loads(outcome.stdout)
     assert outcome.status == 1 and not found["ok"] and len(found["faults"]) == 1 and str(path) in found["faults"][0]
-    if form != "series":
-        assert "Points of frame 2 has changed" in found["faults"][0]
+    assert "Points of frame 2 has changed" in found["faults"][0]
     result = open_result(tmp_path)
     with pytest.raises(InputError, match="damaged"):
         result.frame(2)
@@ -171,42 +166,3 @@ def test_checksums_of_exports_are_those_of_hashlib(tmp_path):
     for command in (["info", out, "--verify"], ["dataset", "verify", out]):
         outcome = run_here(*command)
         assert outcome.status == 1 and "train.h5 has changed" in outcome.stdout
-
-
-def test_a_series_is_whole_whenever_its_run_is_killed(tmp_path, monkeypatch):
-    """Stopped at each of the files that a frame replaces, one after the other."""
-
-    class Killed(BaseException):
-        pass
-
-    from mpmcli.output import VtkSeriesStore, series
-
-    monkeypatch.setattr("os.fsync", lambda descriptor: None)
-    real_text, real_sums = series.write_text, series.write_sums
-    for stop in range(1, 5):
-        left = stop
-
-        def counted(*arguments, real):
-            nonlocal left
-            if left == 0:
-                raise Killed
-            left -= 1
-            real(*arguments)
-
-        directory = tmp_path / str(stop)
-        directory.mkdir()
-        store = VtkSeriesStore(directory, made_header(2))
-        store.write(made_frame(0, 2), made_row(0, 2))
-        monkeypatch.setattr(series, "write_text", lambda *a: counted(*a, real=real_text))
-        monkeypatch.setattr(series, "write_sums", lambda *a: counted(*a, real=real_sums))
-        if stop < 4:
-            with pytest.raises(Killed):
-                for k in (1, 2):
-                    store.write(made_frame(k, 2), made_row(k, 2))
-        monkeypatch.setattr(series, "write_text", real_text)
-        monkeypatch.setattr(series, "write_sums", real_sums)
-        result = open_result(directory)
-        for k, frame in enumerate(result.frames()):
-            np.testing.assert_array_equal(frame.position, made_frame(k, 2).position)
-        assert run_here("info", directory, "--verify").status == 0
-        assert result.frame_count == (1 if stop in (1, 2, 4) else 2)

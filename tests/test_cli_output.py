@@ -77,8 +77,7 @@ def test_few_particles_run_on_one_thread_with_the_same_bytes(results, tmp_path):
     [
         ("packed", "packed"),
         ("packed/particles.vtkhdf", "packed"),
-        ("series", "series"),
-        ("series/particles.pvd", "series"),
+        ("series/particles.pvd", "packed"),
     ],
 )
 def test_info_says_what_a_result_holds(run, path, kind):

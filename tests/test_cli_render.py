@@ -13,7 +13,7 @@ from command import run_here
 from drawn_results import JELLY, WATER, frame, header, lattice, write
 from PIL import Image
 
-from mpmcli.output import Result, VtkSeriesStore, open_result
+from mpmcli.output import Result, open_result
 from mpmcli.output.segments import SEGMENTS
 from mpmcli.render.picture_file import settings_digest, write_picture
 from mpmcli.render.request import Request, plan_render
@@ -234,18 +234,6 @@ def test_without_a_window_the_setting_at_fault_is_named(run: Path, run_python: C
     assert done.status == 2 and done.stdout == ""
     assert done.stderr.startswith("error: ") and "VTK_DEFAULT_OPENGL_WINDOW" in done.stderr
     assert not (run / "render").exists()
-
-
-def test_series_are_drawn_too(tmp_path: Path, run: Path) -> None:
-    source = open_result(run)
-    store = VtkSeriesStore(tmp_path / "series", source.header.stored)
-    for k, entry in enumerate(source.frames()):
-        store.write(entry, source.ledger[k])
-    series = store.finish()
-    places = [(run, tmp_path / "1.png"), (series, tmp_path / "2.png")]
-    pictures = [rendered(path, "-o", out, "--frame", 2)["pictures"][0] for path, out in places]
-    one, other = (np.asarray(Image.open(path)) for path in pictures)
-    np.testing.assert_array_equal(one, other)
 
 
 def test_surfaces_are_drawn_and_saved_for_other_tools(run: Path, tmp_path: Path) -> None:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from drawn_results import WATER, frame, header, row
 
-from mpmcli.output import SegmentStore, VtkSeriesStore, open_result, prepare_directory
+from mpmcli.output import SegmentStore, open_result, prepare_directory
 from mpmcli.output.collider_files import MOVING, RESTING, RESTING_PIECE, SERIES
+from mpmcli.output.series import write_series
 from mpmcli.scene import surface as scene_surface
 from mpmcli.scene.colliders import Collider
 
@@ -81,7 +82,8 @@ def test_lines_of_a_2d_scene_turn(tmp_path: Path) -> None:
 def test_a_series_lists_both_and_overwrite_takes_all_away(tmp_path: Path) -> None:
     import pyvista as pv
 
-    stored(tmp_path, VtkSeriesStore, 2, [PADDLE, POST])
+    stored(tmp_path, SegmentStore, 2, [PADDLE, POST])
+    write_series(tmp_path, open_result(tmp_path).colliders)
     reader = pv.PVDReader(str(tmp_path / SERIES))
     assert reader.time_values == pytest.approx([0.0, 0.01, 0.02])
     reader.set_active_time_value(0.02)

@@ -1,6 +1,7 @@
 """Files that contradict themselves: refused with a sentence before they cost time, memory or the interpreter."""
 
 import json
+import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -10,9 +11,13 @@ import numpy as np
 import pytest
 import pyvista as pv
 from changed_result import changed
-from fuzzing.seeds import datasets, results
+from command import run_here
+from conftest import ROOT
+from made_dataset import made_dataset
+from made_result import write_made
 
-from mpmcli.dataset.folder import Manifest
+from mpmcli.dataset.folder import Manifest, Row
+from mpmcli.dataset.shard import checksum
 from mpmcli.errors import InputError
 from mpmcli.output import open_result, read_record
 from mpmcli.output.guarded_read import DamageError, read_rows, read_whole, require_sound_heaps
@@ -20,12 +25,75 @@ from mpmcli.plain_text import escaped
 from mpmcli.scene.geometry_file import GeometryFileError, read_geometry
 from mpmcli.scene.toml_file import apply_overrides, copied, too_deep
 
+# A file of each kind, each of which once ended a command with a traceback.
+CORPUS = ROOT / "tests" / "corpus"
+READ = [("info", "{}"), ("check", "{}"), ("info", "{}", "--verify"), ("plot", "{}"), ("export", "{}", "--to", "npz")]
+SCENE = """\
+[domain]
+size = [2.0, 2.0, 2.0]
+cells = [16, 16, 16]
+[time]
+end = 0.1
+frames = 4
+[[bodies]]
+name = "thing"
+material = "jelly"
+shape = {{ {shape} = {{ file = "{file}", {more} }} }}
+"""
 
-def placed(directory: Path, files: dict[str, bytes]) -> Path:
-    for name, data in files.items():
-        (directory / name).parent.mkdir(parents=True, exist_ok=True)
-        (directory / name).write_bytes(data)
+
+def with_manifest(directory: Path) -> Path:
+    """Write a dataset of four trajectories with its manifest."""
+    manifest = Manifest(made_dataset(directory))
+    facts = {"count": 4, "seed": 0, "accept": "stable", "per_shard": 2, "part": [1, 1], "version": "0.1"}
+    manifest.create({"key": "k", **facts})
+    for shard in sorted((directory / "shards").iterdir()):
+        with h5py.File(shard) as file:
+            for group in file.values():
+                known = {"verdict": "stable", "accepted": 1, "file": f"shards/{shard.name}", "draws": "{}"}
+                known |= {"checksum": checksum(group), "frames": 11, "particles": group["position"].shape[1]}
+                row = Row.failed(int(group.attrs["number"]), str(group.attrs["split"]))
+                manifest.put([Row(**{**vars(row), **known})])
     return directory
+
+
+def put(name: str, directory: Path) -> tuple[Path, list[tuple[str, ...]]]:
+    """Put a file of the corpus where a command finds it; return what is given to the commands, and these."""
+    checks = [("check", "{}", "--no-probe"), ("info", "{}")]
+    if name in ("mesh.obj", "points.npy"):
+        shape, _, _ = name.partition(".")
+        more = "" if shape == "mesh" else 'spacing = 0.1, velocity = ["vx", "vy", "vz"]'
+        (directory / "scene.toml").write_text(SCENE.format(shape=shape, file=name, more=more), encoding="utf-8")
+        shutil.copy(CORPUS / name, directory)
+        return directory / "scene.toml", checks
+    if name == "sweep.toml":
+        shutil.copy(CORPUS / name, directory)
+        shutil.copy(ROOT / "configs" / "jelly_drop_3d.toml", directory / "base.toml")
+        return directory / name, [("sweep", "{}", "--dry-run")]
+    if name.endswith(".toml"):
+        return shutil.copy(CORPUS / name, directory), checks
+    if name == "manifest.sqlite":
+        shutil.copy(CORPUS / name, with_manifest(directory / "data"))
+        return directory / "data", [("dataset", "status", "{}"), ("dataset", "verify", "{}")]
+    run = write_made(directory / "run", "segments" if name.startswith("frame") else "packed", frames=2)
+    shutil.copy(CORPUS / name, run / "segments" if name.startswith("frame") else run)
+    return run, READ
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in CORPUS.iterdir()))
+def test_a_damaged_file_ends_with_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    given, commands = put(name, tmp_path)
+    ends = []
+    for words in commands:
+        more = ("-o", tmp_path / "out") if words[0] == "export" else ()
+        outcome = run_here(*(word.format(given) for word in words), *more)
+        text = outcome.stdout + outcome.stderr
+        assert "a fault of mpmcli" not in text and "Traceback" not in text and "\x1b" not in text, text
+        ends.append(outcome.status)
+    # What a record or a name says can be left out.
+    assert max(ends) > 0 or name == "run.json"
+    assert max(ends) <= 2
 
 
 def test_a_heap_whose_object_has_no_size(tmp_path: Path) -> None:
@@ -65,15 +133,14 @@ def test_a_data_set_of_more_than_the_file_holds(tmp_path: Path) -> None:
     [{"dimension": 7}, {"bodies": 3}, {"origin": ["a", "b"]}, {"scene": "domain = 3"}, {"laws": [{"colour": 1}] * 2}],
 )
 def test_a_header_of_other_types(tmp_path: Path, change: dict) -> None:
-    place = placed(tmp_path, results("packed")[0])
-    assert open_result(place / "result").frame_count == 3
-    with changed(place / "result" / "particles.vtkhdf") as file:
+    write_made(tmp_path)
+    with changed(tmp_path / "particles.vtkhdf") as file:
         attributes = file["mpmcli"].attrs
         attributes["header"] = json.dumps(json.loads(attributes["header"]) | change)
         if "scene" in change:
             attributes["scene"] = change["scene"]
     with pytest.raises(InputError, match="is damaged: its header"):
-        open_result(place / "result")
+        open_result(tmp_path)
 
 
 def test_entries_of_a_record_that_cannot_be_are_left_out(tmp_path: Path) -> None:
@@ -84,7 +151,7 @@ def test_entries_of_a_record_that_cannot_be_are_left_out(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("file", ["../elsewhere.h5", "/etc/hostname", "shards/../../elsewhere.h5"])
 def test_a_manifest_leads_nowhere_else(tmp_path: Path, file: str) -> None:
-    place = placed(tmp_path, datasets()[0]) / "data"
+    place = with_manifest(tmp_path / "data")
     assert len(Manifest(place).rows()) == 4
     with closing(sqlite3.connect(place / "manifest.sqlite")) as connection, connection:
         connection.execute("UPDATE trajectories SET file = ? WHERE number = 2", (file,))

@@ -67,7 +67,7 @@ def test_datasets_and_trajectories_can_be_sent_to_other_processes(tmp_path):
         same(there[1].velocity, dataset[0].velocity)
 
 
-@pytest.mark.parametrize("form", ["packed", "segments", "series"])
+@pytest.mark.parametrize("form", ["packed", "segments"])
 def test_a_single_result_is_a_dataset_of_one_trajectory(tmp_path, form):
     dataset = mpmcli.dataset.open(write_made(tmp_path / "run", form, dimension=3))
     assert dataset.splits == {"train": (0,), "valid": (), "test": ()} and dataset.dimension == 3

@@ -10,15 +10,16 @@ import pytest
 from test_output_frames import make_frame, make_row
 
 from mpmcli.errors import InputError
-from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore, open_result, prepare_directory, read_record
+from mpmcli.output import RunRecord, SegmentStore, open_result, prepare_directory, read_record
 from mpmcli.output.durable import sealed, write_text
+from mpmcli.output.series import write_series
 
 
-def write_result(directory: Path, store_class, *, finish: bool) -> None:
+def write_result(directory: Path, *, finish: bool) -> None:
     (directory / "scene.toml").write_text("title = 'x'\n")
     record = RunRecord(directory)
     record.write()
-    store = store_class(directory, {})
+    store = SegmentStore(directory, {})
     for k in range(2):
         store.write(make_frame(k, 10, 2), make_row(k, 2))
     if finish:
@@ -58,10 +59,12 @@ def test_nothing_is_made_on_error(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.parametrize("store_class", [SegmentStore, VtkSeriesStore])
+@pytest.mark.parametrize("series", [False, True])
 @pytest.mark.parametrize("finish", [False, True])
-def test_overwrite_removes_a_result_and_nothing_else(tmp_path, store_class, finish):
-    write_result(tmp_path, store_class, finish=finish)
+def test_overwrite_removes_a_result_and_nothing_else(tmp_path, series, finish):
+    write_result(tmp_path, finish=finish)
+    if series and finish:
+        write_series(tmp_path, [])
     foreign = ["movie.mp4", "particles_000001.vtu.bak", "frame_000001.vtkhdf", "particles_1.vtu"]
     for name in foreign:
         (tmp_path / name).write_text("mine")
@@ -71,7 +74,7 @@ def test_overwrite_removes_a_result_and_nothing_else(tmp_path, store_class, fini
     assert open_result(tmp_path).frame_count == 2
     prepare_directory(tmp_path, overwrite=True)
     assert sorted(os.listdir(tmp_path)) == sorted(foreign)
-    write_result(tmp_path, store_class, finish=finish)
+    write_result(tmp_path, finish=finish)
     assert open_result(tmp_path).frame_count == 2
 
 
@@ -139,7 +142,7 @@ def test_the_record_of_a_run(tmp_path):
 
 
 def test_the_record_comes_with_the_result(tmp_path):
-    write_result(tmp_path, SegmentStore, finish=True)
+    write_result(tmp_path, finish=True)
     assert open_result(tmp_path).record["status"] == "running"
     assert open_result(tmp_path / "particles.vtkhdf").record["status"] == "running"
 

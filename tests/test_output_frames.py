@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.layout import FrameLayout
-from mpmcli.output.ledger_table import ledger_columns, ledger_csv, ledger_rows, parse_ledger_csv
+from mpmcli.output.ledger_table import ledger_columns, ledger_rows
 
 # Fields by name: shape per particle as a function of d.
 FIELDS = {
@@ -112,9 +112,7 @@ def test_a_frame_with_other_arrays_than_the_first_is_refused():
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_the_ledger_survives_columns_and_csv(d):
+def test_the_ledger_survives_columns(d):
     rows = [make_row(k, d) for k in range(5)]
     assert ledger_rows(ledger_columns(rows)) == rows
-    columns = {"frame": list(range(5)), "step": [0, 7, 14, 21, 28], "particles": [9] * 5}
-    assert parse_ledger_csv(ledger_csv(rows, columns)) == (rows, columns)
     assert ledger_columns(rows)["angular_momentum"].shape == (5, 1 if d == 2 else 3)

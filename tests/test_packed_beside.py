@@ -12,7 +12,7 @@ from mpmcli.errors import NoRoomError, RunError
 from mpmcli.output import SegmentStore, open_result
 from mpmcli.output import durable as durable_module
 from mpmcli.output import pack as pack_module
-from mpmcli.output import segments as segments_module
+from mpmcli.output import store as store_module
 from mpmcli.output.segments import PACKED
 from mpmcli.output.vtkhdf import VtkhdfWriter
 
@@ -23,8 +23,8 @@ FRAMES = [make_frame(k, 300, 3) for k in range(5)]
 
 @pytest.fixture(autouse=True)
 def small_runs_too(monkeypatch) -> None:
-    monkeypatch.setattr(segments_module, "MOST_WAITING", 0)
-    monkeypatch.setattr(segments_module, "ASIDE", 0)
+    monkeypatch.setattr(store_module, "MOST_WAITING", 0)
+    monkeypatch.setattr(store_module, "ASIDE", 0)
 
 
 def begin(directory: Path, count: int, *, expected: int | None = len(FRAMES), **options) -> SegmentStore:
@@ -152,7 +152,7 @@ def test_without_room_for_both_it_is_not_begun(tmp_path, monkeypatch):
     def refuse(*_: object, **__: object) -> None:
         raise NoRoomError("full")
 
-    monkeypatch.setattr(segments_module, "require_free_space", refuse)
+    monkeypatch.setattr(store_module, "require_free_space", refuse)
     store = begin(tmp_path, 5)
     assert not (tmp_path / TEMPORARY).exists()
     store.finish()

@@ -165,13 +165,10 @@ def test_a_first_frame_that_is_not_finite_is_not_what_changes_are_counted_from(t
     assert np.allclose(impulse[1:, 1], MASS * GRAVITY * (TIMES[1:] - TIMES[1]) / 2, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("form", "frames", "dimension"), [("packed", 6, 3), ("segments", 3, 2), ("series", 6, 2), ("segments", 1, 3)]
-)
+@pytest.mark.parametrize(("form", "frames", "dimension"), [("packed", 6, 3), ("segments", 3, 2), ("segments", 1, 3)])
 def test_every_form_of_result_becomes_a_picture_of_the_size_asked_for(tmp_path, form, frames, dimension):
     directory = write_made(tmp_path / "result", form, frames=frames, dimension=dimension)
-    given = directory / "particles.pvd" if form == "series" else directory
-    outcome = run_here("plot", given, "--size", "451x301", "--json")
+    outcome = run_here("plot", directory, "--size", "451x301", "--json")
     assert outcome.status == 0, outcome.stderr
     said = json.loads(outcome.stdout)
     assert Path(said["path"]) == directory / "ledger.png" and said["frames"] == frames and said["size"] == [451, 301]

@@ -213,24 +213,6 @@ def test_a_killed_run_that_is_resumed_has_the_bytes_of_one_that_was_not(whole, t
     assert record["steps"] == open_result(whole / name).frame(4).step
 
 
-def test_frames_of_a_series_that_are_damaged_are_computed_again(whole, tmp_path):
-    """From the first such frame on, where a copy was cut off, say; one whose first frame is damaged is refused."""
-    shutil.copytree(whole / "series", tmp_path / "series")
-    again = ("simulate", whole / "drop.toml", "-o", tmp_path / "series", "--format", "vtk", "--resume")
-
-    def cut(number: int) -> None:
-        file = tmp_path / "series" / f"particles_{number:06d}.vtu"
-        file.write_bytes(file.read_bytes()[:-100])
-
-    cut(3)
-    outcome = run_here(*again)
-    assert outcome.status == 0 and "resumed: 3 frames kept" in outcome.stderr
-    assert files_of(tmp_path / "series") == files_of(whole / "series")
-    cut(0)
-    outcome = run_here(*again)
-    assert outcome.status == 2 and "the first frame is damaged" in outcome.stderr
-
-
 def interrupted(whole: Path, directory: Path, calls: int, **options: object) -> None:
     """Interrupt a run of the drop at the n-th point where it can stop."""
     count = 0
@@ -265,14 +247,24 @@ def test_an_interrupted_run_goes_on_later_and_longer(whole, tmp_path, short_laun
     assert files_of(tmp_path / "part") == files_of(tmp_path / "long")
 
 
+def test_a_finished_run_that_is_resumed_with_another_format_has_its_series(whole, tmp_path):
+    """No frame is computed for it, and one that goes on without it has none."""
+    shutil.copytree(whole / "packed", tmp_path / "run")
+    resume = ("simulate", whole / "drop.toml", "-o", tmp_path / "run", "--resume", "-q")
+    assert run_here(*resume, "--format", "vtk").status == 0
+    assert files_of(tmp_path / "run") == files_of(whole / "series")
+    assert run_here(*resume, "--set", "time.end=0.1", "--set", "time.frames=8").status == 0
+    assert set(files_of(tmp_path / "run")) == set(files_of(whole / "packed"))
+
+
 def test_a_run_that_was_not_begun_begins(whole, tmp_path):
     outcome = run_here("simulate", whole / "drop.toml", "-o", tmp_path / "new", "--resume", "-q")
     assert outcome.status == 0
     assert files_of(tmp_path / "new") == files_of(whole / "packed")
 
 
-def find(whole: Path, directory: Path, *overrides: str, form: str = "vtkhdf") -> object:
-    return find_resumption(load_scene(whole / "drop.toml", overrides, laws=parameter_models()), directory, form)
+def find(whole: Path, directory: Path, *overrides: str) -> object:
+    return find_resumption(load_scene(whole / "drop.toml", overrides, laws=parameter_models()), directory)
 
 
 @pytest.mark.parametrize(
@@ -302,11 +294,9 @@ def test_frames_of_another_version_or_backend_are_refused_before_a_step(whole, k
 
 def test_what_is_no_run_is_refused_and_left_alone(whole, tmp_path):
     (tmp_path / "scene.toml").write_text("mine = 1\n", encoding="utf-8")
-    for directory, form in ((tmp_path, "vtkhdf"), (whole / "packed", "vtk"), (whole / "series", "vtkhdf")):
-        before = sorted(path.name for path in directory.iterdir())
-        with pytest.raises(InputError, match=r"resume|--format"):
-            find(whole, directory, form=form)
-        assert sorted(path.name for path in directory.iterdir()) == before
+    with pytest.raises(InputError, match="no run that could be resumed"):
+        find(whole, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
     outcome = run_here("simulate", whole / "drop.toml", "-o", tmp_path / "x", "--resume", "--overwrite")
     assert outcome.status == 2 and "give one of them" in outcome.stderr and not (tmp_path / "x").exists()
 

@@ -1,19 +1,16 @@
 """The volume of liquids: it follows the density of the grid, and stays (docs/theory.md, 5.11)."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
 import pytest
-from made_result import made_row
 from scenes import block, scene, volume_errors
 
 from mpmcli.materials.fluid import BESIDE, DEAD_BAND, FULL, LARGEST_LACK, OPENED, RELAXATION, SLACK
 from mpmcli.materials.registry import parameter_models
 from mpmcli.materials.sand import BAND
 from mpmcli.materials.sand import RELAXATION as GRAINS_RELAXATION
-from mpmcli.output.ledger_table import FRAME_COLUMNS, ledger_columns, ledger_csv, ledger_rows, parse_ledger_csv
 from mpmcli.scene import Scene, parse_scene, sample_bodies
 from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.machine.plan import make_plan
@@ -327,15 +324,3 @@ def test_volume_error_of_known_blocks() -> None:
         assert error_of(x, both, ~beside) == pytest.approx(stretch**2 - 1, abs=2 * sharp)
     few = (x < 4 * H).all(1)
     assert error_of(x[few], volume[few], flows[few]) == 0
-
-
-def test_a_ledger_written_before_has_no_volume_error() -> None:
-    """The column is nan, from HDF5 and from CSV; the others are read as they are."""
-    row = made_row(1, 2)
-    columns = ledger_columns([row])
-    del columns["volume_error"]
-    frames = {name: [0] for name in FRAME_COLUMNS}
-    lines = [line.rsplit(",", 1)[0] for line in ledger_csv([row], frames).splitlines()]
-    for (found,) in (ledger_rows(columns), parse_ledger_csv("\n".join(lines))[0]):
-        assert np.isnan(found.volume_error)
-        assert replace(found, volume_error=row.volume_error) == row

@@ -103,7 +103,7 @@ class ResultCheck:
 
 
 def check_result(path: Path) -> ResultCheck:
-    """Check ledger and frames of a result, packed, segments or .pvd, whose run may go on; InputError: none of ours."""
+    """Check ledger and frames of a result, packed or segments, whose run may go on; InputError: none of ours."""
     findings = FrameFindings()
     opened = open_entries(path, findings)
     check = _check(opened, findings)

@@ -13,10 +13,9 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.guarded_read import DAMAGE, DamageError, first_line
 from mpmcli.output.header import RunHeader
-from mpmcli.output.result import Result, open_result
+from mpmcli.output.result import Result, open_result, result_place
 from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
-from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
-from mpmcli.output.series import SERIES, SERIES_HEADER
+from mpmcli.output.segments import PACKED, sealed_segments
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 RUN_AGAIN = "Copy the file again from where it was made, or run the scene again."
@@ -74,7 +73,7 @@ class OpenedResult:
     """The readable part of a result, its frames in the order of the files."""
 
     path: Path
-    # "packed", "segments", "series", "memory", or "none" if nothing can be read.
+    # "packed", "segments", "memory", or "none" if nothing can be read.
     kind: str
     header: RunHeader
     # Content of run.json.
@@ -109,9 +108,7 @@ def kept_entries(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[Le
 
 def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
     """Open what can be read of a result, and note the rest; InputError: nothing is there, or nothing of ours."""
-    path = Path(path)
-    if path.name == SEGMENTS and path.is_dir():
-        path = path.parent
+    path = result_place(path)
     if path.is_dir() and not (path / PACKED).exists() and sealed_segments(path):
         return _open_segments(path, findings)
     try:
@@ -150,20 +147,20 @@ def _directory(path: Path) -> Path:
 
 def _is_damage(path: Path, error: Exception) -> bool:
     """Return whether mpmcli wrote the file, so that it is damaged rather than of another kind."""
-    if not path.exists() or path.suffix == ".vtu":
+    if not path.exists():
         return False
     ours = read_record(_directory(path)) is not None
     if path.is_dir():
         packed = path / PACKED
-        if not packed.exists() and not (path / SERIES).exists():
+        if not packed.exists():
             return ours  # a run that wrote no frame
-        path = packed if packed.exists() else path / SERIES
+        path = packed
     if isinstance(error, DamageError):
         return True
     # open_result sets a cause if the file could not be read, and none if it is of another kind or version.
     if isinstance(error, InputError) and error.__cause__ is None:
         return False
-    if ours or (path.parent / SERIES_HEADER).exists():
+    if ours:
         return True
     with path.open("rb") as file:
         return file.read(8) == HDF5_SIGNATURE

@@ -167,7 +167,7 @@ def _forecast_text(forecast: Forecast) -> str:
         f"{steps}, {forecast.frames:,} frames{took}\n"
         f"{size_text(forecast.device_bytes)} on the device, {size_text(forecast.host_bytes)} for frames beside it, "
         f"{size_text(forecast.file_bytes)} on the disk before "
-        f"compression ({size_text(forecast.vtk_bytes)} as .vtu series)"
+        f"compression ({size_text(forecast.vtk_bytes)} more with --format vtk)"
     )
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 def check_command(path: Path, strict: bool, as_json: bool, **of_scene: object) -> int:
     """Check a scene (PATH.toml): the stable step and its cause, likely faults, and the cost of the run.
 
-    Or check whether a result is stable and complete: its directory, particles.vtkhdf or particles.pvd. Nothing is
+    Or check whether a result is stable and complete: its directory or particles.vtkhdf. Nothing is
     written. The exit code is 1 if there is an error, or with --strict a warning.
     """
     if path.suffix == ".toml":
@@ -76,7 +76,7 @@ def _check_scene(
 def info_command(
     path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], verify: bool, as_json: bool
 ) -> int | None:
-    """Say what PATH holds: a scene (.toml), or a result (its directory, particles.vtkhdf or particles.pvd).
+    """Say what PATH holds: a scene (.toml), or a result (its directory or particles.vtkhdf).
 
     With --verify the exit code is 1 if anything has changed since it was written, or is missing.
     """

@@ -70,7 +70,7 @@ def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool
     RESULT may be a dataset: its montage shows evenly spaced trajectories at one frame, the middle one or --frame, and
     goes to montage.png in the dataset.
 
-    RESULT is a directory, particles.vtkhdf or particles.pvd, of a run that has ended or goes on. A picture that is
+    RESULT is a directory, or particles.vtkhdf, of a run that has ended or goes on. A picture that is
     there and still right is not made again. The path of each picture, or that of the film, and the directory of the
     surfaces are printed on stdout.
     """
@@ -110,7 +110,7 @@ def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool
 def plot_command(
     result: Path, output: Path | None, theme: str, size: str, overwrite: bool, quiet: bool, as_json: bool
 ) -> None:
-    """Draw the ledger of RESULT: its directory, particles.vtkhdf or particles.pvd, also while it is being written.
+    """Draw the ledger of RESULT: its directory or particles.vtkhdf, also while it is being written.
 
     Energies, the momentum that walls and forces gave, the time step and what bounds it, Courant number, volumes, the
     largest speed, and how far the particles reach.

@@ -23,7 +23,7 @@ from mpmcli.errors import InputError
 @click.option("--threads", type=COUNT, help="CPU threads; by default one for each 2,500 particles.")
 @click.option("--precision", type=click.Choice(["f32", "f64"]), help="Replaces solver.precision of the scene.")
 @options.choice_option(
-    "--format form", ["vtkhdf", "vtk"], "vtkhdf", "One temporal VTKHDF file, or a .vtu series with a .pvd."
+    "--format form", ["vtkhdf", "vtk"], "vtkhdf", "One temporal VTKHDF file; vtk: a .vtu series with a .pvd beside it."
 )
 @click.option("--compress", is_flag=True, help="Compress the stored file with gzip.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier result in the output directory.")

@@ -29,7 +29,6 @@ from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.run_record import RECORD
 from mpmcli.output.segments import PACKED, SEGMENTS
-from mpmcli.output.series import SERIES
 from mpmcli.scene.colliders import Collider
 
 Particles = slice | np.ndarray
@@ -258,7 +257,7 @@ def open_dataset(path: Path | str) -> Dataset:
     That trajectory has the number 0 and the split "train".
 
     Args:
-        path: the directory of a dataset, the directory of a result, its particles.vtkhdf or its particles.pvd.
+        path: the directory of a dataset, the directory of a result, or its particles.vtkhdf.
 
     Raises:
         InputError: nothing of the kind is there, it holds no trajectory, or a shard is damaged.
@@ -269,7 +268,7 @@ def open_dataset(path: Path | str) -> Dataset:
     if not is_dataset(path):
         if (path / SWEEP).exists():
             raise InputError(f"{path} is an empty dataset: it holds no trajectory yet.")
-        results = (path / name for name in (PACKED, SEGMENTS, SERIES, RECORD))
+        results = (path / name for name in (PACKED, SEGMENTS, RECORD))
         if path.is_dir() and path.name != SEGMENTS and not any(result.exists() for result in results):
             raise InputError(f"{path} is not a dataset: it has no directory {SHARDS}, and it is no result either.")
         return Dataset(path, {0: SPLITS[0]}, open_result(path))

@@ -125,7 +125,7 @@ def export(
             more, notes = form.write(temporary, lambda: watch(next(count)))
             text = json.dumps(finite_json(metadata | more), indent=2, allow_nan=False) + "\n"
             (temporary / METADATA).write_text(text, encoding="utf-8", newline="\n")
-            sums = {path.name: [path_digest(path)] for path in temporary.iterdir()}
+            sums = {path.name: path_digest(path) for path in temporary.iterdir()}
             (temporary / SUMS).write_text(sums_text(sums), encoding="ascii", newline="\n")
             files = {path.name: path.stat().st_size for path in sorted(temporary.iterdir())}
     except (OSError, RuntimeError) as error:

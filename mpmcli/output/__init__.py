@@ -3,14 +3,12 @@
 from mpmcli.output.directory import check_directory, prepare_directory
 from mpmcli.output.result import Result, open_result
 from mpmcli.output.run_record import RunRecord, read_record
-from mpmcli.output.segments import SegmentStore
-from mpmcli.output.series import VtkSeriesStore
+from mpmcli.output.store import SegmentStore
 
 __all__ = [
     "Result",
     "RunRecord",
     "SegmentStore",
-    "VtkSeriesStore",
     "check_directory",
     "open_result",
     "prepare_directory",

@@ -13,7 +13,7 @@ import re
 import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from hashlib import file_digest, sha256
+from hashlib import file_digest
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -213,40 +213,35 @@ def _between(gaps: Sequence[Gap], size: int) -> Iterator[tuple[int, int]]:
     yield first, size
 
 
-def text_digest(text: str) -> str:
-    """Return the SHA-256 of a text in UTF-8, hexadecimal."""
-    return sha256(text.encode("utf-8")).hexdigest()
-
-
 def path_digest(path: Path) -> str:
     """Return the SHA-256 of a file, hexadecimal."""
     with path.open("rb") as file:
         return file_digest(file, "sha256").hexdigest()
 
 
-def sums_text(sums: Mapping[str, Sequence[str]]) -> str:
-    """Return the text of checksums.sha256: digests by the names of files; one that is about to be replaced has two."""
-    return "".join(f"{digest}  {name}\n" for name in sorted(sums) for digest in sums[name])
+def sums_text(sums: Mapping[str, str]) -> str:
+    """Return the text of checksums.sha256, from digests by the names of files."""
+    return "".join(f"{sums[name]}  {name}\n" for name in sorted(sums))
 
 
-def write_sums(directory: Path, sums: Mapping[str, Sequence[str]]) -> None:
+def write_sums(directory: Path, sums: Mapping[str, str]) -> None:
     """Replace checksums.sha256 of a directory in one durable step."""
     write_text(directory / SUMS, sums_text(sums))
 
 
-def read_sums(directory: Path) -> dict[str, list[str]]:
+def read_sums(directory: Path) -> dict[str, str]:
     """Read checksums.sha256 of a directory, digests by names of files; DamageError where it is missing or damaged."""
     path = directory / SUMS
     try:
         lines = path.read_bytes().decode("ascii").splitlines(keepends=True)
     except (OSError, ValueError) as error:
         raise DamageError(f"{path} is missing or damaged: the files beside it have no checksums.") from error
-    sums: dict[str, list[str]] = {}
+    sums: dict[str, str] = {}
     for line in lines:
         match = _SUMS_LINE.fullmatch(line)
         if match is None:
             raise DamageError(f"{path} is damaged: a line of it is not a checksum and the name of a file.")
-        sums.setdefault(match[2], []).append(match[1])
+        sums[match[2]] = match[1]
     return sums
 
 
@@ -257,10 +252,10 @@ def sums_faults(directory: Path) -> tuple[int, list[str]]:
     except DamageError as error:
         return 0, [str(error)]
     faults = []
-    for name, digests in sums.items():
+    for name, digest in sums.items():
         path = directory / name
         try:
-            if path_digest(path) not in digests:
+            if path_digest(path) != digest:
                 faults.append(f"{path} has changed since it was written: its checksum differs.")
         except OSError as error:
             faults.append(f"{path} cannot be read ({error.strerror or error}).")

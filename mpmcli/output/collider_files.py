@@ -28,7 +28,6 @@ from mpmcli.scene.triangles import ClosedSurface
 RESTING, MOVING = "colliders.vtkhdf", "colliders_moving.vtkhdf"
 SERIES = "colliders.pvd"
 RESTING_PIECE, MOVING_PIECE = "colliders.vtu", "colliders_{:06d}.vtu"
-COLLIDER_FILES = (RESTING, MOVING, SERIES, RESTING_PIECE)
 MOVING_FRAME = re.compile(r"colliders_\d{6,}\.vtu")
 # Groups of cells in the order of VTK; those for 2D and 3D.
 CELLS = ("Vertices", "Lines", "Polygons", "Strips")

@@ -9,16 +9,15 @@ from pathlib import Path
 
 from mpmcli.errors import InputError
 from mpmcli.output.checkpoints import remove_checkpoints
-from mpmcli.output.checksums import SUMS
-from mpmcli.output.collider_files import COLLIDER_FILES, MOVING_FRAME
+from mpmcli.output.collider_files import MOVING, RESTING
 from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory, temporary_of, write_text
 from mpmcli.output.lock import LOCK, DirectoryLock, refuse_locked, refused, take_lock, time_now
 from mpmcli.output.run_record import RECORD, read_record
 from mpmcli.output.segments import PACKED, remove_segments, sealed_segments
-from mpmcli.output.series import SERIES, SERIES_FRAME, SERIES_HEADER, SERIES_LEDGER
+from mpmcli.output.series import is_series_file
 
 SCENE = "scene.toml"
-NAMES = (PACKED, SCENE, SERIES, SERIES_HEADER, SERIES_LEDGER, RECORD, SUMS, *COLLIDER_FILES)
+NAMES = (PACKED, SCENE, RECORD, RESTING, MOVING)
 
 
 @dataclass(frozen=True)
@@ -166,13 +165,12 @@ def _remove_result(directory: Path) -> None:
 
 
 def _is_ours(name: str) -> bool:
-    return name in NAMES or bool(SERIES_FRAME.fullmatch(name) or MOVING_FRAME.fullmatch(name))
+    return name in NAMES or is_series_file(name)
 
 
 def has_frames(directory: Path) -> bool:
     """Return whether a directory holds a frame of a run."""
-    files = (PACKED, SERIES_HEADER)
-    return any((directory / name).exists() for name in files) or bool(sealed_segments(directory))
+    return (directory / PACKED).exists() or bool(sealed_segments(directory))
 
 
 def close_abandoned(directory: Path, made: Sequence[Path], pid: int, signal: str) -> None:

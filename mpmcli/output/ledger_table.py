@@ -77,12 +77,12 @@ def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:
     return [LedgerRow(*values) for values in zip(*lists, strict=True)]
 
 
-def ledger_csv(rows: Sequence[LedgerRow], frames: Mapping[str, Sequence[int]]) -> str:
+def ledger_csv(rows: Sequence[LedgerRow], frames: Sequence[tuple[int, ...]]) -> str:
     """Write T rows as CSV with a header line, after `FRAME_COLUMNS`; numbers have the digits that read back exactly."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     for i, row in enumerate(rows):
-        record: dict[str, object] = {name: frames[name][i] for name in FRAME_COLUMNS}
+        record: dict[str, object] = dict(zip(FRAME_COLUMNS, frames[i], strict=True))
         for name in _stored(rows):
             value = getattr(row, name)
             if name in VECTORS:
@@ -96,29 +96,3 @@ def ledger_csv(rows: Sequence[LedgerRow], frames: Mapping[str, Sequence[int]]) -
             writer.writerow(record)
         writer.writerow(record.values())
     return text.getvalue()
-
-
-def parse_ledger_csv(text: str) -> tuple[list[LedgerRow], dict[str, list[int]]]:
-    """Undo `ledger_csv`: the rows, and the first columns by name."""
-    rows, frames = [], {name: [] for name in FRAME_COLUMNS}
-    for record in csv.DictReader(io.StringIO(text)):
-        for name in FRAME_COLUMNS:
-            frames[name].append(int(record[name]))
-        rows.append(LedgerRow(**{name: _parsed(name, record) for name in COLUMNS}))
-    return rows, frames
-
-
-def _parsed(name: str, record: Mapping[str, str]) -> object:
-    """Return the value of a column; vectors have a column for each number, such as collider_force_0_1."""
-    if name in (*VECTORS, *LOADS):
-        vectors: dict[int, list[float]] = {}
-        for key, entry in record.items():
-            if key.startswith(f"{name}_"):
-                number = int(key.rsplit("_", 2)[1]) if name in LOADS else 0
-                vectors.setdefault(number, []).append(float(entry))
-        in_order = tuple(tuple(vectors[k]) for k in sorted(vectors))
-        return in_order if name in LOADS else tuple(vectors.get(0, ()))
-    if name in MISSING and name not in record:
-        return MISSING[name]
-    entry = record[name]
-    return entry if name == TEXT else int(entry) if name in INTEGERS else float(entry)

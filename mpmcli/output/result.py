@@ -1,4 +1,4 @@
-"""Reading results: packed file, directory, running or broken directory, VTK series, all alike."""
+"""Reading results: packed file, directory, running or broken directory, all alike."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,11 +19,10 @@ from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import POSITION, STANDARD, FrameIndex
 from mpmcli.output.run_record import read_record, run_status
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
-from mpmcli.output.series import SERIES, read_series, read_vtu
 from mpmcli.output.vtkhdf import open_vtkhdf, read_array, read_index_of
 from mpmcli.scene.colliders import Collider
 
-Kind = Literal["packed", "segments", "series"]
+Kind = Literal["packed", "segments"]
 
 
 class Result(ABC):
@@ -32,8 +31,8 @@ class Result(ABC):
     No file stays open, so a Result can be copied to other processes.
 
     Attributes:
-        path: the packed file, the directory of the segments, or the .pvd.
-        kind: "packed", "segments" (running, or ended before packing) or "series".
+        path: the packed file, or the directory of the segments.
+        kind: "packed", or "segments" (running, or ended before packing).
         times: (T,) float64, s.
         numbers: (T,) frame numbers.
         particle_counts: (T,) particles of each frame.
@@ -102,8 +101,12 @@ class Result(ABC):
 
     def numbered_frame(self, k: int) -> tuple[Frame, np.ndarray]:
         """Read the k-th frame with all fields, and the number of each row: 0, 1, 2, ... unless the file has changed."""
-        stored = self._sound(k, [POSITION, *STANDARD, *self.field_names])
+        stored = self.stored(k)
         return self._frame(k, stored), stored["id"]
+
+    def stored(self, k: int) -> dict[str, np.ndarray]:
+        """Read all arrays of the k-th frame in the form of the file, (n,) or (n, components)."""
+        return self._sound(k, [POSITION, *STANDARD, *self.field_names])
 
     def frames(self, fields: Sequence[str] | None = None) -> Iterator[Frame]:
         """Read all frames, one at a time."""
@@ -169,23 +172,13 @@ class _StoredResult(Result):
         return stored
 
 
-class _SeriesResult(Result):
-    kind = "series"
-
-    def __init__(self, path: Path) -> None:
-        index, self._files, self._digests = read_series(path)
-        super().__init__(path, index)
-
-    def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
-        if self.particle_counts[k] == 0:
-            # meshio cannot read back the empty arrays that it wrote.
-            arrays = self.index.layout.arrays
-            return {name: np.empty(arrays[name].stored_shape(0), arrays[name].dtype) for name in names}
-        path = self._files[k]
-        stored = read_vtu(path, None if self._digests is None else self._digests.get(path.name, ()))
-        if missing := [name for name in names if name not in stored]:
-            raise InputError(f"{path} is damaged: it lacks {missing[0]}.")
-        return {name: np.asarray(stored[name]) for name in names}
+def result_place(path: Path) -> Path:
+    """Return the file or the directory of frames that is meant by the folder of segments, or by a file of a series."""
+    path = Path(path)
+    if path.name == SEGMENTS and path.is_dir():
+        return path.parent
+    # The series that mpmcli writes has the frames of the file beside it.
+    return path.with_name(PACKED) if path.suffix in (".pvd", ".vtu") else path
 
 
 def open_result(path: Path) -> Result:
@@ -193,22 +186,16 @@ def open_result(path: Path) -> Result:
 
     Args:
         path: a packed file, its directory, the directory of a run that was not packed (its sealed
-            frames are read, unfinished files are ignored), or the .pvd of a series.
+            frames are read, unfinished files are ignored), or a file of the series beside the packed file.
 
     Raises:
         InputError: there is nothing at `path`, or nothing that mpmcli wrote, or no frame yet.
     """
-    path = Path(path)
-    if path.name == SEGMENTS and path.is_dir():
-        path = path.parent
+    path = result_place(path)
     if path.is_dir():
         return _open_directory(path)
     if not path.exists():
-        raise InputError(f"{path} does not exist: give a {PACKED}, a {SERIES} or their directory.")
-    if path.suffix == ".pvd":
-        return _SeriesResult(path)
-    if path.suffix == ".vtu":
-        raise InputError(f"{path} is one frame of a series: give {path.with_name(SERIES)} instead.")
+        raise InputError(f"{path} does not exist: give a {PACKED} or its directory.")
     return _StoredResult(path, "packed", [path])
 
 
@@ -223,11 +210,9 @@ def _open_directory(directory: Path) -> Result:
                 raise
     if packed.exists():
         return _StoredResult(packed, "packed", [packed])
-    if (directory / SERIES).exists():
-        return _SeriesResult(directory / SERIES)
     record = read_record(directory)
     if record is None:
-        raise InputError(f"{directory} holds no result of mpmcli: no {PACKED}, {SEGMENTS} or {SERIES}.")
+        raise InputError(f"{directory} holds no result of mpmcli: no {PACKED} and no {SEGMENTS}.")
     status = run_status(directory, record)
     raise InputError(f'{directory} holds no frame yet: its run is "{status}" and has written none.')
 

@@ -1,8 +1,9 @@
-"""What every store of frames does: frames in order, room on the disk first, one sentence where writing fails."""
+"""The store of a run: sealed segments of one or more frames while it goes on, one packed VTKHDF file at the end."""
 
+import os
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -10,9 +11,13 @@ from typing import Any
 from mpmcli.errors import InputError, NoRoomError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.durable import is_full, require_free_space
+from mpmcli.output.collider_files import write_collider_files
+from mpmcli.output.durable import Unsealed, is_full, require_free_space, sync_directory, temporary_of
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameIndex, FrameLayout
+from mpmcli.output.pack import PackedBeside, pack_segments
+from mpmcli.output.segments import PACKED, SEGMENTS, remove_segments, sealed_segments, segment_name
+from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, read_index_of
 from mpmcli.scene.colliders import Collider
 
 # Bytes of waiting frames above which they are sealed.
@@ -23,18 +28,18 @@ ASIDE = 4 * 1024 * 1024
 HOLD = 1.0
 
 
-class Store(ABC):
-    """Writes the frames of one run into `directory`, which `prepare_directory` made.
+class SegmentStore:
+    """Writes the frames of one run into `directory`/segments, and `directory`/particles.vtkhdf by `finish`.
 
     Frames are sealed in groups, since a durable file costs about 10 ms, within `hold` s of their write if `seal_due` is
     called. Only sealed ones, which no crash harms, count as `frames_written`, in `seconds` of wall time. Large groups
     are sealed by a thread, one at a time: they lie in the memory of the system then, and the disk takes its time.
-    Taichi holds Python's lock during a launch, so that a thread could do little more. `colliders` are None for those
-    that the header tells.
-    """
+    Taichi holds Python's lock during a launch, so that a thread could do little more.
 
-    # Whether frames that are sealed together have a file each.
-    several = False
+    Segments are complete VTKHDF files, not compressed, so that writing does not hold up the run. The packed file of a
+    large run is written beside them, if `frames_expected`, all of as many particles, is given. `colliders` are None for
+    those that the header tells.
+    """
 
     def __init__(
         self,
@@ -44,9 +49,12 @@ class Store(ABC):
         compress: bool = False,
         hold: float = 0.0,
         colliders: Sequence[Collider] | None = None,
+        frames_expected: int | None = None,
     ) -> None:
+        """Begin in a directory that `prepare_directory` made; nothing is written before the first frame."""
         self._colliders = RunHeader.read(header).colliders if colliders is None else tuple(colliders)
-        self._directory = self.place = Path(directory)
+        self._directory = Path(directory)
+        self.place = self._directory / SEGMENTS
         self._header = header
         self._compress = compress
         self._hold = hold
@@ -58,12 +66,20 @@ class Store(ABC):
         self.seconds = 0.0
         # Frames that an earlier process has written.
         self._kept = 0
+        self._sealed: set[str] = set()
+        self._counts: list[int] = []
+        self._expected = frames_expected or 0
+        self._beside: PackedBeside | None = None
 
     def go_on_after(self, index: FrameIndex) -> None:
         """Go on after frames that an earlier process has written here; they are not written again."""
         self._layout = index.layout
         self.frames_written = self._kept = len(index.times)
         self._start()
+        # A process that was killed may have left one.
+        temporary_of(self._directory / PACKED).unlink(missing_ok=True)
+        self._sealed = {path.name for path in sealed_segments(self._directory)}
+        self._counts = index.counts.tolist()
 
     def write(self, frame: Frame, row: LedgerRow) -> None:
         """Take the next frame, whose arrays must not change; seal when MOST_WAITING bytes or `hold` are reached.
@@ -78,17 +94,16 @@ class Store(ABC):
             raise ValueError(f"frame {frame.index} was given where frame {following} comes next")
         layout = FrameLayout.of(frame)
         if self._layout is None:
-            self._layout = layout
-            if self._holds_result():
+            if (self._directory / PACKED).exists() or sealed_segments(self._directory):
                 raise InputError(f"{self._directory} holds an earlier result: give another directory, or --overwrite.")
+            self._layout = layout
             self._start()
         if layout != self._layout:
             raise ValueError(f"frame {frame.index} holds other arrays, types or shapes than the first frame")
         if not self._waiting:
             self._waiting_since = time.monotonic()
         self._waiting.append((frame, row))
-        size = self._size(layout, [len(waiting.position) for waiting, _ in self._waiting])
-        if size >= MOST_WAITING:
+        if file_size(layout, [len(waiting.position) for waiting, _ in self._waiting]) >= MOST_WAITING:
             self._begin_seal()
         self.seal_due()
 
@@ -104,6 +119,31 @@ class Store(ABC):
         self._begin_seal()
         self._end_seal()
 
+    def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
+        """Seal, pack and verify all frames, and return the packed file, None without a frame.
+
+        The segments stay where it cannot be written (RunError), or `stop` ends it with KeyboardInterrupt.
+        """
+        try:
+            self.seal()
+            if self._beside is not None and not self._beside.whole:
+                self._beside.give_up()
+            return self._pack(None if self._beside is None else self._beside.writer, stop)
+        finally:
+            self._end_beside()
+
+    def give_up(self) -> None:
+        """Forget waiting frames, and remove what is of no use without `finish`; sealed frames stay."""
+        self._waiting.clear()
+        self._end_beside()
+
+    def _start(self) -> None:
+        try:
+            self.place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise RunError(f"{self.place} could not be made ({error.strerror}); no frame was written.") from error
+        sync_directory(self._directory)
+
     def _begin_seal(self) -> None:
         """Write all waiting frames, and begin to make them durable; those before are sealed then."""
         self._end_seal()
@@ -111,18 +151,19 @@ class Store(ABC):
             return
         frames, rows = zip(*self._waiting, strict=True)
         counts = [len(frame.position) for frame in frames]
-        size = self._size(self._layout, counts)
+        size = file_size(self._layout, counts)
+        # What was written beside is no longer free.
+        before = self._counts if self._beside is None or self._beside.writer is None else []
+        joined = file_size(self._layout, [*before, *counts])
         began = time.perf_counter()
         purpose, kept = f"frame {frames[0].index}", _frames_kept(self.frames_written)
         try:
-            joined = self._joined_size(self._layout, counts)
-            require_free_space(self._directory, size, purpose, kept, joined=joined, several=self.several)
+            require_free_space(self._directory, size, purpose, kept, joined=joined)
             seal = self._write(self._layout, frames, rows, size)
         except (OSError, RuntimeError, RunError) as error:
             raise self._failure(error, purpose) from error
         self._waiting.clear()
-        # Files of a series are made by Python, which a thread does not get beside a launch.
-        aside = size >= ASIDE and not self.several
+        aside = size >= ASIDE
         self._sealing = _Sealing(seal, purpose, len(frames), size, began, aside=aside)
         if not aside:
             self._end_seal()
@@ -148,35 +189,84 @@ class Store(ABC):
         kind, kept = NoRoomError if is_full(error) else RunError, _frames_kept(self.frames_written)
         return kind(f"{purpose} could not be written to {self.place} ({reason}); {kept}.")
 
-    @abstractmethod
-    def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
-        """Complete the result and return the file to open, None without one; `stop` ends it with KeyboardInterrupt."""
-
-    def give_up(self) -> None:
-        """Forget waiting frames, and remove what is of no use without `finish`; sealed frames stay."""
-        self._waiting.clear()
-
-    @abstractmethod
-    def _holds_result(self) -> bool:
-        """Return whether an earlier result lies in the directory."""
-
-    @abstractmethod
-    def _start(self) -> None:
-        """Make the folder of the frames."""
-
-    @abstractmethod
-    def _size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
-        """Return the bytes of frames of `counts` particles."""
-
-    def _joined_size(self, layout: FrameLayout, counts: Sequence[int]) -> int:
-        """Return the bytes that `finish` needs beside the sealed frames, if frames of `counts` particles follow."""
-        return 0
-
-    @abstractmethod
     def _write(
         self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int
     ) -> Callable[[], None]:
-        """Write frames, and return what makes them durable."""
+        """Write frames to a segment, and to the packed file beside it; return what makes them durable."""
+        counts = [len(frame.position) for frame in frames]
+        whole = file_size(layout, [counts[0]] * self._expected) if self._expected > 1 else 0
+        if whole > MOST_WAITING and not (self._compress or self._sealed or self._beside):
+            self._beside = PackedBeside(self._directory / PACKED, layout, self._expected, counts[0])
+        beside = self._beside
+        if beside is not None:
+            beside.expect(frames[0].index, counts)
+        try:
+            file = self._write_segment(layout, frames, rows, size)
+        except BaseException as error:
+            if beside is None or beside.writer is None:
+                raise
+            beside.give_up()
+            if not isinstance(error, OSError | RuntimeError):
+                raise
+            # In the room that it took.
+            file = self._write_segment(layout, frames, rows, size)
+
+        # It keeps no frame: another one is built meanwhile.
+        def seal() -> None:
+            # New frames find memory at once where the system need not look for it.
+            file.seal(cached=beside is None or beside.writer is None)
+            if beside is not None:
+                beside.seal(len(counts), sync=size >= ASIDE)
+            self._sealed.add(file.path.name)
+            self._counts += counts
+
+        return seal
+
+    def _write_segment(
+        self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int
+    ) -> Unsealed:
+        counts = [len(frame.position) for frame in frames]
+        file = Unsealed(self.place / segment_name(frames[0].index))
+        with file.written(size) as temporary, VtkhdfWriter(temporary, layout, counts) as writer:
+            for name, arrays in layout.stored_together(frames):
+                writer.append(name, arrays)
+                if self._beside is not None:
+                    self._beside.append(name, arrays)
+                # Before the next one is made.
+                del arrays
+            tables = zip(*((frame.time, frame.index, frame.step) for frame in frames), strict=True)
+            writer.finish(*tables, rows, self._header)
+        return file
+
+    def _pack(self, begun: VtkhdfWriter | None, stop: Callable[[], bool]) -> Path | None:
+        """Pack all segments; `begun` is as `pack_segments` has it."""
+        segments = sealed_segments(self._directory)
+        # An interrupt may fall between the seal and the count; a sealed frame is never left behind.
+        if missing := self._sealed - {path.name for path in segments}:
+            raise RunError(
+                f"{self._directory / SEGMENTS} lacks {min(missing)}, one of the {len(self._sealed)} "
+                "files written: it was removed during the run; the others are kept."
+            )
+        if not segments:
+            return None
+        packed = self._directory / PACKED
+        if len(segments) == 1 and not self._compress and not self._kept:
+            os.replace(segments[0], packed)
+            sync_directory(self._directory)
+        else:
+            pack_segments(segments, packed, compress=self._compress, header=self._header, begun=begun, stop=stop)
+        if self._colliders:
+            times = read_index_of(packed, known=True).times.tolist()
+            write_collider_files(self._directory, self._header, times, self._colliders)
+        # The result is complete; a segment that somebody holds open may stay beside it.
+        with suppress(OSError):
+            remove_segments(self._directory)
+        return packed
+
+    def _end_beside(self) -> None:
+        if self._beside is not None:
+            self._beside.give_up()
+            self._beside = None
 
 
 class _Sealing:

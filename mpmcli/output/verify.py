@@ -23,10 +23,9 @@ from mpmcli.output.directory import SCENE
 from mpmcli.output.durable import number_of
 from mpmcli.output.guarded_read import held
 from mpmcli.output.layout import FrameIndex
-from mpmcli.output.result import open_result
+from mpmcli.output.result import open_result, result_place
 from mpmcli.output.run_record import read_record
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
-from mpmcli.output.series import SERIES
 from mpmcli.output.vtkhdf import open_vtkhdf, read_array, read_index
 from mpmcli.plain_text import counted
 
@@ -60,14 +59,10 @@ class Verification:
 
 def verify_result(path: Path) -> Verification:
     """Compare a result and all that lies beside it with its checksums; InputError: there is none of mpmcli."""
-    path = Path(path)
-    if path.name == SEGMENTS and path.is_dir():
-        path = path.parent
+    path = result_place(path)
     found = Verification(path)
     directory = path if path.is_dir() else path.parent
-    if path.suffix == ".pvd" or (path.is_dir() and (path / SERIES).exists() and not (path / PACKED).exists()):
-        _verify_series(path / SERIES if path.is_dir() else path, found)
-    elif path.is_dir():
+    if path.is_dir():
         files = [path / PACKED] if (path / PACKED).exists() else sealed_segments(path)
         if not files:
             open_result(path)
@@ -75,12 +70,16 @@ def verify_result(path: Path) -> Verification:
         _verify_count(directory, files, counts, found)
     else:
         if not path.exists():
-            raise InputError(f"{path} does not exist: give a {PACKED}, a {SERIES} or their directory.")
+            raise InputError(f"{path} does not exist: give a {PACKED} or its directory.")
         _verify_file(path, found)
     if path.is_dir() or path.name == PACKED:
         for name in (RESTING, MOVING):
             if (directory / name).exists():
                 _verify_file(directory / name, found, frames=False)
+        if (directory / SUMS).exists():
+            files, faults = sums_faults(directory)
+            found.files += files
+            found.faults += faults
         if not found.faults:
             _verify_beside(directory, found)
     return found
@@ -171,26 +170,6 @@ def _verify_count(directory: Path, files: Sequence[Path], counts: Sequence[int],
     if isinstance(written, int) and found.frames < written:
         there = counted(found.frames, "frame")
         found.faults.append(f"{directory} holds {there}, but its run has written {written}.")
-
-
-def _verify_series(path: Path, found: Verification) -> None:
-    directory = path.parent
-    try:
-        result = open_result(path)
-        found.frames = result.frame_count
-    except InputError as error:
-        found.faults.append(str(error))
-    if (directory / SUMS).exists() or found.faults:
-        found.files, faults = sums_faults(directory)
-        found.faults += [fault for fault in faults if fault not in found.faults]
-        return
-    found.unchecked.append(str(path))
-    for k in range(result.frame_count):
-        found.files += 1
-        try:
-            result.frame(k)
-        except InputError as error:
-            found.faults.append(str(error))
 
 
 def _verify_beside(directory: Path, found: Verification) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mpmcli.errors import RunError
 from mpmcli.output.checkpoints import Checkpoint, write_checkpoint
-from mpmcli.output.store import Store
+from mpmcli.output.store import SegmentStore
 from mpmcli.solver.engine.run import Run
 
 # Share of the wall time that checkpoints may take, and the least time between two, s.
@@ -23,7 +23,7 @@ class Checkpointer:
         self,
         directory: Path,
         run: Run,
-        store: Store,
+        store: SegmentStore,
         backend: Mapping[str, object],
         *,
         size: int,

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
@@ -15,12 +15,12 @@ from mpmcli.materials.registry import plugin_file
 from mpmcli.output import read_record
 from mpmcli.output.checkpoints import Checkpoint, read_checkpoints
 from mpmcli.output.checksums import path_digest
-from mpmcli.output.directory import SCENE
+from mpmcli.output.directory import SCENE, has_frames
 from mpmcli.output.durable import TEMPORARY_SUFFIX, number_of, sync_directory
 from mpmcli.output.layout import FrameIndex
 from mpmcli.output.lock import LOCK
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments, segment_name
-from mpmcli.output.series import SERIES, read_sound_series
+from mpmcli.output.series import remove_series
 from mpmcli.output.verify import verify_file
 from mpmcli.output.vtkhdf import read_index_of
 from mpmcli.plain_text import counted
@@ -70,29 +70,19 @@ class Resumption:
         return [] if self.index is None else self.index.ledger
 
 
-def find_resumption(loaded: LoadedScene, directory: Path, form: Literal["vtkhdf", "vtk"]) -> Resumption | None:
+def find_resumption(loaded: LoadedScene, directory: Path) -> Resumption | None:
     """Return how a scene goes on in a directory, None if it is empty; InputError: it holds something else."""
     record = read_record(directory) if directory.is_dir() else None
-    if not (_has_frames(directory) or (directory / SERIES).exists()):
+    if not has_frames(directory):
         # Killed before it had written anything, or not begun.
         names = [path.name for path in directory.iterdir()] if directory.is_dir() else []
         if record is not None or all(name == LOCK or name.endswith(TEMPORARY_SUFFIX) for name in names):
             return None
     if record is None or not (directory / SCENE).is_file():
         raise InputError(f"{directory} holds no run that could be resumed: give its directory with -o.")
-    other = (directory / SERIES).exists() if form == "vtkhdf" else _has_frames(directory)
-    if other:
-        raise InputError(f"{directory} holds a run with another --format: leave --format as it was.")
     _require_same_scene(loaded, directory)
     _require_same_files(loaded, record, directory)
-    packed = 0
-    if form == "vtk":
-        series = directory / SERIES
-        index = read_sound_series(series) if series.exists() else None
-        if index is None and series.exists():
-            raise InputError(f"{directory}: the first frame is damaged, so nothing goes on; --overwrite begins anew.")
-    else:
-        index, packed = _sound_index(directory)
+    index, packed = _sound_index(directory)
     frames = 0 if index is None else len(index.times)
     found = (point for point in read_checkpoints(directory) if point.frame <= frames)
     return Resumption(index, next(found, None), frames == loaded.scene.time.frames + 1, record, packed)
@@ -131,6 +121,8 @@ def require_same_run(resumption: Resumption, header: Mapping[str, Any], director
 def take_over(directory: Path, resumption: Resumption) -> None:
     """Make the frames that are there the first segments of the run, and remove a damaged file and what follows it."""
     packed, folder = directory / PACKED, directory / SEGMENTS
+    # It is written anew from all frames.
+    remove_series(directory)
     if resumption.packed:
         folder.mkdir(exist_ok=True)
     else:
@@ -157,10 +149,6 @@ def file_digests(loaded: LoadedScene) -> dict[str, str]:
             with suppress(OSError):
                 found[name] = path_digest(Path(loaded.source).parent / name)
     return found
-
-
-def _has_frames(directory: Path) -> bool:
-    return (directory / PACKED).exists() or bool(sealed_segments(directory))
 
 
 def _sound_index(directory: Path) -> tuple[FrameIndex | None, int]:

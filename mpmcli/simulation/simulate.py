@@ -14,7 +14,8 @@ from mpmcli.output import RunRecord, check_directory, open_result
 from mpmcli.output.directory import SCENE, TakenDirectory, take_directory
 from mpmcli.output.header import RunHeader
 from mpmcli.output.segments import sealed_segments
-from mpmcli.output.store import Store
+from mpmcli.output.series import SERIES
+from mpmcli.output.store import SegmentStore
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.checkpointing import Checkpointer
 from mpmcli.simulation.engine import backend_for
@@ -59,7 +60,7 @@ def simulate(
     began = time.perf_counter()
     scene = loaded.scene
     check_directory(settings.directory, settings.overwrite, resume=settings.resume)
-    earlier = find_resumption(loaded, settings.directory, settings.form) if settings.resume else None
+    earlier = find_resumption(loaded, settings.directory) if settings.resume else None
     backend = backend_for(scene, settings.arch, settings.threads, compile_cache=settings.compile_cache)
     plan = make_plan(scene, backend)
     findings = check_scene(loaded, plan=plan, directory=settings.directory).findings
@@ -73,7 +74,7 @@ def simulate(
     with take_directory(settings.directory, settings.overwrite, resume=settings.resume) as taken:
         if settings.resume:
             # Once more, as nobody else can write now.
-            earlier = find_resumption(loaded, settings.directory, settings.form)
+            earlier = find_resumption(loaded, settings.directory)
             if run is None and (earlier is None or not earlier.complete):
                 raise InputError(
                     f"{settings.directory} was changed by another process meanwhile: give the command again."
@@ -165,7 +166,7 @@ def _store_run(
     summary.steps = run.step_count
     clock.book(run.first_step_seconds, "compile_s")
     with clock.adding("output_s"):
-        finish(store, summary, halt)
+        finish(store, summary, halt, loaded, settings)
     clock.stop()
     if summary.status == "interrupted" and not summary.frames:
         taken.undo()
@@ -182,10 +183,13 @@ def _complete(begun: _Begun, on_start: Callable[[RunSummary], None], stop: Calla
     on_start(summary)
     clock = Stopwatch(summary.timings, began)
     text = scene_to_toml(loaded.scene)
-    packed = settings.form == "vtk" or not sealed_segments(settings.directory)
+    packed = not sealed_segments(settings.directory)
+    series = settings.directory / SERIES
     same = (settings.directory / SCENE).read_text(encoding="utf-8") == text
-    if packed and same and earlier.record["status"] == "finished":
-        summary.status, summary.path = "finished", open_result(settings.directory).path
+    done = packed and same and earlier.record["status"] == "finished"
+    if done and (settings.form == "vtkhdf" or series.exists()):
+        summary.status = "finished"
+        summary.path = series if settings.form == "vtk" else open_result(settings.directory).path
         return summary
     record = new_record(loaded, settings, summary, earlier)
     take_over(settings.directory, earlier)
@@ -193,7 +197,7 @@ def _complete(begun: _Begun, on_start: Callable[[RunSummary], None], stop: Calla
     store = new_store(loaded, settings, {**earlier.index.header, "scene": text}, earlier)
     summary.status = "finished"
     with clock.adding("output_s"):
-        finish(store, summary, Halt(stop, settings.limits, compress=loaded.scene.output.compress))
+        finish(store, summary, Halt(stop, settings.limits, compress=loaded.scene.output.compress), loaded, settings)
     clock.stop()
     record.timings = summary.timings
     record.close(summary.status, summary.message)
@@ -202,7 +206,7 @@ def _complete(begun: _Begun, on_start: Callable[[RunSummary], None], stop: Calla
 
 def _compute(
     run: Run,
-    store: Store,
+    store: SegmentStore,
     checkpoints: Checkpointer,
     record: RunRecord,
     summary: RunSummary,

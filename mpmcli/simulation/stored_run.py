@@ -4,10 +4,11 @@ from pathlib import Path
 from typing import Any
 
 from mpmcli.errors import NoRoomError, RunError
-from mpmcli.output import RunRecord, SegmentStore, VtkSeriesStore
+from mpmcli.output import RunRecord, SegmentStore
 from mpmcli.output.directory import SCENE
 from mpmcli.output.durable import write_text
-from mpmcli.output.store import HOLD, Store
+from mpmcli.output.series import write_series
+from mpmcli.output.store import HOLD
 from mpmcli.scene import LoadedScene
 from mpmcli.simulation.limits import Halt
 from mpmcli.simulation.resume import Resumption, file_digests
@@ -38,15 +39,19 @@ def new_summary(
     return summary
 
 
-def new_store(loaded: LoadedScene, settings: RunSettings, header: dict[str, Any], earlier: Resumption | None) -> Store:
+def new_store(
+    loaded: LoadedScene, settings: RunSettings, header: dict[str, Any], earlier: Resumption | None
+) -> SegmentStore:
     """Return the store of a run, which goes on after the frames that are there."""
     scene = loaded.scene
-    options = {"compress": scene.output.compress, "hold": HOLD, "colliders": scene.colliders}
-    if settings.form == "vtk":
-        store = VtkSeriesStore(settings.directory, header, **options)
-    else:
-        frames = None if scene.output.drop_retired else scene.time.frames + 1
-        store = SegmentStore(settings.directory, header, frames_expected=frames, **options)
+    store = SegmentStore(
+        settings.directory,
+        header,
+        compress=scene.output.compress,
+        hold=HOLD,
+        colliders=scene.colliders,
+        frames_expected=None if scene.output.drop_retired else scene.time.frames + 1,
+    )
     if earlier is not None and earlier.index is not None:
         store.go_on_after(earlier.index)
     return store
@@ -60,15 +65,24 @@ def write_scene(directory: Path, text: str) -> None:
         raise RunError(f"{directory / SCENE} could not be written ({error.strerror or error}).") from error
 
 
-def finish(store: Store, summary: RunSummary, halt: Halt) -> None:
-    """Pack what was stored; until then, the result is the directory with its sealed frames."""
+def finish(store: SegmentStore, summary: RunSummary, halt: Halt, loaded: LoadedScene, settings: RunSettings) -> None:
+    """Pack what was stored, and write it as a series too, if that is asked for.
+
+    Until then, the result is the directory with its sealed frames.
+    """
     summary.path = summary.directory
     try:
         summary.path = store.finish(halt.packing)
+        if settings.form == "vtk" and summary.path is not None:
+            scene = loaded.scene
+            compress = scene.output.compress
+            summary.path = write_series(settings.directory, scene.colliders, compress=compress, stop=halt.packing)
     except KeyboardInterrupt:
         if not halt.status:
             halt.interrupted()
         where = f"its frames were left unpacked, and stay readable in {store.place}"
+        if summary.path != summary.directory:
+            where = "the series was not written, which --resume does"
         summary.status, summary.message = halt.status, f"{halt.message}; {where}"
     except RunError as error:
         if summary.status == "finished":

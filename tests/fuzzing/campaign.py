@@ -26,8 +26,6 @@ MOST_BYTES = 2**30
 # Inputs of one process; what it has cached counts as its memory.
 OF_ONE_PROCESS = 200
 KEPT_OF_A_KIND = 3
-# What commands write.
-OUTPUTS = ("out", "README.md")
 
 
 @dataclass
@@ -164,7 +162,7 @@ def place(one: Input, directory: Path, before: Files | None = None) -> None:
         before: the files that the directory holds, if it holds no others; the same ones are left as they are, so that
             mpmcli finds what it has read of them.
     """
-    if before is None or any((directory / name).exists() for name in OUTPUTS):
+    if before is None:
         shutil.rmtree(directory, ignore_errors=True)
         before = {}
     directory.mkdir(parents=True, exist_ok=True)

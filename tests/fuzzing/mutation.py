@@ -1,11 +1,8 @@
-"""Damage to bytes, text and trees of values; all from one generator of random numbers."""
+"""Damage to text and trees of values; all from one generator of random numbers."""
 
 import copy
-import json
 import re
-import struct
 from collections.abc import Iterator
-from contextlib import suppress
 from random import Random
 from typing import Any
 
@@ -49,14 +46,6 @@ TEXTS = (
 _NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
 _WORD = re.compile(rb"[A-Za-z_][A-Za-z_0-9]*")
 _BLOCKS = (b"[", b"{", b"(", b"-", b"=", b'"', b"a.", b"[[", b"]]", b"'''", b"\n", b"#", b"\xff", b"\x00", b"9")
-_WIDTHS = ("<b", "<H", "<i", "<q", ">i", "<f", "<d", ">q")
-
-
-def bytes_mutant(data: bytes, rng: Random) -> bytes:
-    """Damage bytes in one to four places."""
-    for _ in range(rng.choice((1, 1, 1, 2, 4))):
-        data = rng.choice(_DAMAGES)(data, rng)
-    return data
 
 
 def text_mutant(data: bytes, rng: Random) -> bytes:
@@ -78,18 +67,6 @@ def _byte(data: bytes, rng: Random) -> bytes:
     return data[:at] + bytes([rng.randrange(256)]) + data[at + 1 :]
 
 
-def _number(data: bytes, rng: Random) -> bytes:
-    kind = rng.choice(_WIDTHS)
-    value = rng.choice(NUMBERS)
-    size = struct.calcsize(kind)
-    try:
-        made = struct.pack(kind, value if kind[1] in "fd" else int(value))
-    except (struct.error, OverflowError, ValueError):
-        made = rng.choice((b"\xff", b"\x7f", b"\x00")) * size
-    at = rng.randrange(len(data) + 1)
-    return data[:at] + made + data[at + size :]
-
-
 def _cut(data: bytes, rng: Random) -> bytes:
     return data[: rng.randrange(len(data) + 1)]
 
@@ -102,11 +79,6 @@ def _remove(data: bytes, rng: Random) -> bytes:
 def _repeat(data: bytes, rng: Random) -> bytes:
     at, size = rng.randrange(len(data) + 1), rng.choice((1, 4, 16, 128, 1024))
     return data[:at] + data[at : at + size] * rng.choice((2, 2, 2, 3, 50)) + data[at + size :]
-
-
-def _insert(data: bytes, rng: Random) -> bytes:
-    at = rng.randrange(len(data) + 1)
-    return data[:at] + rng.randbytes(rng.choice((1, 2, 8, 64))) + data[at:]
 
 
 def _move(data: bytes, rng: Random) -> bytes:
@@ -154,7 +126,6 @@ def _block(data: bytes, rng: Random) -> bytes:
     return data[:at] + rng.choice(_BLOCKS) * rng.choice((1, 1, 2, 40, 3000)) + data[at:]
 
 
-_DAMAGES = (_flip, _flip, _byte, _number, _number, _cut, _remove, _repeat, _insert, _move)
 _TEXT_DAMAGES = (*(_text_number, _text_word, _lines) * 3, _block, _block, _flip, _byte, _cut, _remove, _repeat, _move)
 
 
@@ -225,10 +196,3 @@ def _at(tree: Any, path: tuple) -> Any:
     for part in path:
         tree = tree[part]
     return tree
-
-
-def json_mutant(data: bytes, rng: Random) -> bytes:
-    """Damage the values of a JSON text."""
-    with suppress(ValueError, RecursionError):
-        return json.dumps(tree_mutant(json.loads(data), rng)).encode("utf-8", "replace")
-    return text_mutant(data, rng)

@@ -10,11 +10,27 @@ from pathlib import Path
 
 import click
 
-from fuzzing.readers import command_of
+from mpmcli.cli.program import program
 from mpmcli.cli.streams import print_note
+from mpmcli.dataset.draw import draw
+from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.errors import MpmcliError
+from mpmcli.materials.registry import parameter_models
 
 MOST_OUTPUT = 2**22
+
+
+@click.command("load-sweep")
+@click.argument("path", type=click.Path(path_type=Path))
+def load(path: Path) -> None:
+    """Load a sweep and draw its first trajectories, as a dry run does before minutes of other work."""
+    laws = parameter_models()
+    loaded = load_sweep(path, laws=laws)
+    for number in range(min(2, loaded.count)):
+        draw(loaded, number).scene(laws)
+
+
+OWN = {load.name: load}
 
 
 @dataclass(frozen=True)
@@ -40,8 +56,9 @@ def fault_of(words: Sequence[object]) -> Fault | None:
     with redirect_stdout(out), redirect_stderr(err), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            command, arguments = command_of([str(word) for word in words])
-            command.main(arguments, prog_name="mpmcli", standalone_mode=False)
+            own = OWN.get(str(words[0]))
+            arguments = [str(word) for word in (words[1:] if own else words)]
+            (own or program).main(arguments, prog_name="mpmcli", standalone_mode=False)
         except (MpmcliError, click.ClickException) as error:
             print_note(str(error))
         except (click.exceptions.Exit, SystemExit):
