@@ -43,6 +43,7 @@ def header(
     }
     if colliders:
         scene["colliders"] = list(colliders)
+    laws = sorted({material["law"] for material in materials})
     facts = {
         "title": scene["title"],
         "dimension": d,
@@ -50,7 +51,8 @@ def header(
         "origin": [0.0] * d,
         "size": list(size),
         "bodies": names,
-        "materials": sorted({material["law"] for material in materials}),
+        "materials": laws,
+        "laws": [{"deformation": "J" if law == "fluid" else "F", "coherent": False} for law in laws],
         "precision": "f32",
         "scene": tomli_w.dumps(scene),
     }

@@ -37,6 +37,7 @@ def made_header(dimension: int, *, driven: bool = False) -> dict:
         "size": [1.0] * dimension,
         "bodies": ["left", "right"],
         "materials": ["fluid"],
+        "laws": [{"deformation": "J", "coherent": False, "projects": False}],
         "precision": "f32",
         "scene": SCENE.format(more=more, size=", ".join(["1.0"] * dimension), gravity=gravity),
     }

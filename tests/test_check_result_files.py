@@ -210,5 +210,5 @@ def test_what_is_no_result_is_bad_input(packed, tmp_path):
             check_result(tmp_path / name)
     with changed(packed / PACKED) as file:
         file["mpmcli"].attrs["format"] = 99
-    with pytest.raises(InputError, match="newer version"):
+    with pytest.raises(InputError, match="has format 99"):
         check_result(packed)

@@ -33,7 +33,6 @@ from mpmcli.output.segments import sealed_segments
 HEADER = {
     "dimension": 2,
     "bodies": ["column"],
-    "laws": ["fluid"],
     "precision": "f32",
     "scene": 'title = "é"\n',
 }
@@ -430,7 +429,7 @@ def test_a_damaged_or_foreign_segment_is_not_packed(tmp_path):
     last.unlink()
     with pytest.raises(RunError, match=r"lacks frame_000001.vtkhdf, one of the 2 files written"):
         store.finish()
-    other = SegmentStore(tmp_path / "other", {"scene": "another"})
+    other = SegmentStore(tmp_path / "other", {"scene": "title = 1"})
     for k in range(2):
         other.write(make_frame(k, 20, 3), make_row(k, 3))
     shutil.copy(sealed_segments(tmp_path / "other")[1], last)

@@ -16,7 +16,7 @@ from mpmcli.output import store as store_module
 from mpmcli.output.segments import PACKED
 from mpmcli.output.vtkhdf import VtkhdfWriter
 
-HEADER = {"dimension": 3, "bodies": ["column"], "laws": ["fluid"], "precision": "f32", "scene": "title = 1\n"}
+HEADER = {"dimension": 3, "bodies": ["column"], "precision": "f32", "scene": "title = 1\n"}
 TEMPORARY = f"{PACKED}.tmp"
 FRAMES = [make_frame(k, 300, 3) for k in range(5)]
 
@@ -152,7 +152,7 @@ def test_without_room_for_both_it_is_not_begun(tmp_path, monkeypatch):
     def refuse(*_: object, **__: object) -> None:
         raise NoRoomError("full")
 
-    monkeypatch.setattr(store_module, "require_free_space", refuse)
+    monkeypatch.setattr("mpmcli.output.packed_beside.require_free_space", refuse)
     store = begin(tmp_path, 5)
     assert not (tmp_path / TEMPORARY).exists()
     store.finish()
@@ -200,7 +200,9 @@ def test_what_does_not_read_back_is_no_result(tmp_path, monkeypatch, name):
             file[name][...] = data
 
     monkeypatch.setattr(pack_module, "sync_file", corrupt)
-    with pytest.raises(RunError, match=r"does not read back as it was written .* of frame 4\); the 5 frames written"):
+    with pytest.raises(
+        RunError, match=r"does not read back as it was written .* of frame 4 has changed\); the 5 frames"
+    ):
         store.finish()
     assert [path.name for path in tmp_path.iterdir()] == ["segments"]
     monkeypatch.undo()

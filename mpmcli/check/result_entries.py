@@ -11,8 +11,8 @@ from mpmcli.check.finding import FrameFindings
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.guarded_read import DAMAGE, DamageError, first_line
 from mpmcli.output.header import RunHeader
+from mpmcli.output.reading import DAMAGE, DamageError, first_line
 from mpmcli.output.result import Result, open_result, result_place
 from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
 from mpmcli.output.segments import PACKED, sealed_segments
@@ -118,11 +118,7 @@ def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
             raise
         findings.add("error", "unreadable", 0, f"No frame can be read: {first_line(error)}", RUN_AGAIN)
         return OpenedResult(path, "none", RunHeader.read({}), read_record(_directory(path)), [])
-    listed = min(len(result.ledger), len(result.numbers), len(result.particle_counts))
-    if listed < result.frame_count:
-        what = f"The ledger has {listed} rows for {result.frame_count} frames"
-        findings.add("error", "ledger-missing", listed, what, RUN_AGAIN)
-    entries = [Entry.of(result, k, int(result.numbers[k])) for k in range(min(listed, result.frame_count))]
+    entries = [Entry.of(result, k, int(result.numbers[k])) for k in range(result.frame_count)]
     return OpenedResult(result.path, result.kind, result.header, result.record, entries)
 
 

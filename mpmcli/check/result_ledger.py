@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import fields
 from itertools import pairwise
-from math import isfinite, isnan
+from math import isfinite
 
 import numpy as np
 
@@ -72,8 +72,7 @@ def _not_finite(row: LedgerRow) -> str:
         return ""
     for entry in fields(row):
         value = getattr(row, entry.name)
-        # Files written before it was stored have no volume error.
-        if value is None or isinstance(value, str) or (entry.name == "volume_error" and isnan(value)):
+        if value is None or isinstance(value, str):
             continue
         if not np.isfinite(np.array(value, dtype=float)).all():
             return entry.name
@@ -154,12 +153,10 @@ def _volume(rows: _Rows, header: RunHeader, findings: FrameFindings) -> dict[str
     return {"volume_ratio_min": lowest, "volume_ratio_max": highest}
 
 
-def _volume_error(rows: _Rows, findings: FrameFindings) -> float | None:
+def _volume_error(rows: _Rows, findings: FrameFindings) -> float:
     """Return the volume error that lasts to the end: the smallest one of the last quarter, 0 where its sign changes."""
     last = rows[-max(len(rows) // QUARTER, 1) :]
     errors = np.array([row.volume_error for _, row in last])
-    if np.isnan(errors).any():
-        return None
     lasting = float(errors[np.abs(errors).argmin()]) if abs(np.sign(errors).sum()) == len(errors) else 0.0
     if abs(lasting) > VOLUME_ERROR:
         what = (

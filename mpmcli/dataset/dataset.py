@@ -18,7 +18,6 @@ from mpmcli.dataset.shard import (
     StoredGroup,
     moving_names,
     open_shard,
-    particles_of,
     shard_splits,
 )
 from mpmcli.errors import InputError
@@ -138,7 +137,7 @@ class _StoredTrajectory(Trajectory):
             self.header = RunHeader.read(stored.attribute("header"))
             self.times, self.steps, self.frames = (stored.table(name) for name in TABLES)
             self.field_names = tuple(name for name in moving_names(stored.group) if name not in MOVING)
-            self.particle_count = particles_of(stored.group, self.header.dimension, self.field_names)
+            self.particle_count = stored.group["position"].shape[1]
 
     @property
     def ledger(self) -> list[LedgerRow]:

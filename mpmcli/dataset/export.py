@@ -14,7 +14,7 @@ from typing import Any
 from mpmcli.dataset.dataset import Dataset
 from mpmcli.dataset.folder import MANIFEST
 from mpmcli.dataset.formats import FORMATS
-from mpmcli.dataset.metadata import EXPORTED_BY, FORMAT_KEY, common_facts
+from mpmcli.dataset.metadata import EXPORTED_BY, common_facts
 from mpmcli.dataset.report import status_of
 from mpmcli.dataset.shard import SPLITS
 from mpmcli.dataset.thinned import SEED, ThinnedTrajectory, Walls
@@ -198,11 +198,6 @@ def is_export(path: Path) -> bool:
 def verify_export(directory: Path) -> Verification:
     """Compare the files of an export with its checksums."""
     found = Verification(directory)
-    metadata = _metadata(directory)
-    if not (directory / SUMS).exists() and EXPORTED_BY in metadata and FORMAT_KEY not in metadata:
-        found.files = sum(1 for path in directory.iterdir() if _OURS.fullmatch(path.name))
-        found.unchecked.append(str(directory))
-        return found
     found.files, found.faults = sums_faults(directory)
     return found
 

@@ -1,7 +1,6 @@
 """The directory of a dataset: its manifest, a SQLite file with a row for each trajectory, and its shards."""
 
 import json
-import re
 import shutil
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import h5py
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from mpmcli import __version__
 from mpmcli.check.finding import Verdict
@@ -21,14 +21,13 @@ from mpmcli.output.checksums import checksum_is_right
 from mpmcli.output.directory import check_directory
 from mpmcli.output.durable import require_free_space, sealed
 from mpmcli.output.lock import LOCK
-from mpmcli.plain_text import one_line
+from mpmcli.output.reading import first_line, require_format
 
 MANIFEST = "manifest.sqlite"
 FORMAT = 1
 # Bytes of a shard, about: large enough for a file system and for copies over a network, small enough to lose.
 SHARD_BYTES = 256e6
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
-_PLACE = re.compile(r"(shards|pending|quarantine)/\w+\.h5")
 
 
 @dataclass(frozen=True)
@@ -72,6 +71,18 @@ class Row:
         return cls(**{**values, "version": __version__, "taichi": version("taichi")})
 
 
+class _SweepFacts(BaseModel):
+    """What is read of the facts of a sweep; others are taken as they are."""
+
+    model_config = ConfigDict(extra="allow")
+
+    key: str
+    count: int = Field(gt=0)
+    per_shard: int = Field(gt=0)
+    part: list[int] = Field(min_length=2, max_length=2)
+
+
+_ROWS = TypeAdapter(list[Row])
 _COLUMNS = ", ".join(f.name for f in fields(Row))
 _TYPES = {int: "INTEGER", float: "REAL", str: "TEXT"}
 
@@ -97,24 +108,15 @@ class Manifest:
         """Return the facts about the sweep."""
         with self._reading() as connection:
             facts = {name: json.loads(value) for name, value in connection.execute("SELECT name, value FROM sweep")}
-        if facts.get("format") != FORMAT:
-            raise InputError(f"{self.path} has format {facts.get('format')}; this version of mpmcli reads {FORMAT}.")
-        wrong = [name for name, sound in _SOUND.items() if not sound(facts.get(name))]
-        if wrong:
-            raise InputError(f"{self.path} is damaged: what it says of {wrong[0]} cannot be; copy it again.")
-        return facts
+            require_format(self.path, facts.get("format"), FORMAT)
+            return _SweepFacts.model_validate(facts).model_dump()
 
     def rows(self) -> list[Row]:
         """Return all rows, by number."""
         with self._reading() as connection:
-            rows = [Row(*row) for row in connection.execute(f"SELECT {_COLUMNS} FROM trajectories ORDER BY number")]
-        for row in rows:
-            if wrong := [f.name for f in fields(Row) if type(getattr(row, f.name)) is not f.type]:
-                raise InputError(f"{self.path} is damaged: the {wrong[0]} of trajectory {row.number} cannot be read.")
-            # Paths are data: none leads out of the dataset.
-            if row.file and not _PLACE.fullmatch(row.file):
-                raise InputError(f"{self.path} places trajectory {row.number} in {one_line(row.file)}: it is damaged.")
-        return rows
+            connection.row_factory = sqlite3.Row
+            rows = connection.execute(f"SELECT {_COLUMNS} FROM trajectories ORDER BY number")
+            return _ROWS.validate_python([dict(row) for row in rows])
 
     def put(self, rows: Iterable[Row]) -> None:
         """Add rows, or replace those of the same numbers, all at once and durably."""
@@ -140,20 +142,9 @@ class Manifest:
             # Not mode=ro, which could not roll back what a killed writer left.
             with closing(sqlite3.connect(f"file:{self.path}?mode=rw", uri=True)) as connection:
                 yield connection
-        except (sqlite3.Error, TypeError, ValueError, RecursionError, MemoryError) as error:
-            raise InputError(f"{self.path} cannot be read ({error}); copy it again, or run the sweep again.") from error
-
-
-def _is_count(value: object) -> bool:
-    return type(value) is int and 0 < value <= 10**9
-
-
-def _is_part(value: object) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(map(_is_count, value)) and value[0] <= value[1]
-
-
-# What the facts of a sweep must be.
-_SOUND = {"key": lambda value: isinstance(value, str), "count": _is_count, "per_shard": _is_count, "part": _is_part}
+        except (sqlite3.Error, ValueError) as error:
+            what = first_line(error)
+            raise InputError(f"{self.path} cannot be read ({what}); copy it again, or run the sweep again.") from error
 
 
 def require_empty(directory: Path, *, locked: bool = False) -> None:

@@ -16,7 +16,6 @@ from mpmcli.output.header import RunHeader
 # ones at 2 (2D) and sqrt(3) (3D). LagrangeBench takes about the same (1.45, data_gen/.../gen_dataset.py).
 RADIUS_IN_SPACINGS = 1.5
 EXPORTED_BY = "exported_by"
-# Exports without it have no checksums.
 FORMAT_KEY, FORMAT = "export_format", 2
 # Of the time between frames: they are landed on exactly, up to the rounding of sums.
 UNEVEN = 1e-6

@@ -12,7 +12,6 @@ from mpmcli.dataset.folder import VERDICTS, Folder, Manifest, Row
 from mpmcli.dataset.shard import SHARDS, StoredGroup, checksum, group_name, open_shard
 from mpmcli.errors import InputError
 from mpmcli.output.checksums import checksum_is_right
-from mpmcli.output.guarded_read import held
 from mpmcli.plain_text import counted, one_line
 
 # Trajectories that a text names.
@@ -133,10 +132,9 @@ def _faults_of(file: Path, rows: list[Row]) -> list[str]:
             others = sorted(opened.keys() - names.keys())
             faults += [f"{file} holds {one_line(name)}, which the manifest does not place there." for name in others]
             for name, row in names.items():
-                there = opened.get(name, getlink=True) is not None
+                there = name in opened
                 faults += _trajectory_faults(opened, row) if there else [f"{file} lacks trajectory {row.number}."]
-            checked = opened.attrs["version"] > 1
-        if checked and not faults and not checksum_is_right(file):
+        if not faults and not checksum_is_right(file):
             faults.append(f"{file} has changed between its data: the checksum at its end differs.")
     except InputError as error:
         faults.append(str(error))
@@ -144,13 +142,13 @@ def _faults_of(file: Path, rows: list[Row]) -> list[str]:
 
 
 def _trajectory_faults(file: h5py.File, row: Row) -> list[str]:
-    """Compare a trajectory with its row, and with its own checksums, where its version has any."""
+    """Compare a trajectory with its row, and with its own checksums."""
     it = f"trajectory {row.number} in {file.filename}"
     try:
         stored = StoredGroup(file, row.number)
         if checksum(stored.group) != row.checksum:
             return [f"{it} has changed: its checksum differs."]
-        if held(stored.group, "position").shape[:2] != (row.frames, row.particles):
+        if stored.group["position"].shape[:2] != (row.frames, row.particles):
             return [f"{it} has other counts than its row."]
         if stored.attribute("split") != row.split or stored.attribute("draws") != json.loads(row.draws):
             return [f"{it} has other draws or another split than its row."]

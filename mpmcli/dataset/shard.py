@@ -6,7 +6,7 @@
 /000007/body          (N,) int32; material (N,) int32, index into the laws of the header
 /000007/time          (T,) float64, s; step (T,) int64; frame (T,) int64
 /000007/ledger/mass   and every other column of the ledger, T rows
-/000007/checksums     of each frame and of all else, see `output/checksums.py`; not in version 1
+/000007/checksums     of each frame and of all else, see `output/checksums.py`
 
 The last bytes of the file are a checksum of all before (`output/checksums.py`).
 """
@@ -29,8 +29,8 @@ from mpmcli.output import checksums
 from mpmcli.output.checksums import NAME as CHECKSUMS
 from mpmcli.output.checksums import Checksums, append_checksum, attribute_checksum, store_checksums, table_checksum
 from mpmcli.output.durable import sealed
-from mpmcli.output.guarded_read import DAMAGE, held, items, read_whole, require_sound_heaps, require_stored
 from mpmcli.output.ledger_table import ledger_columns, read_ledger
+from mpmcli.output.reading import opened, require_format
 
 FORMAT, VERSION = "mpmcli-dataset", 2
 SPLITS = ("train", "valid", "test")
@@ -117,11 +117,6 @@ def join_trajectories(files: Mapping[int, Path], path: Path) -> None:
         for number, file in files.items():
             with h5py.File(file, "r") as source:
                 source.copy(group_name(number), joined)
-                group = joined[group_name(number)]
-                if CHECKSUMS not in group:
-                    # An older version has computed it.
-                    names = moving_names(group)
-                    store_checksums(group, "", names, _table([held(group, name)[...] for name in names]))
     append_checksum(path)
 
 
@@ -155,8 +150,9 @@ def write_single(path: Path, data: TrajectoryData, *, compress: bool) -> str:
 
 def checksum(group: h5py.Group) -> str:
     """Return the SHA-256, hexadecimal, of all that a trajectory's group holds, compressed or not."""
-    names = [name for name, item in items(group) if isinstance(item, h5py.Dataset) and name != CHECKSUMS]
-    return _checksum(group.attrs, ((name, read_whole(group, name, "iufS")) for name in sorted(names)))
+    names: list[str] = []
+    group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return _checksum(group.attrs, ((name, group[name][...]) for name in sorted(names) if name != CHECKSUMS))
 
 
 def _checksum(attributes: Mapping[str, Any], arrays: Iterable[tuple[str, np.ndarray]]) -> str:
@@ -174,48 +170,17 @@ def open_shard(path: Path) -> Iterator[h5py.File]:
     """Open a sealed shard for reading; an InputError says that it, or what is read from it, is missing or damaged."""
     if not path.exists():
         raise InputError(f"{path} is missing: the dataset is not complete.")
-    try:
-        require_sound_heaps(path)
-        # A sealed shard never changes, so no lock is taken.
-        with h5py.File(path, "r", locking=False) as file:
-            if file.attrs.get("format") != FORMAT:
-                raise InputError(f"{path} is no shard of a dataset of mpmcli: its format is not {FORMAT}.")
-            if file.attrs["version"] < 1:
-                raise ValueError("there is no such version")
-            if file.attrs["version"] > VERSION:
-                raise InputError(f"{path} was written by a newer version of mpmcli; update mpmcli to read it.")
-            yield file
-    except InputError:
-        raise
-    except DAMAGE as error:
-        raise InputError(f"{path} is damaged: what it should hold cannot be read.") from error
+    with opened(path, "a whole copy of the dataset") as file:
+        if file.attrs.get("format") != FORMAT:
+            raise InputError(f"{path} is no shard of a dataset of mpmcli: its format is not {FORMAT}.")
+        require_format(path, file.attrs["version"], VERSION)
+        yield file
 
 
 def shard_splits(path: Path) -> dict[int, str]:
     """Return the split of each trajectory in a shard, by number; errors are those of `open_shard`."""
     with open_shard(path) as file:
-        splits = {}
-        for name in file:
-            attributes = held(file, name).attrs
-            splits[int(attributes["number"])] = str(attributes["split"])
-            if group_name(int(attributes["number"])) != name:
-                raise ValueError("a trajectory has the name of another")
-        if not set(splits.values()) <= set(SPLITS):
-            raise ValueError("a split has another name")
-        return splits
-
-
-def particles_of(group: h5py.Group, d: int, names: Sequence[str]) -> int:
-    """Return N of a trajectory in d dimensions; KeyError or ValueError: arrays are not of T frames and N particles."""
-    shapes = {name: require_stored(group, name).shape for name in (*MOVING, *LABELS, *TABLES, *names)}
-    frames, particles, axes = shapes["position"]
-    right = {name: (particles,) for name in LABELS} | {name: (frames,) for name in TABLES}
-    right |= {name: (frames, particles, *shapes[name][2:]) for name in names}
-    right |= {name: (frames, particles, d) for name in MOVING}
-    kinds = {group[name].dtype.kind for name in MOVING}, {group[name].dtype.kind for name in LABELS}
-    if right != shapes or axes != d or not frames or kinds[0] != {"f"} or not kinds[1] <= {"i", "u"}:
-        raise ValueError("the arrays of a trajectory have different shapes")
-    return particles
+        return {int(group.attrs["number"]): str(group.attrs["split"]) for group in file.values()}
 
 
 def _fault(data: TrajectoryData) -> str:
@@ -248,42 +213,35 @@ class StoredGroup:
     """A trajectory's group, compared with checksums as it is read; KeyError: there is none; InputError: it changed."""
 
     def __init__(self, file: h5py.File, number: int) -> None:
-        self.group: h5py.Group = held(file, group_name(number))
-        # Version 1 has none.
-        new = file.attrs["version"] > 1
-        self._checksums: Checksums | None = checksums.load_checksums(self.group, "") if new else None
+        self.group: h5py.Group = file[group_name(number)]
+        self._checksums: Checksums = checksums.load_checksums(self.group, "")
 
     def attribute(self, name: str) -> Any:
         """Read an attribute."""
         found = self.group.attrs[name]
-        if self._checksums is not None:
-            self._checksums.require(f"@{name}", attribute_checksum(found))
+        self._checksums.require(f"@{name}", attribute_checksum(found))
         return json.loads(found) if name in ("draws", "header") else found
 
-    def table(self, path: str, kinds: str = "iuf") -> np.ndarray:
-        """Read all of an array without frames, which has one of these kinds of numpy types."""
-        found = read_whole(self.group, path, kinds)
-        if self._checksums is not None:
-            self._checksums.require(path, table_checksum(found))
+    def table(self, path: str) -> np.ndarray:
+        """Read all of an array without frames."""
+        found = self.group[path][...]
+        self._checksums.require(path, table_checksum(found))
         return found
 
     def frames(self, name: str, chosen: slice) -> np.ndarray:
         """Read some frames of an array."""
-        data = require_stored(self.group, name)
+        data = self.group[name]
         found = data[chosen]
-        if self._checksums is not None:
-            for t, rows in zip(range(len(data))[chosen], found, strict=True):
-                self._checksums.require_frame(t, name, rows, t)
+        for t, rows in zip(range(len(data))[chosen], found, strict=True):
+            self._checksums.require_frame(t, name, rows, t)
         return found
 
     def require_all(self) -> None:
         """Compare the checksums of all that the group holds."""
-        if self._checksums is None:
-            return
         for name in self._checksums.arrays:
             self.frames(name, slice(None))
         self._checksums.require_items(checksums.item_checksums(self.group, self._checksums.arrays, CHECKSUMS))
 
     def ledger(self) -> list[LedgerRow]:
         """Read the ledger."""
-        return read_ledger(held(self.group, LEDGER), lambda name, kinds: self.table(f"{LEDGER}/{name}", kinds))
+        return read_ledger(self.group[LEDGER], lambda name: self.table(f"{LEDGER}/{name}"))

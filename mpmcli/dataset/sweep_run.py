@@ -143,8 +143,7 @@ def open_folder(
         if (i, n) != settings.part:
             raise InputError(f"{directory} holds part {i}/{n} of the sweep; resume it with --shard {i}/{n}.")
         now = source_digests(sweep, settings.plugins)
-        # An older version knew none.
-        before = facts.get("files", now)
+        before = facts["files"]
         if changed := sorted(name for name in {*before, *now} if before.get(name) != now.get(name)):
             raise InputError(
                 f"{changed[0]} has changed since {directory} was begun, which cannot be resumed with it: put it back "

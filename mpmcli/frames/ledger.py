@@ -24,7 +24,7 @@ class LedgerRow:
         angular_momentum: sum m x cross v + m h^2/4 axl(C) about the origin of the domain,
             kg m^2/s, one number in 2D and three in 3D.
         volume_error: volume of the cells inside liquids and grains over that of the particles in them, less 1; 0 where
-            hardly any cell is inside, nan in files written before it was stored.
+            hardly any cell is inside.
         collider_force, collider_torque: on each collider, N, and about its pivot, N m: means since the previous frame
             of the momentum that it took from the material (0 at frame 0); per metre of depth in 2D.
         emitted, retired: particles that emitters have let in so far, and that left through open faces; emitted_mass,

@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 
 from mpmcli.output.durable import write_text
-from mpmcli.output.guarded_read import DamageError, held, items
+from mpmcli.output.reading import DamageError
 
 NAME = "checksums"
 _LIST, _OWN = "list", "checksum"
@@ -63,13 +63,17 @@ def attribute_checksum(value: Any) -> int:
 def item_checksums(root: h5py.Group, arrays: Collection[str], own: str) -> dict[str, int]:
     """Return the checksums of all below a group but those at `own`; of `arrays`, which have frames, type and shape."""
     sums = {}
-    for path, item in items(root):
+
+    def note(path: str, item: h5py.Group | h5py.Dataset) -> None:
         if path == own:
-            continue
+            return
         for name in item.attrs:
             sums[f"{path}@{name}"] = attribute_checksum(item.attrs[name])
         if isinstance(item, h5py.Dataset):
             sums[path] = kind_checksum(item.dtype, item.shape) if path in arrays else table_checksum(item[...])
+
+    note("", root)
+    root.visititems(note)
     return sums
 
 
@@ -99,6 +103,10 @@ class FrameChecksums:
             self.table[k, column] = checksum(of_frame, int(self.table[k, column]))
             row, rows = row + len(of_frame), rows[len(of_frame) :]
         self._places[name] = k, row
+
+    def frame(self, name: str) -> int:
+        """Return the frame of the next row of an array."""
+        return self._places[name][0]
 
 
 @dataclass(frozen=True)
@@ -148,17 +156,13 @@ def store_checksums(
 
 
 def load_checksums(root: h5py.Group, place: str) -> Checksums:
-    """Read the checksums that `store_checksums` wrote; DamageError where they are missing or have changed."""
-    file = root.file.filename
-    try:
-        data = held(root, f"{place}/{NAME}" if place else NAME)
-        table, text = data[...], str(data.attrs[_LIST])
-        if int(data.attrs[_OWN]) != checksum(table, zlib.crc32(text.encode("utf-8"))):
-            raise damaged(file, "the list of its checksums")
-        told = json.loads(text)
-        return Checksums(file, tuple(told["arrays"]), table, told["items"])
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise DamageError(f"{file} is damaged: its checksums cannot be read.") from error
+    """Read the checksums that `store_checksums` wrote; DamageError: they have changed; KeyError: there are none."""
+    data = root[f"{place}/{NAME}" if place else NAME]
+    table, text = data[...], str(data.attrs[_LIST])
+    if int(data.attrs[_OWN]) != checksum(table, zlib.crc32(text.encode("utf-8"))):
+        raise damaged(root.file.filename, "the list of its checksums")
+    told = json.loads(text)
+    return Checksums(root.file.filename, tuple(told["arrays"]), table, told["items"])
 
 
 def _item_name(key: str) -> str:

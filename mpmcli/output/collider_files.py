@@ -7,7 +7,7 @@ cells, and those of colliders at rest one set of points.
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,11 +16,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from mpmcli.errors import InputError, RunError
+from mpmcli.errors import RunError
 from mpmcli.output.checksums import append_checksum, load_checksums, store_checksums, table_checksum
 from mpmcli.output.durable import require_free_space, sealed, write_text
-from mpmcli.output.guarded_read import DAMAGE, held, read_whole, require_sound_heaps
-from mpmcli.output.vtkhdf import FORMAT, LIBVER
+from mpmcli.output.vtkhdf import FORMAT, LIBVER, open_vtkhdf
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.surface import Surface, collider_surface, form_surface, joined
 from mpmcli.scene.triangles import ClosedSurface
@@ -113,20 +112,19 @@ def expected_files(header: Mapping[str, Any], colliders: Sequence[Collider]) -> 
 
 
 def read_stored_surfaces(directory: Path) -> dict[int, ClosedSurface]:
-    """Return the surfaces of colliders read from files, by number; InputError: one has changed, or is elsewhere."""
+    """Return the surfaces of colliders read from files, by number; InputError: one has changed."""
     found = {}
-    for name in (RESTING, MOVING):
-        with suppress(*(kind for kind in DAMAGE if kind is not InputError)):
-            require_sound_heaps(directory / name)
-            with h5py.File(directory / name, "r", locking=False) as file:
-                checksums = load_checksums(file, "mpmcli") if held(file, "mpmcli").attrs.get("format", 1) > 1 else None
-                for number in held(file, "mpmcli/surfaces"):
-                    paths = [f"mpmcli/surfaces/{number}/{part}" for part in ("vertices", "triangles")]
-                    arrays = [read_whole(file, path, kinds) for path, kinds in zip(paths, ("f", "iu"), strict=True)]
-                    for path, array in zip(paths, arrays, strict=True):
-                        if checksums is not None:
-                            checksums.require(path, table_checksum(array))
-                    found[int(number)] = _surface(*arrays)
+    for path in (directory / RESTING, directory / MOVING):
+        if not path.exists():
+            continue
+        with open_vtkhdf(path) as file:
+            checksums = load_checksums(file, "mpmcli")
+            for number in file.get("mpmcli/surfaces", ()):
+                names = [f"mpmcli/surfaces/{number}/{part}" for part in ("vertices", "triangles")]
+                arrays = [file[name][...] for name in names]
+                for name, array in zip(names, arrays, strict=True):
+                    checksums.require(name, table_checksum(array))
+                found[int(number)] = ClosedSurface(*arrays)
     return found
 
 
@@ -136,16 +134,6 @@ def _triangles(collider: Collider) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     surface = form_surface(collider.form)
     return surface.points, surface.cells
-
-
-def _surface(vertices: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
-    """Return a surface of vertices (n, 3) and triangles (m, 3); ValueError where it is none."""
-    shapes = vertices.shape == (len(vertices), 3) and triangles.shape == (len(triangles), 3)
-    if not (shapes and triangles.size and np.isfinite(vertices).all()):
-        raise ValueError("it is no surface")
-    if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise ValueError("a triangle has no vertex")
-    return ClosedSurface(vertices.astype(np.float64), triangles.astype(np.int64))
 
 
 def _groups(header: Mapping[str, Any], colliders: Sequence[Collider]) -> Iterator[ColliderGroup]:

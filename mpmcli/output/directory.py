@@ -119,9 +119,6 @@ def _make(directory: Path) -> list[Path]:
             path.mkdir()
             made.append(path)
             sync_directory(path.parent)
-            with suppress(FileExistsError):
-                path.mkdir()
-                made.append(path)
         _refuse_unwritable(directory)
     except (OSError, InputError) as error:
         _unmake(made)

@@ -4,13 +4,12 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from mpmcli import __version__
-from mpmcli.output.stored_facts import require_kinds
 from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider, ColliderShape
 from mpmcli.scene.domain import PERIODIC, Walls
@@ -23,30 +22,106 @@ from mpmcli.scene.sheets import emitted_volumes
 from mpmcli.scene.triangles import ClosedSurface
 from mpmcli.stability.transfer_factors import FARTHEST, INTERVAL
 
-# Of a scene that does not say.
-_TRANSFER, _SOLIDS = (SolverSettings.model_fields[name].default for name in ("transfer", "solids"))
+_DEFAULTS = {name: field.default for name, field in SolverSettings.model_fields.items()}
 
 
-def words_of(walls: Mapping[str, str] | str | None, d: int) -> tuple[tuple[str, str], ...] | None:
-    """Return the words of the faces along each axis, None where they are not known."""
-    if walls is None:
-        return None
-    table = {"default": walls} if isinstance(walls, str) else walls
-    try:
+class _Facts(BaseModel):
+    """Entries of a file; others are left out, and those that are missing are not known."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class _Domain(_Facts):
+    gravity: tuple[float | str, ...] = ()
+    walls: dict[str, str] | str | None = None
+    wall_velocity: dict[str, Any] = {}
+    friction: dict[str, float] | float = 0.0
+
+    def faces(self, d: int) -> tuple[tuple[str, str], ...]:
+        """Return the words of the faces along each axis; none where the walls are not known."""
+        if self.walls is None:
+            return ()
+        table = self.walls if isinstance(self.walls, dict) else {"default": self.walls}
         return Walls.model_validate(table, context={"dimension": d}).faces(d)
-    except ValidationError:
-        return None
+
+    def is_rough(self, axis: str) -> bool:
+        """Return whether a face normal to an axis has friction."""
+        if not isinstance(self.friction, dict):
+            return self.friction > 0
+        return any(self.friction.get(name, 0) > 0 for name in ("default", f"{axis}_min", f"{axis}_max"))
 
 
-def sticking_axes(
-    words: tuple[tuple[str, str], ...] | None, friction: Mapping[str, float] | float
-) -> tuple[bool, ...] | None:
-    """Return per axis whether a face normal to it sticks or has friction, None where walls are not known."""
-    if words is None:
-        return None
-    numbers = friction if isinstance(friction, Mapping) else {"default": friction}
-    rough = [numbers.get("default", 0) > 0 or any(numbers.get(f"{a}_{s}", 0) > 0 for s in ("min", "max")) for a in AXES]
-    return tuple("stick" in pair or rubs for pair, rubs in zip(words, rough, strict=False))
+class _Time(_Facts):
+    end: float | None = None
+    frames: int | None = None
+
+
+class _Solver(_Facts):
+    transfer: str = _DEFAULTS["transfer"]
+    solids: str = _DEFAULTS["solids"]
+    redistribute: str | bool = False
+
+
+class _Output(_Facts):
+    drop_retired: bool = False
+
+
+class _Body(_Facts):
+    material: dict[str, Any] = {}
+    shape: dict[str, Any] = {}
+    particles_per_cell: float | None = None
+
+    def volume(self, d: int) -> float | None:
+        """Return the volume of the shape, None where that is not known."""
+        try:
+            return BodyShape.model_validate(self.shape, context={"dimension": d}).form.volume
+        except (ValidationError, StopIteration):
+            return None
+
+
+class _StoredScene(_Facts):
+    """What is read of a complete scene, of which a shape that is read from a file may be gone."""
+
+    domain: _Domain = _Domain()
+    time: _Time = _Time()
+    solver: _Solver = _Solver()
+    output: _Output = _Output()
+    constants: dict[str, Any] = {}
+    bodies: tuple[_Body, ...] = ()
+    emitters: tuple[_Body, ...] = ()
+    colliders: tuple[dict[str, Any], ...] = ()
+    forces: tuple[Any, ...] = ()
+    impulses: tuple[Any, ...] = ()
+
+
+class LawHeader(_Facts):
+    """A law: its word in a scene, "J" or "F", whether it coheres, and whether it may yield or flow."""
+
+    model_config = ConfigDict(from_attributes=True)
+
+    name: str = ""
+    deformation: Literal["J", "F"]
+    coherent: bool
+    projects: bool = True
+
+
+class _StoredHeader(_Facts):
+    """A header as files hold it; `scene` is TOML there."""
+
+    version: str | None = None
+    title: str = ""
+    dimension: Literal[0, 2, 3] = 0
+    spacing: float | None = None
+    origin: tuple[float, ...] = ()
+    size: tuple[float, ...] = ()
+    bodies: tuple[str, ...] = ()
+    volumes: tuple[float | None, ...] = ()
+    emitter_volumes: tuple[float | None, ...] = ()
+    materials: tuple[str, ...] = ()
+    laws: tuple[LawHeader, ...] = ()
+    precision: Literal["f32", "f64"] = "f32"
+    backend: dict[str, Any] = {}
+    scene: Annotated[_StoredScene, BeforeValidator(tomllib.loads)] = _StoredScene()
 
 
 @dataclass(frozen=True)
@@ -64,65 +139,9 @@ class BodyHeader:
         return self.material.get("density")
 
 
-def body_headers(
-    names: Sequence[str], tables: Sequence[Mapping[str, Any]], volumes: Sequence[float | None], d: int
-) -> tuple[BodyHeader, ...]:
-    """Return the bodies; of other ones than the scene's the names alone; `volumes` where shapes do not tell them."""
-    tables = tables if len(tables) == len(names) else [{} for _ in names]
-    volumes = volumes if len(volumes) == len(names) else [None] * len(names)
-    return tuple(
-        BodyHeader(
-            name,
-            table.get("material", {}),
-            _volume(table.get("shape", {}), d) if volume is None else volume,
-            table.get("particles_per_cell", usual_particles_per_cell(d)),
-        )
-        for name, table, volume in zip(names, tables, volumes, strict=True)
-    )
-
-
-def _volume(shape: Mapping[str, Any], d: int) -> float | None:
-    try:
-        return BodyShape.model_validate(shape, context={"dimension": d}).form.volume
-    except (ValidationError, StopIteration):
-        return None
-
-
-def _collider(table: Mapping[str, Any], context: dict[str, Any], surface: ClosedSurface | None) -> Collider | None:
-    try:
-        if surface is None:
-            return Collider.model_validate(table, context=context)
-        box = {"box": {name: corner.tolist() for name, corner in zip(("min", "max"), surface.bounds(), strict=True)}}
-        found = Collider.model_validate({**table, "shape": box}, context=context)
-    except ValidationError:
-        return None
-    mesh = Mesh.model_construct(file="", scale=1.0, rotate=None, translate=(0.0,) * len(surface.vertices[0]))
-    mesh._surface = surface
-    return found.model_copy(update={"shape": ColliderShape.model_construct(mesh=mesh)})
-
-
-class LawFacts(Protocol):
-    """What a header keeps of a constitutive law; see `LawHeader`."""
-
-    name: str
-    deformation: str
-    coherent: bool
-    projects: bool
-
-
-@dataclass(frozen=True)
-class LawHeader:
-    """A law: its word in a scene, "J" or "F", whether it coheres, and may yield or flow (older files: not known)."""
-
-    name: str
-    deformation: str
-    coherent: bool
-    projects: bool = True
-
-
 @dataclass(frozen=True)
 class RunHeader:
-    """Facts of a run; those that a file does not hold are None, or empty.
+    """Facts of a run; those that a header does not hold are None, or empty.
 
     Attributes:
         stored: the entries as files hold them; JSON can hold all of them.
@@ -144,7 +163,8 @@ class RunHeader:
         bodies: in the order of their labels in the frames.
         laws: in the order of the labels in the frames.
         end: s; frames: expected, the initial one included.
-        precision: "f32" or "f64"; backend: "arch" and "precision", in older files "threads" too.
+        precision: "f32" or "f64"; backend: "arch" and "precision".
+        scene: what is read of the complete scene.
     """
 
     stored: dict[str, Any]
@@ -171,9 +191,10 @@ class RunHeader:
     frames: int | None
     precision: str
     backend: Mapping[str, Any]
+    scene: _StoredScene
 
     @classmethod
-    def of(cls, scene: Scene, text: str, laws: Sequence[LawFacts], backend: Mapping[str, Any]) -> "RunHeader":
+    def of(cls, scene: Scene, text: str, laws: Sequence[Any], backend: Mapping[str, Any]) -> "RunHeader":
         """Return the header of a run that begins; `text` is the complete scene as TOML, laws as in `Frame.material`."""
         # A shape that is read from a file may be gone later.
         from_files = any(body.shape.files for body in scene.bodies)
@@ -188,9 +209,7 @@ class RunHeader:
                 "bodies": [body.name for body in scene.sources],
                 **({"volumes": [body.shape.form.volume for body in scene.bodies]} if from_files else {}),
                 "materials": [law.name for law in laws],
-                "laws": [
-                    {"deformation": law.deformation, "coherent": law.coherent, "projects": law.projects} for law in laws
-                ],
+                "laws": [LawHeader.model_validate(law).model_dump(exclude={"name"}) for law in laws],
                 "precision": backend["precision"],
                 # The bytes of a result do not depend on threads; run.json has their number.
                 "backend": {name: value for name, value in backend.items() if name != "threads"},
@@ -201,67 +220,56 @@ class RunHeader:
 
     @classmethod
     def read(cls, stored: Mapping[str, Any]) -> "RunHeader":
-        """Read a header, and from the scene's text what it lacks; ValueError: an entry has another type than ours."""
-        require_kinds("header", stored)
-        scene = _parsed(stored.get("scene", ""))
-        require_kinds("scene", scene)
-        domain, time, solver = (scene.get(name, {}) for name in ("domain", "time", "solver"))
-        d = int(stored.get("dimension", 0)) or len(domain.get("size", (0, 0)))
-        origin = _vector(stored.get("origin", domain.get("origin")), d)
-        size = _vector(stored.get("size", domain.get("size")), d)
-        placed = origin is not None and size is not None
-        gravity = domain.get("gravity", ())
-        timed = any(isinstance(entry, str) for entry in gravity)
-        steady = _vector([0.0 if isinstance(entry, str) else entry for entry in gravity], d)
-        words = words_of(domain.get("walls"), d)
-        periodic = np.array([PERIODIC in pair for pair in words] if words else [False] * d)
+        """Read a header, and the scene in it; ValidationError, a ValueError: an entry has another type than ours."""
+        facts = _StoredHeader.model_validate(dict(stored))
+        scene, d = facts.scene, facts.dimension
+        domain, solver, faces = scene.domain, scene.solver, scene.domain.faces(d)
+        placed = len(facts.origin) == len(facts.size) == d > 0
+        origin = np.array(facts.origin) if placed else None
+        timed = any(isinstance(entry, str) for entry in domain.gravity)
+        steady = np.array([0.0 if isinstance(entry, str) else entry for entry in domain.gravity])
+        steady = steady if len(steady) == d > 0 else None
+        periodic = np.array([PERIODIC in pair for pair in faces] or [False] * d, bool)
         runs_on = steady is not None and bool(steady[periodic].any())
-        total = solver.get("solids", _SOLIDS) == "total"
-        opens = tuple("open" in pair for pair in words or ())
-        # The volume of an emitter is that of all its particles, which its shape alone does not say.
-        tables = [*scene.get("bodies", []), *scene.get("emitters", [])]
-        own = stored.get("volumes") or [None] * len(scene.get("bodies", []))
-        volumes = [*own, *stored.get("emitter_volumes", ())]
+        total = solver.solids == "total"
+        opens = tuple("open" in pair for pair in faces)
+        comes_and_goes = bool(scene.emitters) or any(opens)
+        moved = bool(domain.wall_velocity or scene.forces or scene.impulses)
+        sticking = tuple("stick" in pair or domain.is_rough(a) for a, pair in zip(AXES, faces, strict=False))
         return cls(
             stored=dict(stored),
-            title=str(stored.get("title") or ""),
-            version=stored.get("version"),
+            title=facts.title,
+            version=facts.version,
             dimension=d,
-            spacing=stored.get("spacing", domain.get("spacing")),
-            origin=origin if placed else None,
-            upper=origin + size if placed else None,
+            spacing=facts.spacing,
+            origin=origin,
+            upper=origin + facts.size if placed else None,
             gravity=None if timed else steady,
             steady_gravity=steady,
-            driven=timed
-            or runs_on
-            or bool(domain.get("wall_velocity"))
-            or any(map(scene.get, ("forces", "impulses", "emitters")))
-            or any(opens),
-            comes_and_goes=bool(scene.get("emitters")) or any(opens),
-            drops=bool(scene.get("output", {}).get("drop_retired")),
+            driven=timed or runs_on or moved or comes_and_goes,
+            comes_and_goes=comes_and_goes,
+            drops=scene.output.drop_retired,
             open_axes=opens,
             total=total,
-            keeps_spin=solver.get("transfer", _TRANSFER) == "apic" and not total,
-            # A scene is stored with all of its keys: what lacks this one is older.
-            shifts=solver.get("redistribute") == "auto",
-            sticking=sticking_axes(words, domain.get("friction", 0.0)),
+            keeps_spin=solver.transfer == "apic" and not total,
+            shifts=solver.redistribute == "auto",
+            sticking=sticking or None,
             periodic=periodic,
-            bodies=body_headers([str(name) for name in stored.get("bodies", ())], tables, volumes, d),
-            laws=_laws(stored),
-            end=time.get("end"),
-            frames=time["frames"] + 1 if isinstance(time.get("frames"), int) else None,
-            precision=stored.get("precision", "f32"),
-            backend=stored.get("backend") or {},
+            bodies=_bodies(facts),
+            laws=tuple(
+                law.model_copy(update={"name": name}) for name, law in zip(facts.materials, facts.laws, strict=True)
+            ),
+            end=scene.time.end,
+            frames=None if scene.time.frames is None else scene.time.frames + 1,
+            precision=facts.precision,
+            backend=facts.backend,
+            scene=scene,
         )
-
-    @cached_property
-    def _scene(self) -> Mapping[str, Any]:
-        return _parsed(self.stored.get("scene", ""))
 
     @property
     def collider_names(self) -> tuple[str, ...]:
         """Names of the colliders, in the order of the ledger's columns."""
-        return tuple(str(table.get("name", "")) for table in self._scene.get("colliders", ()))
+        return tuple(str(table.get("name", "")) for table in self.scene.colliders)
 
     @cached_property
     def colliders(self) -> tuple[Collider, ...]:
@@ -275,10 +283,9 @@ class RunHeader:
 
     def read_colliders(self, surfaces: Mapping[int, ClosedSurface]) -> tuple[Collider | None, ...]:
         """Read the colliders, None where that fails; `surfaces`, by number, take the place of those in files."""
-        constants, _ = definitions(self._scene.get("constants"), self.dimension)
+        constants, _ = definitions(self.scene.constants, self.dimension)
         context = {"dimension": self.dimension, "constants": constants}
-        tables = self._scene.get("colliders", ())
-        return tuple(_collider(table, context, surfaces.get(k)) for k, table in enumerate(tables))
+        return tuple(_collider(table, context, surfaces.get(k)) for k, table in enumerate(self.scene.colliders))
 
     @property
     def body_names(self) -> tuple[str, ...]:
@@ -344,25 +351,33 @@ class RunHeader:
         return kept[body]
 
 
-def _parsed(text: str) -> dict[str, Any]:
+def _bodies(facts: _StoredHeader) -> tuple[BodyHeader, ...]:
+    """Return the bodies and emitters; of other ones than the scene's the names alone."""
+    names, scene, d = facts.bodies, facts.scene, facts.dimension
+    tables = [*scene.bodies, *scene.emitters]
+    # The volume of an emitter is that of all its particles, which its shape alone does not say.
+    volumes = [*(facts.volumes or [None] * len(scene.bodies)), *facts.emitter_volumes]
+    tables = tables if len(tables) == len(names) else [_Body()] * len(names)
+    volumes = volumes if len(volumes) == len(names) else [None] * len(names)
+    return tuple(
+        BodyHeader(
+            name,
+            table.material,
+            table.volume(d) if volume is None else volume,
+            table.particles_per_cell or usual_particles_per_cell(d),
+        )
+        for name, table, volume in zip(names, tables, volumes, strict=True)
+    )
+
+
+def _collider(table: Mapping[str, Any], context: dict[str, Any], surface: ClosedSurface | None) -> Collider | None:
     try:
-        return tomllib.loads(text)
-    # Also of numbers that are too long, and of lists that are too deep.
-    except (ValueError, RecursionError):
-        return {}
-
-
-def _vector(values: object, d: int) -> np.ndarray | None:
-    return np.array(values, dtype=np.float64) if isinstance(values, list | tuple) and len(values) == d else None
-
-
-def _laws(stored: Mapping[str, Any]) -> tuple[LawHeader, ...]:
-    """Return the laws; an older file has their names only, and nothing is known of a law that mpmcli does not have."""
-    names = [str(name) for name in stored.get("materials", ())]
-    facts = stored.get("laws", ())
-    if len(facts) == len(names) and all(isinstance(entry, dict) for entry in facts):
-        return tuple(LawHeader(name, **entry) for name, entry in zip(names, facts, strict=True))
-    from mpmcli.materials.registry import laws
-
-    known = {name: LawHeader(name, law.deformation, law.coherent) for name, law in laws().items()}
-    return tuple(known.get(name, LawHeader(name, "F", False)) for name in names)
+        if surface is None:
+            return Collider.model_validate(table, context=context)
+        box = {"box": {name: corner.tolist() for name, corner in zip(("min", "max"), surface.bounds(), strict=True)}}
+        found = Collider.model_validate({**table, "shape": box}, context=context)
+    except ValidationError:
+        return None
+    mesh = Mesh.model_construct(file="", scale=1.0, rotate=None, translate=(0.0,) * len(surface.vertices[0]))
+    mesh._surface = surface
+    return found.model_copy(update={"shape": ColliderShape.model_construct(mesh=mesh)})

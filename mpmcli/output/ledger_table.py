@@ -2,7 +2,6 @@
 
 import csv
 import io
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 
@@ -10,7 +9,6 @@ import h5py
 import numpy as np
 
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.guarded_read import read_whole
 
 COLUMNS = tuple(f.name for f in fields(LedgerRow))
 VECTORS = ("linear_momentum", "angular_momentum")
@@ -20,8 +18,8 @@ LOADS = ("collider_force", "collider_torque")
 COMINGS = ("emitted", "emitted_mass", "retired", "retired_mass", "blocked")
 INTEGERS = ("steps", "emitted", "retired", "blocked")
 TEXT = "limit"
-# What is read where a file has no such column: those above, and what older files lack.
-MISSING = {"volume_error": math.nan, **dict.fromkeys(LOADS, ()), **dict.fromkeys(COMINGS)}
+# What is read where a file has no such column.
+MISSING = {**dict.fromkeys(LOADS, ()), **dict.fromkeys(COMINGS)}
 # Columns of each frame in the CSV: its number, time steps since the start, particles.
 FRAME_COLUMNS = ("frame", "step", "particles")
 
@@ -47,16 +45,9 @@ def _stored(rows: Sequence[LedgerRow]) -> tuple[str, ...]:
     return tuple(name for name in COLUMNS if comes_and_goes or name not in COMINGS)
 
 
-def read_ledger(group: h5py.Group, read: Callable[[str, str], np.ndarray] | None = None) -> list[LedgerRow]:
-    """Read a ledger, each column by `read` (name, kinds of types); KeyError or ValueError where one is none."""
-    columns = {}
-    for name in COLUMNS:
-        if name in group:
-            kinds = "S" if name == TEXT else "iu" if name in INTEGERS else "f"
-            columns[name] = column = read(name, kinds) if read else read_whole(group, name, kinds)
-            if column.ndim != 1 + (name in VECTORS) + 2 * (name in LOADS):
-                raise ValueError(f"the column {name} of the ledger is {column.shape}")
-    return ledger_rows(columns)
+def read_ledger(group: h5py.Group, read: Callable[[str], np.ndarray]) -> list[LedgerRow]:
+    """Read the ledger in a group, each column by `read`."""
+    return ledger_rows({name: read(name) for name in COLUMNS if name in group})
 
 
 def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:

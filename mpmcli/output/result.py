@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -14,9 +13,9 @@ from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import checksum, damaged
 from mpmcli.output.collider_files import read_stored_surfaces
-from mpmcli.output.guarded_read import DAMAGE, DamageError, first_line
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import POSITION, STANDARD, FrameIndex
+from mpmcli.output.reading import DamageError, first_line
 from mpmcli.output.run_record import read_record, run_status
 from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.vtkhdf import open_vtkhdf, read_array, read_index_of
@@ -58,8 +57,8 @@ class Result(ABC):
         self.ledger: list[LedgerRow] = index.ledger
         try:
             self.header = RunHeader.read(index.header)
-        except DAMAGE as error:
-            raise InputError(f"{path} is damaged: its header cannot be read ({first_line(error)}).") from error
+        except ValueError as error:
+            raise DamageError(f"{path} is damaged: its header cannot be read ({first_line(error)}).") from error
         self.dimension = index.layout.dimension
         names = [name for name in index.layout.arrays if name not in (POSITION, *STANDARD)]
         self.field_names: tuple[str, ...] = tuple(names)
@@ -88,10 +87,7 @@ class Result(ABC):
             if name not in self.index.layout.arrays:
                 known = ", ".join(self.field_names) or "none"
                 raise InputError(f'{self.path} holds no field "{name}": its fields are {known}.')
-        stored = self._sound(k, names)
-        if any(len(array) != self.particle_counts[k] for array in stored.values()):
-            raise InputError(f"{self.path} is damaged: frame {k} is cut off.")
-        return self._frame(k, stored)
+        return self._frame(k, self._read(k, names))
 
     def present_frame(self, k: int, fields: Sequence[str] | None = None) -> Frame:
         """Read the k-th frame as `frame` does, of the particles that are there alone, where some come or go."""
@@ -106,7 +102,7 @@ class Result(ABC):
 
     def stored(self, k: int) -> dict[str, np.ndarray]:
         """Read all arrays of the k-th frame in the form of the file, (n,) or (n, components)."""
-        return self._sound(k, [POSITION, *STANDARD, *self.field_names])
+        return self._read(k, [POSITION, *STANDARD, *self.field_names])
 
     def frames(self, fields: Sequence[str] | None = None) -> Iterator[Frame]:
         """Read all frames, one at a time."""
@@ -117,17 +113,6 @@ class Result(ABC):
         index = self.index
         return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
 
-    def _sound(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """Read arrays of the k-th frame, which have the types and shapes that the file tells of them."""
-        if k >= min(len(self.particle_counts), len(self.numbers), len(self.index.steps)):
-            raise InputError(f"{self.path} is damaged: it lists frame {k}, and tells nothing of it.")
-        stored = self._read(k, names)
-        for name, array in stored.items():
-            told = self.index.layout.arrays[name]
-            if array.dtype != told.dtype or array.shape[1:] != told.stored_shape(0)[1:]:
-                raise InputError(f"{self.path} is damaged: {name} is {array.shape} of {array.dtype} in frame {k}.")
-        return stored
-
     @abstractmethod
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Read arrays of the k-th frame in the form of the file."""
@@ -136,7 +121,7 @@ class Result(ABC):
 class _StoredResult(Result):
     def __init__(self, path: Path, kind: Kind, files: Sequence[Path]) -> None:
         self.kind = kind
-        indices = [_index_of(file) for file in files]
+        indices = [read_index_of(file) for file in files]
         # Of each frame: its file, and its first row there.
         self._places = [
             (file, int(offset)) for file, index in zip(files, indices, strict=True) for offset in index.offsets
@@ -156,19 +141,12 @@ class _StoredResult(Result):
 
     def _read_arrays(self, path: Path, k: int, names: Sequence[str], offset: int) -> dict[str, np.ndarray]:
         """Read arrays of the k-th frame, which begins at row `offset` of a file, and compare their checksums."""
-        count, checksums = int(self.particle_counts[k]), self.index.checksums
-        try:
-            with closing(open_vtkhdf(path)) as file:
-                stored = {name: read_array(file, name, offset, count) for name in names}
-        except InputError:
-            raise
-        except DAMAGE as error:
-            raise DamageError(f"{path} is damaged: a frame that it lists cannot be read.") from error
-        if checksums is not None:
-            columns = list(self.index.layout.arrays)
-            for name, array in stored.items():
-                if checksum(array) != checksums[k, columns.index(name)]:
-                    raise damaged(str(path), f"{name} of frame {self.numbers[k]}")
+        with open_vtkhdf(path) as file:
+            stored = {name: read_array(file, name, offset, int(self.particle_counts[k])) for name in names}
+        columns = list(self.index.layout.arrays)
+        for name, array in stored.items():
+            if checksum(array) != self.index.checksums[k, columns.index(name)]:
+                raise damaged(str(path), f"{name} of frame {self.numbers[k]}")
         return stored
 
 
@@ -215,12 +193,3 @@ def _open_directory(directory: Path) -> Result:
         raise InputError(f"{directory} holds no result of mpmcli: no {PACKED} and no {SEGMENTS}.")
     status = run_status(directory, record)
     raise InputError(f'{directory} holds no frame yet: its run is "{status}" and has written none.')
-
-
-def _index_of(path: Path) -> FrameIndex:
-    try:
-        return read_index_of(path)
-    except InputError:
-        raise
-    except DAMAGE as error:
-        raise DamageError(f"{path} is damaged: its list of frames cannot be read.") from error

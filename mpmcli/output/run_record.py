@@ -10,13 +10,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import BaseModel, ConfigDict, ValidationError
+
 from mpmcli import __version__
 from mpmcli.errors import RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import write_text
 from mpmcli.output.lock import Owner, lock_is_held, time_now
-from mpmcli.output.stored_facts import sound_record
-from mpmcli.scene.toml_file import too_deep
 
 RECORD = "run.json"
 PROGRAM = "mpmcli"
@@ -124,15 +124,33 @@ def host_facts() -> dict[str, Any]:
     }
 
 
+class _StoredRecord(BaseModel):
+    """What is read of run.json; its other entries are taken as they are."""
+
+    model_config = ConfigDict(extra="allow")
+
+    program: Literal["mpmcli"]
+    status: str = "unknown"
+    backend: dict[str, str | int] = {}
+    files: dict[str, str] = {}
+    forced: bool = False
+    frames_expected: int = 0
+    frames_written: int = 0
+    steps: int = 0
+    timings: dict[str, float | None] = {}
+    limits: dict[str, int] = {}
+    failure: dict[str, Any] | None = None
+    process: dict[str, Any] = {}
+    resumed: list[dict[str, Any]] = []
+
+
 def read_record(directory: Path) -> dict[str, Any] | None:
-    """Read run.json; None when there is none, or it is not of mpmcli. Entries of other types than ours are left out."""
+    """Read run.json; None when there is none, or it is damaged or not of mpmcli."""
     try:
-        record = json.loads((Path(directory) / RECORD).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        text = (Path(directory) / RECORD).read_bytes()
+        return _StoredRecord.model_validate_json(text).model_dump(exclude_unset=True)
+    except (OSError, ValidationError):
         return None
-    if not isinstance(record, dict) or record.get("program") != PROGRAM or too_deep(record):
-        return None
-    return sound_record(record)
 
 
 def _plain(value: Any) -> Any:
@@ -160,6 +178,5 @@ def run_status(directory: Path, record: dict[str, Any] | None) -> str:
         return status
     owner = Owner.read(record.get("process"))
     if owner is None:
-        # Written by a version that kept no such facts.
         return ELSEWHERE
     return {"lives": status, "ended": DIED, "elsewhere": ELSEWHERE}[owner.life]

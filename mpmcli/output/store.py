@@ -15,7 +15,8 @@ from mpmcli.output.collider_files import write_collider_files
 from mpmcli.output.durable import Unsealed, is_full, require_free_space, sync_directory, temporary_of
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameIndex, FrameLayout
-from mpmcli.output.pack import PackedBeside, pack_segments
+from mpmcli.output.pack import pack_segments
+from mpmcli.output.packed_beside import PackedBeside
 from mpmcli.output.segments import PACKED, SEGMENTS, remove_segments, sealed_segments, segment_name
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, read_index_of
 from mpmcli.scene.colliders import Collider
@@ -256,7 +257,7 @@ class SegmentStore:
         else:
             pack_segments(segments, packed, compress=self._compress, header=self._header, begun=begun, stop=stop)
         if self._colliders:
-            times = read_index_of(packed, known=True).times.tolist()
+            times = read_index_of(packed).times.tolist()
             write_collider_files(self._directory, self._header, times, self._colliders)
         # The result is complete; a segment that somebody holds open may stay beside it.
         with suppress(OSError):

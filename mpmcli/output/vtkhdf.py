@@ -11,7 +11,7 @@ point numbers, so that the cells cost 8 bytes per particle once and not for ever
 
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +32,13 @@ from mpmcli.output.checksums import (
     store_checksums,
     table_checksum,
 )
-from mpmcli.output.guarded_read import held, read_rows, read_whole, require_sound_heaps, require_stored
 from mpmcli.output.layout import POSITION, FrameIndex, FrameLayout
 from mpmcli.output.ledger_table import ledger_columns, read_ledger
+from mpmcli.output.reading import opened, require_format
 
 # A newer upper bound makes files that no VTK can open ("bad version number for layout message").
 LIBVER = ("v110", "v110")
-# Format 1 has no checksums.
-FORMAT, OLDEST = 2, 1
+FORMAT = 2
 CHUNK_BYTES = 2**20
 # Size without the particles: headers, tables of the steps, ledger. Used to reserve disk space.
 OVERHEAD_BYTES = 64 * 1024
@@ -209,9 +208,6 @@ class VtkhdfWriter:
             self._items[path] = checksum(numbers, self._items[path])
 
     def _put_attribute(self, path: str, name: str, value: Any) -> None:
-        if isinstance(value, str):
-            # What a damaged file holds may be no text.
-            value = value.encode("utf-8", "replace").decode("utf-8")
         self._file[path].attrs[name] = value
         self._items[f"{path}@{name}"] = attribute_checksum(value)
 
@@ -229,95 +225,62 @@ class VtkhdfWriter:
         }
 
 
-def open_vtkhdf(path: Path, *, known: bool = False) -> h5py.File:
-    """Open a sealed file for reading, without a lock; InputError: it is missing, damaged, or not of mpmcli.
-
-    The heaps of one that is `known`, written or opened by this process before, are not searched again.
-    """
-    try:
-        if not known:
-            require_sound_heaps(path)
-        try:
-            file = h5py.File(path, "r", locking=False)
-        except OSError:
-            # This process has the file open with locking; HDF5 requires one setting for all handles.
-            file = h5py.File(path, "r")
-    except OSError as error:
-        reason = "is not an HDF5 file, or a damaged one" if path.exists() else "does not exist"
-        raise InputError(f"{path} {reason}; give a particles.vtkhdf of mpmcli or its directory.") from error
-    try:
-        form = _format(file)
-    except BaseException:
-        file.close()
-        raise
-    if form is not None and OLDEST <= form <= FORMAT:
-        return file
-    file.close()
-    if form is not None and form > FORMAT:
-        raise InputError(f"{path} was written by a newer version of mpmcli; update mpmcli to read it.")
-    raise InputError(f"{path} is an HDF5 file, but mpmcli did not write it: its group /mpmcli is missing.")
-
-
-def _format(file: h5py.File) -> int | None:
-    """Return the format of a file, None where it is not of mpmcli."""
-    try:
-        form = held(file, "mpmcli").attrs["format"]
-        ours = isinstance(form, np.integer) and isinstance(held(file, "VTKHDF"), h5py.Group)
-        return int(form) if ours else None
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError):
-        return None
+@contextmanager
+def open_vtkhdf(path: Path) -> Iterator[h5py.File]:
+    """Open a sealed file for reading as `opened` does; InputError, too: it is not of mpmcli, or of another format."""
+    with opened(path, "a particles.vtkhdf of mpmcli or its directory") as file:
+        if "mpmcli" not in file or "VTKHDF" not in file:
+            raise InputError(f"{path} is an HDF5 file, but mpmcli did not write it: its group /mpmcli is missing.")
+        require_format(path, file["mpmcli"].attrs["format"], FORMAT)
+        yield file
 
 
 def read_index(file: h5py.File) -> FrameIndex:
-    """Read everything but the particles; errors are those of DAMAGE: DamageError where a checksum differs."""
-    checksums = load_checksums(file, "mpmcli") if _format(file) > 1 else None
+    """Read everything but the particles; DamageError where a checksum differs, else errors of h5py and ValueError."""
+    checksums = load_checksums(file, "mpmcli")
 
-    def table(path: str, kinds: str = "iu") -> np.ndarray:
-        found = read_whole(file, path, kinds)
-        if checksums is not None:
-            checksums.require(path, table_checksum(found))
+    def table(path: str) -> np.ndarray:
+        found = file[path][...]
+        checksums.require(path, table_checksum(found))
         return found
 
     def attribute(name: str) -> str:
-        found = group.attrs[name]
-        if checksums is not None:
-            checksums.require(f"mpmcli@{name}", attribute_checksum(found))
+        found = file["mpmcli"].attrs[name]
+        checksums.require(f"mpmcli@{name}", attribute_checksum(found))
         return found
 
-    group = held(file, "mpmcli")
-    header = dict(json.loads(attribute("header")))
-    if "scene" in group.attrs:
+    header = json.loads(attribute("header"))
+    if "scene" in file["mpmcli"].attrs:
         header["scene"] = attribute("scene")
     layout = FrameLayout.from_dict(json.loads(attribute("layout")))
+    columns = [checksums.arrays.index(f"VTKHDF/{array_path(name)}") for name in layout.arrays]
     return FrameIndex(
         layout=layout,
         header=header,
-        times=table("VTKHDF/Steps/Values", "f"),
+        times=table("VTKHDF/Steps/Values"),
         frames=table("mpmcli/frame"),
         steps=table("mpmcli/step"),
         offsets=table("VTKHDF/Steps/PointOffsets"),
         counts=table("VTKHDF/NumberOfPoints"),
-        ledger=read_ledger(held(file, "ledger"), lambda name, kinds: table(f"ledger/{name}", kinds)),
-        # In the order of the arrays of the layout.
-        checksums=checksums
-        and checksums.table[:, [checksums.arrays.index(f"VTKHDF/{array_path(name)}") for name in layout.arrays]],
-    ).checked()
+        ledger=read_ledger(file["ledger"], lambda name: table(f"ledger/{name}")),
+        checksums=checksums.table[:, columns],
+    )
 
 
-def read_index_of(path: Path, *, known: bool = False) -> FrameIndex:
-    """Return `read_index` of a file that is opened for it as by `open_vtkhdf`."""
-    with closing(open_vtkhdf(path, known=known)) as file:
+def read_index_of(path: Path) -> FrameIndex:
+    """Return the index of a file; errors are those of `open_vtkhdf`."""
+    with open_vtkhdf(path) as file:
         return read_index(file)
 
 
 def read_array(file: h5py.File, name: str, offset: int, count: int) -> np.ndarray:
     """Read one array of one frame, in the form of the file; its checksum is not compared."""
-    return read_rows(file, f"VTKHDF/{array_path(name)}", offset, count)
+    return file[f"VTKHDF/{array_path(name)}"][offset : offset + count]
 
 
 def read_blocks(file: h5py.File, name: str, offset: int, count: int) -> Iterator[np.ndarray]:
     """Yield rows of one array as `read_array`, BLOCK_BYTES at a time."""
-    data = require_stored(file, f"VTKHDF/{array_path(name)}")
+    data = file[f"VTKHDF/{array_path(name)}"]
     size = max(1, BLOCK_BYTES * len(data) // max(1, data.nbytes))
     for first in range(offset, offset + count, size):
         yield data[first : min(first + size, offset + count)]
