@@ -1,21 +1,20 @@
-"""Points and triangles from a file, by its ending: PLY, STL and OBJ are read here, all others by VTK.
+"""Points and triangles from a file, by its ending: STL by meshio, PLY and OBJ here, and all others by PyVista.
 
-VTK's readers trust what a file says of itself, and a damaged one may end the interpreter. They run in a process of
-their own.
+meshio refuses an OBJ whose texture coordinates or normals are not as many as its vertices, and knows no voxels of VTU.
 """
 
-import os
-import re
-import tempfile
-from collections.abc import Callable
+import io
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
-from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import ValidationInfo
 
-from mpmcli.processes.questions import Question, ask, module_command
+from mpmcli.scene.ply_file import read_ply
 
 
 # Wavefront Technologies, Advanced Visualizer, appendix B1, Object Files (.obj): its lines v and f.
@@ -38,166 +37,19 @@ def read_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     return np.array(points, np.float64).reshape(-1, 3), polygons
 
 
-# 3D Systems, StereoLithography Interface Specification, 1989.
-_HEAD, _FACET = 84, 50
-_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+def read_stl(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points (n, 3) float64, and the triangles (m, 3)."""
+    from meshio import stl
+
+    mesh = stl.read(path)
+    return mesh.points.reshape(-1, 3).astype(np.float64), mesh.cells_dict.get("triangle", np.empty((0, 3), np.int64))
 
 
-def read_stl(data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (3 m, 3) float64, and the triangles (m, 3), which share none; ValueError for a damaged file."""
-    count = int.from_bytes(data[80:_HEAD], "little")
-    size = _HEAD + _FACET * count
-    if len(data) >= _HEAD and (len(data) == size or (len(data) > size and not data.lstrip().startswith(b"solid"))):
-        facets = np.frombuffer(data, np.dtype([("numbers", "<f4", (4, 3)), ("flags", "<u2")]), count, _HEAD)
-        points = facets["numbers"][:, 1:].reshape(-1, 3).astype(np.float64)
-    elif data.lstrip().startswith(b"solid"):
-        points = np.array([[float(word) for word in words] for words in _VERTEX.findall(data)]).reshape(-1, 3)
-    else:
-        raise ValueError("it is no STL file, or cut off")
-    if len(points) % 3:
-        raise ValueError("a triangle lacks a vertex")
-    return points, np.arange(len(points)).reshape(-1, 3)
-
-
-# G. Turk, The PLY Polygon File Format, 1994. VTK's reader writes beyond its memory where a header and the data behind
-# it disagree, and ends the interpreter.
-_TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
-    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
-}
-_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-_CORNERS = ("vertex_indices", "vertex_index")
-
-
-@dataclass(frozen=True)
-class _Property:
-    """A property of an element: its type, and that of the length of a list, "" of a single number."""
-
-    name: str
-    type: str
-    length: str = ""
-
-
-@dataclass(frozen=True)
-class _Element:
-    name: str
-    count: int
-    properties: list[_Property]
-
-
-def read_ply(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the points (n, 3) float64, and the corners of each polygon; ValueError, LookupError for a damaged file."""
-    order, elements, start = _header(data)
-    source = _Elements(data[start:] if order else _as_bytes(data[start:].split()), order)
-    points, polygons = np.empty((0, 3)), []
-    for element in elements:
-        columns = source.read(element)
-        if element.name == "vertex":
-            points = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64)
-        elif element.name == "face":
-            polygons = columns.get(_CORNERS[0], columns.get(_CORNERS[1], []))
-    return points, polygons
-
-
-def _header(data: bytes) -> tuple[str, list[_Element], int]:
-    """Return the order of bytes, the elements, and where the data begin."""
-    ending = data.index(b"end_header")
-    start = data.index(b"\n", ending) + 1
-    lines = [line.split() for line in data[:ending].decode("ascii").splitlines()]
-    if lines[0] != ["ply"]:
-        raise ValueError("it does not begin with ply")
-    order, elements = None, []
-    for words in lines[1:]:
-        match words:
-            case ["format", form, _]:
-                order = _ORDERS[form]
-            case ["element", name, count]:
-                elements.append(_Element(name, int(count), []))
-            case ["property", "list", length, kind, name]:
-                elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[length]))
-            case ["property", kind, name]:
-                elements[-1].properties.append(_Property(name, _TYPES[kind]))
-    if order is None or any(element.count < 0 for element in elements):
-        raise ValueError("its header is not complete")
-    if not order:
-        for element in elements:
-            element.properties[:] = [_Property(p.name, "f8", "f8" if p.length else "") for p in element.properties]
-    return order, elements, start
-
-
-class _Elements:
-    def __init__(self, data: bytes, order: str) -> None:
-        self.data, self.order, self.at = data, order, 0
-
-    def read(self, element: _Element) -> dict[str, np.ndarray | list]:
-        """Return numbers by the names of properties; lists as one array where all are as long, else one by one."""
-        n, properties, start = element.count, element.properties, self.at
-        if not n or not properties:
-            return {p.name: [] if p.length else np.empty(0) for p in properties}
-        lengths = [len(numbers) for numbers in self._row(properties)]
-        kinds = []
-        for k, (p, length) in enumerate(zip(properties, lengths, strict=True)):
-            head = [(f"length {k}", self.order + p.length)] if p.length else []
-            kinds += [*head, (f"{k}", self.order + p.type, (length,) if p.length else ())]
-        row = np.dtype(kinds)
-        if start + n * row.itemsize <= len(self.data):
-            table = np.frombuffer(self.data, row, n, start)
-            listed = [k for k, p in enumerate(properties) if p.length]
-            if all((table[f"length {k}"] == lengths[k]).all() for k in listed):
-                self.at = start + n * row.itemsize
-                return {p.name: table[f"{k}"] for k, p in enumerate(properties)}
-        if n > len(self.data):
-            raise ValueError("it ends too early")
-        self.at = start
-        columns = list(zip(*(self._row(properties) for _ in range(n)), strict=True))
-        return {
-            p.name: list(column) if p.length else np.concatenate(column)
-            for p, column in zip(properties, columns, strict=True)
-        }
-
-    def _row(self, properties: list[_Property]) -> list[np.ndarray]:
-        found = []
-        for p in properties:
-            length = self._take(p.length, 1)[0] if p.length else 1
-            if length != int(length):
-                raise ValueError("a length is no whole number")
-            found.append(self._take(p.type, int(length)))
-        return found
-
-    def _take(self, kind: str, count: int) -> np.ndarray:
-        dtype = np.dtype(self.order + kind)
-        data = self.data[self.at : self.at + count * dtype.itemsize]
-        if count < 0 or len(data) < count * dtype.itemsize:
-            raise ValueError("it ends too early")
-        self.at += len(data)
-        return np.frombuffer(data, dtype)
-
-
-def _as_bytes(words: list[bytes]) -> bytes:
-    """Return numbers in text, up to the first word that is none, as float64."""
-    try:
-        return np.array(words, np.float64).tobytes()
-    except ValueError:
-        return np.array([float(word) for word in takewhile(is_number, words)]).tobytes()
-
-
-def is_number(word: str | bytes) -> bool:
-    """Say whether a word is a number to Python."""
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-_READERS: dict[str, Callable[[bytes], tuple[np.ndarray, list[np.ndarray] | np.ndarray]]] = {
-    ".ply": read_ply,
+_READERS: dict[str, Callable[[Path], tuple[np.ndarray, list[np.ndarray] | np.ndarray]]] = {
+    ".ply": lambda path: read_ply(path.read_bytes()),
     ".stl": read_stl,
-    ".obj": read_obj,
+    ".obj": lambda path: read_obj(path.read_bytes()),
 }
-# Wall time for VTK to start and read, s; the process limits its own work as well.
-_TIMEOUT = 600.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,13 +96,23 @@ def read_geometry(path: Path) -> Geometry:
     if fault := absence(path):
         raise GeometryFileError(fault)
     reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        return _by_vtk(path)
     try:
-        points, polygons = reader(path.read_bytes())
+        with _quiet():
+            if reader is None:
+                return _by_vtk(path)
+            points, polygons = reader(path)
         return Geometry(points, points, _triangles(polygons, len(points)))
-    except (OSError, ValueError, LookupError, OverflowError, MemoryError):
+    # Of a damaged file readers raise almost anything; meshio even ends the process.
+    except (Exception, SystemExit):
         raise GeometryFileError from None
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep from the terminal what readers print."""
+    with warnings.catch_warnings(), redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+        warnings.simplefilter("ignore")
+        yield
 
 
 def _triangles(polygons: list[np.ndarray] | np.ndarray, count: int) -> np.ndarray:
@@ -268,13 +130,49 @@ def _triangles(polygons: list[np.ndarray] | np.ndarray, count: int) -> np.ndarra
 
 
 def _by_vtk(path: Path) -> Geometry:
-    with tempfile.TemporaryDirectory() as place:
-        out = os.path.join(place, "geometry.npz")
-        command = module_command("mpmcli.scene.vtk_file_process", str(path.absolute()), out)
-        reply = ask(Question(command, _TIMEOUT, {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}))
-        names = reply.answer.get("arrays")
-        if reply.fault or not isinstance(names, list):
-            raise GeometryFileError
-        with np.load(out, allow_pickle=False) as found:
-            arrays = {name: found[f"array_{k}"] for k, name in enumerate(names)}
-            return Geometry(found["points"], found["vertices"], found["triangles"], arrays)
+    """Return what PyVista reads, with the surface of solid cells."""
+    import pyvista as pv
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
+    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
+
+    shown, told = vtkObject.GetGlobalWarningDisplay(), vtkLogger.GetCurrentVerbosityCutoff()
+    vtkObject.GlobalWarningDisplayOff()
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    try:
+        found = pv.read(path)
+        found = found.combine() if isinstance(found, pv.MultiBlock) else found
+        _require_corners(found)
+        surface, triangles = vtkDataSetSurfaceFilter(), vtkTriangleFilter()
+        surface.SetInputData(found)
+        triangles.SetInputConnection(surface.GetOutputPort())
+        triangles.PassVertsOff()
+        triangles.PassLinesOff()
+        triangles.Update()
+        result = triangles.GetOutput()
+    finally:
+        vtkObject.SetGlobalWarningDisplay(shown)
+        vtkLogger.SetStderrVerbosity(told)
+    points, data = np.array(found.points, np.float64), found.point_data
+    arrays = {str(name): np.asarray(data[name]) for name in data.keys()}  # noqa: SIM118
+    arrays = {name: array for name, array in arrays.items() if array.dtype.kind in "iuf"}
+    if not result.GetNumberOfPolys():
+        return Geometry(points, points[:0], np.empty((0, 3), np.int64), arrays)
+    vertices = vtk_to_numpy(result.GetPoints().GetData()).astype(np.float64)
+    corners = vtk_to_numpy(result.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
+    return Geometry(points, vertices, corners, arrays)
+
+
+def _require_corners(found: Any) -> None:
+    """Raise ValueError for a cell of a data set of VTK with a corner that is none of its points."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    if found.IsA("vtkPolyData"):
+        kinds = [found.GetPolys(), found.GetStrips()]
+    else:
+        kinds = [found.GetCells()] if found.IsA("vtkUnstructuredGrid") else []
+    for cells in kinds:
+        corners = vtk_to_numpy(cells.GetConnectivityArray())
+        if corners.size and not 0 <= corners.min() <= corners.max() < found.GetNumberOfPoints():
+            raise ValueError("a corner is no vertex")

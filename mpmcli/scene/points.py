@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from pydantic import Field, PrivateAttr, ValidationInfo, model_validator
 
-from mpmcli.scene.geometry_file import GeometryFileError, absence, file_version, is_number, read_geometry, scene_file
+from mpmcli.scene.geometry_file import GeometryFileError, absence, file_version, read_geometry, scene_file
+from mpmcli.scene.ply_file import is_number
 from mpmcli.scene.primitives import Solid
 from mpmcli.scene.problem import hint_at, listed, quoted
 from mpmcli.scene.quantity import AXES, Positive, Table, Vector, flaw, scene_dimension
