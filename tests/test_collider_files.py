@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from time import sleep
 from typing import Any
 
 import numpy as np
@@ -133,3 +134,12 @@ def test_what_was_read_from_a_file_is_drawn_without_it(tmp_path: Path, monkeypat
     shell = steps(run / RESTING)[0][1].extract_cells(steps(run / RESTING)[0][1].cell_data["collider"] == 2)
     expected = 4 * np.pi * (0.1**2 + 0.06**2)
     assert shell.area == pytest.approx(expected, rel=0.01)
+
+
+def test_bytes_do_not_depend_on_the_time_of_writing(tmp_path: Path) -> None:
+    """More than a second apart, since HDF5 counts in whole ones."""
+    for name in ("first", "second"):
+        stored(tmp_path / name, SegmentStore, 2, [PADDLE, POST])
+        sleep(1.1)
+    for name in (RESTING, MOVING):
+        assert (tmp_path / "first" / name).read_bytes() == (tmp_path / "second" / name).read_bytes()

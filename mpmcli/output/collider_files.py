@@ -185,13 +185,14 @@ def _write_vtkhdf(path: Path, group: ColliderGroup, times: Sequence[float]) -> N
             cell_group["NumberOfConnectivityIds"] = np.array([cells * corners * ours])
             cell_group["Connectivity"] = whole.cells.ravel() if ours else np.empty(0, np.int64)
             cell_group["Offsets"] = np.arange(0, cells * corners * ours + 1, corners)
-        root["CellData/collider"] = labels
+        # Groups that HDF5 makes for a path hold the time.
+        root.create_group("CellData")["collider"] = labels
         steps, zeros = root.create_group("Steps"), np.zeros(len(times), np.int64)
         steps["PartOffsets"] = zeros
         steps["NumberOfParts"] = zeros + 1
         steps["PointOffsets"] = count * np.arange(len(times)) if group.moves else zeros
         steps["CellOffsets"] = steps["ConnectivityIdOffsets"] = np.zeros((len(times), 4), np.int64)
-        steps["CellDataOffsets/collider"] = zeros
+        steps.create_group("CellDataOffsets")["collider"] = zeros
         steps["Values"] = np.asarray(times, float)
         steps.attrs["NSteps"] = len(times)
         names = {number: c.name for number, c in zip(group.numbers, group.colliders, strict=True)}
