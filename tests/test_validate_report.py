@@ -13,7 +13,9 @@ from mpmcli.validation.figures import COURANT, LOOKS, draw_case
 from mpmcli.validation.report import Report, write_report
 from mpmcli.validation.runs import Run, RunResult, variants
 
-LOST = [Run("invented", n, Setting(transfer="pic")) for n in (8, 16, 32)] + [Run("invented", 16, Setting(safety=0.95))]
+LOST = [Run("invented", n, Setting(transfer="aflip")) for n in (8, 16, 32)] + [
+    Run("invented", 16, Setting(safety=0.95))
+]
 
 
 def law(run: Run) -> float | None:
@@ -69,7 +71,7 @@ def test_settings_are_set_against_the_default_one() -> None:
             found[run] = RunResult("finished", "", values, usual.particles, usual.steps, 2 * usual.seconds)
     rows = report_of("default", found).settings().splitlines()
     assert "| cubic kernel | 0.25 (0.25 to 0.25) | 2 (2 to 2) | 0 |" in rows
-    assert "| PIC |  |  | 3 |" in rows and "| f32 | 1 (1 to 1) | 1 (1 to 1) | 0 |" in rows
+    assert "| AFLIP |  |  | 3 |" in rows and "| f32 | 1 (1 to 1) | 1 (1 to 1) | 0 |" in rows
 
 
 @pytest.mark.parametrize("level", ["coarse", "default"])
@@ -82,7 +84,7 @@ def test_a_figure_is_always_the_same_and_tells_of_failures(level: str) -> None:
     assert not re.search(r"20\d\d-\d\d-\d\d", text)
     for word in ("default", "f32", "Error against resolution", "n, cells", "slope of order 2, observed 2.00"):
         assert f">{word}<" in text
-    for word in ("PIC (3 failed)", f"{COURANT} (1 failed)"):
+    for word in ("AFLIP (3 failed)", f"{COURANT} (1 failed)"):
         assert (f">{word}<" in text) == (level == "default")
 
 

@@ -26,14 +26,14 @@ def test_further_levels_try_every_knob_one_at_a_time(level: str) -> None:
     everywhere = list(CASE.levels[level])
     swept = {label: [16] for label in at if label.startswith("Courant")}
     assert len(swept) == 4 and [setting.safety for setting in variants("safety")] == [0.1, 0.2, 0.4, 0.95]
-    names = ["default", "f32", "cubic kernel", "PIC", "AFLIP", "zeroed walls"]
+    names = ["default", "f32", "cubic kernel", "AFLIP"]
     names += ["1 particle per axis", "3 particles per axis"]
     assert at == dict.fromkeys(names, everywhere) | swept
 
 
 def test_a_knob_that_means_nothing_to_a_case_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(type(CASE), "varies", ("transfer",))
-    assert {run.setting.label for run in runs_of(CASE, "default")} == {"default", "PIC", "AFLIP"}
+    assert {run.setting.label for run in runs_of(CASE, "default")} == {"default", "AFLIP"}
     assert {run.setting for run in runs_of(CASE, "coarse")} == {Setting()}
 
 
@@ -90,7 +90,9 @@ def test_single_precision_may_add_rounding_or_a_fifth(ratio: float, error: float
     assert verdict == ("pass" if all(check.passed for check in checks.values()) else "fail")
 
 
-@pytest.mark.parametrize(("setting", "passes"), [(Setting(), False), (SINGLE, False), (Setting(transfer="pic"), True)])
+@pytest.mark.parametrize(
+    ("setting", "passes"), [(Setting(), False), (SINGLE, False), (Setting(transfer="aflip"), True)]
+)
 def test_a_run_that_fails_counts_where_something_is_asked_of_it(setting: Setting, passes: bool) -> None:
     lost = Run("invented", 16, setting)
     verdict = judge(CASE, results(lambda run: None if run == lost else second_order(run)))
