@@ -52,7 +52,7 @@ class Setting:
 
     def solver_table(self) -> Tables:
         """Return the table [solver] of a scene."""
-        return {name: getattr(self, name) for name in ("precision", "kernel", "transfer", "walls")}
+        return {name: getattr(self, name) for name in ("precision", "kernel", "transfer")}
 
 
 @dataclass(frozen=True)
