@@ -1,10 +1,14 @@
 """The page of a report and its figures, of invented results: they parse, and hide no failure."""
 
 import re
+import sys
 import xml.etree.ElementTree as ElementTree
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
 
 import pytest
+from conftest import ROOT
 from invented_case import CASE, SINGLE, results, second_order
 
 from mpmcli.bench.report import describe_machine
@@ -118,3 +122,23 @@ def test_settings_are_told_apart_by_colour_and_by_marker() -> None:
     looks = [LOOKS[setting.label] for setting in shown]
     assert len({look["color"] for look in looks}) == len({look["marker"] for look in looks}) == len(shown)
     assert LOOKS[SINGLE.label]["markerfacecolor"] == "none"
+
+
+def test_the_tables_and_figures_go_into_the_documents(
+    written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    loader = SourceFileLoader("validation_report", str(ROOT / "scripts" / "validation_report"))
+    script = module_from_spec(spec_from_loader("validation_report", loader))
+    loader.exec_module(script)
+    sections = {}
+    monkeypatch.setattr(script, "replace_section", sections.__setitem__)
+    monkeypatch.setattr(script, "DOCS", tmp_path)
+    monkeypatch.setattr(script, "FIGURES", ("invented",))
+    (tmp_path / "validation").mkdir()
+    script.write_page(written, "0123abcd")
+    machine, passed, cases, settings = sections["validation"].split("\n\n")
+    assert ", commit 0123abcd, level default, " in machine and passed.startswith("**1 of 1 cases pass. 28 runs")
+    assert cases.splitlines()[-1].startswith("| invented |") and "| cubic kernel |" in settings
+    assert (tmp_path / "validation" / "invented.svg").read_bytes() == (written / "figures/invented.svg").read_bytes()
