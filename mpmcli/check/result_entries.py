@@ -12,7 +12,7 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.header import RunHeader
-from mpmcli.output.reading import DAMAGE, DamageError, first_line
+from mpmcli.output.reading import DamageError, first_line
 from mpmcli.output.result import Result, open_result, result_place
 from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
 from mpmcli.output.segments import PACKED, sealed_segments
@@ -47,7 +47,7 @@ class Entry:
         """Read the frame and its ids; raise InputError if it cannot be read."""
         try:
             frame, ids = self.result.numbered_frame(self.k)
-        except DAMAGE as error:
+        except InputError as error:
             raise InputError(f"Frame {self.number} cannot be read ({first_line(error)}).") from error
         lengths = {name: len(array) for name, array in arrays_of(frame, ids).items()}
         shortest = min(lengths, key=lambda name: lengths[name])
@@ -113,7 +113,7 @@ def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
         return _open_segments(path, findings)
     try:
         result = open_result(path)
-    except DAMAGE as error:
+    except InputError as error:
         if not _is_damage(path, error):
             raise
         findings.add("error", "unreadable", 0, f"No frame can be read: {first_line(error)}", RUN_AGAIN)
@@ -130,7 +130,7 @@ def _open_segments(directory: Path, findings: FrameFindings) -> OpenedResult:
         try:
             result = open_result(segment)
             entries += [Entry.of(result, k, number + k) for k in range(result.frame_count)]
-        except DAMAGE as error:
+        except InputError as error:
             what = f"The segment of frame {number} cannot be read ({first_line(error)})"
             findings.add("error", "unreadable", number, what, RUN_AGAIN)
     header = entries[0].result.header if entries else RunHeader.read({})
