@@ -71,16 +71,18 @@ def test_every_run_comes_back_with_its_result(capfd: pytest.CaptureFixture) -> N
 
 
 def test_a_process_that_dies_is_a_failure_and_does_no_harm_to_others() -> None:
-    lost = RunResult("failed", "The process of the run ended with exit code 3.")
+    lost = RunResult("failed", "The run failed: its process ended with exit code 3.")
     assert dict(carry_out_all(RUNS[:2], workers=2, work=dies)) == {RUNS[0]: result(0.5), RUNS[1]: lost}
 
 
 def test_an_unforeseen_error_is_a_failure() -> None:
-    assert dict(carry_out_all(RUNS[:1], 1, work=breaks)) == {RUNS[0]: RunResult("failed", "KeyError: 8")}
+    assert dict(carry_out_all(RUNS[:1], 1, work=breaks)) == {
+        RUNS[0]: RunResult("failed", "The run failed: KeyError: 8.")
+    }
 
 
 def test_a_run_that_takes_too_long_is_ended() -> None:
-    late = RunResult("failed", "The run took longer than 0.5 s.")
+    late = RunResult("failed", "The run failed: it took longer than 0.5 s.")
     assert dict(carry_out_all(RUNS[1:], workers=1, timeout=0.5, work=sleeps)) == dict.fromkeys(RUNS[1:], late)
     assert active_children() == []
 

@@ -1,7 +1,6 @@
-"""Tries each component that mpmcli needs in a process of its own: `python -m mpmcli.doctor.examination NAME`."""
+"""Tries each component that mpmcli needs, in a process of its own."""
 
 import importlib.metadata
-import json
 import os
 import platform
 import re
@@ -10,15 +9,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from mpmcli import __version__
 from mpmcli.plain_text import counted, size_text
-from mpmcli.processes.questions import answering
+from mpmcli.processes.each import Fault, in_processes
 
 # As in pyproject.toml.
 OLDEST, NEWEST = (3, 11), (3, 13)
@@ -142,23 +140,23 @@ CHECKS: dict[str, Callable[[], Check]] = {
 OPTIONAL = ("taichi vulkan", "kernel cache")
 
 
-def examine() -> Iterator[tuple[str, Check]]:
-    """Yield (name, result) of every check, in order."""
-    with ThreadPoolExecutor(AT_ONCE) as pool:
-        yield from zip(CHECKS, pool.map(_asked, CHECKS), strict=True)
-
-
-def _asked(name: str) -> Check:
-    """Return the result of a check in a process of its own, which may crash."""
-    command = [sys.executable, "-P", "-m", "mpmcli.doctor.examination", name]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
+def run_check(name: str) -> Check:
+    """Return the result of a check in this process."""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, env=environment)
-        return Check(**json.loads(done.stdout.splitlines()[-1]))
-    except subprocess.TimeoutExpired:
-        return _fault(name, f"took longer than {TIMEOUT:g} s")
-    except (ValueError, IndexError, TypeError):
-        return _fault(name, f"its process ended with {done.returncode}. {done.stderr.strip()[-200:]}")
+        return CHECKS[name]()
+    except Exception as error:
+        return _fault(name, f"{type(error).__name__}: {error}")
+
+
+def examine(work: Callable[[str], Check] = run_check) -> Iterator[tuple[str, Check]]:
+    """Yield (name, result) of every check, in order, each in a process of its own, which may crash."""
+    ended: dict[str, Check] = {}
+    waiting = list(CHECKS)
+    for name, answer in in_processes(waiting, AT_ONCE, work, TIMEOUT):
+        ended[name] = _fault(name, answer.words) if isinstance(answer, Fault) else answer
+        while waiting and waiting[0] in ended:
+            first = waiting.pop(0)
+            yield first, ended[first]
 
 
 def _fault(name: str, detail: str) -> Check:
@@ -172,12 +170,3 @@ def _fault(name: str, detail: str) -> Check:
     elif name.startswith("taichi ") and name != "taichi cpu":
         remedy = "mend or remove the driver; --arch cpu runs without it"
     return Check("information" if name in OPTIONAL else "broken", " ".join(detail.split())[-300:], remedy)
-
-
-if __name__ == "__main__":
-    with answering() as answer:
-        try:
-            result = CHECKS[sys.argv[1]]()
-        except Exception as error:
-            result = _fault(sys.argv[1], f"{type(error).__name__}: {error}")
-        answer(**asdict(result))

@@ -1,18 +1,12 @@
-"""Compiles the kernels of scenes ahead, each in a process of its own.
+"""Compiles the kernels of scenes ahead, each in a process of its own."""
 
-    python -m mpmcli.simulation.warm SCENE '{"arch": "cpu", "threads": null}'
-
-is such a process; it ends with its parent.
-"""
-
-import json
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from mpmcli.processes.questions import Question, answering, ask_as_ended, end_with_parent, module_command
+from mpmcli.processes.each import Fault, in_processes
 
 # Time limit of a process, s.
 TIMEOUT = 1800.0
@@ -43,18 +37,12 @@ def warm(
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Warmed]:
     """Take a step of each scene in a process of its own, and yield outcomes as they end."""
-    asked = json.dumps({"arch": arch, "threads": threads})
-    command = module_command("mpmcli.simulation.warm")
-    questions = (Question([*command, str(path), asked], TIMEOUT, follows=True) for path in scenes)
-    for number, reply in ask_as_ended(questions, at_once, stop):
-        if reply.fault:
-            last = (reply.complaint.splitlines() or [""])[-1]
-            yield Warmed(scenes[number], fault=f"the process {reply.fault}. {last}".rstrip())
-        else:
-            yield Warmed(scenes[number], **reply.answer)
+    compile_one = partial(_compile, arch=arch, threads=threads)
+    for scene, outcome in in_processes(scenes, at_once, compile_one, TIMEOUT, stop):
+        yield Warmed(scene, fault=outcome.words) if isinstance(outcome, Fault) else outcome
 
 
-def main() -> None:
+def _compile(path: Path, arch: str, threads: int | None) -> Warmed:
     from mpmcli.materials.registry import parameter_models
     from mpmcli.scene import load_scene
     from mpmcli.simulation.engine import backend_for
@@ -62,18 +50,11 @@ def main() -> None:
     from mpmcli.solver.machine.backend import start, stop_backend
 
     began = time.perf_counter()
-    path, asked = Path(sys.argv[1]), json.loads(sys.argv[2])
-    end_with_parent()
-    with answering() as answer:
-        scene = load_scene(path, laws=parameter_models()).scene
-        backend = backend_for(scene, asked["arch"], asked["threads"])
-        start(backend)
-        run = build_run(scene, backend)
-        run.step(NO_STEP)
-        stored = backend.on_cpu and run.batch.launch_cpu.stored
-        stop_backend()
-        answer(stored=stored, seconds=time.perf_counter() - began)
-
-
-if __name__ == "__main__":
-    main()
+    scene = load_scene(path, laws=parameter_models()).scene
+    backend = backend_for(scene, arch, threads)
+    start(backend)
+    run = build_run(scene, backend)
+    run.step(NO_STEP)
+    stored = backend.on_cpu and run.batch.launch_cpu.stored
+    stop_backend()
+    return Warmed(path, stored, time.perf_counter() - began)

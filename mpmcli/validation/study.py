@@ -3,29 +3,25 @@
 import hashlib
 import json
 import os
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from functools import cache
-from multiprocessing import connection, get_context
 from pathlib import Path
 
 from mpmcli.bench.report import describe_machine
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.directory import check_directory
 from mpmcli.output.durable import write_text
-from mpmcli.processes.interrupts import interrupts_blocked
+from mpmcli.processes.each import Fault, in_processes
 from mpmcli.validation.cases import all_cases
 from mpmcli.validation.runs import Run, RunResult, carry_out
 
 PACKAGE = Path(__file__).resolve().parent.parent
 RESULTS, PAGE, FIGURES = "results.json", "report.md", "figures"
-# Default time limit of a run, and between two looks at what has ended, s.
-TIMEOUT, PAUSE = 1800.0, 0.1
+# Default time limit of a run, s.
+TIMEOUT = 1800.0
 # Numpy in the process of a run takes one thread, so that concurrent runs do not compete for cores.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-# Taichi starts once in a process, in one precision.
-SPAWN = get_context("spawn")
 
 
 def carry_out_run(run: Run) -> RunResult:
@@ -40,64 +36,10 @@ def carry_out_all(
     stop: Callable[[], object] = lambda: False,
     work: Callable[[Run], RunResult] = carry_out_run,
 ) -> Iterator[tuple[Run, RunResult]]:
-    """Yield (run, result) as runs end, `workers` at a time. A crash, or being late, is reported in the result.
-
-    Args:
-        timeout: time limit of a run, s.
-        stop: polled while runs are in progress: where it returns True, all are ended and KeyboardInterrupt is raised.
-        work: what a process does, a function of a module.
-    """
+    """Yield (run, result) as runs end; see `in_processes`. A crash, or being late, is reported in the result."""
     os.environ.update(ONE_THREAD)
-    waiting, going = list(reversed(runs)), {}
-    try:
-        while waiting or going:
-            while waiting and len(going) < workers:
-                run = waiting.pop()
-                answers, process = _started(work, run)
-                going[answers] = run, process, time.monotonic() + timeout
-            ready = connection.wait(going, PAUSE)
-            if stop():
-                raise KeyboardInterrupt
-            now = time.monotonic()
-            for answers in [answers for answers, (*_, end) in going.items() if answers in ready or now > end]:
-                run, process, _ = going.pop(answers)
-                try:
-                    result = answers.recv() if answers in ready else None
-                except EOFError:
-                    process.join()
-                    result = RunResult("failed", f"The process of the run ended with exit code {process.exitcode}.")
-                _end(answers, process)
-                yield run, result or RunResult("failed", f"The run took longer than {timeout:g} s.")
-    finally:
-        for answers, (_, process, _) in going.items():
-            _end(answers, process)
-
-
-def _started(work: Callable[[Run], RunResult], run: Run) -> tuple[connection.Connection, SPAWN.Process]:
-    answers, theirs = SPAWN.Pipe(duplex=False)
-    process = SPAWN.Process(target=_answer, args=(work, run, theirs), daemon=True)
-    with interrupts_blocked():
-        process.start()
-    theirs.close()
-    return answers, process
-
-
-def _end(answers: connection.Connection, process: SPAWN.Process) -> None:
-    process.kill()
-    process.join()
-    answers.close()
-
-
-def _answer(work: Callable[[Run], RunResult], run: Run, answers: connection.Connection) -> None:
-    """Send the result of a run; nothing that libraries print appears in the terminal."""
-    silent = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(silent, 1)
-    os.dup2(silent, 2)
-    try:
-        result = work(run)
-    except Exception as error:
-        result = RunResult("failed", f"{type(error).__name__}: {error}")
-    answers.send(result)
+    for run, answer in in_processes(runs, workers, work, timeout, stop):
+        yield run, RunResult("failed", f"The run failed: {answer.words}.") if isinstance(answer, Fault) else answer
 
 
 class Journal:
