@@ -173,7 +173,6 @@ kernel = "quadratic"
 transfer = "apic"
 solids = "updated"
 f_bar = "auto"
-walls = "folded"
 grid = "auto"
 redistribute = "auto"
 deterministic = false

@@ -28,12 +28,15 @@ def liquid(density: float, **more: object) -> dict:
 
 
 def pool(*densities: float, precision: str = "f64", walls: object = "slip", d: int = 2) -> Scene:
-    """Return layers of liquid side by side, from wall to wall, in irregular rows of particles."""
+    """Return layers of liquid side by side, from wall to wall, in irregular rows of particles.
+
+    Waves are as fast in all, so that none keeps what nodes do not see.
+    """
     width = 1.2 / len(densities)
     bodies = [
         block(
             f"layer {k}",
-            liquid(density),
+            liquid(density) | {"bulk_modulus": BULK * density / densities[0]},
             [k * width] + [0.0] * (d - 1),
             [(k + 1) * width] + [0.5] * (d - 1),
             sampling="jittered",
@@ -101,7 +104,7 @@ def test_openings_are_remembered(backend_of: Callable) -> None:
             kind,
             [(4 * k + 1) * H, H],
             [(4 * k + 3) * H, 3 * H],
-            velocity=["20 * X - 10 * Y", "10 * X - 25 * Y"],
+            velocity=[f"20 * (X - {4 * k * H}) - 10 * Y", f"10 * (X - {4 * k * H}) - 25 * Y"],
         )
         for k, kind in enumerate(kinds)
     ]
@@ -156,7 +159,7 @@ def test_volume_follows_the_grid(backend_of: Callable, densities: tuple[float, .
     relaxed, plain = found
     volume = np.array([b.volume for b in sample_bodies(run.scene)])[before["body"]]
     seen, least, beside = seen_ratio(before["x"], volume, run.scene.domain.cells)
-    crossings = np.sqrt(BULK / np.array(densities))[before["body"]] * (time + 1e-4) / H
+    crossings = np.sqrt(BULK / densities[0]) * (time + 1e-4) / H
     J = before["deformation"]
     moves = (least > FULL) & ((seen < J) | (beside * seen > BESIDE))
     gap = (seen - J) * moves
