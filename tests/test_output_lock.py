@@ -11,7 +11,7 @@ import pytest
 from mpmcli.errors import InputError
 from mpmcli.output import RunRecord, prepare_directory
 from mpmcli.output.directory import take_directory
-from mpmcli.output.lock import LOCK, Owner, lock_is_held, take_lock
+from mpmcli.output.lock import LOCK, Owner, lock_is_held, process_start, take_lock
 from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
 
 HOLD = """
@@ -99,7 +99,7 @@ print(taken)
 
 @pytest.mark.parametrize(
     "changes",
-    [{"pid": 2**22 + 1}, {"pid": 1}, {"boot": "another"}, {"host": "0" * 16}],
+    [{"pid": 2**22 + 1}, {"started": 1.0}, {"boot": "another"}, {"pid": 2**22 + 1, "host": "0" * 16}],
     ids=["no such process", "the number of another process", "before the machine was started anew", "in a container"],
 )
 def test_a_lock_that_the_system_has_released_is_taken_over(tmp_path: Path, changes: dict) -> None:
@@ -119,26 +119,39 @@ def test_a_lock_of_another_machine_is_respected(tmp_path: Path) -> None:
     assert (tmp_path / LOCK).read_text(encoding="utf-8") == text
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"pid": "x"}', '{"pid": 1, "host": null}', "\x00" * 100])
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"pid": "x"}', '{"pid": 1, "started": null}', "\x00" * 100])
 def test_a_damaged_lock_file_is_no_obstacle(tmp_path: Path, content: str) -> None:
     (tmp_path / LOCK).write_text(content, encoding="utf-8")
     take_lock(tmp_path).release()
 
 
+def test_the_start_of_a_process_tells_it_from_one_of_the_same_number() -> None:
+    assert process_start(os.getpid()) == process_start(os.getpid()) == Owner.here().started
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        assert process_start(child.pid) >= process_start(os.getpid())
+        child.kill()
+        os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+        # It has ended, though its number is not free yet.
+        assert process_start(child.pid) is None
+
+
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({}, DIED),
-        ({"host": "0" * 16}, DIED),
+        ({}, "running"),
+        ({"pid": 2**22 + 1}, DIED),
+        ({"started": 1.0}, DIED),
         ({"boot": "another"}, DIED),
         ({"boot": "another", "host": "0" * 16}, ELSEWHERE),
+        ({"space": "pid:[1]"}, ELSEWHERE),
     ],
 )
-def test_a_run_goes_on_while_its_lock_is_held(tmp_path: Path, changes: dict, expected: str) -> None:
+def test_a_run_goes_on_while_its_process_lives(tmp_path: Path, changes: dict, expected: str) -> None:
     RunRecord(tmp_path).write()
     record = read_record(tmp_path)
     record["process"] |= changes
     assert run_status(tmp_path, record) == expected
+    # Whatever is known of the process, one that has the lock is at work.
     with take_lock(tmp_path):
         assert run_status(tmp_path, record) == "running"
     assert run_status(tmp_path, {**record, "status": "finished"}) == "finished"

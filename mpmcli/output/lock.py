@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from mpmcli.errors import InputError
 
@@ -32,31 +32,40 @@ PAUSE = 0.02
 # What a file system answers that has no locks.
 NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 BOOT_ID, MACHINE_ID = Path("/proc/sys/kernel/random/boot_id"), Path("/etc/machine-id")
+# Where boot identifiers are missing, boots count as the same whose times differ by less, s.
+SAME_BOOT = 60.0
+
+Life = Literal["lives", "ended", "elsewhere"]
 
 
 @dataclass(frozen=True)
 class Owner:
     """A process, as others can recognise it.
 
-    `host` is a hash of the machine's name and identifier, as run.json is published with its data; `boot` identifies the
-    boot of its kernel, "" where the system tells none.
+    `space` tells namespaces of process numbers apart. It `started` at clock ticks since boot on Linux, which no change
+    of the clock moves, else at seconds since 1970. `host` is a hash of the machine's name and identifier, as run.json
+    is published with its data; `boot` identifies the boot.
     """
 
     pid: int
+    started: float
     host: str
     boot: str
+    space: str = ""
 
     @classmethod
     def here(cls) -> "Owner":
         """Return this process."""
-        return cls(os.getpid(), _host(), _boot())
+        pid = os.getpid()
+        return cls(pid, process_start(pid) or 0.0, _host(), _boot(), _space())
 
     @classmethod
     def read(cls, facts: Any) -> "Owner | None":
         """Return the owner that `as_dict` has told, None where these are not such facts."""
         try:
-            return cls(int(facts["pid"]), str(facts["host"]), str(facts["boot"]))
-        except (TypeError, KeyError, ValueError):
+            words = {name: str(facts[name]) for name in ("host", "boot")}
+            return cls(int(facts["pid"]), float(facts["started"]), space=str(facts.get("space", "")), **words)
+        except (TypeError, KeyError, ValueError, AttributeError):
             return None
 
     def as_dict(self) -> dict[str, Any]:
@@ -64,9 +73,39 @@ class Owner:
         return asdict(self)
 
     @property
-    def is_near(self) -> bool:
-        """Whether it is of this machine, or of a container on its kernel: locks of files tell whether it lives."""
-        return self.host == _host() or (self.boot != "" and self.boot == _boot())
+    def shares_kernel(self) -> bool:
+        """Whether it runs or ran under the running kernel, in which locks of files tell of all processes."""
+        return _same_boot(self.boot, _boot())
+
+    @property
+    def life(self) -> Life:
+        """Whether the process lives; "elsewhere" where that cannot be seen from here."""
+        if self.shares_kernel:
+            if self.space != _space():
+                return "elsewhere"
+            start = process_start(self.pid)
+            return "lives" if start is not None and abs(start - self.started) < 2 else "ended"
+        return "ended" if self.host == _host() else "elsewhere"
+
+
+def process_start(pid: int) -> float | None:
+    """Return when a process began, see `Owner.started`; None where there is no such process, or only its remains."""
+    try:
+        # The second field, the name, may hold anything.
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+        return None if fields[0] in "ZX" else float(fields[19])
+    except FileNotFoundError:
+        if Path("/proc/self/stat").exists():
+            return None
+    except (OSError, IndexError, ValueError):
+        pass
+    import psutil
+
+    try:
+        process = psutil.Process(pid)
+        return None if process.status() == psutil.STATUS_ZOMBIE else process.create_time()
+    except psutil.Error:
+        return None
 
 
 def time_now() -> str:
@@ -86,6 +125,21 @@ def _host() -> str:
 def _boot() -> str:
     with suppress(OSError):
         return BOOT_ID.read_text(encoding="utf-8").strip()
+    import psutil
+
+    return f"{psutil.boot_time():.0f}"
+
+
+def _same_boot(one: str, other: str) -> bool:
+    with suppress(ValueError):
+        return abs(float(one) - float(other)) < SAME_BOOT
+    return one == other
+
+
+@cache
+def _space() -> str:
+    with suppress(OSError):
+        return os.readlink("/proc/self/ns/pid")
     return ""
 
 
@@ -215,18 +269,17 @@ def _write(descriptor: int) -> None:
 
 def _refuse_foreign(directory: Path, content: dict[str, Any], *, locks_work: bool) -> None:
     """Refuse a file whose owner may live although the system gives the lock."""
-    import psutil
-
     owner = Owner.read(content)
-    if owner is None or (owner.is_near and locks_work):
+    if owner is None or (locks_work and owner.shares_kernel) or owner.life == "ended":
         return
-    if not owner.is_near:
-        raise InputError(
-            f"{directory} was locked by {_named(content)}, and whether that process has ended cannot be seen from here:"
-            f" if it has, remove {Path(directory) / LOCK}; or give another directory with -o."
-        )
-    if owner.pid != os.getpid() and psutil.pid_exists(owner.pid):
-        raise InputError(_held(directory, content))
+    if owner.life == "lives":
+        if owner.pid != os.getpid():
+            raise InputError(_held(directory, content))
+        return
+    raise InputError(
+        f"{directory} was locked by {_named(content)}, and whether that process has ended cannot be seen from here: "
+        f"if it has, remove {Path(directory) / LOCK}; or give another directory with -o."
+    )
 
 
 def refused(directory: Path, what: str, error: OSError) -> InputError:

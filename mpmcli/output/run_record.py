@@ -169,10 +169,14 @@ def _plain(value: Any) -> Any:
 def run_status(directory: Path, record: dict[str, Any] | None) -> str:
     """Return the status of a run from its record and the lock of its directory, "unknown" without a record.
 
-    "running" without a lock is "died", or `ELSEWHERE` if that cannot be seen from here.
+    "running" without a lock or living process is "died", or `ELSEWHERE` if that cannot be seen from here.
     """
     status = str((record or {}).get("status", "unknown"))
-    if record is None or status != "running" or lock_is_held(directory):
+    if record is None or status != "running":
+        return status
+    if lock_is_held(directory):
         return status
     owner = Owner.read(record.get("process"))
-    return DIED if owner is not None and owner.is_near else ELSEWHERE
+    if owner is None:
+        return ELSEWHERE
+    return {"lives": status, "ended": DIED, "elsewhere": ELSEWHERE}[owner.life]
