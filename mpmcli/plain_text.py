@@ -1,6 +1,7 @@
 """Tables, sizes, counts and titles as plain text."""
 
 import re
+from collections.abc import Collection, Iterable, Sequence
 
 SIZES = ("B", "kB", "MB", "GB", "TB", "PB")
 _UNUSUAL = re.compile(r"[^\x20-\x7e\n\t]")
@@ -17,6 +18,13 @@ def text_table(head: tuple[str, ...], rows: list[tuple[str, ...]], left: set[int
         for row in [head, *rows]
     ]
     return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], left: Collection[int]) -> str:
+    """Return a table in Markdown; columns are aligned to the right but for those numbered in `left`."""
+    rule = ["---" if column in left else "---:" for column in range(len(head))]
+    lines = (" | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in row) for row in (head, rule, *rows))
+    return "\n".join(f"| {line} |" for line in lines)
 
 
 def counted(count: int, noun: str) -> str:

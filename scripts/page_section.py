@@ -35,9 +35,3 @@ def replace_section(name: str, text: str, file: Path | None = None) -> None:
         raise ValueError(f"{file.name} needs one <!-- {name}: ... --> and one <!-- end of {name} --> after it")
     lines[starts[0] + 1 : ends[0]] = text.strip("\n").splitlines()
     file.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
-
-
-def markdown_table(head: list[str], rows: list[list[str]], right: set[int]) -> str:
-    """Write a table; the columns numbered in `right` are aligned to the right."""
-    rule = ["---:" if column in right else "---" for column in range(len(head))]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in [head, rule, *rows])

@@ -24,7 +24,7 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.output import SegmentStore, open_result
 from mpmcli.output.checkpoints import CHECKPOINTS, Checkpoint, read_checkpoints, write_checkpoint
 from mpmcli.output.layout import FrameIndex
-from mpmcli.output.segments import sealed_segments
+from mpmcli.output.segments import DAMAGED, sealed_segments
 from mpmcli.output.vtkhdf import read_index_of
 from mpmcli.scene import Scene, load_scene, parse_scene
 from mpmcli.simulation.checkpointing import Checkpointer
@@ -326,6 +326,18 @@ def test_a_damaged_packed_file_is_computed_again(whole, tmp_path, damage):
     outcome = run_here("simulate", tmp_path / "run" / "scene.toml", "-o", tmp_path / "run", "--resume")
     assert outcome.status == 0 and "0 frames kept, computed again from the start" in outcome.stderr
     assert files_of(tmp_path / "run") == files_of(whole / "packed")
+
+
+def test_a_damaged_packed_file_is_kept_until_it_has_been_computed_again(whole, tmp_path):
+    """A run that is interrupted meanwhile has lost nothing that it had."""
+    shutil.copytree(whole / "packed", tmp_path / "run")
+    packed = tmp_path / "run" / "particles.vtkhdf"
+    packed.write_bytes(packed.read_bytes()[:5000])
+    torn = packed.read_bytes()
+    take_over(tmp_path / "run", find(whole, tmp_path / "run"))
+    assert packed.with_name(DAMAGED).read_bytes() == torn and not packed.exists()
+    outcome = run_here("simulate", tmp_path / "run" / "scene.toml", "-o", tmp_path / "run", "--resume")
+    assert outcome.status == 0 and files_of(tmp_path / "run") == files_of(whole / "packed")
 
 
 def test_frames_that_were_packed_while_their_segments_stay_are_there_once(whole, tmp_path):

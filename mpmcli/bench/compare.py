@@ -9,9 +9,9 @@ from mpmcli.bench.cases import BenchCase
 from mpmcli.bench.contestant import Side, run_block
 from mpmcli.bench.ours import block_of_ours
 from mpmcli.bench.peers import Peer, Yardstick, has_compiler
-from mpmcli.bench.report import describe_machine, markdown_table, page
+from mpmcli.bench.report import describe_machine, page
 from mpmcli.errors import RunError
-from mpmcli.plain_text import counted
+from mpmcli.plain_text import counted, text_table
 
 # Duration of the first block, s, which is not measured: the remaining kernels compile.
 WARM_UP = 0.3
@@ -85,7 +85,7 @@ def bench_table(record: dict) -> str:
         broken = [name for name, side in sides.items() if not side["sound"]]
         notes += [f"Beware: at {case['case']} {name} lost a particle, or took other steps." for name in broken]
     head = ["case", "peer", "particles", "threads", "M steps/s", "peer's", "ratio", "C", "slower", "start", "compile"]
-    return page(record["machine"], record["arch"], markdown_table(head, rows, left=2), notes)
+    return page(record["machine"], record["arch"], text_table(head, rows, left={0, 1}), notes)
 
 
 def _rate(side: dict | None) -> str:

@@ -8,8 +8,9 @@ from mpmcli.bench.cases import EDGE, BenchCase
 from mpmcli.bench.contestant import Side, run_block
 from mpmcli.bench.ours import ProfiledColumn
 from mpmcli.bench.peers import Yardstick, has_compiler
-from mpmcli.bench.report import describe_machine, markdown_table, page
+from mpmcli.bench.report import describe_machine, page
 from mpmcli.materials.registry import laws
+from mpmcli.plain_text import text_table
 
 # Columns of the table, by the names that phases have in the solver and in C; all others are of the grid.
 COLUMN_OF = {name: name for name in ("sort", "p2g", "g2p", "measure")}
@@ -84,5 +85,5 @@ def profile_table(record: dict) -> str:
         [row["case"], row["name"], f"{row['particles']:,}", *(f"{row['ns_per_particle_step'][k]:.1f}" for k in COLUMNS)]
         for row in record["profile"]
     ]
-    table = markdown_table(["case", "law", "particles", *COLUMNS], rows, left=2)
+    table = text_table(["case", "law", "particles", *COLUMNS], rows, left={0, 1})
     return page(record["machine"], f"cpu, threads: {record['threads']}", table, NOTES)

@@ -13,11 +13,12 @@ from pathlib import Path
 from mpmcli.bench.cases import CASES
 from mpmcli.bench.contestant import Side
 from mpmcli.bench.peers import Peer
-from mpmcli.bench.report import describe_machine, markdown_table, page
+from mpmcli.bench.report import describe_machine, page
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.dataset.sweep_run import SweepSettings, SweepState, run_sweep
 from mpmcli.materials.registry import parameter_models
+from mpmcli.plain_text import text_table
 
 # Trajectories of the first sweep, which is not measured: it compiles the kernels, and gives the time of a trajectory.
 WARM_UP = 4
@@ -144,4 +145,4 @@ def throughput_table(record: dict) -> str:
         f"million particle-steps/s; here mpm88 makes {record['peer_particle_steps_per_s'] / 1e6:.2f}.",
     )
     what = f"cpu, a block of sand: 1,444 particles, 64 x 64 cells, {record['frames']} frames"
-    return page(record["machine"], what, markdown_table(head, rows, left=0), notes)
+    return page(record["machine"], what, text_table(head, rows, left=set()), notes)

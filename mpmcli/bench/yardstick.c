@@ -1,8 +1,8 @@
 /* The yardstick of mpmcli bench: an MLS-MPM step of a fluid in C, f32, with vectors of four numbers.
 
-   Quadratic B-splines, APIC, walls that slip, as mpmcli with `walls = "zeroed"`, and a fluid of linear pressure,
+   Quadratic B-splines, APIC, walls that slip (nodes on and behind them have no normal velocity), and a fluid of linear pressure,
    tau = K (J - 1), where J is multiplied by det(I + dt C). The first velocity is that of the first step's start
-   (symplectic Euler). Compile with -DD=2 or -DD=3, the flags of `yardstick.py`.
+   (symplectic Euler). Compile with -DD=2 or -DD=3, the flags of `peers.py`.
 
    A node is one vector: momentum in the first D numbers, mass in the last. Particles are sorted by cell whenever one may
    have moved by a cell. Tiles of TILE cells across all axes but the last one are scattered in colours: those of one

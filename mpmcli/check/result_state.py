@@ -12,7 +12,7 @@ from mpmcli.plain_text import counted
 
 # No law is valid for J below the first. Coherent material would have torn for J above the second.
 CRUSHED, BLOWN_UP = 0.1, 10.0
-# Share of the particles of a frame on walls from which on it is said: where walls are folded there are none.
+# Share of the particles of a frame on walls from which on it is said: of bodies on the grid there are none.
 HELD = 0.01
 LOOK = "Look at this particle, and lower time.safety or refine the domain where it is."
 TOUCHED = "The file was changed after the run; copy it again or run the scene again."
@@ -136,7 +136,7 @@ class StateCheck(FrameCheck):
                 f"In frame {number} {held} of {counted(len(on_wall), 'particle')} lie on a wall, where the domain "
                 "holds what would leave it: the rest of their way is lost"
             )
-            fix = 'Walls that are "folded" let none so near; with solids = "total" a stiffer material gives way less.'
+            fix = 'With solids = "total" a stiffer material gives way less; "updated" lets none so near.'
             self._findings.add("note", "held-positions", number, what, fix, value=held / len(on_wall))
 
     def _labels(self, number: int, frame: Frame, first: Frame, ids: np.ndarray) -> None:

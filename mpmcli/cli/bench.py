@@ -1,6 +1,7 @@
 """`mpmcli bench`."""
 
 import os
+from functools import partial
 
 import click
 
@@ -48,7 +49,7 @@ def bench_command(
         raise InputError(f"--dataset and --profile take one number of threads: give --threads {threads[0]}.")
     if dataset and (profile or names):
         raise InputError("--dataset has one scene and one table: leave out --profile and --case.")
-    tell = lambda line: click.echo(line, err=True)  # noqa: E731
+    tell = partial(click.echo, err=True)
     count = os.cpu_count() or 1
     if dataset:
         from mpmcli.bench.throughput import run_throughput, throughput_table

@@ -13,11 +13,11 @@ from mpmcli.output.collider_files import MOVING, RESTING
 from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory, temporary_of, write_text
 from mpmcli.output.lock import LOCK, DirectoryLock, refuse_locked, refused, take_lock, time_now
 from mpmcli.output.run_record import RECORD, read_record
-from mpmcli.output.segments import PACKED, remove_segments, sealed_segments
+from mpmcli.output.segments import DAMAGED, PACKED, remove_segments, sealed_segments
 from mpmcli.output.series import is_series_file
 
 SCENE = "scene.toml"
-NAMES = (PACKED, SCENE, RECORD, RESTING, MOVING)
+NAMES = (PACKED, DAMAGED, SCENE, RECORD, RESTING, MOVING)
 
 
 @dataclass(frozen=True)

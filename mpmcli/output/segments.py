@@ -6,6 +6,8 @@ from pathlib import Path
 from mpmcli.output.durable import numbered_files, remove_numbered
 
 PACKED = "particles.vtkhdf"
+# A damaged one is kept by this name until it has been computed again.
+DAMAGED = "particles.vtkhdf.damaged"
 SEGMENTS = "segments"
 SEGMENT_NAME = re.compile(r"frame_\d{6,}\.vtkhdf")
 

@@ -19,7 +19,7 @@ from mpmcli.output.directory import SCENE, has_frames
 from mpmcli.output.durable import TEMPORARY_SUFFIX, number_of, sync_directory
 from mpmcli.output.layout import FrameIndex
 from mpmcli.output.lock import LOCK
-from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments, segment_name
+from mpmcli.output.segments import DAMAGED, PACKED, SEGMENTS, sealed_segments, segment_name
 from mpmcli.output.series import remove_series
 from mpmcli.output.verify import verify_file
 from mpmcli.output.vtkhdf import read_index_of
@@ -119,14 +119,17 @@ def require_same_run(resumption: Resumption, header: Mapping[str, Any], director
 
 
 def take_over(directory: Path, resumption: Resumption) -> None:
-    """Make the frames that are there the first segments of the run, and remove a damaged file and what follows it."""
+    """Make the frames that are there the first segments of the run, and remove damaged ones and what follows them.
+
+    A damaged packed file is set aside until the run is complete.
+    """
     packed, folder = directory / PACKED, directory / SEGMENTS
     # It is written anew from all frames.
     remove_series(directory)
     if resumption.packed:
         folder.mkdir(exist_ok=True)
-    else:
-        packed.unlink(missing_ok=True)
+    elif packed.exists():
+        os.replace(packed, directory / DAMAGED)
     for path in sealed_segments(directory):
         if not resumption.packed <= number_of(path) < resumption.frames:
             path.unlink()

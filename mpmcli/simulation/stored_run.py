@@ -7,6 +7,7 @@ from mpmcli.errors import NoRoomError, RunError
 from mpmcli.output import RunRecord, SegmentStore
 from mpmcli.output.directory import SCENE
 from mpmcli.output.durable import write_text
+from mpmcli.output.segments import DAMAGED
 from mpmcli.output.series import write_series
 from mpmcli.output.store import HOLD
 from mpmcli.scene import LoadedScene
@@ -73,6 +74,7 @@ def finish(store: SegmentStore, summary: RunSummary, halt: Halt, loaded: LoadedS
     summary.path = summary.directory
     try:
         summary.path = store.finish(halt.packing)
+        (settings.directory / DAMAGED).unlink(missing_ok=True)
         if settings.form == "vtk" and summary.path is not None:
             scene = loaded.scene
             compress = scene.output.compress

@@ -1,7 +1,7 @@
 """The report of a validation: cases, verdicts and costs, as JSON, as a table, and as a page with figures."""
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import Any
 
 from mpmcli.errors import RunError
 from mpmcli.output.durable import sealed, write_text
-from mpmcli.plain_text import counted, text_table
+from mpmcli.plain_text import counted, markdown_table, text_table
 from mpmcli.validation.case import Case, Level, Setting
 from mpmcli.validation.figures import draw_case
 from mpmcli.validation.runs import Results
@@ -210,10 +210,3 @@ def _ratios(pairs: Iterable[tuple[float, float]], least: float) -> str:
 def bullets(lines: Iterable[str]) -> str:
     """Return a list in Markdown."""
     return "\n".join(f"* {line}" for line in lines)
-
-
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]], left: Collection[int]) -> str:
-    """Return a table in Markdown; columns are aligned to the right but for those numbered in `left`."""
-    rule = ["---" if column in left else "---:" for column in range(len(head))]
-    lines = (" | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in row) for row in (head, rule, *rows))
-    return "\n".join(f"| {line} |" for line in lines)

@@ -83,7 +83,7 @@ def run_key(run: Run) -> str:
 
 @cache
 def _program() -> tuple[str, ...]:
-    sources = sorted(path for path in PACKAGE.rglob("*") if path.suffix in (".py", ".toml"))
+    sources = sorted(path for path in PACKAGE.rglob("*") if path.is_file() and path.suffix != ".pyc")
     digest = hashlib.sha256(b"\0".join(path.read_bytes() for path in sources)).hexdigest()
     machine = describe_machine()
     return digest, machine["taichi"], machine["processor"]

@@ -178,7 +178,8 @@ def store_compiled() -> None:
         key, (folder, began) = _compiled.popitem()
         with contextlib.suppress(OSError):
             # Their files are new, unless a process was killed here.
-            _store(key, folder, began - CLOCKS) or _store(key, folder, 0.0)
+            if not _store(key, folder, began - CLOCKS):
+                _store(key, folder, 0.0)
 
 
 def _store(key: str, folder: Path, since: float) -> bool:
