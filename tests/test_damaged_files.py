@@ -131,7 +131,7 @@ def test_surfaces_as_vtk_reads_them(tmp_path: Path, form: str, binary: bool) -> 
     found, told = read_geometry(path), pv.read(path)
     assert np.abs(found.vertices[found.triangles] - told.points[told.regular_faces]).max() < 1e-6
     path.write_bytes(path.read_bytes()[: 7 * path.stat().st_size // 10])
-    # Others may end behind any triangle; meshio finds none in a binary STL.
+    # Others may end behind any triangle; trimesh finds none in a binary STL.
     if form == "s.ply":
         with pytest.raises(GeometryFileError):
             read_geometry(path)

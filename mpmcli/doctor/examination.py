@@ -25,7 +25,9 @@ AT_ONCE, TIMEOUT, FFMPEG_TIMEOUT = 2, 120.0, 20.0
 # Less disk is a fault, bytes.
 NO_DISK = 1e7
 # Packages, and what they are imported as.
-PACKAGES = {name: name for name in ("pyvista", "pysplashsurf", "matplotlib", "h5py", "meshio")} | {"pillow": "PIL"}
+PACKAGES = {name: name for name in ("pyvista", "pysplashsurf", "matplotlib", "h5py", "meshio", "trimesh")} | {
+    "pillow": "PIL"
+}
 # System libraries that packages load, and their Debian packages.
 SYSTEM_PACKAGES = {"libX11": "libx11-6", "libXrender": "libxrender1", "libGL": "libgl1", "libEGL": "libegl1"}
 

@@ -150,9 +150,7 @@ class ColliderMesh:
         )
 
     def _from_pivot(self, surface: Surface) -> Any:
-        import pyvista as pv
-
-        return pv.PolyData(poly_data(Surface(surface.points - np.array(self.collider.motion.pivot), surface.cells)))
+        return poly_data(Surface(surface.points - np.array(self.collider.motion.pivot), surface.cells))
 
     def shade(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Return places (n, 3) under its surface that take light at a time, s, and their volumes (n,), m^3."""
@@ -167,17 +165,13 @@ class ColliderMesh:
 
     @cached_property
     def _fine(self) -> Surface:
-        from vtkmodules.vtkFiltersModeling import vtkAdaptiveSubdivisionFilter
-
         if len(self.surface.cells) == 0:
             return self.surface
-        divide = vtkAdaptiveSubdivisionFilter()
-        divide.SetInputData(poly_data(self.surface))
-        divide.SetMaximumEdgeLength(FINE * self.side)
-        divide.SetMaximumTriangleArea((FINE * self.side) ** 2)
-        divide.SetMaximumNumberOfPasses(12)
-        divide.Update()
-        return without_doubles(surface_of(divide.GetOutput()))
+        longest = FINE * self.side
+        fine = poly_data(self.surface).subdivide_adaptive(
+            max_edge_len=longest, max_tri_area=longest**2, max_n_passes=12
+        )
+        return without_doubles(surface_of(fine))
 
 
 def collider_meshes(scene: RenderScene) -> tuple[ColliderMesh, ...]:

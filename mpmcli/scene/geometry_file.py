@@ -1,11 +1,11 @@
-"""Points and triangles from a file, by its ending: STL by meshio, PLY and OBJ here, and all others by PyVista.
+"""Points and triangles from a file, by its ending: STL, OBJ and PLY by trimesh, and all others by PyVista.
 
-meshio refuses an OBJ whose texture coordinates or normals are not as many as its vertices, and knows no voxels of VTU.
+VTK ends the process where a binary PLY is cut off; trimesh raises.
 """
 
 import io
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,42 +14,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationInfo
 
-from mpmcli.scene.ply_file import read_ply
-
-
-# Wavefront Technologies, Advanced Visualizer, appendix B1, Object Files (.obj): its lines v and f.
-def read_obj(data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the points (n, 3) float64, and the corners of each polygon; ValueError for a damaged file."""
-    points: list[list[float]] = []
-    polygons = []
-    for line in data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines():
-        words = line.split()
-        if words[:1] == [b"v"]:
-            if len(words) < 4:
-                raise ValueError("a vertex lacks a coordinate")
-            points.append([float(word) for word in words[1:4]])
-        elif words[:1] == [b"f"]:
-            numbers = np.array([int(word.partition(b"/")[0]) for word in words[1:]], np.int64)
-            # Counted from 1, or backwards from the latest vertex.
-            if not numbers.all():
-                raise ValueError("vertices count from 1")
-            polygons.append(np.where(numbers > 0, numbers - 1, len(points) + numbers))
-    return np.array(points, np.float64).reshape(-1, 3), polygons
-
-
-def read_stl(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points (n, 3) float64, and the triangles (m, 3)."""
-    from meshio import stl
-
-    mesh = stl.read(path)
-    return mesh.points.reshape(-1, 3).astype(np.float64), mesh.cells_dict.get("triangle", np.empty((0, 3), np.int64))
-
-
-_READERS: dict[str, Callable[[Path], tuple[np.ndarray, list[np.ndarray] | np.ndarray]]] = {
-    ".ply": lambda path: read_ply(path.read_bytes()),
-    ".stl": read_stl,
-    ".obj": lambda path: read_obj(path.read_bytes()),
-}
+# The endings of files that trimesh reads.
+_BY_TRIMESH = (".obj", ".ply", ".stl")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,14 +61,10 @@ def read_geometry(path: Path) -> Geometry:
     """Return the points and the triangles in a file, or raise a GeometryFileError."""
     if fault := absence(path):
         raise GeometryFileError(fault)
-    reader = _READERS.get(path.suffix.lower())
     try:
         with _quiet():
-            if reader is None:
-                return _by_vtk(path)
-            points, polygons = reader(path)
-        return Geometry(points, points, _triangles(polygons, len(points)))
-    # Of a damaged file readers raise almost anything; meshio even ends the process.
+            return _by_trimesh(path) if path.suffix.lower() in _BY_TRIMESH else _by_vtk(path)
+    # Of a damaged file readers raise almost anything; meshio, which PyVista asks, even ends the process.
     except (Exception, SystemExit):
         raise GeometryFileError from None
 
@@ -115,18 +77,16 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def _triangles(polygons: list[np.ndarray] | np.ndarray, count: int) -> np.ndarray:
-    """Return the triangles of polygons, a fan of each; ValueError for a corner that is none of `count` points."""
-    if isinstance(polygons, np.ndarray):
-        # All of one length.
-        fans = [polygons[:, [0, k, k + 1]] for k in range(1, polygons.shape[1] - 1)]
-        found = np.stack(fans, axis=1).reshape(-1, 3).astype(np.int64) if fans else np.empty((0, 3), np.int64)
-    else:
-        fans = [np.stack([np.full(len(p) - 2, p[0]), p[1:-1], p[2:]], axis=1) for p in polygons if len(p) > 2]
-        found = np.concatenate([np.empty((0, 3), np.int64), *fans]).astype(np.int64)
-    if found.size and not 0 <= found.min() <= found.max() < count:
+def _by_trimesh(path: Path) -> Geometry:
+    import trimesh
+
+    found = trimesh.load(path, process=False, skip_materials=True)
+    if isinstance(found, trimesh.Scene):
+        found = found.to_mesh()
+    points, triangles = np.array(found.vertices, np.float64), getattr(found, "faces", np.empty((0, 3), np.int64))
+    if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
         raise ValueError("a corner is no vertex")
-    return found
+    return Geometry(points, points, np.array(triangles))
 
 
 def _by_vtk(path: Path) -> Geometry:

@@ -11,7 +11,7 @@ from pydantic import Field, PrivateAttr, ValidationInfo, model_validator
 from mpmcli.scene.geometry_file import GeometryFileError, file_version, read_geometry, scene_file
 from mpmcli.scene.primitives import Solid, grid_points, rotation
 from mpmcli.scene.quantity import Axis, Number, Positive, Table, Vector, flaw, place_text
-from mpmcli.scene.triangles import ClosedSurface, surface_distance
+from mpmcli.scene.triangles import ClosedSurface
 
 # Points per axis at which the surface is tried for parts that overlap or are inside out.
 _TRIED = 24
@@ -136,16 +136,11 @@ class Mesh(Table, Solid):
     def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
         inside = self._surface.winding(points) > 0
         if inset > 0:
-            inside[inside] = surface_distance(self._surface, points[inside]) >= inset
+            inside[inside] = self._surface.signed_distance(points[inside]) <= -inset
         return inside
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of each point (n, 3) from the surface, (n,), m; negative inside.
-
-        See `triangles.SurfaceDistance` for what is exact.
-        """
-        distance = surface_distance(self._surface, points)
-        return np.where(self._surface.winding(points) > 0, -distance, distance)
+        return self._surface.signed_distance(points)
 
 
 def leaving(mesh: Mesh, lower: np.ndarray, upper: np.ndarray) -> str:

@@ -11,7 +11,6 @@ import numpy as np
 from pydantic import Field, PrivateAttr, ValidationInfo, model_validator
 
 from mpmcli.scene.geometry_file import GeometryFileError, absence, file_version, read_geometry, scene_file
-from mpmcli.scene.ply_file import is_number
 from mpmcli.scene.primitives import Solid
 from mpmcli.scene.problem import hint_at, listed, quoted
 from mpmcli.scene.quantity import AXES, Positive, Table, Vector, flaw, scene_dimension
@@ -65,6 +64,14 @@ def _chosen(columns: dict[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
     return np.stack([columns[name] for name in names], axis=1)
 
 
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 def _csv(path: Path) -> dict[str, np.ndarray]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -73,10 +80,10 @@ def _csv(path: Path) -> dict[str, np.ndarray]:
             lines = [(rows.line_num, row) for row in rows if row]
     except (UnicodeDecodeError, csv.Error, OSError):
         raise PointFileError("it is no text with comma-separated values") from None
-    if not names or any(is_number(name) for name in names):
+    if not names or any(_is_number(name) for name in names):
         raise PointFileError("its first line must name the columns, such as x,y,z")
     for line, row in lines:
-        if len(row) != len(names) or not all(map(is_number, row)):
+        if len(row) != len(names) or not all(map(_is_number, row)):
             raise PointFileError(f"line {line} must hold {len(names)} numbers, one for each column")
     values = np.array([row for _, row in lines], dtype=np.float64).reshape(-1, len(names))
     return dict(zip(names, values.T, strict=True))

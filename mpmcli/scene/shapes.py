@@ -13,7 +13,6 @@ from mpmcli.scene.mesh import Mesh
 from mpmcli.scene.points import Points
 from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon, Solid, grid_points
 from mpmcli.scene.quantity import Table, flaw, scene_dimension
-from mpmcli.scene.triangles import node_distances
 
 # Cells along the longest axis of the bounding box, of the coarsest lattice, and times that those on the surface are
 # halved, in 2D and 3D.
@@ -240,9 +239,7 @@ def distance_grid(form: Form, spacing: float, margin: float) -> tuple[np.ndarray
         margin: m; the grid reaches at least as far beyond the bounding box.
 
     Returns:
-        values: float32, (n1, ..., nd), m, negative inside. That of a mesh is the distance of a triangle, never too
-            small: within four cells of the surface that of the nearest one, where triangles are much smaller than cells
-            to 0.04 cells; farther away too large by three cells at most. The sign is always right.
+        values: float32, (n1, ..., nd), m, negative inside.
         origin: place of the first node, (d,), m.
         spacing: as given; node i lies at origin + i spacing.
     """
@@ -250,8 +247,6 @@ def distance_grid(form: Form, spacing: float, margin: float) -> tuple[np.ndarray
     cells = np.ceil((upper - lower + 2 * margin) / spacing - 1e-9).astype(int)
     shape = tuple(int(n) for n in np.maximum(cells, 1) + 1)
     origin = (lower + upper - (np.array(shape) - 1) * spacing) / 2
-    if isinstance(form, Mesh):
-        return node_distances(form.surface, origin, spacing, shape).astype(np.float32), origin, spacing
     total = int(np.prod(shape))
     values = np.empty(total, dtype=np.float32)
     for first in range(0, total, _NODES_AT_ONCE):

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from mpmcli.scene.colliders import Collider, Plane
 from mpmcli.scene.mesh import Mesh
 from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon
 from mpmcli.scene.sampling import first_come
+
+if TYPE_CHECKING:
+    import pyvista as pv
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +114,7 @@ def _segments_within(surface: Surface, lower: np.ndarray, upper: np.ndarray) -> 
 
 
 def _triangles_within(surface: Surface, lower: np.ndarray, upper: np.ndarray, caps: bool) -> Surface:
+    import pyvista as pv
     from vtkmodules.vtkCommonDataModel import vtkPlane, vtkPlaneCollection
     from vtkmodules.vtkFiltersGeneral import vtkClipClosedSurface
 
@@ -127,41 +131,27 @@ def _triangles_within(surface: Surface, lower: np.ndarray, upper: np.ndarray, ca
     clip.SetScalarModeToLabels()
     clip.TriangulationErrorDisplayOff()
     clip.Update()
-    found = surface_of(clip.GetOutput())
+    output = pv.wrap(clip.GetOutput())
+    found = surface_of(output)
     if caps or len(found.cells) == 0:
         return found
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
     # Label 0 marks what the input had.
-    labels = vtk_to_numpy(clip.GetOutput().GetCellData().GetScalars())
-    return Surface(found.points, found.cells[labels == 0])
+    return Surface(found.points, found.cells[output.cell_data.active_scalars == 0])
 
 
-def poly_data(surface: Surface) -> Any:
-    """Return triangles as VTK's."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+def poly_data(surface: Surface) -> "pv.PolyData":
+    """Return triangles as PyVista's."""
+    import pyvista as pv
 
-    points, cells, data = vtkPoints(), vtkCellArray(), vtkPolyData()
-    points.SetData(numpy_to_vtk(np.ascontiguousarray(surface.points, dtype=np.float64), deep=True))
-    numbers = np.ascontiguousarray(surface.cells, dtype=np.int64).ravel()
-    offsets = np.arange(0, len(numbers) + 1, 3, dtype=np.int64)
-    cells.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(numbers, deep=True))
-    data.SetPoints(points)
-    data.SetPolys(cells)
-    return data
+    # VTK 9.7's clip takes cell arrays of one stored size for others.
+    return pv.PolyData(surface.points, np.insert(surface.cells, 0, 3, axis=1))
 
 
-def surface_of(data: Any) -> Surface:
-    """Return the triangles of VTK's polygonal data."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
+def surface_of(data: "pv.PolyData") -> Surface:
+    """Return the triangles of PyVista's polygonal data."""
     if data.GetNumberOfPolys() == 0:
         return Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))
-    points = vtk_to_numpy(data.GetPoints().GetData()).astype(np.float64)
-    cells = vtk_to_numpy(data.GetPolys().GetConnectivityArray()).astype(np.int64)
-    return Surface(points, cells.reshape(-1, 3))
+    return Surface(np.array(data.points, np.float64), np.array(data.regular_faces, np.int64))
 
 
 # Straight pieces of a half circle, and cells along the longest side of a form that is found as a level set.
@@ -237,14 +227,7 @@ def oriented(surface: Surface, distance: Callable[[np.ndarray], np.ndarray]) -> 
 
 def without_doubles(surface: Surface) -> Surface:
     """Return triangles whose corners at one place are one point."""
-    from vtkmodules.vtkFiltersCore import vtkCleanPolyData
-
-    clean = vtkCleanPolyData()
-    clean.SetInputData(poly_data(surface))
-    clean.SetTolerance(0.0)
-    clean.ConvertPolysToLinesOff()
-    clean.Update()
-    return surface_of(clean.GetOutput())
+    return surface_of(poly_data(surface).clean(tolerance=0.0, lines_to_points=False, polys_to_lines=False))
 
 
 def _arc(start: float, end: float) -> np.ndarray:

@@ -1,23 +1,16 @@
-"""Closed surfaces of triangles: volume, area, inside test, and distance of points and of the nodes of a grid."""
+"""Closed surfaces of triangles: volume, inside test, and signed distance of points."""
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
-from typing import NamedTuple
-from weakref import WeakKeyDictionary
+from typing import Any, NamedTuple
 
 import numpy as np
-
-from mpmcli.scene.primitives import grid_points
 
 # Points, and pairs of a point and a triangle, that are looked at together: bounds the memory, keeps pairs in the cache.
 POINTS_AT_ONCE = 200_000
 _PAIRS_AT_ONCE = 50_000
 # Bins per axis of the raster that finds the triangles over a point.
 _BINS = 1024
-
-# Nodes along each axis.
-Shape = tuple[int, int, int]
 
 
 class Crossings(NamedTuple):
@@ -64,6 +57,24 @@ class ClosedSurface:
                 met.line[above], weights=met.sign[above], minlength=len(some)
             ).astype(np.int64)
         return found
+
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        """Return the distance of each point (n, 3) from the surface, (n,), m; negative inside."""
+        from vtkmodules.util.numpy_support import numpy_to_vtk
+        from vtkmodules.vtkCommonCore import vtkDoubleArray
+
+        found = vtkDoubleArray()
+        self._vtk_distance.FunctionValue(numpy_to_vtk(np.ascontiguousarray(points, dtype=np.float64)), found)
+        return np.where(self.winding(points) > 0, -1.0, 1.0) * np.abs(np.array(found))
+
+    @cached_property
+    def _vtk_distance(self) -> Any:
+        import pyvista as pv
+        from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
+
+        function = vtkImplicitPolyDataDistance()
+        function.SetInput(pv.PolyData(self.vertices, np.insert(self.triangles, 0, 3, axis=1)))
+        return function
 
     def crossings(self, lines: np.ndarray) -> Crossings:
         """Return where lines along z at some x, y, (n, 2), meet the surface; n and the crossings have to fit in memory.
@@ -135,207 +146,3 @@ class _Raster:
         bins = self._bins(lines)
         flat = bins[:, 0] * self.count + bins[:, 1]
         return self.starts[flat], self.starts[flat + 1] - self.starts[flat]
-
-
-# Triangles around a point that are looked at.
-_AROUND = 8
-# Cells along the longest axis of the grid from which points far from the surface take their triangles, and cells from
-# the surface below which a point is near.
-_CELLS, _NEAR = 48, 4
-# Cells around the surface within which nodes ask all of their neighbours for a nearer triangle.
-_BAND = 4
-# Times that nodes farther away ask them, where they do.
-_ROUNDS = 3
-
-
-class Planes:
-    """What the distance from each of m triangles needs, by component, so that loops over pairs are short."""
-
-    def __init__(self, corners: np.ndarray) -> None:
-        a, b, c = np.moveaxis(corners, 1, 0)
-        u, v = b - a, c - a
-        normal = np.cross(u, v)
-        length = np.linalg.norm(normal, axis=1)
-        self.uu, self.uv, self.vv = (np.einsum("ij,ij->i", p, q) for p, q in ((u, u), (u, v), (v, v)))
-        self.area = self.uu * self.vv - self.uv**2
-        self.a, self.u, self.v = a, u, v
-        self.normal = normal / np.where(length > 0, length, 1.0)[:, None]
-
-    def squared_distances(self, points: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-        """Return the squared distance of point i, (n, 3), from triangle number `triangle[i]`: (n,), m^2."""
-        found = np.empty(len(points))
-        for i in range(0, len(points), _PAIRS_AT_ONCE):
-            some = slice(i, i + _PAIRS_AT_ONCE)
-            found[some] = self._squared(points[some], triangle[some])
-        return found
-
-    def _squared(self, points: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-        """Return the squared distance of each point: from the plane above its triangle, else from the nearest edge.
-
-        a, a + u and a + v are the corners.
-        """
-        away = points - self.a[triangle]
-        u, v, normal = self.u[triangle], self.v[triangle], self.normal[triangle]
-        uu, uv, vv, area = self.uu[triangle], self.uv[triangle], self.vv[triangle], self.area[triangle]
-        pu, pv, height = (np.einsum("ij,ij->i", away, axis) for axis in (u, v, normal))
-        s, t = vv * pu - uv * pv, uu * pv - uv * pu
-        above = (s >= 0) & (t >= 0) & (s + t <= area) & (area > 0)
-        nearest = np.full(len(points), np.inf)
-        # Along u, along v, and from the end of u to that of v.
-        for along, length, base, edge in (
-            (pu, uu, None, u),
-            (pv, vv, None, v),
-            (pv - uv - pu + uu, uu - 2 * uv + vv, u, v - u),
-        ):
-            share = np.clip(along / np.where(length > 0, length, 1.0), 0.0, 1.0)[:, None]
-            beside = away - share * edge if base is None else away - base - share * edge
-            nearest = np.minimum(nearest, np.einsum("ij,ij->i", beside, beside))
-        return np.where(above, height**2, nearest)
-
-
-def pieces_of(corners: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Cut triangles until no edge is longer than `longest`, m; return the centre and the triangle of each piece."""
-    centers, owners = [], []
-    rest, owner = corners, np.arange(len(corners))
-    while len(rest):
-        edges = np.linalg.norm(np.roll(rest, -1, axis=1) - rest, axis=2)
-        long = edges.max(axis=1) > longest
-        centers.append(rest[~long].mean(axis=1))
-        owners.append(owner[~long])
-        # The longest edge is halved, which keeps the pieces from becoming thin.
-        k, rest, owner = edges[long].argmax(axis=1), rest[long], owner[long]
-        rows = np.arange(len(rest))
-        a, b, c = (rest[rows, (k + j) % 3] for j in range(3))
-        middle = (a + b) / 2
-        rest = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-        owner = np.concatenate([owner, owner])
-    return np.concatenate(centers), np.concatenate(owners)
-
-
-class NodeDistances:
-    """The nearest triangle, and its distance, of every node of a regular grid around a surface.
-
-    The nodes around each piece of a triangle look at it; then nodes near the surface ask their neighbours, and those
-    farther away take the triangle of the nearest such node. A distance is that of a triangle, never too small. It is
-    too large by three cells at most beyond the band, where nodes do not ask their neighbours unless `thorough`.
-    """
-
-    def __init__(
-        self, surface: ClosedSurface, origin: np.ndarray, spacing: float, shape: Shape, thorough: bool = False
-    ) -> None:
-        from scipy.ndimage import distance_transform_edt
-
-        self.origin, self.spacing, self.shape = origin, spacing, np.array(shape)
-        self.planes = Planes(surface.corners)
-        self.centers, self.owners = pieces_of(surface.corners, spacing)
-        total = int(np.prod(shape))
-        self.triangle = np.full(total, -1)
-        self.squared = np.full(total, np.inf)
-        changed = self._begin()
-        for _ in range(_BAND):
-            changed = self._spread(changed)
-        unknown = np.flatnonzero(self.triangle < 0)
-        if unknown.size:
-            known = distance_transform_edt(
-                (self.triangle < 0).reshape(shape), return_distances=False, return_indices=True
-            )
-            nearest = np.ravel_multi_index(tuple(axis.ravel()[unknown] for axis in known), shape)
-            self.triangle[unknown] = self.triangle[nearest]
-            self.squared[unknown] = self.planes.squared_distances(self._places(unknown), self.triangle[unknown])
-        changed = unknown
-        for _ in range(_ROUNDS if thorough else 0):
-            changed = self._spread(changed)
-
-    def _places(self, nodes: np.ndarray) -> np.ndarray:
-        return self.origin + self.spacing * np.stack(np.unravel_index(nodes, self.shape), axis=1)
-
-    def _begin(self) -> np.ndarray:
-        """Give the corners of the cells that hold the centre of a piece its triangle, and return these nodes."""
-        cells = np.clip(((self.centers - self.origin) / self.spacing).astype(np.int64), 0, self.shape - 2)
-        corners = [np.ravel_multi_index(tuple((cells + offset).T), self.shape) for offset in product((0, 1), repeat=3)]
-        # Pairs of a node and a triangle as one number each, which sort faster.
-        many = len(self.planes.area)
-        node, triangle = np.divmod(np.unique(np.concatenate(corners) * many + np.tile(self.owners, 8)), many)
-        squared = self.planes.squared_distances(self._places(node), triangle)
-        order = np.lexsort((squared, node))
-        nodes, first = np.unique(node[order], return_index=True)
-        self.triangle[nodes], self.squared[nodes] = triangle[order[first]], squared[order[first]]
-        return nodes
-
-    def _spread(self, changed: np.ndarray) -> np.ndarray:
-        """Let the neighbours of some nodes take their triangles where these are nearer, and return those that did."""
-        place = np.stack(np.unravel_index(changed, self.shape), axis=1)
-        triangle = self.triangle[changed]
-        took = []
-        for offset in product((-1, 0, 1), repeat=3):
-            beside = place + offset
-            inside = np.all((beside >= 0) & (beside < self.shape), axis=1)
-            nodes, offered = np.ravel_multi_index(tuple(beside[inside].T), self.shape), triangle[inside]
-            new = offered != self.triangle[nodes]
-            nodes, offered = nodes[new], offered[new]
-            squared = self.planes.squared_distances(self._places(nodes), offered)
-            nearer = squared < self.squared[nodes]
-            self.triangle[nodes[nearer]], self.squared[nodes[nearer]] = offered[nearer], squared[nearer]
-            took.append(nodes[nearer])
-        return np.unique(np.concatenate(took))
-
-
-class SurfaceDistance:
-    """Distance of points from a surface.
-
-    Near the surface it is that of the triangles whose pieces are nearest; farther away than _NEAR cells of a grid of
-    _CELLS cells, that of the triangles of the nodes around the point, too large by a tenth of a cell at most where the
-    surface is smooth.
-    """
-
-    def __init__(self, surface: ClosedSurface) -> None:
-        from scipy.spatial import KDTree
-
-        lower, upper = surface.bounds()
-        spacing = float((upper - lower).max()) / _CELLS
-        shape = tuple(int(n) for n in np.ceil((upper - lower) / spacing).astype(int) + 2 * _NEAR + 1)
-        self.nodes = NodeDistances(surface, lower - _NEAR * spacing, spacing, shape, thorough=True)
-        self.tree = KDTree(self.nodes.centers)
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of each point (n, 3), (n,), m."""
-        nodes = self.nodes
-        cells = np.clip(((points - nodes.origin) / nodes.spacing).astype(np.int64), 0, nodes.shape - 2)
-        squared = np.full(len(points), np.inf)
-        for offset in product((0, 1), repeat=3):
-            triangle = nodes.triangle[np.ravel_multi_index(tuple((cells + offset).T), nodes.shape)]
-            squared = np.minimum(squared, nodes.planes.squared_distances(points, triangle))
-        near = np.flatnonzero(squared < (_NEAR * nodes.spacing) ** 2)
-        around = np.arange(1, min(_AROUND, self.tree.n) + 1)
-        triangle = nodes.owners[self.tree.query(points[near], k=around, workers=-1)[1]]
-        found = nodes.planes.squared_distances(np.repeat(points[near], len(around), axis=0), triangle.ravel())
-        squared[near] = np.minimum(squared[near], found.reshape(-1, len(around)).min(axis=1, initial=np.inf))
-        return np.sqrt(squared)
-
-
-_PREPARED: WeakKeyDictionary[ClosedSurface, SurfaceDistance] = WeakKeyDictionary()
-
-
-def surface_distance(surface: ClosedSurface, points: np.ndarray) -> np.ndarray:
-    """Return the distance of each point (n, 3) from a surface, (n,), m; see `SurfaceDistance`."""
-    if surface not in _PREPARED:
-        _PREPARED[surface] = SurfaceDistance(surface)
-    return _PREPARED[surface](points)
-
-
-def node_distances(surface: ClosedSurface, origin: np.ndarray, spacing: float, shape: Shape) -> np.ndarray:
-    """Return the signed distance from a surface at the nodes of a grid, of this shape, m; negative inside.
-
-    The sign is that of the winding number, from where the lines of nodes along z meet the surface.
-    """
-    distance = np.sqrt(NodeDistances(surface, origin, spacing, shape).squared).reshape(shape)
-    axes = [origin[k] + spacing * np.arange(shape[k]) for k in range(2)]
-    lines = grid_points(*axes)
-    met = surface.crossings(lines)
-    heights = origin[2] + spacing * np.arange(shape[2])
-    # A crossing counts for all nodes below it.
-    below = np.searchsorted(heights, met.z)
-    steps = np.zeros((len(lines), shape[2] + 1), dtype=np.int64)
-    np.add.at(steps, (met.line, below), met.sign)
-    winding = np.cumsum(steps[:, ::-1], axis=1)[:, ::-1][:, 1:]
-    return np.where(winding.reshape(shape) != 0, -distance, distance)
