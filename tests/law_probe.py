@@ -1,12 +1,17 @@
 """What tests ask of a law: its response and its energy, as the kernels compute them, of many states at once."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import taichi as ti
 
 from mpmcli.materials.law import Law
+from mpmcli.materials.registry import laws
 from mpmcli.scene.material import MaterialParameters
+
+EPSILON = {"f64": 2.3e-16, "f32": 1.2e-7}
 
 
 @dataclass(frozen=True)
@@ -101,3 +106,53 @@ class LawProbe:
             tau[:, 2, 2] = values[:, 18]
         deformation = values[:, 9 : 9 + d * d].reshape(n, d, d) if keeps_F else values[:, 9]
         return Response(tau, deformation, values[:, 20 : 20 + internal.shape[1]], values[:, 19])
+
+
+class Probes:
+    """Probes of one precision, one for each dimension and parameters, compiled when first asked for."""
+
+    def __init__(self, parameters: Callable[..., MaterialParameters], precision: str = "f64") -> None:
+        self.epsilon = EPSILON[precision]
+        self.real = np.float64 if precision == "f64" else np.float32
+        self._parameters, self._made = parameters, {}
+
+    def __call__(self, d: int, *which: Any, **changes: Any) -> LawProbe:
+        """Return the probe of the parameters that belong to the other arguments."""
+        key = (d, *which, *sorted(changes.items()))
+        if key not in self._made:
+            parameters = self._parameters(*which, **changes)
+            self._made[key] = LawProbe(laws()[parameters.law], parameters, d)
+        return self._made[key]
+
+
+def rotations(random: np.random.Generator, count: int, d: int) -> np.ndarray:
+    """Return random rotations (n, d, d), by QR decompositions."""
+    Q, R = np.linalg.qr(random.normal(size=(count, d, d)))
+    Q = Q * np.sign(np.einsum("nii->ni", R))[:, None, :]
+    Q[:, :, 0] *= np.sign(np.linalg.det(Q))[:, None]
+    return Q
+
+
+def stretched(stretches: np.ndarray, seed: int | np.random.Generator = 1) -> np.ndarray:
+    """Return F (n, d, d) of random principal axes with these signed stretches (n, d)."""
+    random = np.random.default_rng(seed)
+    n, d = stretches.shape
+    axes = (rotations(random, n, d), rotations(random, n, d).transpose(0, 2, 1))
+    return axes[0] * stretches[:, None, :] @ axes[1]
+
+
+def wild(d: int) -> np.ndarray:
+    """Return crushed, torn, flat, vanished, inverted and badly sheared states (n, d, d)."""
+    sheared = np.eye(d)
+    sheared[0, 1] = 10.0
+    flat = np.diag([0.0, 1.0, 1.0][:d])
+    mirrored = np.diag([-1.0, 1.0, 1.0][:d])
+    shapes = [sheared, flat, flat @ sheared, mirrored, 0.5 * mirrored, sheared @ mirrored, np.zeros((d, d))]
+    return np.array([size * np.eye(d) for size in (0.01, 1e-6, 1.05, 3.0, 100.0, 1e9)] + shapes)
+
+
+def assert_finite(*answers: Response) -> None:
+    """Fail where anything of an answer is not finite."""
+    for answer in answers:
+        for values in (answer.tau, answer.deformation, answer.internal, answer.energy):
+            assert np.isfinite(values).all()

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import taichi as ti
-from law_probe import LawProbe
+from law_probe import EPSILON, LawProbe, rotations, stretched
 from law_tangent import largest_stiffness
 
 from mpmcli.materials.fixed_corotated import FixedCorotated, FixedCorotatedParameters
@@ -14,7 +14,6 @@ from mpmcli.materials.tensors import polar_rotation
 
 E, NU = 3e5, 0.3
 MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
-EPSILON = {"f64": 2.3e-16, "f32": 1.2e-7}
 PARAMETERS = FixedCorotatedParameters(density=1000.0, youngs_modulus=E, poissons_ratio=NU)
 
 
@@ -53,21 +52,6 @@ def rotation_kernel(d: int) -> Callable:
 def backend(backend_of: Callable, request: pytest.FixtureRequest) -> Backend:
     backend_of(request.param)
     return Backend(request.param)
-
-
-def random_rotations(random: np.random.Generator, count: int, d: int) -> np.ndarray:
-    Q, R = np.linalg.qr(random.normal(size=(count, d, d)))
-    Q = Q * np.sign(np.einsum("nii->ni", R))[:, None, :]
-    Q[:, :, 0] *= np.sign(np.linalg.det(Q))[:, None]
-    return Q
-
-
-def stretched(stretches: np.ndarray, seed: int = 1) -> np.ndarray:
-    """Return F (n, d, d) of random principal axes with these signed stretches (n, d)."""
-    random = np.random.default_rng(seed)
-    n, d = stretches.shape
-    axes = (random_rotations(random, n, d), random_rotations(random, n, d).transpose(0, 2, 1))
-    return axes[0] * stretches[:, None, :] @ axes[1]
 
 
 def nearest_rotations(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -144,8 +128,8 @@ def test_stress_in_principal_stretches(backend: Backend, d: int) -> None:
     """tau_i = 2 mu (s_i - 1) s_i + lambda (J - 1) J along the axes of b, also for s_d < 0; the z axis has s = 1."""
     random = np.random.default_rng(4)
     stretches = np.concatenate([random.uniform(0.3, 2.5, (500, d)), flattened(random, 100, d, -0.3)])
-    Q = random_rotations(random, len(stretches), d)
-    F = Q * stretches[:, None, :] @ random_rotations(random, len(stretches), d)
+    Q = rotations(random, len(stretches), d)
+    F = Q * stretches[:, None, :] @ rotations(random, len(stretches), d)
     J = stretches.prod(axis=1)
     pressure_part = LAMBDA * (J - 1) * J
     principal = 2 * MU * (stretches - 1) * stretches + pressure_part[:, None]
@@ -163,7 +147,7 @@ def test_stress_in_principal_stretches(backend: Backend, d: int) -> None:
 @pytest.mark.parametrize("d", [2, 3])
 def test_turning_alone_makes_no_stress(backend: Backend, d: int) -> None:
     """tau is exactly 0 at rest, and a few roundings of the moduli after any rotation."""
-    F = np.concatenate([np.eye(d)[None], random_rotations(np.random.default_rng(5), 1000, d)])
+    F = np.concatenate([np.eye(d)[None], rotations(np.random.default_rng(5), 1000, d)])
     answer = backend.law[d](F)
     assert not answer.tau[0].any()
     assert answer.energy[0] == 0

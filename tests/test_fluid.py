@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from law_probe import LawProbe
+from law_probe import Probes
 from law_tangent import largest_stiffness, largest_viscosity
 
 from mpmcli.materials.fluid import CRUSHED, Fluid, FluidParameters
@@ -12,23 +12,7 @@ from mpmcli.materials.law import StateBound
 from mpmcli.scene.material import SceneBounds
 
 K = 2e5
-EPSILON = {"f64": 2.3e-16, "f32": 1.2e-7}
 WATER = FluidParameters(density=1000.0, bulk_modulus=K)
-
-
-class Probes:
-    """Probes of one precision, compiled when first asked for."""
-
-    def __init__(self, precision: str) -> None:
-        self.epsilon = EPSILON[precision]
-        self.real = np.float64 if precision == "f64" else np.float32
-        self._made: dict[tuple, LawProbe] = {}
-
-    def __call__(self, d: int, **changes: object) -> LawProbe:
-        key = (d, *sorted(changes.items()))
-        if key not in self._made:
-            self._made[key] = LawProbe(Fluid, fluid(**changes), d)
-        return self._made[key]
 
 
 def fluid(**changes: object) -> FluidParameters:
@@ -51,7 +35,7 @@ def spherical(answer: np.ndarray) -> np.ndarray:
 @pytest.fixture(scope="module", params=["f64", "f32"])
 def probes(backend_of: Callable, request: pytest.FixtureRequest) -> Probes:
     backend_of(request.param)
-    return Probes(request.param)
+    return Probes(fluid, request.param)
 
 
 @pytest.mark.parametrize("d", [2, 3])

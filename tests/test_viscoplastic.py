@@ -4,31 +4,15 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from law_probe import LawProbe
+from law_probe import LawProbe, Probes, rotations
 from law_tangent import largest_stiffness
 from pydantic import ValidationError
 
 from mpmcli.materials.law import StateBound
-from mpmcli.materials.viscoplastic import CRUSHED, TEAR_STRAIN, Viscoplastic, ViscoplasticParameters
+from mpmcli.materials.viscoplastic import CRUSHED, TEAR_STRAIN, ViscoplasticParameters
 from mpmcli.scene.material import SceneBounds
 
 K, G, YIELD, CONSISTENCY = 1e6, 1e5, 100.0, 10.0
-EPSILON = {"f64": 2.3e-16, "f32": 1.2e-7}
-
-
-class Probes:
-    """Probes of one precision, compiled when first asked for."""
-
-    def __init__(self, precision: str) -> None:
-        self.epsilon = EPSILON[precision]
-        self.real = np.float64 if precision == "f64" else np.float32
-        self._made: dict[tuple, LawProbe] = {}
-
-    def __call__(self, d: int, **changes: object) -> LawProbe:
-        key = (d, *sorted(changes.items()))
-        if key not in self._made:
-            self._made[key] = LawProbe(Viscoplastic, parameters(**changes), d)
-        return self._made[key]
 
 
 def parameters(**changes: object) -> ViscoplasticParameters:
@@ -39,13 +23,7 @@ def parameters(**changes: object) -> ViscoplasticParameters:
 @pytest.fixture(scope="module", params=["f64", "f32"])
 def probes(backend_of: Callable, request: pytest.FixtureRequest) -> Probes:
     backend_of(request.param)
-    return Probes(request.param)
-
-
-def random_rotation(random: np.random.Generator, d: int) -> np.ndarray:
-    Q, _ = np.linalg.qr(random.normal(size=(d, d)))
-    Q[:, 0] *= np.linalg.det(Q)
-    return Q
+    return Probes(parameters, request.param)
 
 
 def gradients(count: int, d: int, size: float, seed: int = 1) -> np.ndarray:
@@ -54,7 +32,7 @@ def gradients(count: int, d: int, size: float, seed: int = 1) -> np.ndarray:
     F = np.eye(d) + size * random.normal(size=(count, d, d))
     F[:, :, 0] *= np.sign(np.linalg.det(F))[:, None]
     F /= (np.linalg.det(F) ** (1 / d))[:, None, None]
-    return random_rotation(random, d) @ F
+    return rotations(random, 1, d) @ F
 
 
 def trial(F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
