@@ -187,12 +187,12 @@ def slow_disk(monkeypatch) -> Event:
     monkeypatch.setattr(store_module, "ASIDE", 0)
     ready, synced, sync = Event(), [], durable_module.sync_file
 
-    def slow(path: Path, *, cached: bool = True) -> None:
+    def slow(path: Path) -> None:
         assert ready.wait(60)
         synced.append(path)
         if len(synced) == 3:
             raise OSError(errno.EIO, "the disk is gone")
-        sync(path, cached=cached)
+        sync(path)
 
     monkeypatch.setattr(durable_module, "sync_file", slow)
     return ready

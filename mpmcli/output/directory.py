@@ -186,7 +186,6 @@ def close_abandoned(directory: Path, made: Sequence[Path], pid: int, signal: str
         if not has_frames(directory) and (ours or (record is None and made)):
             taken.undo()
         elif ours:
-            # The packed file that it wrote beside the segments.
             with suppress(OSError):
                 temporary_of(directory / PACKED).unlink(missing_ok=True)
             message = f"the run was interrupted ({signal}) and ended by force; its frames were left unpacked"

@@ -27,14 +27,11 @@ def temporary_of(path: Path) -> Path:
     return path.with_name(path.name + TEMPORARY_SUFFIX)
 
 
-def sync_file(path: Path, *, cached: bool = True) -> None:
-    """Force the content of a closed file to the disk; what is not to be read soon need not stay `cached`."""
+def sync_file(path: Path) -> None:
+    """Force the content of a closed file to the disk."""
     descriptor = os.open(path, os.O_RDWR)
     try:
         os.fsync(descriptor)
-        if not cached and hasattr(os, "posix_fadvise"):
-            with suppress(OSError):
-                os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
     finally:
         os.close(descriptor)
 
@@ -75,10 +72,10 @@ class Unsealed:
                 ask_for(self._temporary, size)
             yield self._temporary
 
-    def seal(self, *, cached: bool = True) -> None:
-        """Put the file at its path; where that fails, the temporary one is removed; `cached` is as in `sync_file`."""
+    def seal(self) -> None:
+        """Put the file at its path; where that fails, the temporary one is removed."""
         with self._removed_on_error():
-            sync_file(self._temporary, cached=cached)
+            sync_file(self._temporary)
             os.replace(self._temporary, self.path)
         sync_directory(self.path.parent)
 

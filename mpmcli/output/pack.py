@@ -25,13 +25,12 @@ def pack_segments(
     *,
     compress: bool = False,
     header: Mapping[str, Any],
-    begun: VtkhdfWriter | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> None:
     """Write all frames of sealed segments of one run into `target`, prove it equal, then give it its name.
 
     Segments stay as they are; memory is that of a block of one array. "scene" of the header may differ from that of the
-    segments. `begun` has all arrays already (`PackedBeside`).
+    segments.
     RunError, and no `target`: the disk is too small, segments are of several runs, or it does not read back.
     """
     try:
@@ -47,15 +46,12 @@ def pack_segments(
     counts = expected.counts.tolist()
     kept = f"the {len(counts)} frames written are kept in {segments[0].parent} and stay readable there"
     purpose = f"packing the frames into {target.name}"
-    size = 0
-    if begun is None:
-        size = file_size(first.layout, counts)
-        require_free_space(target.parent, size, purpose, kept)
+    size = file_size(first.layout, counts)
+    require_free_space(target.parent, size, purpose, kept)
     try:
         with sealed(target, size) as temporary:
-            with begun or VtkhdfWriter(temporary, first.layout, counts, compress=compress) as writer:
-                if begun is None:
-                    _copy(parts, writer, stop, by_name=compress)
+            with VtkhdfWriter(temporary, first.layout, counts, compress=compress) as writer:
+                _copy(parts, writer, stop, by_name=compress)
                 _require_unchanged(writer.checksums, parts)
                 writer.finish(expected.times, expected.frames, expected.steps, expected.ledger, header=expected.header)
             sync_file(temporary)

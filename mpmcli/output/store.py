@@ -12,11 +12,10 @@ from mpmcli.errors import InputError, NoRoomError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.collider_files import write_collider_files
-from mpmcli.output.durable import Unsealed, is_full, require_free_space, sync_directory, temporary_of
+from mpmcli.output.durable import Unsealed, is_full, require_free_space, sync_directory
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameIndex, FrameLayout
 from mpmcli.output.pack import pack_segments
-from mpmcli.output.packed_beside import PackedBeside
 from mpmcli.output.segments import PACKED, SEGMENTS, remove_segments, sealed_segments, segment_name
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, read_index_of
 from mpmcli.scene.colliders import Collider
@@ -37,9 +36,8 @@ class SegmentStore:
     are sealed by a thread, one at a time: they lie in the memory of the system then, and the disk takes its time.
     Taichi holds Python's lock during a launch, so that a thread could do little more.
 
-    Segments are complete VTKHDF files, not compressed, so that writing does not hold up the run. The packed file of a
-    large run is written beside them, if `frames_expected`, all of as many particles, is given. `colliders` are None for
-    those that the header tells.
+    Segments are complete VTKHDF files, not compressed, so that writing does not hold up the run. `colliders` are None
+    for those that the header tells.
     """
 
     def __init__(
@@ -50,7 +48,6 @@ class SegmentStore:
         compress: bool = False,
         hold: float = 0.0,
         colliders: Sequence[Collider] | None = None,
-        frames_expected: int | None = None,
     ) -> None:
         """Begin in a directory that `prepare_directory` made; nothing is written before the first frame."""
         self._colliders = RunHeader.read(header).colliders if colliders is None else tuple(colliders)
@@ -69,16 +66,12 @@ class SegmentStore:
         self._kept = 0
         self._sealed: set[str] = set()
         self._counts: list[int] = []
-        self._expected = frames_expected or 0
-        self._beside: PackedBeside | None = None
 
     def go_on_after(self, index: FrameIndex) -> None:
         """Go on after frames that an earlier process has written here; they are not written again."""
         self._layout = index.layout
         self.frames_written = self._kept = len(index.times)
         self._start()
-        # A process that was killed may have left one.
-        temporary_of(self._directory / PACKED).unlink(missing_ok=True)
         self._sealed = {path.name for path in sealed_segments(self._directory)}
         self._counts = index.counts.tolist()
 
@@ -125,18 +118,8 @@ class SegmentStore:
 
         The segments stay where it cannot be written (RunError), or `stop` ends it with KeyboardInterrupt.
         """
-        try:
-            self.seal()
-            if self._beside is not None and not self._beside.whole:
-                self._beside.give_up()
-            return self._pack(None if self._beside is None else self._beside.writer, stop)
-        finally:
-            self._end_beside()
-
-    def give_up(self) -> None:
-        """Forget waiting frames, and remove what is of no use without `finish`; sealed frames stay."""
-        self._waiting.clear()
-        self._end_beside()
+        self.seal()
+        return self._pack(stop)
 
     def _start(self) -> None:
         try:
@@ -153,9 +136,7 @@ class SegmentStore:
         frames, rows = zip(*self._waiting, strict=True)
         counts = [len(frame.position) for frame in frames]
         size = file_size(self._layout, counts)
-        # What was written beside is no longer free.
-        before = self._counts if self._beside is None or self._beside.writer is None else []
-        joined = file_size(self._layout, [*before, *counts])
+        joined = file_size(self._layout, [*self._counts, *counts])
         began = time.perf_counter()
         purpose, kept = f"frame {frames[0].index}", _frames_kept(self.frames_written)
         try:
@@ -193,54 +174,26 @@ class SegmentStore:
     def _write(
         self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int
     ) -> Callable[[], None]:
-        """Write frames to a segment, and to the packed file beside it; return what makes them durable."""
-        counts = [len(frame.position) for frame in frames]
-        whole = file_size(layout, [counts[0]] * self._expected) if self._expected > 1 else 0
-        if whole > MOST_WAITING and not (self._compress or self._sealed or self._beside):
-            self._beside = PackedBeside(self._directory / PACKED, layout, self._expected, counts[0])
-        beside = self._beside
-        if beside is not None:
-            beside.expect(frames[0].index, counts)
-        try:
-            file = self._write_segment(layout, frames, rows, size)
-        except BaseException as error:
-            if beside is None or beside.writer is None:
-                raise
-            beside.give_up()
-            if not isinstance(error, OSError | RuntimeError):
-                raise
-            # In the room that it took.
-            file = self._write_segment(layout, frames, rows, size)
-
-        # It keeps no frame: another one is built meanwhile.
-        def seal() -> None:
-            # New frames find memory at once where the system need not look for it.
-            file.seal(cached=beside is None or beside.writer is None)
-            if beside is not None:
-                beside.seal(len(counts), sync=size >= ASIDE)
-            self._sealed.add(file.path.name)
-            self._counts += counts
-
-        return seal
-
-    def _write_segment(
-        self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int
-    ) -> Unsealed:
+        """Write frames to a segment; return what makes them durable."""
         counts = [len(frame.position) for frame in frames]
         file = Unsealed(self.place / segment_name(frames[0].index))
         with file.written(size) as temporary, VtkhdfWriter(temporary, layout, counts) as writer:
             for name, arrays in layout.stored_together(frames):
                 writer.append(name, arrays)
-                if self._beside is not None:
-                    self._beside.append(name, arrays)
                 # Before the next one is made.
                 del arrays
             tables = zip(*((frame.time, frame.index, frame.step) for frame in frames), strict=True)
             writer.finish(*tables, rows, self._header)
-        return file
 
-    def _pack(self, begun: VtkhdfWriter | None, stop: Callable[[], bool]) -> Path | None:
-        """Pack all segments; `begun` is as `pack_segments` has it."""
+        # It keeps no frame: another one is built meanwhile.
+        def seal() -> None:
+            file.seal()
+            self._sealed.add(file.path.name)
+            self._counts += counts
+
+        return seal
+
+    def _pack(self, stop: Callable[[], bool]) -> Path | None:
         segments = sealed_segments(self._directory)
         # An interrupt may fall between the seal and the count; a sealed frame is never left behind.
         if missing := self._sealed - {path.name for path in segments}:
@@ -255,7 +208,7 @@ class SegmentStore:
             os.replace(segments[0], packed)
             sync_directory(self._directory)
         else:
-            pack_segments(segments, packed, compress=self._compress, header=self._header, begun=begun, stop=stop)
+            pack_segments(segments, packed, compress=self._compress, header=self._header, stop=stop)
         if self._colliders:
             times = read_index_of(packed).times.tolist()
             write_collider_files(self._directory, self._header, times, self._colliders)
@@ -263,11 +216,6 @@ class SegmentStore:
         with suppress(OSError):
             remove_segments(self._directory)
         return packed
-
-    def _end_beside(self) -> None:
-        if self._beside is not None:
-            self._beside.give_up()
-            self._beside = None
 
 
 class _Sealing:

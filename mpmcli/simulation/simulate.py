@@ -161,7 +161,6 @@ def _store_run(
     finally:
         if summary.status == "running":
             # A fault of mpmcli: the record must not state that the run is going on.
-            store.give_up()
             record.close("failed", "an internal error ended the run")
     summary.steps = run.step_count
     clock.book(run.first_step_seconds, "compile_s")

@@ -51,7 +51,6 @@ def new_store(
         compress=scene.output.compress,
         hold=HOLD,
         colliders=scene.colliders,
-        frames_expected=None if scene.output.drop_retired else scene.time.frames + 1,
     )
     if earlier is not None and earlier.index is not None:
         store.go_on_after(earlier.index)
