@@ -59,7 +59,8 @@ def test_a_packed_file_without_its_record_is_still_known(packed):
     check = check_result(packed)
     assert rules(check) == {"no-record"} and check.verdict == "stable" and check.status == "unknown"
     cut(packed / PACKED, 0.5)
-    assert the(check_result(packed / PACKED), "unreadable").frame == 0
+    with pytest.raises(InputError, match="is not an HDF5 file, or a damaged one"):
+        check_result(packed / PACKED)
 
 
 @pytest.mark.parametrize("part", [0.0, 0.5, 0.99])
@@ -85,9 +86,7 @@ def test_segments_that_are_missing(segments, gone):
 def test_a_segment_under_two_names(segments):
     shutil.copy(segments / SEGMENTS / segment_name(K - 1), segments / SEGMENTS / segment_name(K))
     check = check_result(segments)
-    finding = the(check, "frame-number")
-    assert finding.frame == check.first_bad_frame == K and finding.value == K - 1
-    assert "frame-time" in rules(check)
+    assert rules(check) == {"frame-time"} and check.first_bad_frame == K and check.verdict == "unstable"
 
 
 def test_all_segments_damaged(segments):
@@ -97,40 +96,12 @@ def test_all_segments_damaged(segments):
     assert check.frames == 0 and check.first_bad_frame == 0 and check.verdict == "unstable"
 
 
-@pytest.mark.parametrize(
-    ("swaps", "rule", "frame"),
-    [
-        ({3: 4, 4: 3}, "frame-order", 3),
-        ({4: 3}, "duplicated-frames", 3),
-        ({10: 12}, "extra-frames", 11),
-    ],
-)
-def test_numbers_of_packed_frames_that_are_wrong(packed, swaps, rule, frame):
-    with changed(packed / PACKED) as file:
-        numbers = file["mpmcli/frame"]
-        numbers[:] = [swaps.get(k, k) for k in numbers[:].tolist()]
-    check = check_result(packed)
-    assert the(check, rule).frame == frame and check.verdict == "unstable"
-    # Frame 10 is missing where 12 takes its place.
-    assert check.first_bad_frame == min(frame, 10)
-
-
 @pytest.mark.parametrize("time", [0.1201, 0.0801, np.nan])
 def test_a_time_that_is_wrong(packed, time):
     with changed(packed / PACKED) as file:
         file["VTKHDF/Steps/Values"][K] = time
     check = check_result(packed)
     assert the(check, "frame-time").frame == check.first_bad_frame == K
-
-
-def test_a_packed_array_that_has_lost_its_last_rows(run, packed):
-    with changed(packed / PACKED) as file:
-        values = file["VTKHDF/PointData/velocity"][:-5]
-        del file["VTKHDF/PointData/velocity"]
-        file["VTKHDF/PointData/velocity"] = values
-    check = check_result(packed)
-    assert rules(check) == {"unreadable"} and (check.first_bad_frame, check.frames) == (10, 10)
-    assert f"velocity has {run.particles - 5} of {run.particles} rows" in check.findings[0].what
 
 
 def test_a_run_that_is_packed_while_it_is_checked(run, segments, monkeypatch):
@@ -144,16 +115,6 @@ def test_a_run_that_is_packed_while_it_is_checked(run, segments, monkeypatch):
     monkeypatch.setattr(result_check, "check_order", packed_meanwhile)
     check = check_result(segments)
     assert (check.kind, check.verdict) == ("packed", "stable")
-
-
-def test_ids_that_change(packed, run):
-    with changed(packed / PACKED) as file:
-        ids = file["VTKHDF/PointData/id"]
-        first = K * run.particles
-        ids[first + 3], ids[first + 4] = 4, 3
-    check = check_result(packed)
-    assert the(check, "label").frame == check.first_bad_frame == K
-    assert "the id of particle 3 is 4 instead of 3, and 1 more differ" in the(check, "label").what
 
 
 def test_a_damaged_chunk_of_a_compressed_file_is_one_frame_and_not_the_whole(run, packed):

@@ -7,14 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from mpmcli.check.finding import Finding, FrameFindings, Verdict, passes
-from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, arrays_of, check_order, kept_entries, open_entries
-from mpmcli.check.result_ledger import AgreementCheck, check_ledger
-from mpmcli.check.result_motion import MomentumCheck, MotionCheck, screen
+from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, check_order, kept_entries, open_entries
+from mpmcli.check.result_ledger import check_ledger
+from mpmcli.check.result_motion import MomentumCheck, MotionCheck
 from mpmcli.check.result_state import CrowdCheck, StateCheck, StretchCheck
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.header import RunHeader
+from mpmcli.output.reading import first_line
 from mpmcli.output.segments import PACKED
 from mpmcli.plain_json import finite_json
 
@@ -45,20 +46,20 @@ class ResultCheck:
     """Result of the check of a run; `path` and `kind` are those of `OpenedResult`, `status` is that of its record.
 
     `limit` is the bound on the step that was smallest at the first frame with an error or a warning, "" if not known.
-    None are figures that are not available: those of TOLD, momentum_frames (compared), ledger_difference (largest
-    relative one of ledger and frames), step_ratio (smallest over first), bytes (of particle data read).
+    None are figures that are not available: those of TOLD, momentum_frames (compared), step_ratio (smallest over
+    first), bytes (of particle data read).
     """
 
-    path: Path
-    kind: str
-    status: str
-    findings: tuple[Finding, ...]
     first_bad_frame: int | None
     limit: str
+    findings: tuple[Finding, ...]
     frames: int
     frames_expected: int | None
     particles: int
     figures: dict[str, float | None]
+    kind: str
+    status: str
+    path: Path
 
     @property
     def verdict(self) -> Verdict:
@@ -73,18 +74,9 @@ class ResultCheck:
 
     def as_dict(self) -> dict:
         """Return the check as a dictionary for JSON."""
-        return {
-            "ok": self.passes(),
-            "verdict": self.verdict,
-            "first_bad_frame": self.first_bad_frame,
-            "limit": self.limit,
-            "findings": [finite_json(finding.as_dict()) for finding in self.findings],
-            **{name: getattr(self, name) for name in ("frames", "frames_expected", "particles")},
-            "figures": finite_json(self.figures),
-            "kind": self.kind,
-            "status": self.status,
-            "path": str(self.path),
-        }
+        findings = [finite_json(finding.as_dict()) for finding in self.findings]
+        own = {**vars(self), "findings": findings, "figures": finite_json(self.figures), "path": str(self.path)}
+        return {"ok": self.passes(), "verdict": self.verdict, **own}
 
     def text(self) -> str:
         """Return the check as text: the verdict, the figures, and a line for each finding."""
@@ -92,11 +84,9 @@ class ResultCheck:
         limit = f', nearest limit "{self.limit}"' if bad and self.limit else ""
         expected = "" if self.frames_expected is None else f" of {self.frames_expected}"
         told = {"frames": f"{self.frames}{expected}", "particles": str(self.particles), "status": self.status}
-        for name, words in TOLD.items():
-            value = self.figures.get(name)
-            if value is not None:
-                told[words] = f"{value:.4g}"
-        width = max(len(words) for words in told)
+        known = {name: value for name, value in self.figures.items() if value is not None}
+        told |= {words: f"{known[name]:.4g}" for name, words in TOLD.items() if name in known}
+        width = max(map(len, told))
         lines = [f"{self.path}: {self.verdict}{bad}{limit}"]
         lines += [f"  {words:<{width}}  {value}" for words, value in told.items()]
         return "\n".join([*lines, *(finding.line for finding in self.findings)])
@@ -124,8 +114,7 @@ def _check(opened: OpenedResult, findings: FrameFindings) -> ResultCheck:
     if opened.entries:
         figures |= _check_frames(opened, findings)
     found = findings.found()
-    bad = [f.frame for f in found if f.severity != "note" and f.frame is not None]
-    first_bad = min(bad, default=None)
+    first_bad = min((f.frame for f in found if f.severity != "note" and f.frame is not None), default=None)
     return ResultCheck(
         path=opened.path,
         kind=opened.kind,
@@ -141,53 +130,36 @@ def _check(opened: OpenedResult, findings: FrameFindings) -> ResultCheck:
 
 
 def _check_frames(opened: OpenedResult, findings: FrameFindings) -> dict[str, float | None]:
-    """Read each frame once; check its values, and compare it with the previous frame and the ledger."""
+    """Read each frame once, and check its values and what changed since the frame before."""
     header = opened.header
-    # Only a file can have been changed since the run.
-    stored = opened.kind != "memory"
-    state, motion = StateCheck(header, findings, stored=stored), MotionCheck(header, findings)
-    agreement, stretch = AgreementCheck(header, findings), StretchCheck(header, findings)
+    state, motion, stretch = (kind(header, findings) for kind in (StateCheck, MotionCheck, StretchCheck))
     momentum = MomentumCheck(header, findings, opened.entries[0].row)
     crowd = CrowdCheck(header, findings, len(opened.entries))
     size = 0
-    before: tuple[int, int] | None = None
-    screened = None if stored else screen(header, opened.entries)
     for k, entry in enumerate(opened.entries):
         number, row = entry.number, entry.row
         try:
             frame, ids = entry.read()
         except InputError as error:
-            findings.add("error", "unreadable", number, str(error).rstrip("."), RUN_AGAIN)
-            motion.forget()
+            what = f"Frame {number} cannot be read ({first_line(error)})"
+            findings.add("error", "unreadable", number, what, RUN_AGAIN)
             momentum.lost()
-            before = None
             continue
-        size += sum(array.nbytes for array in arrays_of(frame, ids).values())
-        if screened is not None and screened.quiet[k]:
-            motion.passed(number, frame, float(screened.ratio[k]))
-            momentum.check(number, frame, row, (screened.lowest[k], screened.highest[k]))
-            stretch.check(number, frame)
-            crowd.check(k, number, frame)
-            continue
+        arrays = (ids, frame.position, frame.velocity, frame.body, frame.material, *frame.fields.values())
+        size += sum(array.nbytes for array in arrays)
         # Values that are not finite have one finding, and must not cause others.
-        with np.errstate(invalid="ignore", over="ignore"):
-            sound = state.check(number, frame, ids, entry.count)
-            J = state.volume_ratio(frame)
-            if J is not None:
-                state.check_volume(number, frame, J)
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            sound = state.check(number, frame)
+            J = state.volume_ratio(number, frame)
             if not header.drops:
                 motion.check(number, frame, row, sound)
-            if sound is None:
-                steps = frame.step - before[1] if before is not None and before[0] + 1 == number else None
-                if stored:
-                    agreement.check(number, frame, row, J, steps)
-                momentum.check(number, frame, row)
-                crowd.check(k, number, frame, J)
-                if not header.comes_and_goes:
-                    stretch.check(number, frame)
-            else:
+            if sound is not None:
                 momentum.lost()
-        before = (number, frame.step)
+                continue
+            momentum.check(number, frame, row)
+            crowd.check(k, number, frame, J)
+            if not header.comes_and_goes:
+                stretch.check(number, frame)
     return {
         "displacement_ratio": motion.largest_ratio,
         "deformation_max": motion.deformation,
@@ -196,16 +168,13 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings) -> dict[str, fl
         "empty_cells": crowd.empty,
         "momentum_drift": momentum.drift,
         "momentum_frames": momentum.frames,
-        "ledger_difference": agreement.largest if stored else None,
         "bytes": size,
     }
 
 
 def _limit_at(opened: OpenedResult, number: int) -> str:
     """Return the bound that was smallest at a frame: from the ledger, or from the diagnosis of an unstable run."""
-    last = max((entry.number for entry in opened.entries), default=-1)
-    diagnosed = ((opened.record or {}).get("failure") or {}).get("limit")
-    if number > last and diagnosed:
-        return str(diagnosed)
-    up_to = [entry.row.limit for entry in opened.entries if entry.number <= max(number, 1) and entry.row.limit]
-    return up_to[-1] if up_to else ""
+    if number > opened.last and opened.failure.get("limit"):
+        return str(opened.failure["limit"])
+    rows = [entry.row for entry in opened.entries if entry.number <= max(number, 1)]
+    return next((row.limit for row in reversed(rows) if row.limit), "")

@@ -1,13 +1,15 @@
-"""Opens a result that may be damaged, and checks that it holds each frame once, at its time, and how the run ended."""
+"""Opens a result that may be damaged, and checks that it holds each frame at its time, and how the run ended."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mpmcli.check.finding import FrameFindings
+from mpmcli.check.finding import FrameFindings, Severity
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -17,55 +19,34 @@ from mpmcli.output.result import Result, open_result, result_place
 from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
 from mpmcli.output.segments import PACKED, sealed_segments
 
-HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 RUN_AGAIN = "Copy the file again from where it was made, or run the scene again."
+GO_ON = "mpmcli simulate --resume goes on with it."
+WAIT = "Wait for it, or run it again."
 # Tolerance of times, relative to the duration of the run.
 TIME_ERROR = 1e-9
+# What is said of a run that did not finish, by its status.
+GOES_ON = "The run has not ended; there are {far}, and "
+ENDS: dict[str, tuple[Severity, str, str, str]] = {
+    "unstable": ("error", "unstable-run", "After {far} {why}", "Change what the sentence names and run it again."),
+    "failed": ("error", "failed-run", "The run failed after {far}{told}", "Run it again."),
+    "interrupted": ("warning", "interrupted-run", "The run was interrupted after {far}", GO_ON),
+    "stopped": ("warning", "stopped-run", "The run stopped after {far}{told}", GO_ON),
+    DIED: ("warning", "died-run", "The run died after {far}: its process has ended and left no word", GO_ON),
+    "running": ("warning", "running", GOES_ON + "it goes on", WAIT),
+    ELSEWHERE: ("warning", "running", GOES_ON + "whether it goes on cannot be seen from here", WAIT),
+}
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One frame of a result, not yet read: frame k of `result`, which is None where it is in memory."""
+    """A frame that is not read yet: its number, time, s, row of the ledger and number of particles."""
 
-    # From the name of its file if it has its own, and by its content.
     number: int
-    said: int
-    # Time, s, row of the ledger and number of particles that the file lists.
     time: float
     row: LedgerRow
     count: int
-    result: Result | None
-    k: int
-
-    @classmethod
-    def of(cls, result: Result, k: int, number: int) -> "Entry":
-        """Return frame k of a result."""
-        time, count = float(result.times[k]), int(result.particle_counts[k])
-        return cls(number, int(result.numbers[k]), time, result.ledger[k], count, result, k)
-
-    def read(self) -> tuple[Frame, np.ndarray]:
-        """Read the frame and its ids; raise InputError if it cannot be read."""
-        try:
-            frame, ids = self.result.numbered_frame(self.k)
-        except InputError as error:
-            raise InputError(f"Frame {self.number} cannot be read ({first_line(error)}).") from error
-        lengths = {name: len(array) for name, array in arrays_of(frame, ids).items()}
-        shortest = min(lengths, key=lambda name: lengths[name])
-        if lengths[shortest] < max(lengths.values()):
-            raise InputError(
-                f"Frame {self.number} is cut off: {shortest} has {lengths[shortest]} of {max(lengths.values())} rows."
-            )
-        return frame, ids
-
-
-@dataclass(frozen=True)
-class KeptEntry(Entry):
-    """A frame in memory, all of which is known."""
-
-    frame: Frame
-
-    def read(self) -> tuple[Frame, np.ndarray]:
-        return self.frame, np.arange(self.count, dtype=np.int32)
+    # Reads the frame and its ids; InputError: it is damaged.
+    read: Callable[[], tuple[Frame, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -90,19 +71,25 @@ class OpenedResult:
         """Number of frames of the whole run, None if it is not known."""
         return (self.record or {}).get("frames_expected") or self.header.frames
 
+    @property
+    def last(self) -> int:
+        """Number of the last frame, -1 without any."""
+        return max((entry.number for entry in self.entries), default=-1)
 
-def arrays_of(frame: Frame, ids: np.ndarray) -> dict[str, np.ndarray]:
-    """Return all arrays of a frame by name."""
-    standard = {name: getattr(frame, name) for name in ("position", "velocity", "body", "material")}
-    return {"id": ids, **standard, **frame.fields}
+    @property
+    def failure(self) -> dict[str, Any]:
+        """What the record says of the failure of the run."""
+        return (self.record or {}).get("failure") or {}
 
 
 def kept_entries(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[LedgerRow]) -> OpenedResult:
     """Return the frames of a run in memory that has finished, with the rows of its ledger."""
-    entries = [
-        KeptEntry(frame.index, frame.index, frame.time, row, len(frame.position), None, k, frame)
-        for k, (frame, row) in enumerate(zip(frames, ledger, strict=True))
-    ]
+
+    def entry(frame: Frame, row: LedgerRow) -> Entry:
+        n = len(frame.position)
+        return Entry(frame.index, frame.time, row, n, lambda: (frame, np.arange(n, dtype=np.int32)))
+
+    entries = list(map(entry, frames, ledger))
     return OpenedResult(Path(), "memory", header, {"status": "finished"}, entries)
 
 
@@ -118,143 +105,68 @@ def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
             raise
         findings.add("error", "unreadable", 0, f"No frame can be read: {first_line(error)}", RUN_AGAIN)
         return OpenedResult(path, "none", RunHeader.read({}), read_record(_directory(path)), [])
-    entries = [Entry.of(result, k, int(result.numbers[k])) for k in range(result.frame_count)]
-    return OpenedResult(result.path, result.kind, result.header, result.record, entries)
+    return OpenedResult(result.path, result.kind, result.header, result.record, _entries(result))
+
+
+def _entries(result: Result, number: int | None = None) -> list[Entry]:
+    """Return the frames of a result, numbered from `number` on where the name of its file gives that."""
+    numbers = result.numbers.tolist() if number is None else range(number, number + result.frame_count)
+    columns = zip(numbers, result.times.tolist(), result.ledger, result.particle_counts.tolist(), strict=True)
+    return [Entry(*facts, partial(result.numbered_frame, k)) for k, facts in enumerate(columns)]
 
 
 def _open_segments(directory: Path, findings: FrameFindings) -> OpenedResult:
     """Open each sealed segment separately, so that damage to one does not affect the others."""
-    entries: list[Entry] = []
+    header, entries = None, []
     for segment in sealed_segments(directory):
         number = int(segment.stem.split("_")[1])
         try:
             result = open_result(segment)
-            entries += [Entry.of(result, k, number + k) for k in range(result.frame_count)]
+            entries += _entries(result, number)
+            header = header or result.header
         except InputError as error:
             what = f"The segment of frame {number} cannot be read ({first_line(error)})"
             findings.add("error", "unreadable", number, what, RUN_AGAIN)
-    header = entries[0].result.header if entries else RunHeader.read({})
-    return OpenedResult(directory, "segments", header, read_record(directory), entries)
+    return OpenedResult(directory, "segments", header or RunHeader.read({}), read_record(directory), entries)
 
 
 def _directory(path: Path) -> Path:
     return path if path.is_dir() else path.parent
 
 
-def _is_damage(path: Path, error: Exception) -> bool:
-    """Return whether mpmcli wrote the file, so that it is damaged rather than of another kind."""
-    if not path.exists():
-        return False
+def _is_damage(path: Path, error: InputError) -> bool:
+    """Return whether mpmcli wrote what cannot be read, so that it is damaged rather than of another kind."""
     ours = read_record(_directory(path)) is not None
-    if path.is_dir():
-        packed = path / PACKED
-        if not packed.exists():
-            return ours  # a run that wrote no frame
-        path = packed
-    if isinstance(error, DamageError):
-        return True
-    # open_result sets a cause if the file could not be read, and none if it is of another kind or version.
-    if isinstance(error, InputError) and error.__cause__ is None:
-        return False
-    if ours:
-        return True
-    with path.open("rb") as file:
-        return file.read(8) == HDF5_SIGNATURE
+    if path.is_dir() and not (path / PACKED).exists():
+        return ours  # a run that wrote no frame
+    # A cause is set if the file could not be read, and none if it is of another kind or version.
+    return isinstance(error, DamageError) or (ours and error.__cause__ is not None)
 
 
 def check_order(opened: OpenedResult, findings: FrameFindings) -> None:
-    """Check the numbers and times of the frames, and that a finished run has all of them."""
-    entries, expected = opened.entries, opened.frames_expected
-    _numbers(entries, findings)
-    _times(entries, opened.header, findings)
-    status = (opened.record or {}).get("status")
-    numbers = {entry.number for entry in entries} | {entry.said for entry in entries}
-    if expected is not None and entries and max(numbers) >= expected:
-        what = f"There is a frame {max(numbers)}, where the scene has frames 0 to {expected - 1} only"
-        findings.add("error", "extra-frames", expected, what, "Remove what was added to the result.")
+    """Check the times of the frames, that a finished run has all of them, and how the run ended."""
+    entries, expected, header = opened.entries, opened.frames_expected, opened.header
+    for entry in entries if header.end is not None and header.frames is not None else ():
+        planned = header.end * entry.number / (header.frames - 1)
+        if not abs(entry.time - planned) <= TIME_ERROR * header.end:
+            what = f"Frame {entry.number} is at {entry.time:.6g} s, where the scene has it at {planned:.6g} s"
+            findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time)
     # Frames missing at the end of a run that did not finish are reported by its status.
-    whole = expected if expected is not None and status in (None, "finished") else max(numbers, default=-1) + 1
+    over = (opened.record or {}).get("status") in (None, "finished")
+    whole = expected if expected is not None and over else opened.last + 1
     there = {entry.number for entry in entries} | findings.frames_of("unreadable")
-    first, count = _missing(there, whole if expected is None else min(whole, expected))
-    if count and entries:
-        named = f"Frame {first} is" if count == 1 else f"Frame {first} and {count - 1} more of {whole} are"
-        findings.add("error", "missing-frames", first, f"{named} missing", RUN_AGAIN, value=count)
-    _status(opened, findings)
-
-
-def _missing(there: set[int], whole: int) -> tuple[int, int]:
-    # A damaged file may state any number, so that a loop over all of them could be endless.
-    known = sorted(number for number in there if 0 <= number < whole)
-    first = next((k for k, number in enumerate(known) if k != number), len(known))
-    return first, whole - len(known)
-
-
-def _numbers(entries: Sequence[Entry], findings: FrameFindings) -> None:
-    seen: set[int] = set()
-    highest = -1
-    for entry in entries:
-        if entry.said != entry.number:
-            what = f"The file of frame {entry.number} holds frame {entry.said}"
-            findings.add("error", "frame-number", entry.number, what, RUN_AGAIN, value=entry.said)
-        elif entry.said in seen:
-            what = f"Frame {entry.said} is there more than once"
-            findings.add("error", "duplicated-frames", entry.said, what, "Remove the second one.", value=entry.said)
-        elif entry.said < highest:
-            what = f"Frame {entry.said} comes after frame {highest}"
-            findings.add("error", "frame-order", entry.said, what, "Put the frames in order.", value=entry.said)
-        seen.add(entry.said)
-        highest = max(highest, entry.said)
-
-
-def _times(entries: Sequence[Entry], header: RunHeader, findings: FrameFindings) -> None:
-    before = None
-    for entry in entries:
-        allowed = TIME_ERROR * max(abs(entry.time), header.end or 0.0)
-        if not abs(entry.time - entry.row.time) <= allowed:
-            what = f"Frame {entry.number} is listed at {entry.time:.6g} s and its ledger row at {entry.row.time:.6g} s"
-            findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time, kind="ledger")
-        elif before is not None and not entry.time > before:
-            what = f"Frame {entry.number}, at {entry.time:.6g} s, is not later than the one before it"
-            findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time, kind="order")
-        elif header.end is not None and header.frames is not None:
-            planned = header.end * entry.number / (header.frames - 1)
-            if not abs(entry.time - planned) <= allowed:
-                what = f"Frame {entry.number} is at {entry.time:.6g} s, where the scene has it at {planned:.6g} s"
-                findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time, kind="scene")
-        before = entry.time
-
-
-def _status(opened: OpenedResult, findings: FrameFindings) -> None:
-    count, expected = max((entry.number for entry in opened.entries), default=-1) + 1, opened.frames_expected
-    far = f"{count} of {expected} frames" if expected is not None else f"{count} frames"
-    record = opened.record
-    if record is None:
+    missing = whole - sum(number < whole for number in there)
+    if missing and entries:
+        first = next(number for number in count() if number not in there)
+        named = f"Frame {first} is" if missing == 1 else f"Frame {first} and {missing - 1} more of {whole} are"
+        findings.add("error", "missing-frames", first, f"{named} missing", RUN_AGAIN, value=missing)
+    if opened.record is None:
         what = "No run.json lies beside the frames, so how the run ended is not known"
         findings.add("note", "no-record", None, what, "Keep run.json together with the frames.")
-        return
-    status = opened.status
-    message = ((record.get("failure") or {}).get("message") or "").rstrip(".")
-    said = f": {message}" if message else ""
-    if status == "unstable":
-        fix = "Change what the sentence names and run it again."
-        findings.add("error", "unstable-run", count, f"After {far} {message or 'the run became unstable'}", fix)
-    elif status == "failed":
-        findings.add("error", "failed-run", count, f"The run failed after {far}{said}", "Run it again.")
-    elif status == "interrupted":
-        what = f"The run was interrupted after {far}"
-        findings.add("warning", "interrupted-run", count, what, "mpmcli simulate --resume goes on with it.")
-    elif status == "stopped":
-        findings.add(
-            "warning",
-            "stopped-run",
-            count,
-            f"The run stopped after {far}{said}",
-            "mpmcli simulate --resume goes on with it.",
-        )
-    elif status == DIED:
-        what = f"The run died after {far}: its process has ended and left no word"
-        findings.add("warning", "died-run", count, what, "mpmcli simulate --resume goes on with it.")
-    elif status in ("running", ELSEWHERE):
-        still = "and it goes on" if status == "running" else "and whether it goes on cannot be seen from here"
-        what = f"The run has not ended; there are {far}, {still}"
-        findings.add("warning", "running", count, what, "Wait for it, or run it again.")
+    elif opened.status in ENDS:
+        severity, rule, what, fix = ENDS[opened.status]
+        message = (opened.failure.get("message") or "").rstrip(".")
+        written = opened.last + 1
+        far = f"{written} frames" if expected is None else f"{written} of {expected} frames"
+        what = what.format(far=far, why=message or "the run became unstable", told=message and f": {message}")
+        findings.add(severity, rule, written, what, fix)
