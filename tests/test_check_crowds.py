@@ -26,10 +26,10 @@ def pool(per_cell: int = 4) -> Scene:
 
 def checked(scene: Scene, places: list[np.ndarray], law: str = "fluid") -> tuple[CrowdCheck, list]:
     findings = FrameFindings()
-    check = CrowdCheck(header_of(scene, law), findings, len(places))
+    check = CrowdCheck(header_of(scene, law), findings, len(places) - 1)
     for k, x in enumerate(places):
         label = np.zeros(len(x), np.int32)
-        check.check(k, k, Frame(k, 0.1 * k, 10 * k, x, np.zeros_like(x), label, label))
+        check.check(Frame(k, 0.1 * k, 10 * k, x, np.zeros_like(x), label, label))
     return check, list(findings.found())
 
 
@@ -38,7 +38,7 @@ def test_a_pool_at_rest_has_no_crowds(sampling: str) -> None:
     scene = pool()
     scene = scene.model_copy(update={"bodies": (scene.bodies[0].model_copy(update={"sampling": sampling}),)})
     check, found = checked(scene, [sample_bodies(scene)[0].position])
-    assert (check.densest, check.empty, found) == (1.0, 0.0, [])
+    assert (check.figures, found) == ({"densest_cell": 1.0, "empty_cells": 0.0}, [])
 
 
 def test_rows_that_pile_up_are_told() -> None:
@@ -51,9 +51,9 @@ def test_rows_that_pile_up_are_told() -> None:
     piled = x.copy()
     piled[:, 0] = (np.floor(x[:, 0] / (5 * H)) + 0.4 + 0.2 * (x[:, 0] / H % 1)) * 5 * H
     check, found = checked(scene, [x, piled])
-    assert check.densest == pytest.approx(5.0)
+    assert check.figures["densest_cell"] == pytest.approx(5.0)
     # Windows of five cells are as full as before.
-    assert check.empty == pytest.approx(0.8, abs=0.02)
+    assert check.figures["empty_cells"] == pytest.approx(0.8, abs=0.02)
     assert [(one.rule, one.severity, one.frame) for one in found] == [("crowd", "note", 1)]
     assert checked(scene, [x * [0.6, 1.0] + [0.3, 0.03]])[1] == []
     assert checked(scene, [piled], "neo_hookean")[1] == []
@@ -67,7 +67,8 @@ def test_a_viscous_liquid_that_sprays_is_told(viscosity: float, mean: float, fir
     x, findings = sample_bodies(scene)[0].position, FrameFindings()
     label, J = np.zeros(len(x), np.int32), np.full(len(x), 1.0)
     J[::2] += 2 * (mean - 1)
-    CrowdCheck(header_of(scene, "fluid"), findings, 1).check(0, 0, Frame(0, 0.0, 0, x, x, label, label), J)
+    frame = Frame(0, 0.0, 0, x, x, label, label, {"volume_ratio": J})
+    CrowdCheck(header_of(scene, "fluid"), findings, 0).check(frame)
     assert [one.rule for one in findings.found()] == ["spray"] * fires
 
 

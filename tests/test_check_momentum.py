@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mpmcli.check.finding import FrameFindings
-from mpmcli.check.result_motion import MomentumCheck
+from mpmcli.check.result_state import MomentumCheck
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.header import RunHeader
@@ -41,9 +41,9 @@ def test_spin_that_is_lost_is_a_fault_of_apic_alone(transfer: str, found: bool) 
     label = np.zeros(2, dtype=np.int32)
     lost = 0.05 * np.sqrt(0.2) * np.hypot(2.0, 1.0)
     findings = FrameFindings()
-    check = MomentumCheck(header_of(transfer), findings, row(0, 1.0))
+    check = MomentumCheck(header_of(transfer), findings)
     for k in range(2):
-        check.check(k, Frame(k, 0.1 * k, k, position, velocity, label, label, {}), row(k, 1.0 - k * lost))
-    assert check.frames == 1
-    assert check.drift == pytest.approx(0.05 if found else 0.0, abs=1e-12)
+        check.check(Frame(k, 0.1 * k, k, position, velocity, label, label, {}), row(k, 1.0 - k * lost))
+    assert check.figures["momentum_frames"] == 1
+    assert check.figures["momentum_drift"] == pytest.approx(0.05 if found else 0.0, abs=1e-12)
     assert [finding.rule for finding in findings.found()] == (["momentum"] if found else [])

@@ -60,8 +60,6 @@ def test_an_unbroken_result_is_stable_in_every_form(run, checked, form):
     figures = check.figures
     assert figures["mass_change"] == 0
     assert figures["courant_max"] == max(row.courant_max for row in run.rows)
-    # The fastest node is at least as fast as the fastest particle, and not by much.
-    assert 0.8 < figures["displacement_ratio"] <= 1
     total = [row.energy for row in run.rows]
     assert figures["energy_growth"] < 1e-3 and figures["energy_lost"] * total[0] > 0
     # Nothing but gravity acts before the drop meets the floor; rounding is relative 6e-8 a step.
@@ -92,30 +90,13 @@ def test_a_nan_is_found_and_named(run, checked, name, form):
 
 @settings(max_examples=10)
 @given(data=st.data())
-def test_a_nan_and_a_teleport_are_found_wherever_they_are(run, data):
+def test_a_nan_is_found_wherever_it_is(run, data):
     k, p = data.draw(st.integers(1, 10)), data.draw(st.integers(0, run.particles - 1))
     name = data.draw(st.sampled_from(["position", "velocity", *run.frames[0].fields]))
     value = data.draw(st.sampled_from([np.nan, np.inf, -np.inf]))
-    angle = data.draw(st.floats(0, 2 * np.pi))
-    place = run.frames[k].position[p] + 0.2 * np.array([np.cos(angle), np.sin(angle)], np.float32)
     with TemporaryDirectory() as directory:
-        lost = check_result(run.patched(Path(directory) / "lost", k, name, p, value))
-        gone = check_result(run.patched(Path(directory) / "gone", k, "position", p, place))
-    assert the(lost, "not-finite").frame == lost.first_bad_frame == k
-    # At most 2 m/s for 0.02 s, and so less than 0.04 m from one frame to the next.
-    assert the(gone, "teleported").frame == gone.first_bad_frame == k
-    assert f"particle {p} of" in the(gone, "teleported").what
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_a_teleported_particle_is_found(run, checked, form):
-    moved = run.frames[K].position[3] + np.array([0.3, 0.0], np.float32)
-    check = checked(run.with_value(K, "position", 3, moved), form=form)
-    finding = the(check, "teleported")
-    assert check.verdict == "unstable" and check.first_bad_frame == finding.frame == K
-    assert f"Up to frame {K} particle 3" in finding.what and "in 1 more frame" in finding.what
-    row = run.rows[K]
-    assert finding.value == pytest.approx(0.3 / (row.steps * row.courant_max / 16), rel=0.2)
+        check = check_result(run.patched(Path(directory) / "lost", k, name, p, value))
+    assert the(check, "not-finite").frame == check.first_bad_frame == k
 
 
 # The last one is on a wall, and rounded.
@@ -129,16 +110,6 @@ def test_an_escaped_particle_is_found(run, checked, place):
     finding = the(check, "escaped")
     assert finding.frame == K and "number 9" in finding.what
     assert finding.value == pytest.approx(beyond, rel=1e-5)
-
-
-@pytest.mark.parametrize("count", [-1, 1])
-def test_particles_that_come_or_go_are_found(run, checked, count):
-    frame, rows = run.frames[K], np.arange(run.particles + count) % run.particles
-    fields = {name: array[rows] for name, array in frame.fields.items()}
-    arrays = {name: getattr(frame, name)[rows] for name in ("position", "velocity", "body", "material")}
-    frames = [*run.frames[:K], replace(frame, **arrays, fields=fields), *run.frames[K + 1 :]]
-    finding = the(checked(frames), "particle-count")
-    assert finding.frame == K and finding.value == count
 
 
 @pytest.mark.parametrize("k", [0, K])
@@ -198,19 +169,6 @@ def test_a_collapsed_step_is_found(run, checked):
     finding = the(check, "step-collapse")
     assert (finding.severity, finding.frame, check.limit) == ("warning", K, "deformation")
     assert finding.value == check.figures["step_ratio"] == pytest.approx(1e-3)
-
-
-@pytest.mark.parametrize(("deformation", "severity"), [(0.5, None), (0.7, "warning"), (1.5, "error")])
-def test_particles_that_deform_too_much_in_a_step_are_found(run, checked, deformation, severity):
-    """A fluid by (|tr C| + sqrt(-det C)) dt; a solid by the largest row sum of |C + C^T| dt / 2, however it spins."""
-    rate = deformation / run.rows[K].step_max
-    fluid = checked(run.with_value(K, "affine", 3, [0.4 * rate, 0.6 * rate, 0.6 * rate, 0.0]))
-    solid = checked(run.with_value(K, "affine", run.particles - 1, [0.25 * rate, 9.75 * rate, -8.25 * rate, 0.0]))
-    for check in (fluid, solid):
-        assert [(f.rule, f.severity, f.frame) for f in check.findings] == (
-            [("deformation", severity, K)] if severity else []
-        )
-        assert check.figures["deformation_max"] == pytest.approx(deformation, rel=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,6 @@ def test_check_counts_what_walls_hold(held: int) -> None:
     check = StateCheck(RunHeader.read(made_header(2)), findings)
     for frame in frames:
         frame.position[:held, 0] = 0.0
-        check.check(frame.index, frame)
+        check.check(frame)
     told = [(f.rule, f.severity, f.frame, f.value) for f in findings.found() if f.rule == "held-positions"]
     assert told == ([("held-positions", "note", 1, 0.25)] if held else [])

@@ -9,8 +9,7 @@ import numpy as np
 from mpmcli.check.finding import Finding, FrameFindings, Verdict, passes
 from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, check_order, kept_entries, open_entries
 from mpmcli.check.result_ledger import check_ledger
-from mpmcli.check.result_motion import MomentumCheck, MotionCheck
-from mpmcli.check.result_state import CrowdCheck, StateCheck, StretchCheck
+from mpmcli.check.result_state import CrowdCheck, MomentumCheck, StateCheck, StretchCheck
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -27,8 +26,6 @@ TOLD = {
     "momentum_drift": "momentum drift",
     "collider_impulse": "momentum that colliders took, kg m/s",
     "courant_max": "largest Courant number",
-    "deformation_max": "largest deformation in a step",
-    "displacement_ratio": "displacement / reach",
     "speed_max": "largest speed, m/s",
     "volume_ratio_min": "smallest J",
     "volume_ratio_max": "largest J",
@@ -130,51 +127,37 @@ def _check(opened: OpenedResult, findings: FrameFindings) -> ResultCheck:
 
 
 def _check_frames(opened: OpenedResult, findings: FrameFindings) -> dict[str, float | None]:
-    """Read each frame once, and check its values and what changed since the frame before."""
+    """Read each frame once, and check its values."""
     header = opened.header
-    state, motion, stretch = (kind(header, findings) for kind in (StateCheck, MotionCheck, StretchCheck))
-    momentum = MomentumCheck(header, findings, opened.entries[0].row)
-    crowd = CrowdCheck(header, findings, len(opened.entries))
+    state, stretch, momentum = (kind(header, findings) for kind in (StateCheck, StretchCheck, MomentumCheck))
+    crowd = CrowdCheck(header, findings, opened.last)
     size = 0
-    for k, entry in enumerate(opened.entries):
-        number, row = entry.number, entry.row
+    for entry in opened.entries:
         try:
             frame, ids = entry.read()
         except InputError as error:
-            what = f"Frame {number} cannot be read ({first_line(error)})"
-            findings.add("error", "unreadable", number, what, RUN_AGAIN)
+            what = f"Frame {entry.number} cannot be read ({first_line(error)})"
+            findings.add("error", "unreadable", entry.number, what, RUN_AGAIN)
             momentum.lost()
             continue
         arrays = (ids, frame.position, frame.velocity, frame.body, frame.material, *frame.fields.values())
         size += sum(array.nbytes for array in arrays)
         # Values that are not finite have one finding, and must not cause others.
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            sound = state.check(number, frame)
-            J = state.volume_ratio(number, frame)
-            if not header.drops:
-                motion.check(number, frame, row, sound)
-            if sound is not None:
+            if not state.check(frame):
                 momentum.lost()
                 continue
-            momentum.check(number, frame, row)
-            crowd.check(k, number, frame, J)
+            momentum.check(frame, entry.row)
+            crowd.check(frame)
             if not header.comes_and_goes:
-                stretch.check(number, frame)
-    return {
-        "displacement_ratio": motion.largest_ratio,
-        "deformation_max": motion.deformation,
-        "neighbour_distance": stretch.largest,
-        "densest_cell": crowd.densest,
-        "empty_cells": crowd.empty,
-        "momentum_drift": momentum.drift,
-        "momentum_frames": momentum.frames,
-        "bytes": size,
-    }
+                stretch.check(frame)
+    return {**stretch.figures, **crowd.figures, **momentum.figures, "bytes": size}
 
 
 def _limit_at(opened: OpenedResult, number: int) -> str:
     """Return the bound that was smallest at a frame: from the ledger, or from the diagnosis of an unstable run."""
-    if number > opened.last and opened.failure.get("limit"):
-        return str(opened.failure["limit"])
+    failure = opened.record.get("failure") or {}
+    if number > opened.last and failure.get("limit"):
+        return str(failure["limit"])
     rows = [entry.row for entry in opened.entries if entry.number <= max(number, 1)]
     return next((row.limit for row in reversed(rows) if row.limit), "")

@@ -13,9 +13,10 @@ from mpmcli.check.finding import FrameFindings, Severity
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.durable import number_of
 from mpmcli.output.header import RunHeader
 from mpmcli.output.reading import DamageError, first_line
-from mpmcli.output.result import Result, open_result, result_place
+from mpmcli.output.result import open_result, result_place
 from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
 from mpmcli.output.segments import PACKED, sealed_segments
 
@@ -57,77 +58,60 @@ class OpenedResult:
     # "packed", "segments", "memory", or "none" if nothing can be read.
     kind: str
     header: RunHeader
-    # Content of run.json.
-    record: dict[str, Any] | None
+    # Content of run.json, {} without one.
+    record: dict[str, Any]
     entries: list[Entry]
 
     @property
     def status(self) -> str:
         """How the run stands, see `run_status`."""
-        return run_status(_directory(self.path), self.record)
+        return run_status(_directory(self.path), self.record or None)
 
     @property
     def frames_expected(self) -> int | None:
         """Number of frames of the whole run, None if it is not known."""
-        return (self.record or {}).get("frames_expected") or self.header.frames
+        return self.record.get("frames_expected") or self.header.frames
 
     @property
     def last(self) -> int:
         """Number of the last frame, -1 without any."""
         return max((entry.number for entry in self.entries), default=-1)
 
-    @property
-    def failure(self) -> dict[str, Any]:
-        """What the record says of the failure of the run."""
-        return (self.record or {}).get("failure") or {}
-
 
 def kept_entries(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[LedgerRow]) -> OpenedResult:
     """Return the frames of a run in memory that has finished, with the rows of its ledger."""
-
-    def entry(frame: Frame, row: LedgerRow) -> Entry:
-        n = len(frame.position)
-        return Entry(frame.index, frame.time, row, n, lambda: (frame, np.arange(n, dtype=np.int32)))
-
-    entries = list(map(entry, frames, ledger))
+    # Ids are those of the rows, as many as labels of bodies.
+    entries = [
+        Entry(frame.index, frame.time, row, len(frame.body), lambda frame=frame: (frame, frame.body))
+        for frame, row in zip(frames, ledger, strict=True)
+    ]
     return OpenedResult(Path(), "memory", header, {"status": "finished"}, entries)
 
 
 def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
-    """Open what can be read of a result, and note the rest; InputError: nothing is there, or nothing of ours."""
+    """Open what can be read of a result, and note the rest; InputError: nothing is there, or nothing of ours.
+
+    Each segment is opened separately, so that damage to one does not affect the others.
+    """
     path = result_place(path)
-    if path.is_dir() and not (path / PACKED).exists() and sealed_segments(path):
-        return _open_segments(path, findings)
-    try:
-        result = open_result(path)
-    except InputError as error:
-        if not _is_damage(path, error):
-            raise
-        findings.add("error", "unreadable", 0, f"No frame can be read: {first_line(error)}", RUN_AGAIN)
-        return OpenedResult(path, "none", RunHeader.read({}), read_record(_directory(path)), [])
-    return OpenedResult(result.path, result.kind, result.header, result.record, _entries(result))
-
-
-def _entries(result: Result, number: int | None = None) -> list[Entry]:
-    """Return the frames of a result, numbered from `number` on where the name of its file gives that."""
-    numbers = result.numbers.tolist() if number is None else range(number, number + result.frame_count)
-    columns = zip(numbers, result.times.tolist(), result.ledger, result.particle_counts.tolist(), strict=True)
-    return [Entry(*facts, partial(result.numbered_frame, k)) for k, facts in enumerate(columns)]
-
-
-def _open_segments(directory: Path, findings: FrameFindings) -> OpenedResult:
-    """Open each sealed segment separately, so that damage to one does not affect the others."""
-    header, entries = None, []
-    for segment in sealed_segments(directory):
-        number = int(segment.stem.split("_")[1])
+    segments = sealed_segments(path) if path.is_dir() and not (path / PACKED).exists() else []
+    kind, header, entries = "segments" if segments else "none", RunHeader.read({}), []
+    for file in segments or [path]:
+        first = number_of(file) if segments else 0
         try:
-            result = open_result(segment)
-            entries += _entries(result, number)
-            header = header or result.header
+            result = open_result(file)
         except InputError as error:
-            what = f"The segment of frame {number} cannot be read ({first_line(error)})"
-            findings.add("error", "unreadable", number, what, RUN_AGAIN)
-    return OpenedResult(directory, "segments", header or RunHeader.read({}), read_record(directory), entries)
+            if not segments and not _is_damage(path, error):
+                raise
+            which = f"The segment of frame {first} cannot be read ({{}})" if segments else "No frame can be read: {}"
+            findings.add("error", "unreadable", first, which.format(first_line(error)), RUN_AGAIN)
+            continue
+        header = header if entries else result.header
+        numbers = range(first, first + result.frame_count) if segments else result.numbers.tolist()
+        columns = zip(numbers, result.times.tolist(), result.ledger, result.particle_counts.tolist(), strict=True)
+        entries += [Entry(*facts, partial(result.numbered_frame, k)) for k, facts in enumerate(columns)]
+        path, kind = (path, kind) if segments else (result.path, result.kind)
+    return OpenedResult(path, kind, header, read_record(_directory(path)) or {}, entries)
 
 
 def _directory(path: Path) -> Path:
@@ -152,7 +136,7 @@ def check_order(opened: OpenedResult, findings: FrameFindings) -> None:
             what = f"Frame {entry.number} is at {entry.time:.6g} s, where the scene has it at {planned:.6g} s"
             findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time)
     # Frames missing at the end of a run that did not finish are reported by its status.
-    over = (opened.record or {}).get("status") in (None, "finished")
+    over = opened.record.get("status") in (None, "finished")
     whole = expected if expected is not None and over else opened.last + 1
     there = {entry.number for entry in entries} | findings.frames_of("unreadable")
     missing = whole - sum(number < whole for number in there)
@@ -160,12 +144,12 @@ def check_order(opened: OpenedResult, findings: FrameFindings) -> None:
         first = next(number for number in count() if number not in there)
         named = f"Frame {first} is" if missing == 1 else f"Frame {first} and {missing - 1} more of {whole} are"
         findings.add("error", "missing-frames", first, f"{named} missing", RUN_AGAIN, value=missing)
-    if opened.record is None:
+    if not opened.record:
         what = "No run.json lies beside the frames, so how the run ended is not known"
         findings.add("note", "no-record", None, what, "Keep run.json together with the frames.")
     elif opened.status in ENDS:
         severity, rule, what, fix = ENDS[opened.status]
-        message = (opened.failure.get("message") or "").rstrip(".")
+        message = ((opened.record.get("failure") or {}).get("message") or "").rstrip(".")
         written = opened.last + 1
         far = f"{written} frames" if expected is None else f"{written} of {expected} frames"
         what = what.format(far=far, why=message or "the run became unstable", told=message and f": {message}")

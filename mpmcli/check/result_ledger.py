@@ -9,7 +9,7 @@ import numpy as np
 
 from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_entries import Entry
-from mpmcli.check.result_state import BLOWN_UP, CRUSHED, LOWER_SAFETY, TOUCHED
+from mpmcli.check.result_state import BLOWN_UP, CRUSHED
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.header import RunHeader
 from mpmcli.stability.limits import COURANT
@@ -31,6 +31,8 @@ COLLAPSE = 1e-2
 # Cells per step above which particles leave all nodes that they act on. Impacts near the speed of sound reach 1.7 in
 # single steps without a gain of energy: it is the speed of a node, which particles rarely reach.
 LEFT_BEHIND = 2.0
+LOWER_SAFETY = "Lower time.safety, or refine the domain."
+AGAIN = "The file was changed after the run; copy it again or run the scene again."
 STIFFER = "Make the material stiffer, the domain finer, or time.safety lower."
 
 
@@ -67,7 +69,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     scale, change = np.maximum(usual, emitted), np.abs(mass - usual)
     change = np.divide(change, scale, out=(change > 0).astype(float), where=scale > 0)
     what = f"In frame {{number}} the mass is {{row.mass:.8g}} kg, where the run has {usual:.8g} kg"
-    tell("mass", change, change > MASS_ERROR, True, what, TOUCHED)
+    tell("mass", change, change > MASS_ERROR, True, what, AGAIN)
     energy: dict[str, float | None] = {"energy_growth": None, "energy_lost": None}
     if header.driven or header.moved:
         findings.add("note", "driven", None, _drive(header), "Nothing needs to be done.")

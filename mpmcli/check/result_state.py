@@ -1,11 +1,13 @@
-"""Checks the values of a frame: finite numbers, inside the domain, volumes, distances of neighbours, crowds."""
+"""Checks the frames of a result: their values, momentum, distances of neighbours, and crowds."""
 
 from collections.abc import Iterator
+from typing import ClassVar
 
 import numpy as np
 
-from mpmcli.check.finding import FrameFindings
+from mpmcli.check.finding import FrameFindings, Severity
 from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
 from mpmcli.output.header import BodyHeader, RunHeader
 from mpmcli.plain_text import counted
@@ -14,10 +16,11 @@ from mpmcli.plain_text import counted
 CRUSHED, BLOWN_UP = 0.1, 10.0
 # Share of the particles of a frame on walls from which on it is said: of bodies on the grid there are none.
 HELD = 0.01
-LOOK = "Look at this particle, and lower time.safety or refine the domain where it is."
-TOUCHED = "The file was changed after the run; copy it again or run the scene again."
-SOFTER = "Make its material stiffer, the domain finer, or time.safety lower."
-LOWER_SAFETY = "Lower time.safety, or refine the domain."
+# On a GPU the Courant number is estimated between measurements, during which an impact may double the speed.
+GPU_FACTOR = 2.0
+# Distance from a wall, in cells, from which on it does not act: a particle acts on nodes up to 1.5 cells away, and the
+# first plane of nodes of a wall is the wall itself.
+WALL_REACH = 2.0
 # Distance of neighbours, in cells, above which the grid hardly sees their relative motion; with one particle per cell,
 # which stand a cell apart at rest, that at which they are stretched by SPARSE.
 STRETCHED, SPARSE = 0.9, 1.25
@@ -36,46 +39,44 @@ WINDOW, INSIDE, ENOUGH = 2, 0.85, 64
 
 
 class FrameCheck:
-    """One of the checks that look at the frames of a run in their order."""
+    """One of the checks that look at the frames of a run in their order; `figures` by name, see `ResultCheck`."""
+
+    START: ClassVar[dict[str, float | None]] = {}
 
     def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
-        self._header = header
-        self._findings = findings
+        self._header, self._findings = header, findings
+        self.figures = dict(self.START)
 
-    def _body(self, frame: Frame, p: int) -> str:
-        return self._header.body_name(int(frame.body[p]))
+    def _most(self, name: str, value: float) -> None:
+        self.figures[name] = max(self.figures[name] or 0.0, value)
+
+    def _tell(
+        self, severity: Severity, rule: str, frame: Frame, p: int, what: str, fix: str, value: float, kind: str = ""
+    ) -> None:
+        """Add a finding of particle p, which `what` names by {one}."""
+        body = self._header.body_name(int(frame.body[p]))
+        what = f"In frame {frame.index} " + what.format(one=f'{p} of body "{body}"')
+        self._findings.add(severity, rule, frame.index, what, fix, value, body, kind)
 
 
 class StateCheck(FrameCheck):
-    """Checks the values of each frame by themselves, and the number of its particles."""
+    """Checks the values of each frame by themselves."""
 
-    _count: int | None = None
-
-    def check(self, number: int, frame: Frame) -> np.ndarray | None:
-        """Check a frame; return which particles have finite values only, (n,) bool, None if all."""
-        n = len(frame.position)
-        if self._count is None or self._header.drops:
-            self._count = n
-        if n != self._count:
-            what = f"Frame {number} holds {n} particles instead of {self._count}"
-            fix = "No particle may come or go in a run: run the scene again."
-            self._findings.add("error", "particle-count", number, what, fix, value=n - self._count)
-        self._inside(number, frame)
-        sound = None
+    def check(self, frame: Frame) -> bool:
+        """Check a frame; return whether all of its values are finite."""
+        finite = True
         for name, array in (("position", frame.position), ("velocity", frame.velocity), *frame.fields.items()):
-            if array.dtype.kind != "f" or np.isfinite(array).all():
-                continue
-            rows = np.isfinite(array).reshape(len(array), -1).all(1)
-            p, lost = int(np.flatnonzero(~rows)[0]), len(rows) - int(rows.sum())
-            body = self._body(frame, p)
-            first = f'the first of them number {p} of body "{body}"'
-            what = f"In frame {number} {name} is not finite at {counted(lost, 'particle')}, {first}"
-            fix = "Leave out the frames from here on, and run the scene again with a lower time.safety."
-            self._findings.add("error", "not-finite", number, what, fix, value=lost, body=body, kind=name)
-            sound = rows if sound is None else sound & rows
-        return sound
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                finite = False
+                lost = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(1))
+                what = f"{name} is not finite at {counted(len(lost), 'particle')}, the first of them number {{one}}"
+                fix = "Leave out the frames from here on, and run the scene again with a lower time.safety."
+                self._tell("error", "not-finite", frame, int(lost[0]), what, fix, len(lost), name)
+        self._inside(frame)
+        self._volumes(frame)
+        return finite
 
-    def _inside(self, number: int, frame: Frame) -> None:
+    def _inside(self, frame: Frame) -> None:
         """Find particles out of the domain, and those that it holds on a wall (docs/theory.md, 3.5)."""
         header, frame = self._header, frame.of_present
         if header.origin is None or len(frame.position) == 0:
@@ -87,31 +88,27 @@ class StateCheck(FrameCheck):
         out = np.fmax(header.origin - frame.position, frame.position - header.upper)
         held = int(((out >= 0) & ~header.periodic).any(1).sum())
         opened = any(header.open_axes)
-        if number > 0 and not opened and held > HELD * len(out):
+        if frame.index > 0 and not opened and held > HELD * len(out):
             what = (
-                f"In frame {number} {held} of {counted(len(out), 'particle')} lie on a wall, where the domain "
+                f"In frame {frame.index} {held} of {counted(len(out), 'particle')} lie on a wall, where the domain "
                 "holds what would leave it: the rest of their way is lost"
             )
             fix = 'With solids = "total" a stiffer material gives way less; "updated" lets none so near.'
-            self._findings.add("note", "held-positions", number, what, fix, value=held / len(out))
+            self._findings.add("note", "held-positions", frame.index, what, fix, value=held / len(out))
         # At an open face particles stay outside until the next sort.
         late = 2 * header.spacing * np.array(header.open_axes) if opened else 0.0
         far = (out > 4 * header.place_error(frame.position.dtype) + late) & np.isfinite(out)
         beyond = np.where(far, out, 0.0).max(1)
         if beyond.any():
-            p = int(beyond.argmax())
-            body = self._body(frame, p)
-            farthest = f'the farthest of them, number {p} of body "{body}", by {beyond[p]:.4g} m'
-            what = f"In frame {number} {counted(np.count_nonzero(beyond), 'particle')} out of the domain, {farthest}"
-            self._findings.add("error", "escaped", number, what, LOOK, value=float(beyond[p]), body=body)
+            p, escaped = int(beyond.argmax()), counted(np.count_nonzero(beyond), "particle")
+            what = f"{escaped} out of the domain, the farthest of them, number {{one}}, by {beyond[p]:.4g} m"
+            fix = "Look at this particle, and lower time.safety or refine the domain where it is."
+            self._tell("error", "escaped", frame, p, what, fix, float(beyond[p]))
 
-    def volume_ratio(self, number: int, frame: Frame) -> np.ndarray | None:
-        """Check J of each particle as stored, or from the density; return it, (n,), None if neither is stored."""
-        J, densities = frame.fields.get("volume_ratio"), self._header.densities
-        if J is None and "density" in frame.fields and densities:
-            J = np.array(densities)[frame.body] / frame.fields["density"]
+    def _volumes(self, frame: Frame) -> None:
+        J = volume_ratio(self._header, frame)
         if J is None or len(J) == 0 or (J.min() >= CRUSHED and J.max() <= BLOWN_UP):
-            return J
+            return
         fine, coherent = np.isfinite(J), np.array([law.coherent for law in self._header.laws], bool)
         coheres = coherent[frame.material] if len(coherent) else False
         for severity, bad, word in (
@@ -122,10 +119,9 @@ class StateCheck(FrameCheck):
             rows = np.flatnonzero(bad)
             if len(rows):
                 p = int(rows[0] if severity == "error" else rows[np.abs(np.log(J[rows])).argmax()])
-                body = self._body(frame, p)
-                what = f'In frame {number} particle {p} of body "{body}" {word}: its J is {J[p]:.4g}'
-                self._findings.add(severity, "volume", number, what, SOFTER, float(J[p]), body, kind=word)
-        return J
+                what = f"particle {{one}} {word}: its J is {J[p]:.4g}"
+                fix = "Make its material stiffer, the domain finer, or time.safety lower."
+                self._tell(severity, "volume", frame, p, what, fix, float(J[p]), word)
 
 
 def extent(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -134,40 +130,126 @@ def extent(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return columns.min(1), columns.max(1)
 
 
+def volume_ratio(header: RunHeader, frame: Frame) -> np.ndarray | None:
+    """Return J of each particle as stored, or from the density, (n,); None if neither is stored."""
+    J = frame.fields.get("volume_ratio")
+    if J is None and "density" in frame.fields and header.densities:
+        return np.array(header.densities)[frame.body] / frame.fields["density"]
+    return J
+
+
+def _reach(header: RunHeader, row: LedgerRow, frame: Frame) -> float | None:
+    """Return the largest displacement in a row's steps, m, with shifts and rounding; None: not known."""
+    if header.spacing is None or not np.isfinite(row.courant_max):
+        return None
+    factor = GPU_FACTOR if header.on_gpu else 1.0
+    rounding = row.steps * header.step_error + 2 * header.place_error(frame.position.dtype)
+    shifts = header.shifts and any(law.name in laws() and laws()[law.name].shifts for law in header.laws)
+    shifted = header.shifted(row.steps, frame.step) if shifts else 0.0
+    # What an emitter lets in begins where it would be, had it entered when it was due: up to a step before.
+    steps = row.steps + bool(row.emitted)
+    return factor * steps * row.courant_max * header.spacing * (1 + 1e-3) + shifted + rounding
+
+
+class MomentumCheck(FrameCheck):
+    """Compares the momentum of the ledger with P0 + M g (t - dt/2) while no wall can have acted.
+
+    What colliders took counts as there; velocities are those in the middle of the last step. Along an axis momentum is
+    conserved while no particle is near a wall normal to it or one with "stick"; angular momentum without gravity, far
+    from all walls, if the transfer conserves it (docs/theory.md, 9.2). The drift is relative to sqrt(2 M E_kin), a
+    bound on sum m |v|.
+    """
+
+    START: ClassVar = {"momentum_drift": None, "momentum_frames": 0}
+
+    def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
+        super().__init__(header, findings)
+        self._first: LedgerRow | None = None
+        self._time, self._steps, self._kinetic, self._taken = 0.0, 0, 0.0, np.zeros(header.dimension)
+        self._colliders = len(header.collider_names)
+        known = header.origin is not None and header.gravity is not None and header.sticking is not None
+        self._free = np.full(header.dimension, known and not header.driven)
+        # Of the particles from the walls normal to each axis, in the frame before.
+        self._distance = np.zeros(header.dimension)
+
+    def check(self, frame: Frame, row: LedgerRow) -> None:
+        """Check the row of a frame of finite values; frames must come in order, without gaps."""
+        header = self._header
+        if not self._free.any() or len(frame.position) == 0:
+            return
+        if len(row.collider_force) != self._colliders:
+            self.lost()
+            return
+        self._first = first = self._first or row
+        self._kinetic = max(self._kinetic, row.kinetic)
+        self._steps += row.steps
+        self._taken += np.sum(row.collider_force, axis=0) * (row.time - self._time)
+        self._time = row.time
+        if frame.index > 0:
+            allowed = _reach(header, row, frame)
+            touching = ~(self._distance > (np.inf if allowed is None else WALL_REACH * header.spacing + allowed))
+            # A wall with "stick" acts along its tangents too.
+            self._free &= ~touching & ~(touching & np.array(header.sticking)).any()
+        lowest, highest = extent(frame.position)
+        self._distance = np.minimum(lowest - header.origin, header.upper - highest)
+        self._distance[header.periodic] = np.inf
+        scale = float(np.sqrt(2 * row.mass * self._kinetic))
+        if frame.index == 0 or not self._free.any() or scale == 0 or not np.isfinite(scale):
+            return
+        middle = row.time - (row.step_min + row.step_max) / 4
+        expected = np.array(first.linear_momentum) + row.mass * header.gravity * (middle - first.time)
+        unknown = row.mass * np.abs(header.gravity) * (row.step_max - row.step_min) / 4
+        difference = (np.abs(np.array(row.linear_momentum) + self._taken - expected) - unknown)[self._free].max()
+        angular = 0.0
+        spins_on = header.keeps_spin and not (header.gravity.any() or self._colliders or header.periodic.any())
+        if spins_on and self._free.all():
+            turned = np.abs(np.array(row.angular_momentum) - np.array(first.angular_momentum)).max()
+            angular = float(turned) / float(np.linalg.norm(header.upper - header.origin))
+        drift = float(max(difference, angular, 0.0)) / scale
+        self.figures["momentum_frames"] += 1
+        self._most("momentum_drift", drift)
+        # Rounding may have the same sign in every step.
+        if drift > 1e-3 + self._steps * header.epsilon:
+            acted = "gravity and colliders" if self._colliders else "gravity"
+            what = f"By frame {frame.index} momentum has drifted by {drift:.3g} of what moves"
+            what += f", though no wall was near and nothing but {acted} acted"
+            fix = 'Run it with solver.precision = "f64" to see whether it is rounding.'
+            self._findings.add("warning", "momentum", frame.index, what, fix, value=drift)
+
+    def lost(self) -> None:
+        """Compare no further frames: one could not be read, or is not finite."""
+        self._free[:] = False
+
+
 class StretchCheck(FrameCheck):
-    """Follows neighbours in elastic bodies, which the grid must see; `largest` distance in cells, None without any."""
+    """Follows neighbours in elastic bodies, which the grid must see."""
 
-    _count: int | None = None
-    largest: float | None = None
+    START: ClassVar = {"neighbour_distance": None}
+    _pairs: list[tuple[BodyHeader, np.ndarray, np.ndarray, float]] | None = None
 
-    def check(self, number: int, frame: Frame) -> None:
+    def check(self, frame: Frame) -> None:
         """Check a frame of finite values."""
         header, h = self._header, self._header.spacing
-        if self._count is None:
-            self._count, self._pairs = len(frame.position), [] if h is None else list(self._neighbours(frame, h))
-        if len(frame.position) != self._count:
-            return
+        if self._pairs is None:
+            self._pairs = [] if h is None else list(self._neighbours(frame, h))
         for body, first, second, allowed in self._pairs:
             apart = frame.position[second] - frame.position[first]
             squares = np.einsum("ij,ij->i", apart, apart)
             cells = float(np.sqrt(float(squares.max()))) / h
-            self.largest = max(self.largest or 0.0, cells)
+            self._most("neighbour_distance", cells)
             if cells <= allowed:
                 continue
+            severity = "warning" if cells > TORN else "note"
             count = int((squares > (allowed * h) ** 2).sum())
+            what = f'In frame {frame.index} {count} pairs of neighbours of body "{body.name}" stand up to '
+            what += f"{cells:.3g} cells apart, " + (
+                f"farther than {TORN:g}, which a kernel reaches: it has torn, which its material cannot"
+                if cells > TORN
+                else f"above {allowed:.3g}: the grid hardly sees what moves between them, noise grows, and gaps open"
+            )
             per_axis = int(np.ceil(body.particles_per_cell ** (1 / header.dimension) * cells / STRETCHED))
-            pairs = f'{count} pairs of neighbours of body "{body.name}"'
-            what = f"In frame {number} {pairs} stand up to {cells:.3g} cells apart"
-            if cells > TORN:
-                severity = "warning"
-                what += f", farther than {TORN:g}, which a kernel reaches: it has torn, which its material cannot"
-            else:
-                severity = "note"
-                what += (
-                    f", above {allowed:.3g}: the grid hardly sees what moves between them, noise grows, and gaps open"
-                )
             fix = f"Set particles_per_cell = {per_axis**header.dimension}, or stretch it less."
-            self._findings.add(severity, "stretch", number, what, fix, cells, body.name, kind=body.name)
+            self._findings.add(severity, "stretch", frame.index, what, fix, cells, body.name, kind=body.name)
 
     def _neighbours(self, frame: Frame, h: float) -> Iterator[tuple[BodyHeader, np.ndarray, np.ndarray, float]]:
         """Yield each elastic body that moves on the grid, rows of its pairs along axes, and the cells they may have."""
@@ -192,35 +274,31 @@ class StretchCheck(FrameCheck):
 class CrowdCheck(FrameCheck):
     """Looks for crowds of liquids and grains, and for viscous liquids that spray, in a few frames and the last one.
 
-    Attributes:
-        densest: particles in the fullest cell over those meant; empty: share of empty cells of those inside, in the
-            last frame that was looked at. None without such material.
+    Its figures are those of the last frame that was looked at, None without such material.
     """
 
-    densest: float | None = None
-    empty: float | None = None
+    START: ClassVar = {"densest_cell": None, "empty_cells": None}
 
-    def __init__(self, header: RunHeader, findings: FrameFindings, frames: int) -> None:
+    def __init__(self, header: RunHeader, findings: FrameFindings, last: int) -> None:
         super().__init__(header, findings)
         self._flows = np.array([law.name in laws() and laws()[law.name].flows for law in header.laws], bool)
         self._share = np.array([1 / body.particles_per_cell for body in header.bodies])
         # Of fewer than two along an axis a crowd is no more than chance.
         coarse = (self._share > 2.0**-header.dimension).any()
         known = header.spacing is not None and header.origin is not None and self._flows.any()
-        self._every = max(1, frames // FEW) if known and not coarse else 0
-        self._last = frames - 1
+        self._every = max(1, (last + 1) // FEW) if known and not coarse else 0
+        self._last = last
 
-    def check(self, k: int, number: int, frame: Frame, J: np.ndarray | None = None) -> None:
-        """Check the k-th frame, of finite values, with the J of its particles, (n,), where they are known."""
-        if self._every == 0 or (k % self._every and k != self._last):
+    def check(self, frame: Frame) -> None:
+        """Check a frame of finite values."""
+        if self._every == 0 or (frame.index % self._every and frame.index != self._last):
             return
-        if J is not None:
-            self._spray(number, frame, J)
-        frame, d, h = frame.of_present, self._header.dimension, self._header.spacing
+        self._spray(frame)
+        header, frame = self._header, frame.of_present
         rows = self._flows[frame.material]
         if not rows.any():
             return
-        cells = np.floor((frame.position[rows] - self._header.origin) / h).astype(np.int64)
+        cells = np.floor((frame.position[rows] - header.origin) / header.spacing).astype(np.int64)
         # Cells around the material, of which those of the middle have whole windows.
         margin = 2 * WINDOW
         first = cells.min(axis=0) - margin
@@ -230,35 +308,33 @@ class CrowdCheck(FrameCheck):
         places = np.ravel_multi_index((cells - first).T, shape)
         filled = np.bincount(places, self._share[frame.body[rows]], int(np.prod(shape))).reshape(shape)
         # Means over the cells of the domain alone, as nothing can be behind its walls; axes take turns as the last one.
-        around, ends = filled, np.round((self._header.upper - self._header.origin) / h)
-        for axis in reversed(range(d)):
+        around, ends = filled, np.round((header.upper - header.origin) / header.spacing)
+        for axis in reversed(range(header.dimension)):
             along = np.arange(shape[axis]) + first[axis]
             there = ((along >= 0) & (along < ends[axis])).astype(float)
-            total, count = (
-                sum(array[..., i : array.shape[-1] - margin + i] for i in range(margin + 1))
-                for array in (around, there)
-            )
+            parts = [slice(i, shape[axis] - margin + i) for i in range(margin + 1)]
+            total, count = (sum(array[..., part] for part in parts) for array in (around, there))
             around = np.moveaxis(total / np.where(there[WINDOW:-WINDOW], count, np.inf), -1, 0)
-        inside = around > INSIDE
-        holes = filled[(slice(WINDOW, -WINDOW),) * d][inside] == 0
-        self.densest = float(filled.max())
-        self.empty = float(holes.mean()) if len(holes) >= ENOUGH else 0.0
-        if self.densest > CROWDED or self.empty > GAPS:
+        holes = filled[(slice(WINDOW, -WINDOW),) * header.dimension][around > INSIDE] == 0
+        densest, empty = float(filled.max()), float(holes.mean()) if len(holes) >= ENOUGH else 0.0
+        self.figures = {"densest_cell": densest, "empty_cells": empty}
+        if densest > CROWDED or empty > GAPS:
             what = (
-                f"In frame {number} a cell of liquid or grains has {self.densest:.3g} times the particles meant, and "
-                f"{100 * self.empty:.2g} % of the cells inside have none: flow has piled particles up"
+                f"In frame {frame.index} a cell of liquid or grains has {densest:.3g} times the particles meant, and "
+                f"{100 * empty:.2g} % of the cells inside have none: flow has piled particles up"
             )
             fix = 'Set solver.redistribute = "auto", or jitter the sampling.'
-            self._findings.add("note", "crowd", number, what, fix, value=self.densest)
+            self._findings.add("note", "crowd", frame.index, what, fix, value=densest)
 
-    def _spray(self, number: int, frame: Frame, J: np.ndarray) -> None:
+    def _spray(self, frame: Frame) -> None:
         """Find viscous bodies that have opened, as only what falls apart into drops does."""
-        for label, body in enumerate(self._header.bodies):
-            own = frame.body == label if body.material.get("viscosity", 0) > 0 else np.zeros(len(J), bool)
-            mean = float(J[own].mean()) if own.any() else 0.0
-            if mean > OPENED:
+        J = volume_ratio(self._header, frame)
+        for label, body in enumerate(self._header.bodies if J is not None else ()):
+            own = J[frame.body == label]
+            if body.material.get("viscosity", 0) > 0 and len(own) and own.mean() > OPENED:
+                mean, name = float(own.mean()), body.name
                 what = (
-                    f'In frame {number} the viscous liquid of "{body.name}" has a mean J of {mean:.3g}: it falls apart'
+                    f'In frame {frame.index} the viscous liquid of "{name}" has a mean J of {mean:.3g}: it falls apart'
                 )
                 fix = "Refine the domain across it, or pour it thicker."
-                self._findings.add("note", "spray", number, what, fix, value=mean, body=body.name, kind=body.name)
+                self._findings.add("note", "spray", frame.index, what, fix, value=mean, body=name, kind=name)

@@ -327,14 +327,6 @@ class RunHeader:
         shifts = last // INTERVAL - (last - steps) // INTERVAL
         return shifts * 2 * FARTHEST * self.spacing if self.shifts and self.spacing is not None else 0.0
 
-    def way(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return the ways between places, (..., d), m, less than half of the domain along axes that repeat."""
-        found = end - start
-        for a in np.flatnonzero(self.periodic):
-            size = (self.upper - self.origin)[a].astype(found.dtype)
-            found[..., a] -= size * np.round(found[..., a] / size)
-        return found
-
     def body_name(self, label: int) -> str:
         """Return the name of a body, or its number where it has none."""
         return self.bodies[label].name if 0 <= label < len(self.bodies) else f"number {label}"

@@ -121,8 +121,8 @@ def fracture(per_cell: int) -> Outcome:
     header = RunHeader.of(solver.scene, scene_to_toml(solver.scene), [group.law for group in solver.groups], facts)
     findings = FrameFindings()
     check = StretchCheck(header, findings)
-    for number, frame in enumerate([replace(done.frames[0], position=sample.position), *done.frames]):
-        check.check(number, frame)
+    for frame in (replace(done.frames[0], position=sample.position), *done.frames):
+        check.check(frame)
     told = any(finding.severity == "warning" for finding in findings.found())
     return Outcome(
         done.sound and (widest < 1 or told),
