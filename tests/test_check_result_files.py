@@ -54,7 +54,7 @@ def test_a_packed_file_that_is_cut_off(packed, part):
     assert check.text().endswith(check.findings[0].line)
 
 
-def test_a_packed_file_without_its_record_is_still_known(packed):
+def test_a_packed_file_without_its_record(packed):
     (packed / RECORD).unlink()
     check = check_result(packed)
     assert rules(check) == {"no-record"} and check.verdict == "stable" and check.status == "unknown"
@@ -78,30 +78,21 @@ def test_segments_that_are_missing(segments, gone):
         (segments / SEGMENTS / segment_name(k)).unlink()
     check = check_result(segments)
     finding = the(check, "missing-frames")
-    assert rules(check) == {"missing-frames"}
+    assert rules(check) == {"missing-frames"} and check.frames == 11 - len(gone)
     assert finding.frame == check.first_bad_frame == gone[0] and finding.value == len(gone)
-    assert check.frames == 11 - len(gone)
 
 
-def test_a_segment_under_two_names(segments):
+def test_a_frame_at_a_wrong_time(packed, segments):
+    """As of a segment under two names."""
     shutil.copy(segments / SEGMENTS / segment_name(K - 1), segments / SEGMENTS / segment_name(K))
-    check = check_result(segments)
-    assert rules(check) == {"frame-time"} and check.first_bad_frame == K and check.verdict == "unstable"
-
-
-def test_all_segments_damaged(segments):
-    for segment in (segments / SEGMENTS).iterdir():
-        segment.write_bytes(b"")
-    check = check_result(segments)
-    assert check.frames == 0 and check.first_bad_frame == 0 and check.verdict == "unstable"
-
-
-@pytest.mark.parametrize("time", [0.1201, 0.0801, np.nan])
-def test_a_time_that_is_wrong(packed, time):
-    with changed(packed / PACKED) as file:
-        file["VTKHDF/Steps/Values"][K] = time
-    check = check_result(packed)
-    assert the(check, "frame-time").frame == check.first_bad_frame == K
+    checks = [check_result(segments)]
+    for time in (0.1201, 0.0801, np.nan):
+        with changed(packed / PACKED) as file:
+            file["VTKHDF/Steps/Values"][K] = time
+        checks.append(check_result(packed))
+    for check in checks:
+        assert rules(check) == {"frame-time"} and check.verdict == "unstable"
+        assert the(check, "frame-time").frame == check.first_bad_frame == K
 
 
 def test_a_run_that_is_packed_while_it_is_checked(run, segments, monkeypatch):
@@ -117,17 +108,22 @@ def test_a_run_that_is_packed_while_it_is_checked(run, segments, monkeypatch):
     assert (check.kind, check.verdict) == ("packed", "stable")
 
 
-def test_a_damaged_chunk_of_a_compressed_file_is_one_frame_and_not_the_whole(run, packed):
-    """Each chunk holds whole frames; one whose bytes are overwritten does not decompress."""
-    path = packed / PACKED
-    with changed(path) as file:
-        values = file["VTKHDF/PointData/density"][:]
-        del file["VTKHDF/PointData/density"]
-        file["VTKHDF/PointData"].create_dataset("density", data=values, chunks=(run.particles,), compression="gzip")
-        place = file["VTKHDF/PointData/density"].id.get_chunk_info(K)
-    with path.open("r+b") as file:
-        file.seek(place.byte_offset)
-        file.write(b"\xff" * place.size)
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_damaged_frame_is_one_frame_and_not_the_whole(run, packed, compressed):
+    """A value that has changed since; and a compressed chunk, of a frame each, that does not decompress."""
+    path, name = packed / PACKED, "VTKHDF/PointData/density"
+    if compressed:
+        with changed(path) as file:
+            values = file[name][:]
+            del file[name]
+            file.create_dataset(name, data=values, chunks=(run.particles,), compression="gzip")
+            place = file[name].id.get_chunk_info(K)
+        with path.open("r+b") as file:
+            file.seek(place.byte_offset)
+            file.write(b"\xff" * place.size)
+    else:
+        with h5py.File(path, "r+") as file:
+            file[name][K * run.particles + 3] *= 2
     check = check_result(packed)
     assert rules(check) == {"unreadable"} and (check.first_bad_frame, check.frames) == (K, 10)
 
@@ -137,6 +133,7 @@ def test_a_damaged_chunk_of_a_compressed_file_is_one_frame_and_not_the_whole(run
     [
         ("running", "running", "suspect"),
         ("interrupted", "interrupted-run", "suspect"),
+        ("stopped", "stopped-run", "suspect"),
         ("failed", "failed-run", "unstable"),
         ("unstable", "unstable-run", "unstable"),
         ("finished", "missing-frames", "unstable"),
@@ -152,13 +149,18 @@ def test_a_run_that_did_not_come_to_its_end(segments, status, rule, verdict):
     assert rules(check) == {rule} and check.verdict == verdict and check.status == status
     assert (check.first_bad_frame, check.frames, check.frames_expected) == (K, K, 11)
     assert check.limit == "deformation"
-    assert ("the disk was full." in check.findings[0].what) == (status in ("failed", "unstable"))
+    assert ("the disk was full." in check.findings[0].what) == (status in ("stopped", "failed", "unstable"))
 
 
-def test_a_run_that_wrote_no_frame(run, tmp_path):
-    shutil.copy(run.directory / RECORD, tmp_path / RECORD)
-    check = check_result(tmp_path)
-    assert check.verdict == "unstable" and check.frames == 0 and check.first_bad_frame == 0
+@pytest.mark.parametrize("emptied", [False, True])
+def test_a_run_without_a_frame_that_can_be_read(segments, emptied):
+    """None was written, or all are damaged."""
+    for segment in (segments / SEGMENTS).iterdir():
+        segment.write_bytes(b"")
+    if not emptied:
+        shutil.rmtree(segments / SEGMENTS)
+    check = check_result(segments)
+    assert (check.verdict, check.frames, check.first_bad_frame) == ("unstable", 0, 0)
 
 
 def test_what_is_no_result_is_bad_input(packed, tmp_path):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from solver_state import scene_of
 from test_batch import batch_of, outputs_of, same
-from test_check_stretch import header_of
+from test_check_frames import header_of
 from test_deterministic import on_gpu_path, twice
 
 from mpmcli.check.result_check import check_kept

@@ -32,7 +32,6 @@ COLLAPSE = 1e-2
 # single steps without a gain of energy: it is the speed of a node, which particles rarely reach.
 LEFT_BEHIND = 2.0
 LOWER_SAFETY = "Lower time.safety, or refine the domain."
-AGAIN = "The file was changed after the run; copy it again or run the scene again."
 STIFFER = "Make the material stiffer, the domain finer, or time.safety lower."
 
 
@@ -52,15 +51,12 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     numeric = [name for name, value in vars(rows[0]).items() if isinstance(value, Real)]
     of = {name: np.array([getattr(row, name) for row in rows]) for name in numeric}
 
-    def tell(
-        rule: str, values: np.ndarray, bad: np.ndarray, wrong: np.ndarray | bool, what: str, fix: str, kind: str = ""
-    ) -> None:
+    def tell(rule: str, values: np.ndarray, bad: np.ndarray, wrong: np.ndarray | bool, what: str, fix: str) -> None:
         """Add a finding for each row that is bad, an error where it is wrong, too."""
-        wrong = bad & wrong
         for k in np.flatnonzero(bad).tolist():
-            severity, value = "error" if wrong[k] else "warning", float(values[k])
+            severity, value = "error" if (bad & wrong)[k] else "warning", float(values[k])
             said = what.format(number=numbers[k], value=value, row=rows[k])
-            findings.add(severity, rule, numbers[k], said, fix, value, kind=kind)
+            findings.add(severity, rule, numbers[k], said, fix, value, kind=what)
 
     # What came in since the start and what left is not counted. The median identifies a single row, also the first.
     emitted = of.get("emitted_mass", np.zeros(len(rows)))
@@ -69,13 +65,19 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     scale, change = np.maximum(usual, emitted), np.abs(mass - usual)
     change = np.divide(change, scale, out=(change > 0).astype(float), where=scale > 0)
     what = f"In frame {{number}} the mass is {{row.mass:.8g}} kg, where the run has {usual:.8g} kg"
-    tell("mass", change, change > MASS_ERROR, True, what, AGAIN)
-    energy: dict[str, float | None] = {"energy_growth": None, "energy_lost": None}
-    if header.driven or header.moved:
+    tell(
+        "mass",
+        change,
+        change > MASS_ERROR,
+        True,
+        what,
+        "The file was changed after the run; copy it again or run the scene again.",
+    )
+    growth, lost = energy_change(of["kinetic"], of["potential"], of["elastic"])
+    conserved = not (header.driven or header.moved)
+    if not conserved:
         findings.add("note", "driven", None, _drive(header), "Nothing needs to be done.")
     else:
-        growth, lost = energy_change(of["kinetic"], of["potential"], of["elastic"])
-        energy = {"energy_growth": float(growth.max()), "energy_lost": lost}
         what = "By frame {number} the energy has grown by {value:.3g} of the energy turned over, without a source"
         tell("energy", growth, growth > ENERGY_SUSPECT, growth > ENERGY_WRONG, what, LOWER_SAFETY)
     courant, forced = of["courant_max"], any(row.limit == "forced" for row in rows)
@@ -84,27 +86,26 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     tell("courant", courant, courant > COURANT * MARGIN, courant > LEFT_BEHIND, what, fix)
     low, high = of["volume_ratio_min"], of["volume_ratio_max"]
     what = "In frame {number} a particle has no volume left: the smallest J is {value:.4g}"
-    tell("volume", low, low <= 0, True, what, STIFFER, "ledger")
+    tell("volume", low, low <= 0, True, what, STIFFER)
     what = "In frame {number} a particle is crushed: the smallest J is {value:.4g}"
-    tell("volume", low, (low > 0) & (low < CRUSHED), False, what, STIFFER, "ledger")
+    tell("volume", low, (low > 0) & (low < CRUSHED), False, what, STIFFER)
     coherent = bool(header.laws) and all(law.coherent for law in header.laws)
     what = "In frame {number} a particle is blown up: the largest J is {value:.4g}"
-    tell("volume", high, (high > BLOWN_UP) & coherent, False, what, STIFFER, "ledger high")
+    tell("volume", high, (high > BLOWN_UP) & coherent, False, what, STIFFER)
     stepped = of["steps"] > 0
     steps: dict[str, float | None] = dict.fromkeys(("step_min", "step_max", "step_ratio"))
     if stepped.any():
         first, smallest = float(of["step_max"][stepped][0]), float(of["step_min"][stepped].min())
         ratio = of["step_min"] / first
-        what = (
-            "Before frame {number} the step fell to {row.step_min:.3g} s, where the run began with "
-            f'{first:.3g} s, by the bound "{{row.limit}}"'
-        )
+        what = "Before frame {number} the step fell to {row.step_min:.3g} s, where the run began with "
+        what += f'{first:.3g} s, by the bound "{{row.limit}}"'
         fix = "Look for a high speed, stiffness or deformation in this frame."
         tell("step-collapse", ratio, stepped & (ratio < COLLAPSE), False, what, fix)
         steps = {"step_min": smallest, "step_max": float(of["step_max"].max()), "step_ratio": smallest / first}
     return {
         "mass_change": float(change.max()),
-        **energy,
+        "energy_growth": float(growth.max()) if conserved else None,
+        "energy_lost": lost if conserved else None,
         "courant_max": float(courant.max()),
         "speed_max": float(of["speed_max"].max()),
         "volume_ratio_min": float(low.min()),
@@ -124,12 +125,10 @@ def _finite(value: object) -> bool:
 def _drive(header: RunHeader) -> str:
     if header.comes_and_goes:
         return "Material comes or goes, so that energy and momentum are not conserved"
-    if header.driven:
-        return (
-            "Forces, walls that move, or a gravity that depends on time or acts along a periodic axis do work, so "
-            "that energy and momentum are not conserved"
-        )
-    return "Colliders that move do work, so that energy is not conserved"
+    if not header.driven:
+        return "Colliders that move do work, so that energy is not conserved"
+    forces = "Forces, walls that move, or a gravity that depends on time or acts along a periodic axis"
+    return f"{forces} do work, so that energy and momentum are not conserved"
 
 
 def energy_change(kinetic: np.ndarray, potential: np.ndarray, elastic: np.ndarray) -> tuple[np.ndarray, float]:
@@ -148,10 +147,8 @@ def _volume_error(numbers: Sequence[int], errors: np.ndarray, findings: FrameFin
     first = numbers[-len(last)]
     lasting = float(last[np.abs(last).argmin()]) if abs(np.sign(last).sum()) == len(last) else 0.0
     if abs(lasting) > VOLUME_ERROR:
-        what = (
-            f"From frame {first} to the end liquids and grains fill {100 * abs(lasting):.3g} % "
-            f"{'more' if lasting > 0 else 'less'} than the volume of their particles"
-        )
+        what = f"From frame {first} to the end liquids and grains fill {100 * abs(lasting):.3g} % "
+        what += f"{'more' if lasting > 0 else 'less'} than the volume of their particles"
         fix = "Leave volume_correction = true in a fluid, or refine the domain."
         findings.add("note", "volume-error", first, what, fix, value=lasting)
     return lasting
@@ -159,9 +156,5 @@ def _volume_error(numbers: Sequence[int], errors: np.ndarray, findings: FrameFin
 
 def _taken(rows: Sequence[LedgerRow]) -> float | None:
     """Return the momentum that all colliders took, kg m/s; None without any."""
-    taken = [
-        np.sum(row.collider_force, axis=0) * (row.time - before.time)
-        for before, row in pairwise(rows)
-        if row.collider_force
-    ]
-    return float(np.linalg.norm(np.sum(taken, axis=0))) if taken else None
+    took = [(row.collider_force, row.time - before.time) for before, row in pairwise(rows) if row.collider_force]
+    return float(np.linalg.norm(sum(np.sum(force, axis=0) * time for force, time in took))) if took else None

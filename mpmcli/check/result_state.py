@@ -89,10 +89,8 @@ class StateCheck(FrameCheck):
         held = int(((out >= 0) & ~header.periodic).any(1).sum())
         opened = any(header.open_axes)
         if frame.index > 0 and not opened and held > HELD * len(out):
-            what = (
-                f"In frame {frame.index} {held} of {counted(len(out), 'particle')} lie on a wall, where the domain "
-                "holds what would leave it: the rest of their way is lost"
-            )
+            what = f"In frame {frame.index} {held} of {counted(len(out), 'particle')} lie on a wall"
+            what += ", where the domain holds what would leave it: the rest of their way is lost"
             fix = 'With solids = "total" a stiffer material gives way less; "updated" lets none so near.'
             self._findings.add("note", "held-positions", frame.index, what, fix, value=held / len(out))
         # At an open face particles stay outside until the next sort.
@@ -241,12 +239,11 @@ class StretchCheck(FrameCheck):
                 continue
             severity = "warning" if cells > TORN else "note"
             count = int((squares > (allowed * h) ** 2).sum())
-            what = f'In frame {frame.index} {count} pairs of neighbours of body "{body.name}" stand up to '
-            what += f"{cells:.3g} cells apart, " + (
-                f"farther than {TORN:g}, which a kernel reaches: it has torn, which its material cannot"
-                if cells > TORN
-                else f"above {allowed:.3g}: the grid hardly sees what moves between them, noise grows, and gaps open"
-            )
+            told = f"farther than {TORN:g}, which a kernel reaches: it has torn, which its material cannot"
+            if severity == "note":
+                told = f"above {allowed:.3g}: the grid hardly sees what moves between them, noise grows, and gaps open"
+            what = f'In frame {frame.index} {count} pairs of neighbours of body "{body.name}"'
+            what += f" stand up to {cells:.3g} cells apart, {told}"
             per_axis = int(np.ceil(body.particles_per_cell ** (1 / header.dimension) * cells / STRETCHED))
             fix = f"Set particles_per_cell = {per_axis**header.dimension}, or stretch it less."
             self._findings.add(severity, "stretch", frame.index, what, fix, cells, body.name, kind=body.name)
@@ -286,12 +283,11 @@ class CrowdCheck(FrameCheck):
         # Of fewer than two along an axis a crowd is no more than chance.
         coarse = (self._share > 2.0**-header.dimension).any()
         known = header.spacing is not None and header.origin is not None and self._flows.any()
-        self._every = max(1, (last + 1) // FEW) if known and not coarse else 0
-        self._last = last
+        self._looked_at = {*range(0, last + 1, max(1, (last + 1) // FEW)), last} if known and not coarse else set()
 
     def check(self, frame: Frame) -> None:
         """Check a frame of finite values."""
-        if self._every == 0 or (frame.index % self._every and frame.index != self._last):
+        if frame.index not in self._looked_at:
             return
         self._spray(frame)
         header, frame = self._header, frame.of_present
@@ -319,10 +315,8 @@ class CrowdCheck(FrameCheck):
         densest, empty = float(filled.max()), float(holes.mean()) if len(holes) >= ENOUGH else 0.0
         self.figures = {"densest_cell": densest, "empty_cells": empty}
         if densest > CROWDED or empty > GAPS:
-            what = (
-                f"In frame {frame.index} a cell of liquid or grains has {densest:.3g} times the particles meant, and "
-                f"{100 * empty:.2g} % of the cells inside have none: flow has piled particles up"
-            )
+            what = f"In frame {frame.index} a cell of liquid or grains has {densest:.3g} times the particles meant"
+            what += f", and {100 * empty:.2g} % of the cells inside have none: flow has piled particles up"
             fix = 'Set solver.redistribute = "auto", or jitter the sampling.'
             self._findings.add("note", "crowd", frame.index, what, fix, value=densest)
 
@@ -333,8 +327,8 @@ class CrowdCheck(FrameCheck):
             own = J[frame.body == label]
             if body.material.get("viscosity", 0) > 0 and len(own) and own.mean() > OPENED:
                 mean, name = float(own.mean()), body.name
-                what = (
-                    f'In frame {frame.index} the viscous liquid of "{name}" has a mean J of {mean:.3g}: it falls apart'
-                )
+                what = f'In frame {frame.index} the viscous liquid of "{name}" has a mean J of {mean:.3g}'
                 fix = "Refine the domain across it, or pour it thicker."
-                self._findings.add("note", "spray", frame.index, what, fix, value=mean, body=name, kind=name)
+                self._findings.add(
+                    "note", "spray", frame.index, f"{what}: it falls apart", fix, value=mean, body=name, kind=name
+                )
