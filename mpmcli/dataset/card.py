@@ -18,7 +18,7 @@ from mpmcli.dataset.shard import BASE, LABELS, LEDGER, SPLITS, SWEEP, TABLES, gr
 from mpmcli.errors import RunError
 from mpmcli.output.checksums import NAME as CHECKSUMS
 from mpmcli.output.durable import write_text
-from mpmcli.plain_text import counted, one_line, size_text
+from mpmcli.plain_text import counted, markdown_table, one_line, size_text
 
 CARD, MONTAGE = "README.md", "montage.png"
 # Of a histogram; where values repeat and there are few, each is counted by itself.
@@ -139,7 +139,8 @@ def _counts(expected: int, rows: Sequence[Row]) -> str:
         counts = Counter(row.verdict for row in own)
         told = [len(own), sum(row.accepted for row in own), *(counts[verdict] for verdict in verdicts)]
         table.append((split, *(f"{count:,}" for count in told)))
-    return f"## Splits and verdicts\n\nOf {counted(expected, 'trajectory')} of the sweep:\n\n{_table(table)}"
+    told = markdown_table(table[0], table[1:], range(len(table[0])))
+    return f"## Splits and verdicts\n\nOf {counted(expected, 'trajectory')} of the sweep:\n\n{told}"
 
 
 def _left_out(rows: Sequence[Row]) -> str:
@@ -172,13 +173,8 @@ def _drawn(sweep: Mapping[str, Any], included: Sequence[Row]) -> str:
     head = ("key", "drawn from", "min", "mean", "max", "values")
     return (
         f"## What varies\n\nWhat the included trajectories have drawn (method: {method}); a histogram has ten bins "
-        f"from min to max.\n\n{_table([head, *rows])}"
+        f"from min to max.\n\n{markdown_table(head, rows, range(len(head)))}"
     )
-
-
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    lines = [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in rows]
-    return "\n".join([lines[0], f"|{' --- |' * len(rows[0])}", *lines[1:]])
 
 
 _LOADING = """\
