@@ -10,7 +10,6 @@ import pytest
 from PIL import Image
 
 from mpmcli.errors import InputError, RunError
-from mpmcli.render import film
 from mpmcli.render.film import write_film
 from mpmcli.render.picture_file import write_picture
 
@@ -121,27 +120,6 @@ def test_the_same_pictures_give_the_same_bytes(pictures, tmp_path, end):
     assert (tmp_path / f"a.{end}").read_bytes() == (tmp_path / f"b.{end}").read_bytes()
 
 
-@pytest.mark.parametrize("end", ["mp4", "gif"])
-def test_pictures_are_taken_in_one_at_a_time(pictures, tmp_path, monkeypatch, end):
-    """Those that a film still holds are counted when the next one is read; a gif holds a few for its palette."""
-    import weakref
-
-    alive: list[weakref.ref] = []
-    counts = []
-    read = film._image
-
-    def counting(path: Path) -> np.ndarray:
-        counts.append(sum(reference() is not None for reference in alive))
-        image = read(path)
-        alive.append(weakref.ref(image))
-        return image
-
-    monkeypatch.setattr(film, "_image", counting)
-    monkeypatch.setattr(film, "FEW", 2)
-    write_film(pictures, tmp_path / f"film.{end}", 24)
-    assert len(counts) == COUNT + 2 * (end == "gif") and max(counts) <= 3 + 2 * (end == "gif")
-
-
 @pytest.mark.parametrize(
     ("name", "fps", "sentence"),
     [
@@ -194,7 +172,7 @@ def test_without_ffmpeg_one_sentence_says_so(pictures, tmp_path, monkeypatch):
         raise RuntimeError("No ffmpeg exe could be found.")
 
     monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", none)
-    with pytest.raises(InputError, match=r"There is no ffmpeg for an .mp4: install imageio-ffmpeg or ffmpeg"):
+    with pytest.raises(InputError, match=r"There is no ffmpeg for films: install imageio-ffmpeg or ffmpeg"):
         write_film(pictures, tmp_path / "film.mp4", 24)
 
 

@@ -1,4 +1,4 @@
-"""Films of pictures: H.264 in .mp4 by the ffmpeg that imageio-ffmpeg provides, and animated .gif."""
+"""Films of pictures by the ffmpeg that imageio-ffmpeg provides: H.264 in .mp4, and animated .gif."""
 
 import errno
 import math
@@ -6,12 +6,11 @@ import os
 import signal
 import struct
 import subprocess
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
-from tempfile import TemporaryFile
-from typing import IO, TYPE_CHECKING
+from tempfile import TemporaryDirectory, TemporaryFile
 
 import numpy as np
 
@@ -20,19 +19,13 @@ from mpmcli.output.durable import sealed
 from mpmcli.render.frame_choice import evenly_spaced
 from mpmcli.render.picture_file import write_fault
 
-if TYPE_CHECKING:
-    from PIL.Image import Image
-
 FPS_MIN, FPS_MAX = 0.01, 1000.0  # frames per second, least and most
 FEW = 12  # number of pictures from which the palette of a gif is computed
 KEYWORD = b"mpmcli"  # marks the digest at the end of a film
 SKIPPED = b"free"  # type of the box that players of .mp4 skip
 DIGEST_MAX = 64
 GIF_FPS_MAX = 50  # browsers slow down faster films
-# Colours of the palette; the last index marks pixels unchanged since the previous picture.
-COLOURS, UNCHANGED = 255, 255
-BITS = 6  # bits of each channel in the histogram of colours
-CHOOSING = 200_000  # number of pixels from which the palette is computed
+COLOURS = 255  # of the palette, beside the one that marks pixels unchanged since the previous picture
 QUALITY = 18  # constant rate factor of H.264: 18 is visually near-lossless, 23 is ffmpeg's default
 PRESET = "veryfast"  # three times as fast as "medium", for visually equal films of the same size
 THREADS = 2  # fixed, since the bytes of a film depend on the number of threads
@@ -68,26 +61,31 @@ def write_film(
     digest: str = "",
     watch: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Write a film, whole or not at all, in place of what is there; the same pictures give the same bytes.
+    """Write a film of PNG files, whole or not at all, in place of what is there; the same files give the same bytes.
 
     An .mp4 is H.264 in yuv420p, the colours of BT.709, which every player shows; a picture of odd width or height
     gets one more column or row like its last. A .gif repeats for ever and has 255 colours, chosen for the whole film;
-    its frames last whole hundredths of a second, such that each begins within half of one of its time and the film
-    lasts as long as it should. Only a few pictures, all of one size, are in memory at a time.
+    its frames last whole hundredths of a second, such that each begins within half of one of its time.
 
     The `digest` is one of `settings_digest`; `watch` is called after each picture with the number of pictures read.
     """
     check_film(path, fps)
     if not pictures:
         raise InputError("A film needs at least one picture, and there is none.")
+    width, height = _checked(pictures[0], None)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with sealed(path) as temporary:
+        with sealed(path) as temporary, TemporaryDirectory() as directory:
             if path.suffix.lower() == ".mp4":
-                write_h264(_images(pictures, watch), temporary, path, fps)
+                # Colours are stored for 2x2 pixels.
+                even = f"pad=iw+{width % 2}:ih+{height % 2},fillborders=right={width % 2}:bottom={height % 2},{BT709}"
+                form = ["-vf", even, "-c:v", "libx264", "-preset", PRESET, "-crf", str(QUALITY), "-pix_fmt", "yuv420p"]
+                form += ["-movflags", "+faststart", "-f", "mp4"]
             else:
-                few = [_image(pictures[k]) for k in evenly_spaced(range(len(pictures)), FEW)]
-                write_gif(few, _images(pictures, watch), temporary, fps)
+                palette = Path(directory) / "palette.png"
+                _write_palette(evenly_spaced(pictures, FEW), palette)
+                form = ["-i", str(palette), "-lavfi", "paletteuse=dither=none", "-f", "gif"]
+            _encode(_contents(pictures, (width, height), watch), form, temporary, path, fps)
             with temporary.open("ab") as file:
                 file.write(_end(digest))
     except OSError as error:
@@ -114,172 +112,91 @@ def _end(digest: str) -> bytes:
     return struct.pack(">I", 8 + len(content)) + SKIPPED + content
 
 
-def _images(pictures: Sequence[Path], watch: Callable[[int], None]) -> Iterator[np.ndarray]:
-    """Yield the pictures as arrays of one size."""
-    size = None
+def _contents(pictures: Sequence[Path], size: tuple[int, int], watch: Callable[[int], None]) -> Iterator[bytes]:
+    """Yield the files of pictures of one size."""
     for done, picture in enumerate(pictures, start=1):
-        image = _image(picture)
-        size = size or image.shape[:2]
-        if image.shape[:2] != size:
-            raise InputError(
-                f"{picture} is {image.shape[1]}x{image.shape[0]} and those before it "
-                f"{size[1]}x{size[0]}: a film needs pictures of one size."
-            )
-        yield image
+        _checked(picture, size)
+        yield picture.read_bytes()
         watch(done)
 
 
-def _image(picture: Path) -> np.ndarray:
+def _checked(picture: Path, size: tuple[int, int] | None) -> tuple[int, int]:
+    """Return width and height of a picture; raise InputError where they are not `size`, or the file is damaged."""
     from PIL import Image
 
     try:
-        with Image.open(picture) as image:
-            return np.asarray(image.convert("RGB"))
+        with Image.open(picture, formats=["PNG"]) as image:
+            image.verify()
     # A damaged file makes Pillow raise a SyntaxError too.
     except (OSError, ValueError, SyntaxError) as error:
         raise InputError(f"{picture} cannot be read as a picture: make it anew with --overwrite.") from error
+    if size not in (None, image.size):
+        raise InputError(
+            f"{picture} is {image.size[0]}x{image.size[1]} and those before it {size[0]}x{size[1]}: a film needs "
+            "pictures of one size."
+        )
+    return image.size
 
 
-def write_gif(few: Sequence[np.ndarray], images: Iterable[np.ndarray], place: Path, fps: float) -> None:
-    """Write pictures (h, w, 3), one at a time, as a gif that repeats for ever and has the colours of a few of them.
-
-    One palette serves the whole film, and of each picture only what has changed is written. Frame k begins at the
-    hundredth of a second next to k / fps. Pillow's `save_all` keeps every frame in memory (254 MB for 151 frames of
-    1280x720, against 135 MB here), takes 9.8 s against 5.2 s, and merges equal frames.
-    """
+def _write_palette(few: Sequence[Path], path: Path) -> None:
+    """Write the colours of a few pictures as a picture, chosen by the root of their frequency: no ground dominates."""
     from PIL import Image
 
-    palette = _palette(few)
-    before = None
-    with place.open("wb") as file:
-        for k, image in enumerate(images):
-            shown = np.asarray(Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE))
-            if before is None:
-                file.write(_header(shown, palette))
-            hundredths = round((k + 1) * 100 / fps) - round(k * 100 / fps)
-            file.writelines(_changes(shown, before, 10 * hundredths))
-            before = shown
-        file.write(b";")
+    for picture in few:
+        _checked(picture, None)
+    pixels = [np.asarray(Image.open(picture).convert("RGBA")).view(np.uint32).ravel() for picture in few]
+    colors, counts = np.unique(np.concatenate(pixels), return_counts=True)
+    chosen = np.repeat(colors, np.ceil(np.sqrt(counts)).astype(int)).view(np.uint8).reshape(1, -1, 4)
+    image = Image.fromarray(chosen).convert("RGB").quantize(COLOURS, method=Image.Quantize.MEDIANCUT)
+    # The last of the 256 that ffmpeg asks for is clear.
+    table = np.resize(np.array(image.getpalette(), np.uint8).reshape(-1, 3), (256, 3))
+    opaque = np.where(np.arange(256) < COLOURS, np.uint8(255), np.uint8(0))
+    Image.fromarray(np.column_stack([table, opaque]).reshape(16, 16, 4)).save(path)
 
 
-def _palette(few: Sequence[np.ndarray]) -> "Image":
-    """Return an image with the colours of the film, by the root of their frequency: no ground dominates."""
-    from PIL import Image
-
-    size = 1 << (3 * BITS)
-    count, total = np.zeros(size), np.zeros((3, size))
-    for image in few:
-        pixels = image.reshape(-1, 3)
-        r, g, b = (pixels >> (8 - BITS)).astype(np.int32).T
-        place = (r << (2 * BITS)) | (g << BITS) | b
-        count += np.bincount(place, minlength=size)
-        for channel in range(3):
-            total[channel] += np.bincount(place, weights=pixels[:, channel], minlength=size)
-    seen = count > 0
-    means = np.rint(total[:, seen] / count[seen]).astype(np.uint8).T
-    weight = np.sqrt(count[seen])
-    times = np.maximum(1, np.rint(weight * CHOOSING / weight.sum())).astype(int)
-    chosen = Image.fromarray(np.repeat(means, times, axis=0)[None])
-    return chosen.quantize(COLOURS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-
-
-def _header(shown: np.ndarray, palette: "Image") -> bytes:
-    """Return signature, size, 256 colours and the extension that repeats the film (GIF89a specification, 17 to 19)."""
-    height, width = shown.shape
-    colours = bytes(palette.getpalette() or [])[: 3 * COLOURS].ljust(3 * 256, b"\x00")
-    forever = b"!\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00"
-    return b"GIF89a" + struct.pack("<HHBBB", width, height, 0xF7, 0, 0) + colours + forever
-
-
-def _changes(shown: np.ndarray, before: np.ndarray | None, milliseconds: int) -> list[bytes]:
-    """Return the block of a picture: the box in which it differs from the one before, and only what differs there."""
-    from PIL import GifImagePlugin, Image
-
-    if before is None:
-        return GifImagePlugin.getdata(Image.fromarray(shown), duration=milliseconds, disposal=1)
-    changed = shown != before
-    rows, columns = (np.flatnonzero(changed.any(axis)) for axis in (1, 0))
-    box = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)) if len(rows) else (slice(1), slice(1))
-    part = np.where(changed, shown, np.uint8(UNCHANGED))[box]
-    offset = (int(box[1].start or 0), int(box[0].start or 0))
-    keywords = {"duration": milliseconds, "disposal": 1, "transparency": UNCHANGED}
-    return GifImagePlugin.getdata(Image.fromarray(part), offset, **keywords)
-
-
-def write_h264(images: Iterable[np.ndarray], place: Path, name: Path, fps: float) -> None:
-    """Write pictures (h, w, 3), one at a time, as a film to a place; errors call it by its name."""
-    program = _ffmpeg()
-    process: subprocess.Popen[bytes] | None = None
-    with TemporaryFile() as messages:
-        try:
-            for image in images:
-                # The last row or column is repeated where their number is odd: colours are stored for 2x2 pixels.
-                height, width = image.shape[:2]
-                image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-                if process is None:
-                    process = _started(program, image.shape[1], image.shape[0], place, fps, messages)
-                assert process.stdin is not None
-                try:
-                    process.stdin.write(np.ascontiguousarray(image))
-                except OSError:
-                    break  # ffmpeg has ended; its stderr gives the reason
-            if process is not None:
-                _finish(process, messages, name)
-        finally:
-            if process is not None:
-                process.kill()
-                process.wait()
-                _close(process)
-
-
-def _ffmpeg() -> str:
+def _encode(contents: Iterator[bytes], form: Sequence[str], place: Path, name: Path, fps: float) -> None:
+    """Let ffmpeg write the contents of PNG files, one at a time, to a place; errors call it by its name."""
     import imageio_ffmpeg
 
     try:
-        return imageio_ffmpeg.get_ffmpeg_exe()
+        program = imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as error:
         raise InputError(
-            "There is no ffmpeg for an .mp4: install imageio-ffmpeg or ffmpeg, or name its program in "
-            "IMAGEIO_FFMPEG_EXE; a .gif needs none."
+            "There is no ffmpeg for films: install imageio-ffmpeg or ffmpeg, or name its program in IMAGEIO_FFMPEG_EXE."
         ) from error
-
-
-def _started(program: str, width: int, height: int, place: Path, fps: float, messages: IO[bytes]) -> subprocess.Popen:
-    rate = str(Fraction(fps).limit_denominator(100_000))
-    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", rate, "-i", "pipe:0"]
-    codec = ["-c:v", "libx264", "-preset", PRESET, "-crf", str(QUALITY), "-pix_fmt", "yuv420p"]
+    given = ["-f", "image2pipe", "-c:v", "png", "-r", str(Fraction(fps).limit_denominator(100_000)), "-i", "pipe:0"]
     # No time, no version: the same pictures are the same bytes.
     exact = ["-threads", str(THREADS), "-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact"]
-    out = ["-movflags", "+faststart", "-f", "mp4", f"file:{place}"]
-    try:
-        return subprocess.Popen(
-            [program, "-y", "-v", "error", "-nostdin", *raw, "-vf", BT709, *codec, *exact, *out],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=messages,
-            # Ctrl-C at the terminal reaches only this process, which then ends ffmpeg.
-            start_new_session=True,
-        )
-    except OSError as error:
-        raise RunError(f"ffmpeg could not be started ({error.strerror}): is {program} the program?") from error
-
-
-def _finish(process: subprocess.Popen, messages: IO[bytes], name: Path) -> None:
-    _close(process)
-    status = process.wait()
-    if status != 0:
+    with TemporaryFile() as messages:
+        try:
+            process = subprocess.Popen(
+                [program, "-y", "-v", "error", *given, *form, *exact, f"file:{place}"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=messages,
+                # Ctrl-C at the terminal reaches only this process, which then ends ffmpeg.
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise RunError(f"ffmpeg could not be started ({error.strerror}): is {program} the program?") from error
+        try:
+            # Where ffmpeg has ended its stderr gives the reason.
+            with suppress(BrokenPipeError):
+                for content in contents:
+                    process.stdin.write(content)
+                process.stdin.close()
+            status = process.wait()
+        finally:
+            process.kill()
+            process.wait()
+            with suppress(BrokenPipeError):
+                process.stdin.close()
         messages.seek(0)
-        if status in FULL_STATUS:
-            raise OSError(FULL_STATUS[status], os.strerror(FULL_STATUS[status]))
         words = " ".join(messages.read().decode("utf-8", errors="replace").split("\n")[-LAST_WORDS - 1 :]).strip()
+    if status in FULL_STATUS:
+        raise OSError(FULL_STATUS[status], os.strerror(FULL_STATUS[status]))
+    if status != 0:
         how = f"it was ended by signal {-status}" if status < 0 else f"its status is {status}"
         raise RunError(
             f"ffmpeg failed to write {name}, {how}: {words.rstrip('.') or 'it said nothing'}; mpmcli doctor tries it."
         )
-
-
-def _close(process: subprocess.Popen) -> None:
-    assert process.stdin is not None
-    # The process may have ended.
-    with suppress(OSError):
-        process.stdin.close()
