@@ -168,16 +168,14 @@ def test_blur_has_its_width(deviation: float):
     result = blurred(image, deviation)
     assert result.sum() == pytest.approx(1.0, rel=1e-5)
     offset = np.arange(2 * reach + 3) - reach - 1
-    # Cut off at three standard deviations a Gaussian loses 2.7 % of its variance. Boxes are odd numbers of pixels: one
-    # of three that is two wider adds (low + 1) / 3, so that they are within half of that; low is 17 or more.
+    # Cut off at three standard deviations a Gaussian loses 2.7 % of its variance.
     # At half a pixel the samples are too few for the integral: their sum is 2 exp(-2) / (1 + 2 exp(-2)) = 0.213.
     expected = 0.213 if deviation == 0.5 else deviation**2
     assert (offset**2 * result.sum(axis=0)).sum() == pytest.approx(expected, rel=0.04)
     assert (offset * result.sum(axis=0)).sum() == pytest.approx(0.0, abs=1e-3)
-    # Its height in the middle, of a Gaussian in two dimensions; three boxes of 2 deviations have 3 / 8 to 0.399.
+    # Its height in the middle, of a Gaussian in two dimensions.
     if deviation > 1:
-        share = 1.0 if deviation < 8 else (0.375 * np.sqrt(2 * np.pi)) ** 2
-        assert result.max() == pytest.approx(share / (2 * np.pi * deviation**2), rel=0.05)
+        assert result.max() == pytest.approx(1 / (2 * np.pi * deviation**2), rel=0.05)
 
 
 def test_normals_of_a_plane_and_of_a_sphere():

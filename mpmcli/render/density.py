@@ -1,6 +1,7 @@
 """The density of the grid by the kernel of the solver (docs/theory.md, 2.1): an image in 2D, a slice in 3D."""
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import STATUS, Frame
@@ -105,19 +106,10 @@ class DensityPainter:
         (left, bottom), (right, top) = self._box
         u = (np.arange(width) + 0.5 - left) / (right - left) * (density.shape[0] - 1)
         v = (bottom - np.arange(height) - 0.5) / (bottom - top) * (density.shape[1] - 1)
-        values = _between(_between(density, u).T, v)
+        values = map_coordinates(density, np.meshgrid(u, v), order=1, mode="nearest")
         inside = ((v >= 0) & (v <= density.shape[1] - 1))[:, None] & ((u >= 0) & (u <= density.shape[0] - 1))
         alpha = np.clip(values / (FADING * self._colors.limits[1]), 0.0, 1.0) * inside
         picture = self._ground + alpha[:, :, None] * (self._colors.rgb(values) - self._ground)
         picture /= 255.0
         self._solid.draw(picture, frame)
         return (255.0 * picture + 0.5).astype(np.uint8)
-
-
-def _between(table: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Interpolate the rows of a table linearly at fractional row numbers, those beyond its ends at its ends."""
-    places = np.clip(places, 0.0, len(table) - 1.0)
-    below = np.minimum(places.astype(np.intp), max(len(table) - 2, 0))
-    share = (places - below)[:, None]
-    above = np.minimum(below + 1, len(table) - 1)
-    return table[below] * (1.0 - share) + table[above] * share

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from mpmcli.render.dots import hidden
-from mpmcli.render.particle_grid import deposited, gaussian
+from mpmcli.render.particle_grid import deposited
 from mpmcli.render.render_scene import Appearance, RenderScene
 from mpmcli.render.view import View
 
@@ -23,7 +24,6 @@ LARGEST = 24.0
 NOTHING = np.float32(1e9)  # depth, m, of a pixel that no liquid covers
 BLOCK = 24  # rows that are smoothed together: few enough to stay in the cache
 CUT = 2.0  # standard deviations at which a Gaussian is cut off
-BOXES_FROM = 8.0  # pixels of deviation from which a Gaussian is made of boxes
 MOST_TAPS = 16  # taps to one side of a pixel; a wider filter takes wider steps instead
 
 
@@ -368,29 +368,7 @@ def _narrow_range(part: np.ndarray, decay: np.ndarray, radius: np.float32, taps:
 
 def blurred(image: np.ndarray, deviation: float) -> np.ndarray:
     """Return an image (h, w) under a Gaussian, pixels; its sum is kept but for what runs over the edges."""
-    if deviation > BOXES_FROM:
-        return _boxed(image, deviation)
-    reach = int(np.ceil(3 * deviation))
-    # Along the rows first.
-    return np.ascontiguousarray(gaussian(image.T, deviation, reach).T)
-
-
-def _boxed(image: np.ndarray, deviation: float) -> np.ndarray:
-    """Return an image under three boxes, which are as good as a wide Gaussian and cost the same at every width.
-
-    A box of w pixels has the variance (w^2 - 1) / 12; the widths are the odd ones whose sum is nearest.
-    """
-    low = 2 * int((np.sqrt(4 * deviation**2 + 1) - 1) / 2) + 1
-    # With m boxes of `low` and the rest two wider: 12 deviation^2 = 3 (low + 2)^2 - 3 - m (4 low + 4).
-    count = round((3 * (low + 2) ** 2 - 3 - 12 * deviation**2) / (4 * low + 4))
-    result = image.astype(np.float64)
-    for _ in range(2):
-        for k in range(3):
-            half = (low if k < count else low + 2) // 2
-            total = np.cumsum(np.pad(result, ((half + 1, half), (0, 0))), axis=0)
-            result = (total[2 * half + 1 :] - total[: -2 * half - 1]) / (2 * half + 1)
-        result = np.ascontiguousarray(result.T)
-    return result.astype(image.dtype)
+    return gaussian_filter(image, deviation, mode="constant", truncate=3.0)
 
 
 def thickness(

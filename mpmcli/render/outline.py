@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from scipy.ndimage import affine_transform
 
 from mpmcli.frames.frame import Frame
 from mpmcli.render.colliders import FlatColliders, with_collider_images
@@ -219,11 +220,4 @@ def _finer(values: np.ndarray, step: int, shape: tuple[int, int]) -> np.ndarray:
     """Interpolate values at the coarse nodes to all nodes, (h, w)."""
     if step == 1:
         return values[: shape[0], : shape[1]]
-    for axis in range(2):
-        values = np.moveaxis(values, axis, 0)
-        nodes = np.arange(shape[axis]) / step
-        low = np.minimum(nodes.astype(int), len(values) - 1)
-        high = np.minimum(low + 1, len(values) - 1)
-        part = (nodes - low).astype(np.float32)[:, None]
-        values = np.moveaxis((1.0 - part) * values[low] + part * values[high], 0, axis)
-    return np.ascontiguousarray(values)
+    return affine_transform(values, (1.0 / step, 1.0 / step), output_shape=shape, order=1, mode="nearest")

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import convolve1d, gaussian_filter, map_coordinates
 
 STRAY = 4.0  # radii that a particle may lie outside of the domain and still be drawn
 SPREAD = 1.25  # standard deviation of the Gaussian of a particle's area, in distances between particles
@@ -58,41 +59,14 @@ def deposited(place: np.ndarray, amounts: np.ndarray, shape: tuple[int, int]) ->
 
 def sampled(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
     """Return values between the pixels of an image (r, c, k), linear in between; the outermost go on outside."""
-    rows, columns = image.shape[:2]
-    row, column = np.clip(row - 0.5, 0, rows - 1.001), np.clip(column - 0.5, 0, columns - 1.001)
-    j, i = row.astype(np.int32), column.astype(np.int32)
-    v, u = (row - j)[..., None], (column - i)[..., None]
-    flat, home = image.reshape(rows * columns, -1), j * columns + i
-    upper = flat[home] * (1 - u) + flat[home + 1] * u
-    lower = flat[home + columns] * (1 - u) + flat[home + columns + 1] * u
-    return upper * (1 - v) + lower * v
+    place = np.stack([row, column]) - 0.5
+    channels = (map_coordinates(image[..., k], place, order=1, mode="nearest") for k in range(image.shape[2]))
+    return np.stack(list(channels), axis=-1)
 
 
 def blurred_along(values: np.ndarray, axis: int) -> np.ndarray:
     """Return values blurred along an axis with weights 1/4, 1/2, 1/4; what would leave at an end is kept there."""
-    values = np.moveaxis(values, axis, 0)
-    result = 0.5 * values
-    result[1:] += 0.25 * values[:-1]
-    result[:-1] += 0.25 * values[1:]
-    result[0] += 0.25 * values[0]
-    result[-1] += 0.25 * values[-1]
-    return np.moveaxis(result, 0, axis)
-
-
-def gaussian(values: np.ndarray, deviation: float, reach: int) -> np.ndarray:
-    """Return values (rows, columns) blurred by a Gaussian, cut off `reach` cells away; beyond the edges they are 0."""
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / deviation) ** 2)
-    weights = (weights / weights.sum()).astype(values.dtype)
-    for _ in range(2):
-        rows = len(values)
-        padded = np.pad(values, ((reach, reach), (0, 0)))
-        total = weights[reach] * values
-        for k in range(1, reach + 1):
-            pair = padded[reach - k : reach - k + rows] + padded[reach + k : reach + k + rows]
-            pair *= weights[reach + k]
-            total += pair
-        values = np.ascontiguousarray(total.T)
-    return values
+    return convolve1d(values, (0.25, 0.5, 0.25), axis)
 
 
 @dataclass(frozen=True)
@@ -149,7 +123,7 @@ def spread(position: np.ndarray, weights: np.ndarray, deviation: float, grid: Gr
 
 def soft(values: np.ndarray, deviation: float) -> np.ndarray:
     """Return values (rows, columns) blurred by a Gaussian of a deviation in cells, if it is wide enough to matter."""
-    return values if deviation < 0.15 else gaussian(values, deviation, max(math.ceil(REACH * deviation), 1))
+    return values if deviation < 0.15 else gaussian_filter(values, deviation, mode="constant", truncate=REACH)
 
 
 def disk_nodes(position: np.ndarray, reach: float, grid: Grid) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

@@ -5,6 +5,7 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from mpmcli.frames.frame import Frame
 from mpmcli.render import lighting
@@ -13,7 +14,7 @@ from mpmcli.render.coloring import Coloring
 from mpmcli.render.lighting import Lights
 from mpmcli.render.occlusion import Background, Occlusion, occlusion_by
 from mpmcli.render.offscreen import OffscreenRenderer
-from mpmcli.render.particle_grid import blurred_along, deposited, sampled
+from mpmcli.render.particle_grid import blurred_along, deposited
 from mpmcli.render.reconstruction import reconstruct
 from mpmcli.render.render_scene import Appearance, Group, RenderScene, groups_of
 from mpmcli.render.settings import Theme, rgb
@@ -219,7 +220,7 @@ def _thickness_at(view: View, position: np.ndarray, distance: float, points: np.
         area = area * (seen[:, 2] / view.distance) ** 2
     total = deposited(seen[:, :2] / edge + 0.5, np.broadcast_to(distance**3 / area, len(seen)), shape)
     total = blurred_along(blurred_along(total, 0), 1)
-    return sampled(total, wanted[:, 1] / edge + 1.0, wanted[:, 0] / edge + 1.0)[:, 0]
+    return map_coordinates(total, wanted[:, 1::-1].T / edge + 0.5, order=1, mode="nearest")
 
 
 def _texture() -> Any:
