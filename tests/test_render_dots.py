@@ -101,8 +101,8 @@ def test_colours_follow_a_known_gradient(tmp_path: Path) -> None:
     options = {"by": "pressure", "limits": (0.0, 1000.0), "cmap": "gray"}
     (picture,), view, _, _ = painted(tmp_path, [gradient], (1.0, 0.75), **options)
     seen = at(picture, view.pixels(deep(block))).astype(float)
-    # Exactly the colour of the value, as 256 steps of grey have it.
-    np.testing.assert_allclose(seen, np.repeat(255.0 * block[:, :1], 3, axis=1), atol=1.01)
+    # Exactly the colour of the value, as 256 steps of grey have it; matplotlib cuts both the step and its grey off.
+    np.testing.assert_allclose(seen, np.repeat(255.0 * block[:, :1], 3, axis=1), atol=2.0)
 
 
 def test_nan_is_drawn_in_its_colour_and_lost_particles_are_left_out(tmp_path: Path) -> None:

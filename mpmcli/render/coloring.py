@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import get_args
 
 import numpy as np
@@ -12,11 +11,10 @@ from mpmcli.frames.frame import Frame
 from mpmcli.output.result import Result
 from mpmcli.render.frame_choice import evenly_spaced
 from mpmcli.render.render_scene import RenderScene
-from mpmcli.render.settings import LIMIT_MAX, LIMIT_MIN, Theme, rgb, rgb_bytes
+from mpmcli.render.settings import LIMIT_MAX, LIMIT_MIN, Theme, rgb_bytes
 from mpmcli.scene.problem import listed, nearest
 from mpmcli.scene.schema import ParticleField
 
-SHADES = 1024  # steps of a colour map under light, which makes more of the differences between neighbouring colours
 # Values available in every result, and values that need a stored field.
 ALWAYS = ("speed", "material", "body", "id")
 DERIVED = ("density", "pressure", "J", "stress")
@@ -66,31 +64,13 @@ class Coloring:
 
     def rgb(self, values: np.ndarray) -> np.ndarray:
         """Return the colours (..., 3) uint8 of values (...)."""
-        low, high = self.limits
-        known = np.isfinite(values)
-        with np.errstate(all="ignore"):
-            share = np.where(known, (values - low) / (high - low), 0.0)
-        colors = self._table[np.clip(share * 255.0 + 0.5, 0, 255).astype(np.intp)]
-        colors[~known] = rgb_bytes(self.missing)
-        return colors
-
-    def shades(self, values: np.ndarray) -> np.ndarray:
-        """Return the colours (..., 3) float32 from 0 to 1 of values (...), in finer steps than `rgb`."""
-        low, high = self.limits
-        known = np.isfinite(values)
-        share = (np.where(known, values, low) - low) / max(high - low, 1e-300)
-        colors = self._map(SHADES).astype(np.float32)[np.clip(share * SHADES, 0, SHADES - 1).astype(int)]
-        colors[~known] = rgb(self.missing)
-        return colors
-
-    @cached_property
-    def _table(self) -> np.ndarray:
-        return (self._map(256) * 255.0 + 0.5).astype(np.uint8)
-
-    def _map(self, steps: int) -> np.ndarray:
         import matplotlib as mpl
 
-        return mpl.colormaps[self.cmap](np.linspace(0.0, 1.0, steps))[:, :3]
+        low, high = self.limits
+        with np.errstate(all="ignore"):
+            share = np.where(np.isfinite(values), (values - low) / (high - low), np.nan)
+        # Matplotlib takes what is not a number as bad.
+        return mpl.colormaps[self.cmap].with_extremes(bad=self.missing)(share, bytes=True)[..., :3]
 
 
 @dataclass(frozen=True)

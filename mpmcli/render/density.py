@@ -1,7 +1,7 @@
 """The density of the grid by the kernel of the solver (docs/theory.md, 2.1): an image in 2D, a slice in 3D."""
 
 import numpy as np
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import affine_transform
 
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import STATUS, Frame
@@ -106,7 +106,8 @@ class DensityPainter:
         (left, bottom), (right, top) = self._box
         u = (np.arange(width) + 0.5 - left) / (right - left) * (density.shape[0] - 1)
         v = (bottom - np.arange(height) - 0.5) / (bottom - top) * (density.shape[1] - 1)
-        values = map_coordinates(density, np.meshgrid(u, v), order=1, mode="nearest")
+        steps, start, shape = (v[1] - v[0], u[1] - u[0]), (v[0], u[0]), (height, width)
+        values = affine_transform(density.T, steps, start, output_shape=shape, order=1, mode="nearest")
         inside = ((v >= 0) & (v <= density.shape[1] - 1))[:, None] & ((u >= 0) & (u <= density.shape[0] - 1))
         alpha = np.clip(values / (FADING * self._colors.limits[1]), 0.0, 1.0) * inside
         picture = self._ground + alpha[:, :, None] * (self._colors.rgb(values) - self._ground)

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
 
 from mpmcli.render.settings import Theme
 from mpmcli.render.view import View
@@ -65,13 +66,7 @@ class OffscreenRenderer:
 
     def picture(self) -> np.ndarray:
         """Return the rows from the top, (h, w, 3) uint8, averaged over the samples of each pixel."""
-        image, step = self.pixels(), self.samples
-        if step == 1:
-            return np.ascontiguousarray(image)
-        total = np.zeros((image.shape[0] // step, image.shape[1] // step, 3), np.uint16)
-        for i, j in np.ndindex(step, step):
-            total += image[i::step, j::step]
-        return ((total + step * step // 2) // (step * step)).astype(np.uint8)
+        return np.array(Image.fromarray(self.pixels()).reduce(self.samples))
 
     def pixels(self) -> np.ndarray:
         """Return the pixels of the window, rows from the top, (h, w, 3) uint8."""

@@ -159,7 +159,7 @@ class OutlinePainter:
             for weight in (np.where(known, values, 0.0), known.astype(float), np.ones(len(values)))
         ]
         number = np.divide(sums[0], sums[1], out=np.full_like(sums[0], np.nan), where=sums[1] > 0.5 * sums[2])
-        return self.colors.shades(_finer(number, step, self.grid.shape).astype(np.float64))
+        return self.colors.rgb(_finer(number, step, self.grid.shape)) / np.float32(255)
 
     def _grainy(self, group: Group, base: np.ndarray, depth: np.ndarray, lit: np.ndarray) -> np.ndarray:
         """Return colours (h, w, 3) of grains, each a disk of its own brightness, over a darker ground."""

@@ -103,7 +103,7 @@ class SurfaceRenderer:
             value, known = (mesh.attributes[name].astype(np.float64) for name in ("value", "known"))
             # The mean over those particles that have a number, where they are the majority.
             mean = np.divide(value, known, out=np.full_like(value, np.nan), where=known > 0.5)
-            tint = self.colors.shades(mean) ** np.float32(2.2)
+            tint = (self.colors.rgb(mean) / 255.0) ** 2.2
         rough = mesh.attributes.get("rough", np.zeros((count, 3), dtype=np.float32))
         _carry(actor, mesh.points, mesh.triangles, (light, tint, rough, mesh.normals))
         actor.SetVisibility(bool(len(mesh.triangles)))
@@ -119,7 +119,7 @@ class SurfaceRenderer:
         actor = self.actors[group.key]
         color, hashes = np.array(rgb(group.appearance.color)), group.hashes
         if self.colors is not None:
-            color = self.colors.shades(np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows])
+            color = self.colors.particle_rgb(frame)[group.rows] / 255.0
             # A colour that means something is not varied.
             hashes = np.zeros_like(hashes)
         lamp, sky = np.ones((2, len(hashes)))
