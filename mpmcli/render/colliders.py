@@ -1,8 +1,8 @@
 """Colliders in pictures: flat in the plane, meshes in space, and the mirror images of particles behind them."""
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,81 +36,53 @@ class FlatColliders:
     """Covers the pixels of a view of a plane by the signed distances of colliders, within the domain."""
 
     def __init__(self, scene: RenderScene, view: View, theme: Theme, plane: Slice) -> None:
-        self._scene, self._colliders, self._across = scene, scene.colliders, list(plane.across)
-        corners = plane.corners(scene)
-        pixels = view.pixels(corners)[:, :2]
-        # The axes of the plane may run to the left or down in the picture.
-        backwards = (pixels[1] - pixels[0]) * (1, -1) < 0
-        self._signs, self._start = np.where(backwards, -1.0, 1.0), corners[0].copy()
-        self._start[self._across] = np.where(backwards, *corners[::-1, self._across])
-        (left, top), (right, bottom) = pixels.min(axis=0).tolist(), pixels.max(axis=0).tolist()
-        self._edge = 1.0 / view.pixels_per_metre
+        self._scene, self._view = scene, view
         self._rim = RIM * view.size[1] / 720.0
-        self._color, self._ground = np.array(rgb(theme.solid)), np.array(rgb(theme.ground))
-        width, height = view.size
-        self._rows = slice(max(math.floor(top), 0), min(math.ceil(bottom), height))
-        self._columns = slice(max(math.floor(left), 0), min(math.ceil(right), width))
-        x = np.arange(self._columns.start, self._columns.stop) + 0.5
-        y = np.arange(self._rows.start, self._rows.stop) + 0.5
-        self._right, self._up = (x - left) * self._edge, (bottom - y) * self._edge
-        inside = [
-            np.clip(np.minimum(a - lo, hi - a) + 0.5, 0.0, 1.0) for a, lo, hi in ((x, left, right), (y, top, bottom))
-        ]
-        self._inside = (inside[1][:, None] * inside[0]).astype(np.float32)
+        color, ground = np.array(rgb(theme.solid)), np.array(rgb(theme.ground))
+        self._fill, self._dark = ground + FILLED * (color - ground), (1.0 - DARKER) * color
+        x, y = (np.arange(size) + 0.5 for size in view.size)
+        low, high = np.sort(view.pixels(plane.corners(scene))[:, :2], axis=0)
+        across, up = (np.clip(np.minimum(a - low[k], high[k] - a) + 0.5, 0.0, 1.0) for k, a in enumerate((x, y)))
+        self._inside = (up[:, None] * across).astype(np.float32)
+        self._points = view.rays(x[None, :], y[:, None])[0]
+        if plane.normal is not None:
+            self._points[..., plane.normal] = plane.place
         self._kept: dict[int, np.ndarray] = {}
 
-    def draw(self, picture: np.ndarray, frame: Frame, free: np.ndarray | None = None) -> None:
+    def draw(self, picture: np.ndarray, frame: Frame, free: np.ndarray | float = 1.0) -> None:
         """Draw the colliders of a frame over a picture (h, w, 3) from 0 to 1, in the `free` share (h, w) of pixels."""
-        if not self._colliders or not self._inside.size:
-            return
-        depth = np.full(self._inside.shape, -np.inf, np.float32)
-        for number, collider in enumerate(self._colliders):
-            if self._scene.shows(number, frame):
-                np.maximum(depth, self._depth(number, collider, frame.time), out=depth)
-        cover = np.clip(depth + 0.5, 0.0, 1.0) * self._inside
-        if free is not None:
-            cover = cover * free[self._rows, self._columns]
-        rim = np.clip(self._rim + 0.5 - depth, 0.0, 1.0)[..., None]
-        fill = self._ground + FILLED * (self._color - self._ground)
-        color = fill + rim * ((1.0 - DARKER) * self._color - fill)
-        shown = picture[self._rows, self._columns]
-        shown += cover[..., None] * (color - shown)
-
-    def _place(self, places: np.ndarray) -> np.ndarray:
-        """Return the points (n, d) at places (n, 2), m, from the domain's lower left corner in the picture."""
-        points = np.tile(self._start, (len(places), 1))
-        points[:, self._across] += self._signs * places
-        return points[:, : self._scene.dimension]
+        shown = [(k, it) for k, it in enumerate(self._scene.colliders) if self._scene.shows(k, frame)]
+        if shown:
+            depth = np.max([self._depth(number, collider, frame.time) for number, collider in shown], axis=0)
+            cover = np.clip(depth + 0.5, 0.0, 1.0) * self._inside * free
+            rim = np.clip(self._rim + 0.5 - depth, 0.0, 1.0)[..., None]
+            picture += cover[..., None] * (self._fill + rim * (self._dark - self._fill) - picture)
 
     def _depth(self, number: int, collider: Collider, time: float) -> np.ndarray:
-        """Return how many pixels (h, w) each pixel of the domain lies inside a collider, negative outside."""
+        """Return how many pixels (h, w) each pixel lies inside a collider, negative outside."""
         if number in self._kept:
             return self._kept[number]
-        rows, columns = self._near(collider, time)
-        right, up = np.meshgrid(self._right[columns], self._up[rows])
+        place = self._near(collider, time)
+        points = self._points[place][..., : self._scene.dimension]
         depth = np.full(self._inside.shape, -np.inf, np.float32)
-        if right.size:
-            points = self._place(np.stack([right.ravel(), up.ravel()], axis=1))
-            depth[rows, columns] = -collider.signed_distance(points, time).reshape(right.shape) / self._edge
+        if points.size:
+            distance = collider.signed_distance(points.reshape(-1, points.shape[-1]), time)
+            depth[place] = -self._view.pixels_per_metre * distance.reshape(points.shape[:2])
         if not collider.motion.moves:
             self._kept[number] = depth
         return depth
 
     def _near(self, collider: Collider, time: float) -> tuple[slice, slice]:
+        """Return rows and columns of the picture that a collider may be seen in."""
         if isinstance(collider.form, Plane) or collider.side == "inside":
             return slice(None), slice(None)
-        lower, upper = collider.form.bounds()
-        d = len(lower)
-        corners = np.array([[upper[a] if k >> a & 1 else lower[a] for a in range(d)] for k in range(2**d)])
-        ends = collider.motion.placed(corners, time)
-        origin, reach = self._place(np.zeros((1, 2)))[0], 2.0 * self._edge
-
-        def seen(axis: tuple[float, float], steps: np.ndarray) -> slice:
-            along = (ends - origin) @ (self._place(np.array([axis]))[0] - origin)
-            hit = np.flatnonzero((steps >= along.min() - reach) & (steps <= along.max() + reach))
-            return slice(hit[0], hit[-1] + 1) if len(hit) else slice(0, 0)
-
-        return seen((0.0, 1.0), self._up), seen((1.0, 0.0), self._right)
+        corners = np.array(list(product(*zip(*collider.form.bounds(), strict=True))))
+        ends = np.zeros((len(corners), 3))
+        ends[:, : corners.shape[1]] = collider.motion.placed(corners, time)
+        pixels = self._view.pixels(ends)[:, :2]
+        left, top = np.clip(pixels.min(axis=0) - 2.0, 0, self._view.size).astype(int)
+        right, bottom = np.clip(pixels.max(axis=0) + 3.0, 0, self._view.size).astype(int)
+        return slice(top, bottom), slice(left, right)
 
 
 @dataclass(frozen=True, eq=False)

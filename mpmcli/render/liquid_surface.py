@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from mpmcli.render.dots import hidden
-from mpmcli.render.particle_grid import deposited
+from mpmcli.render.particle_grid import deposited, with_images
 from mpmcli.render.render_scene import Appearance, RenderScene
 from mpmcli.render.view import View
 
@@ -191,23 +191,11 @@ def _spheres(pixels: np.ndarray, scale: np.ndarray, radius: float, shape: tuple[
 
 def _mirrored(liquid: Liquid, view: View, scene: RenderScene) -> Liquid:
     """Add the mirror images of the particles at the walls: the surface then meets a wall without a gap or a dent."""
-    images = []
-    for axis in range(3):
-        for wall in (scene.lower[axis], scene.upper[axis]):
-            near = np.abs(liquid.position[:, axis] - wall) < MIRRORED * liquid.distance
-            image = liquid.position[near]
-            image[:, axis] = 2 * wall - image[:, axis]
-            images.append(image)
-    added = np.concatenate(images)
-    pixels = view.pixels(added)
+    position, _ = with_images(liquid.position, MIRRORED * liquid.distance, scene.lower, scene.upper)
+    pixels = view.pixels(position)
     front = pixels[:, 2] > max(view.near, liquid.distance)
-    added, pixels = added[front], pixels[front]
-    return replace(
-        liquid,
-        position=np.concatenate([liquid.position, added]),
-        pixels=np.concatenate([liquid.pixels, pixels]),
-        scale=np.concatenate([liquid.scale, view.scale_at(pixels[:, 2])]),
-    )
+    pixels = pixels[front]
+    return replace(liquid, position=position[front], pixels=pixels, scale=view.scale_at(pixels[:, 2]))
 
 
 def _passage(window: Window, view: View, scene: RenderScene) -> tuple[np.ndarray, np.ndarray]:
@@ -295,45 +283,24 @@ def smoothed(depth: np.ndarray, deviation: np.ndarray, radius: float) -> np.ndar
 
 def _cleaned(depth: np.ndarray, radius: float) -> np.ndarray:
     """Wipe out the streaks that rows and columns leave: a filter of five by five pixels, in both directions at once."""
-    covered = depth < NOTHING
-    used_rows, used_columns = np.flatnonzero(covered.any(axis=1)), np.flatnonzero(covered.any(axis=0))
-    if len(used_rows) == 0:
-        return depth
-    place = slice(used_rows[0], used_rows[-1] + 1), slice(used_columns[0], used_columns[-1] + 1)
-    centre, mask = depth[place], covered[place]
-    rows, columns = centre.shape
-    padded = np.pad(centre, 2, constant_values=NOTHING)
-    total, weight = np.zeros_like(centre), np.ones_like(centre)
+    rows, columns = depth.shape
+    padded = np.pad(depth, 2, constant_values=NOTHING)
+    total, weight = np.zeros_like(depth), np.ones_like(depth)
     for i, j in product(range(-2, 3), repeat=2):
-        if i == j == 0:
-            continue
-        difference = padded[2 + i : 2 + i + rows, 2 + j : 2 + j + columns] - centre
+        difference = padded[2 + i : 2 + i + rows, 2 + j : 2 + j + columns] - depth
         share = np.float32(np.exp(-(i * i + j * j) / 6)) * (np.abs(difference) < np.float32(2 * radius))
-        total += share * np.where(share > 0, difference, 0)
-        weight += share
-    result = depth.copy()
-    result[place] = np.where(mask, centre + total / weight, centre)
-    return result
+        total += share * difference
+        weight += share * (i != 0 or j != 0)
+    return np.where(depth < NOTHING, depth + total / weight, depth)
 
 
 def _along_rows(depth: np.ndarray, decay: np.ndarray, radius: float, taps: int, step: int) -> np.ndarray:
-    """Filter along the rows, only where there is something."""
-    rows = len(depth)
+    """Filter along the rows, a block of them at a time."""
     reach = taps * step
-    result = depth.copy()
     padded = np.pad(depth, ((0, 0), (reach, reach)), constant_values=NOTHING)
-    covered = depth < NOTHING
-    for top in range(0, rows, BLOCK):
-        here = slice(top, min(top + BLOCK, rows))
-        used = np.flatnonzero(covered[here].any(axis=0))
-        if len(used) == 0:
-            continue
-        left, right = int(used[0]), int(used[-1]) + 1
-        part = padded[here, left : right + 2 * reach]
-        moved = _narrow_range(part, decay[here, left:right], np.float32(radius), taps, step)
-        mask = covered[here, left:right]
-        result[here, left:right][mask] = moved[mask]
-    return result
+    blocks = (slice(top, top + BLOCK) for top in range(0, len(depth), BLOCK))
+    moved = [_narrow_range(padded[here], decay[here], np.float32(radius), taps, step) for here in blocks]
+    return np.where(depth < NOTHING, np.concatenate(moved), depth)
 
 
 def _narrow_range(part: np.ndarray, decay: np.ndarray, radius: np.float32, taps: int, step: int) -> np.ndarray:

@@ -41,9 +41,7 @@ class SurfaceRenderer:
         self.window = OffscreenRenderer(view, theme, samples=FINER if FINER * max(view.size) <= LONGEST else 1)
         self.window.add_box(scene.lower, scene.upper, theme.wall, width=1.3)
         self.renderer = self.window.plotter.renderer
-        self.behind, self.background_texture = _texture(), _texture()
-        for texture in (self.behind, self.background_texture):
-            _put(texture, self.background.image(None))
+        self.behind, self.background_texture = (_texture(self.background.image(None)) for _ in range(2))
         self.renderer.SetBackgroundTexture(self.background_texture)
         self.renderer.TexturedBackgroundOn()
         self.actors: dict[Any, Any] = {}
@@ -223,28 +221,19 @@ def _thickness_at(view: View, position: np.ndarray, distance: float, points: np.
     return map_coordinates(total, wanted[:, 1::-1].T / edge + 0.5, order=1, mode="nearest")
 
 
-def _texture() -> Any:
-    import vtk
+def _texture(picture: np.ndarray) -> Any:
+    import pyvista as pv
 
-    texture = vtk.vtkTexture()
-    texture.SetInputData(vtk.vtkImageData())
-    texture.SetColorModeToDirectScalars()
-    texture.InterpolateOn()
-    texture.MipmapOff()
-    texture.RepeatOff()
-    texture.EdgeClampOn()
+    texture = pv.Texture(picture)
+    texture.mipmap = False
+    texture.wrap = pv.Texture.WrapType.CLAMP_TO_EDGE
     return texture
 
 
 def _put(texture: Any, picture: np.ndarray) -> None:
-    import vtk
-    from vtkmodules.util.numpy_support import numpy_to_vtk
+    import pyvista as pv
 
-    image = vtk.vtkImageData()
-    height, width = picture.shape[:2]
-    image.SetDimensions(width, height, 1)
-    image.GetPointData().SetScalars(numpy_to_vtk(picture[::-1].reshape(-1, 3), deep=True))
-    texture.SetInputData(image)
+    texture.SetInputDataObject(pv.Texture(picture).to_image())
 
 
 def _new_grains(view: View, lights: Lights, distance: float) -> Any:
