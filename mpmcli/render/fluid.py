@@ -34,20 +34,7 @@ SAMPLES = 2  # samples along each axis of a pixel in what VTK draws
 HEAD_ON = 0.02  # reflectance of water at normal incidence: ((n - 1) / (n + 1))^2, n = 1.33
 SKIN = 0.05  # a skin of this thickness, in lengths of the scene, is added to every liquid: a film of it is seen
 RIM = 0.35  # light that comes from behind is lost at the rim, where it would leave at a grazing angle
-
-
-@dataclass(frozen=True)
-class Sample:
-    """What one sample of each pixel shows, of the m pixels in which it shows a dot or a line."""
-
-    row: np.ndarray  # (m,); `column` alike
-    column: np.ndarray
-    light: np.ndarray  # (m, 3)
-    distance: np.ndarray  # (m,), m
-
-    def where(self, chosen: np.ndarray) -> "Sample":
-        """Return what it shows in the chosen of its pixels, (m,) bool."""
-        return Sample(self.row[chosen], self.column[chosen], self.light[chosen], self.distance[chosen])
+LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)  # displayed values as amounts of light
 
 
 class FluidPainter:
@@ -64,54 +51,65 @@ class FluidPainter:
         self._lights = fluid_lights(theme, view.axes @ self._lamp, view.axes @ np.array(scene.up))
         self._background = Background(scene, view, theme)
         # The background without shadows (h, w, 3), in amounts of light.
-        self._bare = linear(self._background.image(None) / np.float32(255))
+        self._bare = LINEAR[self._background.image(None)]
         # One window for lines, colliders and dots.
         self._offscreen = OffscreenRenderer(replace(view, size=(view.size[0] * SAMPLES, view.size[1] * SAMPLES)), theme)
         self._offscreen.add_box(scene.lower, scene.upper, theme.wall, width=1.6 * SAMPLES)
         self._colliders = ColliderActors(scene, theme, self._offscreen)
-        if scene.colliders:
-            self._offscreen.add_light()
+        self._offscreen.add_light()
         self._actors: dict[tuple[int, int], pv.Actor] = {}
-        self._lines: tuple[np.ndarray, ...] | None = None
 
     def draw(self, frame: Frame) -> np.ndarray:
         """Return the picture of a frame, (h, w, 3) uint8; particles without a place (NaN) are left out."""
         groups = groups_of(self._scene, frame)
-        solids = [group for group in groups if not group.appearance.liquid]
-        picture, depth, dots = self._things(solids, frame)
+        picture, depth, shade = self._things([group for group in groups if not group.appearance.liquid], frame)
         occlusion = occlusion_by(self._scene, groups, self._lamp, self._colliders.shades(frame.time))
-        image = linear(self._background.image(occlusion) / np.float32(255))
-        samples = self._samples(picture, depth, dots, max((group.distance for group in solids), default=None))
+        image = LINEAR[self._background.image(occlusion)]
+        # What each sample of the pixels shows: its light, and its distance.
+        places = list(np.ndindex(SAMPLES, SAMPLES))
+        samples = [
+            (LINEAR[picture[i::SAMPLES, j::SAMPLES]] * shade, depth[i::SAMPLES, j::SAMPLES, None]) for i, j in places
+        ]
+        shown = [np.where(np.isfinite(far), light, image) for light, far in samples]
         liquids = [self._liquid(group, frame) for group in groups if group.appearance.liquid]
         liquids = [liquid for liquid in liquids if len(liquid.pixels)]
         window = window_of(liquids, self._view)
-        if window is None:
-            _add(image, samples)
-        else:
+        if window is not None:
             surface = surface_of(liquids, window, self._view, self._scene)
             layers = layers_of(liquids, window, depth, SAMPLES)
-            self._pour(image, samples, surface, list(zip(liquids, layers, strict=True)))
-        return (displayed(image) * 255 + 0.5).astype(np.uint8)
+            place, part = window.inner(self._view.size)
+            front, cover = np.full_like(image[..., :1], NOTHING), np.zeros_like(image[..., :1])
+            front[place][..., 0] = np.where(surface.alpha > 0, surface.depth, NOTHING)[part]
+            front += np.float32(LIES_ON * min(liquid.distance for liquid in liquids))
+            cover[place][..., 0] = surface.alpha[part]
+            # Part of the light that a liquid takes from the floor beside it falls through it on the floor under it.
+            floor = image + np.float32(FALLS_THROUGH) * (self._bare - image)
+            behind = _mean([np.where(np.isfinite(far) & (far >= front), light, floor) for light, far in samples])
+            wet = np.zeros_like(image)
+            wet[place] = self._lit(surface, list(zip(liquids, layers, strict=True)), behind)[part]
+            shown = [
+                here + np.where(far < front, 0, cover) * (wet - here)
+                for here, (_, far) in zip(shown, samples, strict=True)
+            ]
+        return (displayed(_mean(shown)) * 255 + 0.5).astype(np.uint8)
 
     def _things(self, groups: list[Group], frame: Frame) -> tuple[np.ndarray, ...]:
         """Draw lines, colliders and the groups as dots.
 
-        Returned are the picture (2h, 2w, 3) uint8, the depth, inf where there is nothing, and that without colliders.
+        Returned are the picture (2h, 2w, 3) uint8, the depth, inf where there is nothing, and the share of light left.
         """
-        if not groups and self._lines is not None:
-            return self._lines
         for actor in self._actors.values():
             actor.SetVisibility(False)
         for group in groups:
             self._show(group)
         self._colliders.pose(frame)
         self._offscreen.render()
-        seen = self._offscreen.picture(), *[self._offscreen.depth()] * 2
-        if groups and self._colliders.meshes:
-            seen = *seen[:2], self._colliders.depth_without(self._offscreen)
-        if not groups and not self._scene.colliders:
-            self._lines = seen
-        return seen
+        picture, depth, shade = self._offscreen.picture(), self._offscreen.depth(), np.float32(1)
+        if groups:
+            dots = self._colliders.depth_without(self._offscreen) if self._colliders.meshes else None
+            size = OVERLAP * max(group.distance for group in groups)
+            shade = LINEAR[depth_shaded(np.full_like(self._bare, 255), depth, size, self._view, SAMPLES, dots)]
+        return picture, depth, shade
 
     def _show(self, group: Group) -> None:
         """Let the next picture show the dots of a group, each a little lighter or darker."""
@@ -122,8 +120,6 @@ class FluidPainter:
         colors = np.array(rgb_bytes(group.appearance.color)) * tone
         cloud["rgb"] = np.clip(colors + 0.5, 0, 255).astype(np.uint8)
         if group.key not in self._actors:
-            if not self._actors and not self._scene.colliders:
-                self._offscreen.add_light()
             self._actors[group.key] = self._offscreen.add_dots(cloud)
         actor = self._actors[group.key]
         actor.mapper.dataset = cloud
@@ -145,53 +141,6 @@ class FluidPainter:
         body = np.clip(frame.body[group.rows[seen]], 0, len(self._scene.bodies) - 1)
         volume = np.array(self._scene.distances)[body] ** 3
         return Liquid(group.appearance, group.distance, group.position[seen], pixels[seen], scale, volume)
-
-    def _samples(
-        self, picture: np.ndarray, depth: np.ndarray, dots: np.ndarray, distance: float | None
-    ) -> list[Sample]:
-        """Part a picture with several samples to a pixel, leaving out what shows nothing.
-
-        `dots` is the depth without colliders, `distance` that between the dots, m; None where there are none.
-        """
-        width, height = self._view.size
-        shade = None
-        if distance is not None:
-            white = np.full((height, width, 3), 255, np.uint8)
-            shade = depth_shaded(white, depth, OVERLAP * distance, self._view, SAMPLES, dots)[..., 0] / np.float32(255)
-        samples = []
-        for i, j in np.ndindex(SAMPLES, SAMPLES):
-            far = depth[i::SAMPLES, j::SAMPLES]
-            row, column = np.nonzero(np.isfinite(far))
-            color = picture[i::SAMPLES, j::SAMPLES][row, column] / np.float32(255)
-            if shade is not None:
-                color *= shade[row, column, None]
-            samples.append(Sample(row, column, linear(color), far[row, column]))
-        return samples
-
-    def _pour(
-        self, image: np.ndarray, samples: list[Sample], surface: Surface, layers: list[tuple[Liquid, np.ndarray]]
-    ) -> None:
-        """Draw the liquids, and the samples before and behind them, into an image, in amounts of light."""
-        picture, part = surface.window.inner(self._view.size)
-        depth = np.full(image.shape[:2], NOTHING, np.float32)
-        depth[picture] = np.where(surface.alpha > 0, surface.depth, NOTHING)[part]
-        depth += np.float32(LIES_ON * min(liquid.distance for liquid, _ in layers))
-        before = [sample.distance < depth[sample.row, sample.column] for sample in samples]
-        # Part of the light that a liquid takes from the floor beside it falls through it on the floor under it.
-        behind = image + np.float32(FALLS_THROUGH) * (self._bare - image)
-        _add(behind, [sample.where(~front) for sample, front in zip(samples, before, strict=True)])
-        alpha = np.zeros((*image.shape[:2], 1), np.float32)
-        alpha[picture] = surface.alpha[part][..., None]
-        wet = np.zeros_like(image)
-        wet[picture] = self._lit(surface, layers, behind)[part]
-        image += alpha * (wet - image)
-        shown = []
-        for sample, front in zip(samples, before, strict=True):
-            place = sample.row, sample.column
-            cover = np.where(front[:, None], 0, alpha[place])
-            light = sample.light + cover * (wet[place] - sample.light)
-            shown.append(Sample(*place, light, sample.distance))
-        _add(image, shown)
 
     def _lit(self, surface: Surface, layers: list[tuple[Liquid, np.ndarray]], behind: np.ndarray) -> np.ndarray:
         """Return the light (h, w, 3) of the pixels of the window that the liquids cover."""
@@ -225,12 +174,8 @@ class FluidPainter:
         return light
 
 
-def _add(image: np.ndarray, samples: list[Sample]) -> None:
-    """Average the samples of each pixel."""
-    bare = image.copy()
-    for sample in samples:
-        place = sample.row, sample.column
-        image[place] += (sample.light - bare[place]) / len(samples)
+def _mean(images: list[np.ndarray]) -> np.ndarray:
+    return sum(images[1:], images[0]) / np.float32(len(images))
 
 
 @dataclass(frozen=True)

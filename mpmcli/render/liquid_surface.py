@@ -295,12 +295,19 @@ def _cleaned(depth: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _along_rows(depth: np.ndarray, decay: np.ndarray, radius: float, taps: int, step: int) -> np.ndarray:
-    """Filter along the rows, a block of them at a time."""
+    """Filter along the rows, only where there is something."""
     reach = taps * step
+    result = depth.copy()
     padded = np.pad(depth, ((0, 0), (reach, reach)), constant_values=NOTHING)
-    blocks = (slice(top, top + BLOCK) for top in range(0, len(depth), BLOCK))
-    moved = [_narrow_range(padded[here], decay[here], np.float32(radius), taps, step) for here in blocks]
-    return np.where(depth < NOTHING, np.concatenate(moved), depth)
+    for top in range(0, len(depth), BLOCK):
+        rows = slice(top, top + BLOCK)
+        used = np.flatnonzero((depth[rows] < NOTHING).any(axis=0))
+        if len(used):
+            columns = slice(used[0], used[-1] + 1)
+            part = padded[rows, used[0] : used[-1] + 1 + 2 * reach]
+            moved = _narrow_range(part, decay[rows, columns], np.float32(radius), taps, step)
+            np.copyto(result[rows, columns], moved, where=depth[rows, columns] < NOTHING)
+    return result
 
 
 def _narrow_range(part: np.ndarray, decay: np.ndarray, radius: np.float32, taps: int, step: int) -> np.ndarray:

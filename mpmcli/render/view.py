@@ -51,7 +51,7 @@ class View:
 
     def pixels(self, points: np.ndarray) -> np.ndarray:
         """Return (n, 3) for points (n, 3), m: pixels from the left and from the top, and the distance, m."""
-        right, up, back = ((points - np.array(self.position)) @ self.axes.T).T
+        right, up, back = np.einsum("ij,nj->in", self.axes, points - np.array(self.position))
         depth = -back
         scale = self.pixels_per_metre * (1.0 if self.parallel else self.distance / depth)
         width, height = self.size
