@@ -26,11 +26,8 @@ def choose_frames(text: str, result: Result) -> list[int]:
         if wanted not in numbers:
             raise InputError(f"--frame {word}: {_holds(result)}.")
         return [numbers.index(wanted)]
-    match = re.fullmatch(r"(-?\d*):(-?\d*)(?::(-?\d*))?", word)
-    try:
-        start, end, step = (int(part) if part else None for part in match.groups()) if match else (0, 0, 0)
-    except ValueError:
-        step = 0
+    match = re.fullmatch(r"(-?\d+)?:(-?\d+)?(?::(-?\d+)?)?", word)
+    start, end, step = (int(part) if part else None for part in match.groups()) if match else (0, 0, 0)
     if step == 0:
         raise InputError(f'--frame "{text}" means no frame: {HINT}.')
     chosen = list(range(count))[start:end:step]

@@ -6,6 +6,7 @@ dimmed by its thickness, after the law of Beer and Lambert, with Schlick's appro
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -20,6 +21,8 @@ CLEAR = ("water", "syrup", "translucent")  # finishes that show what is behind t
 # Names of what each vertex carries to the shader: lamp, sky, thickness; colour; roughness of the normal; normal.
 LIGHT, TINT, ROUGH, OUTWARDS = "lightMC", "tintMC", "roughMC", "outwardsMC"
 CARRIED = (LIGHT, TINT, ROUGH, OUTWARDS)
+# Handed from vertices to fragments, sampled at the centroid of the covered part of the pixel.
+VARYINGS = "centroid {0} vec4 carriedLight;\ncentroid {0} vec3 carriedTint, carriedRough, worldPoint, worldNormal;\n"
 BEHIND = "behindTexture"  # name of the picture behind clear things
 # How far what lies behind a clear finish is shifted, as a share of its thickness.
 BENT = {"translucent": "0.16", "water": "0.22", "syrup": "0.2"}
@@ -63,7 +66,7 @@ def vertex_code() -> tuple[str, str]:
     """Return what the vertex shader declares and does to hand over what the vertices carry."""
     declared = f"in vec4 {LIGHT};\n" + "".join(f"in vec3 {name};\n" for name in CARRIED[1:])
     done = f"carriedLight = {LIGHT}; carriedTint = {TINT}; carriedRough = {ROUGH};\n"
-    return declared + _carried("out"), done + f"worldPoint = vertexMC.xyz; worldNormal = {OUTWARDS};"
+    return declared + VARYINGS.format("out"), done + f"worldPoint = vertexMC.xyz; worldNormal = {OUTWARDS};"
 
 
 def fragment_code(
@@ -75,29 +78,25 @@ def fragment_code(
     must not change them much. What is `walled` leans on the walls of the domain that it lies at, and is flat there.
     """
     extent = np.subtract(scene.upper, scene.lower)
-    volume_length = float(np.prod(np.maximum(extent, 1e-12))) ** (1 / 3)
     right, up, back = view.axes
-    vectors = {
+    constants = {
         **{"lowerWall": scene.lower, "upperWall": scene.upper, "upwards": scene.up},
         **{"lampTo": lights.lamp, "rimTo": lights.rim, "fillTo": lights.fill},
         **{"lampColor": lights.lamp_color, "skyColor": lights.sky},
         **{"horizonColor": lights.horizon, "groundColor": lights.ground},
         **{"cameraAt": view.position, "toCamera": back, "cameraRight": right, "cameraUp": up},
+        **{"grainSize": [max(scene.distances)], "wallGap": [1e-5 * max(extent)]},
+        "thickUnit": [0.3 * np.cbrt(np.prod(np.maximum(extent, 1e-12)))],
+        "pictureSize": [finer * length for length in view.size],
+        "pixelsToMetre": [finer * view.pixels_per_metre],
     }
-    declared = _carried("in")
-    declared += "".join(f"const vec3 {name} = {_vec(values)};\n" for name, values in vectors.items())
-    declared += f"const float grainSize = {max(scene.distances):.9g};\n"
-    declared += f"const float wallGap = {1e-5 * max(extent):.9g};\n"
-    declared += f"const float thickUnit = {0.3 * volume_length:.9g};\n"
-    declared += f"const vec2 pictureSize = vec2({finer * view.size[0]}.0, {finer * view.size[1]}.0);\n"
-    declared += f"const float pixelsToMetre = {finer * view.pixels_per_metre:.9g};\n"
     parts = shader_parts()
-    declared += parts["room"]
+    declared = VARYINGS.format("in") + "".join(map(_constant, constants, constants.values())) + parts["room"]
     kind: str = "field" if by_field else appearance.finish
     if appearance.name.startswith("lava") and kind == "syrup":
         kind = "lava"
     towards = "toCamera" if view.parallel else "normalize(cameraAt - worldPoint)"
-    common = parts["common"].replace("TOWARDS", towards).replace("WALLED", "true" if walled else "false")
+    common = parts["common"].replace("TOWARDS", towards).replace("WALLED", str(walled).lower())
     behind = parts["behind"].replace("BENT", BENT[kind]) if kind in BENT else ""
     return declared, common + behind + parts.get(kind, parts["matte"]) + parts["tone"]
 
@@ -109,15 +108,11 @@ def shader_parts() -> dict[str, str]:
     return dict(re.findall(r"^//// (\w+)(\n.*?)(?=^////|\Z)", text, re.MULTILINE | re.DOTALL))
 
 
-def _carried(direction: str) -> str:
-    """Return the declarations of the varyings, sampled at the centroid of the covered part of the pixel."""
-    names = ("carriedTint", "carriedRough", "worldPoint", "worldNormal")
-    return f"centroid {direction} vec4 carriedLight;\n" + "".join(f"centroid {direction} vec3 {n};\n" for n in names)
-
-
 def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def _vec(values: tuple[float, ...] | np.ndarray) -> str:
-    return "vec3(" + ", ".join(f"{float(value):.9g}" if value % 1 else f"{float(value):.1f}" for value in values) + ")"
+def _constant(name: str, values: Sequence[float]) -> str:
+    """Return the declaration of a number or of a vector."""
+    kind = "float" if len(values) == 1 else f"vec{len(values)}"
+    return f"const {kind} {name} = {kind}({', '.join(f'{value:#.9g}' for value in values)});\n"

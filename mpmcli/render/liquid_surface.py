@@ -378,18 +378,14 @@ def normals(points: np.ndarray, covered: np.ndarray) -> np.ndarray:
 def _smaller_step(points: np.ndarray, covered: np.ndarray, axis: int) -> np.ndarray:
     step = np.diff(points, axis=axis)
     pixel = float(np.median(np.abs(step[..., 1 - axis][step[..., 1 - axis] != 0]))) if step.any() else 0.0
-    size = np.abs(step[..., 2])
     pair = covered[1:] & covered[:-1] if axis == 0 else covered[:, 1:] & covered[:, :-1]
-    size = np.where(pair, size, np.inf)
+    size = np.where(pair, np.abs(step[..., 2]), np.inf)
     step = np.where(pair[..., None], step, 0)
-    edge = [(0, 0)] * 3
-    ahead, back = edge.copy(), edge.copy()
-    ahead[axis], back[axis] = (0, 1), (1, 0)
-    forward, backward = np.pad(step, ahead), np.pad(step, back)
-    size_forward = np.pad(size, ahead[:2], constant_values=np.inf)
-    size_backward = np.pad(size, back[:2], constant_values=np.inf)
-    smaller = np.where((size_forward < size_backward)[..., None], forward, backward)
+    ahead, back = ([(0, 0)] * axis + [end] + [(0, 0)] * (2 - axis) for end in ((0, 1), (1, 0)))
+    steps = [np.pad(step, ends) for ends in (ahead, back)]
+    sizes = [np.pad(size, ends[:2], constant_values=np.inf) for ends in (ahead, back)]
+    smaller = np.where((sizes[0] < sizes[1])[..., None], *steps)
     # Where neither is an edge their mean is one order more exact.
-    low, high = np.minimum(size_forward, size_backward), np.maximum(size_forward, size_backward)
+    low, high = np.minimum(*sizes), np.maximum(*sizes)
     alike = np.isfinite(high) & (high <= 2 * low + np.float32(0.5) * pixel)
-    return np.where(alike[..., None], np.float32(0.5) * (forward + backward), smaller)
+    return np.where(alike[..., None], np.float32(0.5) * (steps[0] + steps[1]), smaller)

@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkCommonCore import vtkDataArray, vtkFloatArray, vtkUnsignedCharArray
 
 from mpmcli.render.settings import Theme
 from mpmcli.render.view import View
@@ -22,6 +24,7 @@ class OffscreenRenderer:
         width, height = view.size
         self.plotter = pv.Plotter(off_screen=True, window_size=(width * samples, height * samples), lighting="none")
         self.plotter.render_window.SetMultiSamples(0)
+        self._corners = 0, 0, width * samples - 1, height * samples - 1
         self.plotter.background_color = theme.ground
         self.plotter.disable_anti_aliasing()
         view.place(self.plotter)
@@ -70,24 +73,19 @@ class OffscreenRenderer:
 
     def pixels(self) -> np.ndarray:
         """Return the pixels of the window, rows from the top, (h, w, 3) uint8."""
-        from vtkmodules.util.numpy_support import vtk_to_numpy
-        from vtkmodules.vtkCommonCore import vtkUnsignedCharArray
-
-        width, height = self.plotter.render_window.GetSize()
         array = vtkUnsignedCharArray()
-        self.plotter.render_window.GetPixelData(0, 0, width - 1, height - 1, 0, array, 0)
-        return vtk_to_numpy(array).reshape(height, width, 3)[::-1]
+        self.plotter.render_window.GetPixelData(*self._corners, 0, array, 0)
+        return self._rows(array)
 
     def depth(self) -> np.ndarray:
         """Return the distance of each sample from the camera, (h, w) float32, m; inf where nothing is drawn."""
-        from vtkmodules.util.numpy_support import vtk_to_numpy
-        from vtkmodules.vtkCommonCore import vtkFloatArray
-
-        width, height = (length * self.samples for length in self.view.size)
         array = vtkFloatArray()
-        self.plotter.render_window.GetZbufferData(0, 0, width - 1, height - 1, array)
-        z = vtk_to_numpy(array).reshape(height, width)[::-1]
+        self.plotter.render_window.GetZbufferData(*self._corners, array)
+        z = self._rows(array)[..., 0]
         near, far = self.plotter.camera.clipping_range
         span = far - near
         distance = near + z * span if self.view.parallel else near * far / (far - z * span)
         return np.where(z >= 1.0, np.float32(np.inf), distance.astype(np.float32))
+
+    def _rows(self, array: vtkDataArray) -> np.ndarray:
+        return vtk_to_numpy(array).reshape(self._corners[3] + 1, self._corners[2] + 1, -1)[::-1]

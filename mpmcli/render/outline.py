@@ -23,6 +23,19 @@ GRAIN, VARIETY = 0.62, 0.17
 JITTER = 0.35  # by how much a grain is moved, in distances: heaps are no lattices
 # How rough the edge of crumbs is, as a share of the cover, and at which scale, in distances.
 ROUGHNESS, CRUMB = 0.55, 0.75
+HOT, CRUST = np.float32([1.0, 0.62, 0.16]), np.float32([0.30, 0.05, 0.03])  # colours of lava, within and at its edge
+
+
+# How smooth bodies are shaded: shares of its colour that the edge has and of white added to it, how fast it goes over
+# into the inside, the share of its colour there, and shares of white added towards the light and of colour left away.
+LOOKS = {
+    "water": (1.0, 0.42, 1.25, 0.93, 0.25, 1.0),
+    "syrup": (1.06, 0.0, 1.0, (0.86, 0.72, 0.6), 0.30, 1.0),
+    "translucent": (0.96, 0.16, 1.0, 0.96, 0.30, 0.84),
+    "crumbly": (0.95, 0.0, 1.0, 0.97, 0.0, (0.82, 0.89, 0.98)),
+    "metal": (0.88, 0.0, 1.0, 1.0, 0.65, 0.62),
+    "matte": (1.0, 0.0, 1.0, 0.97, 0.22, 0.78),
+}
 
 
 class OutlinePainter:
@@ -181,34 +194,17 @@ class OutlinePainter:
 def _shaded(appearance: Appearance, base: np.ndarray, depth: np.ndarray, lit: np.ndarray) -> np.ndarray:
     """Return the colours (h, w, 3) of a smooth body; depth is 0 at the edge and 1 within, lit 1 towards the light."""
     depth, lit = depth[..., None], lit[..., None]
-    white = np.ones(3, dtype=np.float32)
-    toward, away = np.maximum(lit, 0.0), np.maximum(-lit, 0.0)
     if appearance.name.startswith("lava"):
-        hot = np.array([1.0, 0.62, 0.16], dtype=np.float32)
-        crust = np.array([0.30, 0.05, 0.03], dtype=np.float32)
-        color = crust + np.clip(1.8 * depth, 0.0, 1.0) * (base - crust)
-        return color + np.clip(1.6 * depth - 0.6, 0.0, 1.0) * 0.75 * (hot - color)
-    if appearance.finish == "water":
-        pale = base + 0.42 * (white - base)
-        color = pale + np.clip(1.25 * depth, 0.0, 1.0) * (base * 0.93 - pale)
-        return color + 0.25 * toward * (white - color)
-    if appearance.finish == "syrup":
-        deep = base * np.array([0.86, 0.72, 0.6], dtype=np.float32)
-        color = np.minimum(base * 1.06, 1.0) + depth * (deep - base)
-        return color + 0.45 * toward * (1.0 - depth) * (white - color)
-    if appearance.finish == "translucent":
-        pale = base + 0.30 * (white - base)
-        color = base * 0.96 + (1.0 - depth) * 0.55 * (pale - base)
-        return (color + 0.30 * toward * (white - color)) * (1.0 - 0.16 * away)
-    if appearance.finish == "crumbly":
-        shade = np.array([0.74, 0.83, 0.95], dtype=np.float32)
-        color = base * (0.90 + 0.10 * depth)
-        return color + (0.10 + 0.75 * away) * (shade - color) * (1.0 - 0.5 * depth)
-    if appearance.finish == "metal":
-        color = base * (0.88 + 0.12 * depth)
-        return (color + 0.65 * toward * (white - color)) * (1.0 - 0.38 * away)
-    color = base * (1.0 - 0.03 * depth)
-    return (color + 0.22 * toward * (white - color)) * (1.0 - 0.22 * away)
+        return (
+            CRUST
+            + np.clip(1.8 * depth, 0.0, 1.0) * (base - CRUST)
+            + np.clip(1.6 * depth - 0.6, 0.0, 0.75) * (HOT - base)
+        )
+    rim, pale, rise, deep, shine, shade = LOOKS.get(appearance.finish, LOOKS["matte"])
+    edge = rim * base + pale * (1.0 - base)
+    color = edge + np.clip(rise * depth, 0.0, 1.0) * (np.float32(deep) * base - edge)
+    color += shine * np.maximum(lit, 0.0) * (1.0 - color)
+    return color + np.maximum(-lit, 0.0) * (np.float32(shade) - 1.0) * color
 
 
 def _within(places: np.ndarray, low: float, high: float, edge: float) -> np.ndarray:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from mpmcli.errors import InputError, RunError
 from mpmcli.frames.frame import Frame
@@ -29,8 +30,7 @@ IMAGE_REACH = 5.0  # radii from a wall within which particles have images behind
 FULLNESS_CELL, FULLNESS_CELLS = 4.0, 4e6
 # Shares of room filled, below which a vertex is not smoothed and above which it is smoothed in full.
 ALONE, HALF = 0.03, 0.22
-# Radii from a wall within which a particle touches it, and the edge of the cells in which such are looked for.
-CONTACT, CONTACT_CELL = 3.0, 2.0
+CONTACT = 3.0  # radii from a wall within which a particle touches it, and aside from its middle what is near it
 NODES = 3e7  # most nodes of the grid on which a flat surface is found
 
 
@@ -152,21 +152,11 @@ def _pressed_flat(
     flat = np.zeros(len(triangles), dtype=bool)
     for axis in range(3):
         others = [k for k in range(3) if k != axis]
-        shape = tuple(np.maximum(np.ceil((high - low)[others] / CONTACT_CELL).astype(int), 1) + 2)
         for wall, inwards in ((low[axis], 1.0), (high[axis], -1.0)):
-            beyond = inwards * (raw[:, axis] - wall) < 0.0
-            rows = np.flatnonzero(beyond[triangles].all(axis=1))
-            if not len(rows):
-                continue
+            rows = np.flatnonzero((inwards * (raw[:, axis] - wall) < 0.0)[triangles].all(axis=1))
             close = particles[inwards * (particles[:, axis] - wall) < CONTACT][:, others]
-            at = np.minimum(((close - low[others]) / CONTACT_CELL).astype(int) + 1, np.array(shape) - 2)
-            touched = np.zeros(shape, dtype=bool)
-            touched[at[:, 0], at[:, 1]] = True
-            for side in range(2):
-                touched |= np.roll(touched, 1, axis=side) | np.roll(touched, -1, axis=side)
             middles = vertices[triangles[rows]].mean(axis=1)[:, others]
-            at = np.minimum(((middles - low[others]) / CONTACT_CELL).astype(int) + 1, np.array(shape) - 2)
-            flat[rows] |= ~touched[at[:, 0], at[:, 1]]
+            flat[rows] |= np.isinf(KDTree(close).query(middles, distance_upper_bound=CONTACT)[0])
     return flat
 
 
@@ -341,8 +331,6 @@ def _write_vtp(path: Path, mesh: Mesh, time: float) -> None:
         writer = vtk.vtkXMLPolyDataWriter()
         writer.SetFileName(str(temporary))
         writer.SetInputData(data)
-        writer.SetDataModeToAppended()
-        writer.EncodeAppendedDataOff()
         if not writer.Write():
             raise OSError(f"VTK could not write {temporary}")
 

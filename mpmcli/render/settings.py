@@ -58,16 +58,14 @@ THEMES: dict[str, Theme] = {
 }
 
 
-def rgb_bytes(color: str) -> tuple[int, int, int]:
+def rgb_bytes(color: str) -> tuple[int, ...]:
     """Return "#rrggbb" as three numbers from 0 to 255."""
-    red, green, blue = (int(color[k : k + 2], 16) for k in (1, 3, 5))
-    return red, green, blue
+    return tuple(bytes.fromhex(color[1:]))
 
 
-def rgb(color: str) -> tuple[float, float, float]:
+def rgb(color: str) -> tuple[float, ...]:
     """Return "#rrggbb" as three numbers from 0 to 1."""
-    red, green, blue = rgb_bytes(color)
-    return red / 255.0, green / 255.0, blue / 255.0
+    return tuple(part / 255.0 for part in rgb_bytes(color))
 
 
 def parse_size(text: str) -> tuple[int, int | None]:
