@@ -221,7 +221,7 @@ def test_a_floating_body_casts_a_shadow_below_it() -> None:
     tool = painter(3, ("clay",), "iso")
     frame = frame_of(ball(3, 0.2, 0.5))
     change = tool.draw(frame).astype(int) - tool.draw(frame_of(frame.position[:0]))
-    lamp = lights_of(subject_with(3, "clay"), tool.view, LIGHT).lamp
+    lamp = lights_of(subject_with(3, "clay"), tool.view, LIGHT)["lampTo"]
     below = np.array([0.5, 0.5, 0.5]) - 0.5 / lamp[2] * lamp
     away = np.array([0.5, 0.5, 0.5]) + 0.5 / lamp[2] * lamp * (1, 1, -1)
     shadow, other = (change[on(tool.view, place[None])].max() for place in (below, away))

@@ -10,11 +10,12 @@ from mpmcli.output.result import Result
 from mpmcli.render.colliders import FlatColliders
 from mpmcli.render.coloring import Coloring, color_map
 from mpmcli.render.frame_choice import evenly_spaced
+from mpmcli.render.particle_grid import with_images
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.settings import Theme, rgb_bytes
 from mpmcli.render.view import Slice, View
 
-GHOSTS = 2  # nodes beyond a wall that receive mass from inside, which is mirrored back (docs/theory.md, 3.1)
+GHOSTS = 2  # nodes beyond a wall that receive mass from inside and from its mirror image (docs/theory.md, 3.1)
 FADING = 0.1  # fraction of the upper limit below which the picture fades into the background
 LOOKED_AT = 8  # maximum number of frames from which the limits are computed
 OUTSIDE = 0.01  # fraction of the nodes with mass that may exceed the upper limit
@@ -38,7 +39,8 @@ def grid_density(frame: Frame, header: RunHeader, plane: Slice) -> np.ndarray:
         kept &= np.abs(place[:, plane.normal] - through) < 1.5
         # The plane may lie between nodes, where the kernel is defined too.
         weight = weight * _kernel(place[:, plane.normal] - through)
-    place, weight = place[kept][:, list(plane.across)], weight[kept]
+    place, source = with_images(place[kept][:, list(plane.across)], 1.5, (0.0, 0.0), cells[list(plane.across)])
+    weight = weight[kept][source]
     size = cells[list(plane.across)] + 1 + 2 * GHOSTS
     base = np.floor(place - 0.5).astype(np.intp)
     total = np.zeros(size[0] * size[1])
@@ -47,24 +49,13 @@ def grid_density(frame: Frame, header: RunHeader, plane: Slice) -> np.ndarray:
         share = weight * _kernel(place[:, 0] - node[:, 0]) * _kernel(place[:, 1] - node[:, 1])
         index = (node[:, 0] + GHOSTS) * size[1] + node[:, 1] + GHOSTS
         total += np.bincount(index, share, minlength=len(total))
-    return _folded(_folded(total.reshape(size)).T).T
+    return total.reshape(size)[GHOSTS:-GHOSTS, GHOSTS:-GHOSTS]
 
 
 def _kernel(x: np.ndarray) -> np.ndarray:
     """Return the quadratic B-spline at distances x, in cells."""
     r = np.abs(x)
     return np.where(r < 0.5, 0.75 - r * r, 0.5 * np.square(np.clip(1.5 - r, 0.0, None)))
-
-
-def _folded(total: np.ndarray) -> np.ndarray:
-    """Add the mirror images at both ends of the first axis to what lies within."""
-    inner = total[GHOSTS:-GHOSTS].copy()
-    inner[[0, -1]] *= 2.0
-    for k in range(1, GHOSTS + 1):
-        if len(inner) > 2 * k:
-            inner[k] += total[GHOSTS - k]
-            inner[-1 - k] += total[-GHOSTS - 1 + k]
-    return inner
 
 
 def density_colors(

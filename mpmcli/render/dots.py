@@ -4,6 +4,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from mpmcli.frames.frame import Frame
 from mpmcli.render.colliders import ColliderActors, FlatColliders
@@ -186,7 +187,6 @@ def hidden(pixels: np.ndarray, cell: float, gap: float, reach: int = 1, cover: i
     column, row = (np.floor(pixels[:, :2] / cell).astype(np.int64) - low + reach).T
     nearest = np.full((row.max() + reach + 1, column.max() + reach + 1), np.inf)
     np.minimum.at(nearest, (row, column), pixels[:, 2])
-    for spread, rounds in ((np.minimum, cover), (np.maximum, reach)):
-        for axis in (0, 1) * rounds:
-            nearest = spread(nearest, spread(np.roll(nearest, 1, axis), np.roll(nearest, -1, axis)))
+    nearest = minimum_filter(nearest, 2 * cover + 1, mode="constant", cval=np.inf)
+    nearest = maximum_filter(nearest, 2 * reach + 1, mode="constant", cval=np.inf)
     return pixels[:, 2] > nearest[row, column] + gap

@@ -47,7 +47,7 @@ class FluidPainter:
         extent = np.subtract(scene.upper, scene.lower)
         # Absorption scales with the size of the scene: a beaker and a reservoir look alike.
         self._length = float(np.cbrt(np.prod(np.maximum(extent, 1e-3 * extent.max()))))
-        self._lamp = lights_of(scene, view, theme).lamp
+        self._lamp = lights_of(scene, view, theme)["lampTo"]
         self._lights = fluid_lights(theme, view.axes @ self._lamp, view.axes @ np.array(scene.up))
         self._background = Background(scene, view, theme)
         # The background without shadows (h, w, 3), in amounts of light.

@@ -7,7 +7,6 @@ dimmed by its thickness, after the law of Beer and Lambert, with Schlick's appro
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
@@ -28,33 +27,23 @@ BEHIND = "behindTexture"  # name of the picture behind clear things
 BENT = {"translucent": "0.16", "water": "0.22", "syrup": "0.2"}
 
 
-@dataclass(frozen=True)
-class Lights:
-    """Directions (3,) towards three lights, in the scene, and colours (3,), in linear light."""
+def lights_of(scene: RenderScene, view: View, theme: Theme) -> dict[str, np.ndarray]:
+    """Return directions (3,) to the lamps about a camera and colours (3,) in linear light, by their names in shaders.
 
-    lamp: np.ndarray
-    rim: np.ndarray
-    fill: np.ndarray
-    lamp_color: np.ndarray
-    sky: np.ndarray
-    horizon: np.ndarray
-    ground: np.ndarray
-
-
-def lights_of(scene: RenderScene, view: View, theme: Theme) -> Lights:
-    """Set up the lamps about a camera: one over the left shoulder, one behind, one from the side."""
+    One lamp is over the left shoulder, one behind, one at the side.
+    """
     right, up, back = view.axes
     above = np.array(scene.up)
     dark = theme.name == "dark"
-    return Lights(
-        lamp=_unit(-0.42 * right + 1.0 * above + 0.40 * back - 0.1 * up),
-        rim=_unit(0.55 * right + 0.55 * above - 0.75 * back),
-        fill=_unit(0.8 * right + 0.25 * above + 0.6 * back),
-        lamp_color=np.array([1.50, 1.56, 1.66]) * 0.72 if dark else np.array([1.62, 1.55, 1.42]) * 0.66,
-        sky=np.array([0.30, 0.38, 0.52]) * (0.72 if dark else 1.25),
-        horizon=np.array([0.22, 0.26, 0.33]) if dark else np.array([0.86, 0.90, 0.95]),
-        ground=linear(theme.floor) * (1.0 if dark else 0.42) + (0.03 if dark else 0.0),
-    )
+    return {
+        "lampTo": _unit(-0.42 * right + 1.0 * above + 0.40 * back - 0.1 * up),
+        "rimTo": _unit(0.55 * right + 0.55 * above - 0.75 * back),
+        "fillTo": _unit(0.8 * right + 0.25 * above + 0.6 * back),
+        "lampColor": np.array([1.50, 1.56, 1.66]) * 0.72 if dark else np.array([1.62, 1.55, 1.42]) * 0.66,
+        "skyColor": np.array([0.30, 0.38, 0.52]) * (0.72 if dark else 1.25),
+        "horizonColor": np.array([0.22, 0.26, 0.33]) if dark else np.array([0.86, 0.90, 0.95]),
+        "groundColor": linear(theme.floor) * (1.0 if dark else 0.42) + (0.03 if dark else 0.0),
+    }
 
 
 def linear(color: str) -> np.ndarray:
@@ -70,7 +59,7 @@ def vertex_code() -> tuple[str, str]:
 
 
 def fragment_code(
-    scene: RenderScene, view: View, lights: Lights, appearance: Appearance, finer: int, *, by_field: bool, walled: bool
+    scene: RenderScene, view: View, theme: Theme, appearance: Appearance, finer: int, *, by_field: bool, walled: bool
 ) -> tuple[str, str]:
     """Return what the fragment shader declares and does for one material.
 
@@ -81,9 +70,7 @@ def fragment_code(
     right, up, back = view.axes
     constants = {
         **{"lowerWall": scene.lower, "upperWall": scene.upper, "upwards": scene.up},
-        **{"lampTo": lights.lamp, "rimTo": lights.rim, "fillTo": lights.fill},
-        **{"lampColor": lights.lamp_color, "skyColor": lights.sky},
-        **{"horizonColor": lights.horizon, "groundColor": lights.ground},
+        **lights_of(scene, view, theme),
         **{"cameraAt": view.position, "toCamera": back, "cameraRight": right, "cameraUp": up},
         **{"grainSize": [max(scene.distances)], "wallGap": [1e-5 * max(extent)]},
         "thickUnit": [0.3 * np.cbrt(np.prod(np.maximum(extent, 1e-12)))],

@@ -141,7 +141,7 @@ class PictureLayout:
         if self.colors is None:
             return 0
         if isinstance(self.colors, Coloring):
-            texts, head = self._ticks(self.colors)[1], self._bar_heading(self.colors)
+            texts, head = self._bar(self.colors)[3:]
             ticks = self._px(BAR_WIDTH + TICK + 6) + max(map(length, texts))
             wide = max(ticks, self._px(BAR_WIDTH + 6) + length(NO_NUMBER), *map(length, head))
         else:
@@ -203,35 +203,25 @@ class PictureLayout:
             more = self._cut(f"and {len(colors.names) - named} more", room)
             self._write(draw, beside, y + swatch / 2, more, self.theme.faint)
 
-    def _bar_heading(self, colors: Coloring) -> list[str]:
-        unit = self._ticks(colors)[2]
-        return [colors.name, unit] if unit else [colors.name]
-
-    def _bar_span(self, colors: Coloring) -> tuple[int, int]:
-        """Return the first and last row of the bar, estimated before the text of its heading is known."""
+    def _bar(self, colors: Coloring) -> tuple[int, int, list[float], list[str], list[str]]:
+        """Return the first and last row of the bar, places and texts of its ticks, and the lines above it."""
         line = self._px(SMALL + 6)
-        top = self._px(TOP) + self._px(4) + (2 if colors.unit else 1) * line + self._px(8)
-        return top, self.size[1] - self._bottom - self._px(PAD) - 2 * line
-
-    def _ticks(self, colors: Coloring) -> tuple[list[float], list[str], str]:
-        """Return places, texts and unit of the ticks that fit along the bar."""
-        top, bottom = self._bar_span(colors)
-        return ticks_of(colors, max(1, min(TICKS, int((bottom - top) / (1.5 * self._px(SMALL))))))
+        top = self._px(TOP) + self._px(4) + 2 * line + self._px(8)
+        bottom = self.size[1] - self._bottom - self._px(PAD) - 2 * line
+        places, texts, unit = ticks_of(colors, max(1, min(TICKS, int((bottom - top) / (1.5 * self._px(SMALL))))))
+        return top, bottom, places, texts, [colors.name, unit]
 
     def _color_bar(self, draw: "ImageDraw", colors: Coloring, missing: int) -> None:
         line, width = self._px(SMALL + 6), self._px(BAR_WIDTH)
         x, y = self._scene_box[2] + self._px(PAD), self._scene_box[1] + self._px(4)
-        for text in self._bar_heading(colors):
-            self._write(draw, x, y, text, anchor="lt")
-            y += line
-        top, bottom = y + self._px(8), self._bar_span(colors)[1]
+        top, bottom, places, texts, heading = self._bar(colors)
+        for k, text in enumerate(heading):
+            self._write(draw, x, y + k * line, text, anchor="lt")
         if bottom - top < 2 * line:
             return
         low, high = colors.limits
-        rows = np.linspace(high, low, max(bottom - top, 2))
-        for k, color in enumerate(colors.rgb(rows).tolist()):
+        for k, color in enumerate(colors.rgb(np.linspace(high, low, bottom - top)).tolist()):
             draw.rectangle((x, top + k, x + width - 1, top + k), fill=tuple(color))
-        places, texts, _ = self._ticks(colors)
         start, end = x + width, x + width + self._px(TICK)
         for place, text in zip(places, texts, strict=True):
             row = bottom - (place - low) / (high - low) * (bottom - top)
@@ -249,8 +239,8 @@ def ticks_of(colors: Coloring, most: int) -> tuple[list[float], list[str], str]:
     from matplotlib.ticker import MaxNLocator
 
     low, high = colors.limits
-    ticks = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high).tolist()
-    places = [place for place in ticks if low <= place <= high] or [low, high]
+    ticks = MaxNLocator(most, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+    places = [place for place in ticks.tolist() if low <= place <= high] or [low, high]
     largest = max(abs(low), abs(high))
     factor, unit = 1.0, colors.unit
     if unit == "Pa" and 1e3 <= largest < 1e13:
@@ -260,12 +250,9 @@ def ticks_of(colors: Coloring, most: int) -> tuple[list[float], list[str], str]:
         power = math.floor(math.log10(largest))
         factor = 10.0**power
         unit = f"10{str(power).translate(SUPERSCRIPTS)} {unit}".strip()
-    step = (places[1] - places[0]) / factor if len(places) > 1 else largest / factor
-    digits = max(0, -math.floor(math.log10(abs(step)) + 1e-9)) if step else 0
-    if round(step, digits) and abs(step - round(step, digits)) > 1e-6 * abs(step):
-        digits += 1
-    texts = [f"{place / factor:.{digits}f}".replace("-", "\u2212") for place in places]
-    return places, texts, unit
+    shown, near = np.array(places) / factor, 1e-6 * (high - low) / factor
+    digits = next((n for n in range(DIGITS_MAX) if np.abs(shown.round(n) - shown).max() < near), DIGITS_MAX)
+    return places, [f"{number:.{digits}f}".replace("-", "\u2212") for number in shown], unit
 
 
 def time_text(time: float, times: Sequence[float]) -> str:

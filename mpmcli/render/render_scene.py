@@ -163,12 +163,7 @@ class Group:
     @property
     def hashes(self) -> np.ndarray:
         """Three numbers from -1 to 1 of each particle, (n, 3) float32: always the same of the same row."""
-        words = self.rows.astype(np.uint32)[:, None] * np.uint32(3) + np.arange(3, dtype=np.uint32)
-        # The finaliser of MurmurHash3 (Appleby).
-        for factor, shift in ((0x85EBCA6B, 16), (0xC2B2AE35, 13)):
-            words = (words ^ (words >> np.uint32(shift))) * np.uint32(factor)
-        words ^= words >> np.uint32(16)
-        return (words.astype(np.float64) / 2.0**31 - 1.0).astype(np.float32)
+        return np.random.default_rng(1).uniform(-1.0, 1.0, (self.rows.max() + 1, 3)).astype(np.float32)[self.rows]
 
 
 def groups_of(scene: RenderScene, frame: Frame) -> list[Group]:

@@ -11,7 +11,6 @@ from mpmcli.frames.frame import Frame
 from mpmcli.render import lighting
 from mpmcli.render.colliders import ColliderMesh, collider_meshes, edge_actors
 from mpmcli.render.coloring import Coloring
-from mpmcli.render.lighting import Lights
 from mpmcli.render.occlusion import Background, Occlusion, occlusion_by
 from mpmcli.render.offscreen import OffscreenRenderer
 from mpmcli.render.particle_grid import blurred_along, deposited
@@ -37,7 +36,7 @@ class SurfaceRenderer:
         self.scene, self.view, self.theme, self.colors = scene, view, theme, colors
         self.fields = () if colors is None else colors.fields
         self.background = Background(scene, view, theme)
-        self.lights = lighting.lights_of(scene, view, theme)
+        self.lamp = lighting.lights_of(scene, view, theme)["lampTo"]
         self.window = OffscreenRenderer(view, theme, samples=FINER if FINER * max(view.size) <= LONGEST else 1)
         self.window.add_box(scene.lower, scene.upper, theme.wall, width=1.3)
         self.renderer = self.window.plotter.renderer
@@ -53,7 +52,7 @@ class SurfaceRenderer:
         groups = groups_of(self.scene, frame)
         solids = [(mesh, shown) for mesh, shown in self.solids if self.scene.shows(mesh.number, frame)]
         shades = [mesh.shade(frame.time) for mesh, _ in solids if mesh.casts]
-        occlusion = occlusion_by(self.scene, groups, self.lights.lamp, shades)
+        occlusion = occlusion_by(self.scene, groups, self.lamp, shades)
         clear = []
         for actor in (*self.actors.values(), *chain(*self.rims.values())):
             actor.SetVisibility(False)
@@ -112,7 +111,7 @@ class SurfaceRenderer:
         import pyvista as pv
 
         if group.key not in self.actors:
-            self.actors[group.key] = _new_grains(self.view, self.lights, group.distance)
+            self.actors[group.key] = _new_grains(self.view, self.lamp, group.distance)
             self.renderer.AddActor(self.actors[group.key])
         actor = self.actors[group.key]
         color, hashes = np.array(rgb(group.appearance.color)), group.hashes
@@ -180,7 +179,7 @@ class SurfaceRenderer:
         shader.AddVertexShaderReplacement("//VTK::Normal::Dec", True, f"//VTK::Normal::Dec\n{declared}", False)
         shader.AddVertexShaderReplacement("//VTK::Normal::Impl", True, f"//VTK::Normal::Impl\n{done}", False)
         declared, done = lighting.fragment_code(
-            self.scene, self.view, self.lights, appearance, self.window.samples, by_field=by_field, walled=walled
+            self.scene, self.view, self.theme, appearance, self.window.samples, by_field=by_field, walled=walled
         )
         # After all that the window does itself; its own lights and textures are left out.
         shader.AddFragmentShaderReplacement("//VTK::TCoord::Dec", True, f"//VTK::TCoord::Dec\n{declared}", False)
@@ -236,7 +235,7 @@ def _put(texture: Any, picture: np.ndarray) -> None:
     texture.SetInputDataObject(pv.Texture(picture).to_image())
 
 
-def _new_grains(view: View, lights: Lights, distance: float) -> Any:
+def _new_grains(view: View, lamp: np.ndarray, distance: float) -> Any:
     """Return an actor without grains, whose balls are lit from the side of the lamp."""
     import vtk
 
@@ -244,7 +243,7 @@ def _new_grains(view: View, lights: Lights, distance: float) -> Any:
     mapper.SetInputData(vtk.vtkPolyData())
     mapper.EmissiveOff()
     mapper.SetScaleFactor(RADIUS * distance)
-    right, up, back = (float(lights.lamp @ axis) for axis in view.axes)
+    right, up, back = (float(lamp @ axis) for axis in view.axes)
     lamp = f"vec3({right:.6f}, {up:.6f}, {back:.6f})"
     mapper.SetSplatShaderCode(lighting.shader_parts()["grain"].replace("LAMP", lamp))
     actor = vtk.vtkActor()
