@@ -22,7 +22,7 @@ OVERLAP = 1.15
 SMALLEST = 1.5  # smallest diameter of a dot, pixels, so that a single particle is visible
 SMOOTHED = 400_000  # up to this number of particles, each pixel is the average of four, which makes round edges smooth
 DOT_MAX = 255  # largest diameter of a dot that is drawn, pixels
-LAYERS = 12  # number of sizes of dots in a perspective picture, one for each layer of distances
+LEVEL = 0.04  # logarithm of the ratio of the sizes in which dots are drawn
 FARTHEST = 16  # maximum number of squares on each side in which dots that hide another are sought
 STRENGTH = 0.55  # fraction of the light that a deep gap absorbs
 DEEP = 4.0  # depth of a deep gap, in diameters of a dot
@@ -41,7 +41,6 @@ class DotsPainter:
         self._diameters = OVERLAP * np.array(scene.distances)
         largest = float(self._diameters.max()) * view.pixels_per_metre
         self._offscreen = OffscreenRenderer(view, theme, samples=samples_of(view.size, count, largest))
-        self._levels = self._all_levels()
         self._corner = np.array(scene.lower)
         self._actors: dict[int, tuple[pv.PolyData, pv.Actor]] = {}
         self._ground = FlatColliders(scene, view, theme, Slice((0, 1))) if self._flat and scene.colliders else None
@@ -62,11 +61,11 @@ class DotsPainter:
         if not self._flat and len(points):
             seen = ~self._hidden(points, sizes)
             points, colors, sizes = points[seen], colors[seen], sizes[seen]
-        # The level whose size has the ratio nearest to one.
-        level_of = np.searchsorted(np.sqrt(self._levels[1:] * self._levels[:-1]), sizes)
-        for level, size in enumerate(self._levels.tolist()):
+        # One actor for each size, the same in all frames.
+        level_of = np.rint(np.log(sizes) / LEVEL).astype(int)
+        for level in {*self._actors, *np.unique(level_of).tolist()}:
             chosen = level_of == level
-            self._set(level, points[chosen], colors[chosen], size)
+            self._set(level, points[chosen], colors[chosen], math.exp(LEVEL * level))
         if not self._flat:
             self._colliders.pose(frame)
         self._offscreen.render()
@@ -99,16 +98,6 @@ class DotsPainter:
             if reach <= FARTHEST:
                 result[inside] = hidden(pixels[inside], side, float(self._diameters.max()), reach, cover=1)
         return result
-
-    def _all_levels(self) -> np.ndarray:
-        """Return the diameters in which dots are drawn, pixels, increasing: the same in all frames."""
-        view = self._view
-        if view.parallel:
-            return np.unique(np.maximum(self._diameters * view.pixels_per_metre, SMALLEST))
-        nearest, farthest = (view.pixels_per_metre * view.distance / depth for depth in (view.near, view.far))
-        low = max(float(self._diameters.min()) * farthest, SMALLEST)
-        high = max(float(self._diameters.max()) * nearest, low)
-        return np.geomspace(low, high, LAYERS) if high > 1.02 * low else np.array([high])
 
     def _set(self, level: int, points: np.ndarray, colors: np.ndarray, size: float) -> None:
         import pyvista as pv

@@ -60,18 +60,18 @@ class Occlusion:
 
 def occlusion_by(
     scene: RenderScene, groups: Sequence[Group], lamp: np.ndarray, shades: Sequence[tuple[np.ndarray, np.ndarray]] = ()
-) -> Occlusion | None:
-    """Return what groups, and opaque shades (places (n, 3), volumes (n,)), take of light; None without any.
+) -> Occlusion:
+    """Return what groups, and opaque shades (places (n, 3), volumes (n,)), take of light.
 
     The optical depth of each cell is that of the particles in it, by the law of Beer and Lambert; `lamp` is the
     direction (3,) towards the lamp, above the horizon.
     """
-    if not groups and not shades:
-        return None
     blocked = [OPACITY.get(group.appearance.finish, 1.0) * group.distance**3 for group in groups]
     blocked = [np.full(len(group.position), amount) for group, amount in zip(groups, blocked, strict=True)]
-    volumes = np.concatenate([*blocked, *(volumes for _, volumes in shades)])
-    places = np.concatenate([*(group.position for group in groups), *(places for places, _ in shades)])
+    volumes = np.concatenate([np.empty(0), *blocked, *(volumes for _, volumes in shades)])
+    places = np.concatenate(
+        [np.empty((0, 3)), *(group.position for group in groups), *(places for places, _ in shades)]
+    )
     axes = np.argsort(np.abs(scene.up), stable=True)[[2, 0, 1]].tolist()
     signs = np.array([sum(scene.up), 1.0, 1.0])
     low, high = np.sort(signs * np.array([scene.lower, scene.upper])[:, axes], axis=0)

@@ -78,12 +78,6 @@ class Grid:
     shape: tuple[int, int]  # numbers of rows, upwards, and columns
 
 
-def grid_over(lower: Sequence[float], upper: Sequence[float], edge: float) -> Grid:
-    """Return the grid of nodes in the middles of cells that cover a rectangle from its lower left corner."""
-    columns, rows = (max(math.ceil((high - low) / edge - 1e-6), 1) for low, high in zip(lower, upper, strict=True))
-    return Grid((lower[0] + 0.5 * edge, lower[1] + 0.5 * edge), edge, (rows, columns))
-
-
 def cover_of(
     position: np.ndarray, distance: float, lower: Sequence[float], upper: Sequence[float], grid: Grid
 ) -> np.ndarray:

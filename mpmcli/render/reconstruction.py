@@ -15,7 +15,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.output.durable import sealed, write_text
 from mpmcli.output.result import Result, open_result
 from mpmcli.processes.pool import render_frames
-from mpmcli.render.particle_grid import FINENESS, blurred_along, cover_of, drawable, grid_over, with_images
+from mpmcli.render.particle_grid import FINENESS, Grid, blurred_along, cover_of, drawable, with_images
 from mpmcli.render.render_scene import RenderScene, groups_of, render_scene_of
 
 if TYPE_CHECKING:
@@ -135,9 +135,8 @@ def empty_mesh(attributes: Mapping[str, np.ndarray] | None = None) -> Mesh:
 
 def _area_vectors(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return (t, 3), twice the area of each triangle times its normal."""
-    first, second, third = (points[triangles[:, k]] for k in range(3))
-    a, b = second - first, third - first
-    return np.stack([a[:, i - 2] * b[:, i - 1] - a[:, i - 1] * b[:, i - 2] for i in range(3)], axis=1)
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    return np.cross(b - a, c - a)
 
 
 def _pressed_flat(
@@ -269,7 +268,8 @@ def flat_mesh(position: np.ndarray, distance: float, lower: Sequence[float], upp
     first = np.maximum(position.min(axis=0) - spare, low)
     last = np.minimum(position.max(axis=0) + spare, high)
     edge = max(distance / FINENESS, float(np.sqrt(np.prod(last - first) / NODES)))
-    grid = grid_over(first.tolist(), last.tolist(), edge)
+    columns, rows = np.maximum(np.ceil((last - first) / edge - 1e-6), 1).astype(int).tolist()
+    grid = Grid(tuple((first + 0.5 * edge).tolist()), edge, (rows, columns))
     cover = cover_of(position, distance, low.tolist(), high.tolist(), grid)
     # A ring of nodes without cover closes every contour: half a cell beyond the last node, which is on the wall.
     mesh = _filled(np.pad(np.clip(cover, 0.0, 1.0), 1), np.array(grid.corner) - edge, edge)
@@ -296,8 +296,7 @@ def _filled(cover: np.ndarray, corner: np.ndarray, edge: float) -> Mesh:
     filled = pv.wrap(triangulator.GetOutput()).clean(point_merging=False)
     triangles = filled.regular_faces.astype(np.int64) if filled.n_cells else np.empty((0, 3), dtype=np.int64)
     points = np.asarray(filled.points, dtype=np.float32).reshape(-1, 3)
-    a, b, c = (points[triangles[:, k], :2].astype(np.float64) for k in range(3))
-    areas = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    areas = _area_vectors(points.astype(np.float64), triangles)[:, 2]
     triangles = np.where((areas < 0)[:, None], triangles[:, ::-1], triangles)[areas != 0]
     return Mesh(points, triangles, np.tile(np.float32([0.0, 0.0, 1.0]), (len(points), 1)))
 

@@ -1,6 +1,7 @@
 """Draws 3D surfaces in one off-screen window, its meshes replaced with every frame."""
 
 import math
+from collections.abc import Sequence
 from itertools import chain
 from typing import Any
 
@@ -74,7 +75,7 @@ class SurfaceRenderer:
         self.window.render()
         return self.window.picture()
 
-    def _posed(self, group: Group, frame: Frame, occlusion: Occlusion | None) -> Any:
+    def _posed(self, group: Group, frame: Frame, occlusion: Occlusion) -> Any:
         """Return the actor of a group, with the mesh of this frame."""
         finish = group.appearance.finish
         if finish == "grains":
@@ -88,25 +89,19 @@ class SurfaceRenderer:
         mesh = reconstruct(group.position, group.distance, *domain, attributes, close=finish == "crumbly")
         if group.key not in self.actors:
             self.actors[group.key] = self._new_actor(group.appearance, by_field=self.colors is not None)
-        actor = self.actors[group.key]
-        count = len(mesh.points)
-        light = np.ones((count, 4), dtype=np.float32)
-        if occlusion is not None and count:
-            light[:, 0], light[:, 1] = occlusion.at(mesh.points, mesh.normals)
-            if finish in lighting.CLEAR:
-                light[:, 2] = _thickness_at(self.view, group.position, group.distance, mesh.points)
-        tint = np.broadcast_to(lighting.linear(group.appearance.color), (count, 3))
+        tint = lighting.linear(group.appearance.color)
         if self.colors is not None:
             value, known = (mesh.attributes[name].astype(np.float64) for name in ("value", "known"))
             # The mean over those particles that have a number, where they are the majority.
             mean = np.divide(value, known, out=np.full_like(value, np.nan), where=known > 0.5)
             tint = (self.colors.rgb(mean) / 255.0) ** 2.2
-        rough = mesh.attributes.get("rough", np.zeros((count, 3), dtype=np.float32))
-        _carry(actor, mesh.points, mesh.triangles, (light, tint, rough, mesh.normals))
-        actor.SetVisibility(bool(len(mesh.triangles)))
-        return actor
+        thick = 0.0
+        if finish in lighting.CLEAR:
+            thick = _thickness_at(self.view, group.position, group.distance, mesh.points)
+        looks = tint, thick, mesh.attributes.get("rough", 0.0)
+        return _carry(self.actors[group.key], occlusion, mesh.points, mesh.triangles, mesh.normals, looks)
 
-    def _posed_grains(self, group: Group, frame: Frame, occlusion: Occlusion | None) -> Any:
+    def _posed_grains(self, group: Group, frame: Frame, occlusion: Occlusion) -> Any:
         """Return the actor of a group of loose grains: balls for particles, each a little lighter or darker."""
         import pyvista as pv
 
@@ -119,9 +114,7 @@ class SurfaceRenderer:
             color = self.colors.particle_rgb(frame)[group.rows] / 255.0
             # A colour that means something is not varied.
             hashes = np.zeros_like(hashes)
-        lamp, sky = np.ones((2, len(hashes)))
-        if occlusion is not None:
-            lamp, sky = occlusion.at(group.position, np.broadcast_to(self.scene.up, group.position.shape))
+        lamp, sky = occlusion.at(group.position, np.array(self.scene.up))
         light = 0.42 + 0.34 * lamp + 0.30 * sky
         light = light * (1.0 + VARIETY * hashes[:, 0] * np.abs(hashes[:, 0]) + 0.08 * hashes[:, 1])
         shown = np.clip(np.broadcast_to(color, hashes.shape) * light[:, None], 0.0, 1.0)
@@ -136,7 +129,7 @@ class SurfaceRenderer:
         actor.SetVisibility(True)
         return actor
 
-    def _pose_solid(self, mesh: ColliderMesh, shown: Any, time: float, occlusion: Occlusion | None) -> None:
+    def _pose_solid(self, mesh: ColliderMesh, shown: Any, time: float, occlusion: Occlusion) -> None:
         """Put a collider where it is at a time, s, in the light there."""
         color, key, matrix = self.theme.solid, ("collider", mesh.number), mesh.transform(time)
         if key not in self.actors:
@@ -148,18 +141,12 @@ class SurfaceRenderer:
             # The rims of a container stand for its near side, which is not seen.
             inside = mesh.collider.side == "inside"
             self.rims[mesh.number] = edge_actors(mesh, self.theme, self.window) if inside else []
-        actor = self.actors[key]
         for rim in self.rims[mesh.number]:
             rim.user_matrix = matrix
             rim.SetVisibility(True)
         normals = shown.point_data["Normals"] @ matrix[:3, :3].T
         points = shown.points @ matrix[:3, :3].T + matrix[:3, 3]
-        light = np.ones((len(points), 4), dtype=np.float32)
-        if occlusion is not None:
-            light[:, 0], light[:, 1] = occlusion.at(points, normals)
-        tint = np.broadcast_to(lighting.linear(color), points.shape)
-        _carry(actor, points, shown.regular_faces, (light, tint, np.zeros_like(points), normals))
-        actor.SetVisibility(True)
+        _carry(self.actors[key], occlusion, points, shown.regular_faces, normals, (lighting.linear(color), 0.0, 0.0))
 
     def _new_actor(self, appearance: Appearance, *, by_field: bool, walled: bool = True) -> Any:
         import vtk
@@ -189,17 +176,31 @@ class SurfaceRenderer:
         return actor
 
 
-def _carry(actor: Any, points: np.ndarray, triangles: np.ndarray, carried: tuple[np.ndarray, ...]) -> None:
-    """Give an actor a mesh whose vertices hand the values of `lighting.CARRIED` to the shader."""
+def _carry(
+    actor: Any,
+    occlusion: Occlusion,
+    points: np.ndarray,
+    triangles: np.ndarray,
+    normals: np.ndarray,
+    looks: Sequence[Any],
+) -> Any:
+    """Give an actor a mesh whose vertices hand light, tint, thickness and roughness, the `looks`, to the shader."""
     import pyvista as pv
 
     data = pv.PolyData.from_regular_faces(points, triangles) if len(points) else pv.PolyData()
-    for name, values in zip(lighting.CARRIED, carried, strict=True):
-        data.point_data[name] = np.ascontiguousarray(values, dtype=np.float32)
+    tint, thick, rough = looks
+    light = np.zeros((len(points), 4), dtype=np.float32)
+    light[:, :2] = np.transpose(occlusion.at(points, normals))
+    light[:, 2] = thick
+    for name, values in zip(lighting.CARRIED, (light, tint, rough, normals), strict=True):
+        columns = 4 if name == lighting.LIGHT else 3
+        data.point_data[name] = np.array(np.broadcast_to(values, (len(points), columns)), dtype=np.float32)
     # Only because the window declares textures of meshes that have these.
     data.point_data["places"] = np.zeros((len(points), 2), dtype=np.float32)
     data.GetPointData().SetActiveTCoords("places")
     actor.GetMapper().SetInputData(data)
+    actor.SetVisibility(bool(len(triangles)))
+    return actor
 
 
 def _thickness_at(view: View, position: np.ndarray, distance: float, points: np.ndarray) -> np.ndarray:
