@@ -42,7 +42,7 @@ class DotsPainter:
         largest = float(self._diameters.max()) * view.pixels_per_metre
         self._offscreen = OffscreenRenderer(view, theme, samples=samples_of(view.size, count, largest))
         self._corner = np.array(scene.lower)
-        self._actors: dict[int, tuple[pv.PolyData, pv.Actor]] = {}
+        self._actors: dict[int, pv.Actor] = {}
         self._ground = FlatColliders(scene, view, theme, Slice((0, 1))) if self._flat and scene.colliders else None
         if not self._flat:
             self._offscreen.add_light()
@@ -63,7 +63,9 @@ class DotsPainter:
             points, colors, sizes = points[seen], colors[seen], sizes[seen]
         # One actor for each size, the same in all frames.
         level_of = np.rint(np.log(sizes) / LEVEL).astype(int)
-        for level in {*self._actors, *np.unique(level_of).tolist()}:
+        for actor in self._actors.values():
+            actor.visibility = False
+        for level in np.unique(level_of).tolist():
             chosen = level_of == level
             self._set(level, points[chosen], colors[chosen], math.exp(LEVEL * level))
         if not self._flat:
@@ -101,26 +103,17 @@ class DotsPainter:
 
     def _set(self, level: int, points: np.ndarray, colors: np.ndarray, size: float) -> None:
         import pyvista as pv
-        from vtkmodules.util.numpy_support import numpy_to_vtk
 
+        # VTK stores positions in single precision, too coarse for a domain far from the origin.
+        cloud = pv.PolyData((points - self._corner).astype(np.float32))
+        cloud["rgb"] = colors
         if level not in self._actors:
-            mesh = pv.PolyData(np.zeros((1, 3), np.float32))
-            mesh.point_data["rgb"] = np.zeros((1, 3), np.uint8)
             # Flat dots have exactly the colours of the colour bar.
-            actor = self._offscreen.add_dots(mesh, lit=not self._flat)
-            # VTK stores positions in single precision, too coarse for a domain far from the origin.
-            actor.position = tuple(self._corner.tolist())
-            self._actors[level] = mesh, actor
-        mesh, actor = self._actors[level]
-        actor.visibility = len(points) > 0
-        actor.prop.point_size = size * self._offscreen.samples
-        if len(points) == 0:
-            return
-        shown = pv.PolyData((points - self._corner).astype(np.float32))
-        rgb = numpy_to_vtk(np.ascontiguousarray(colors), deep=True)
-        rgb.SetName("rgb")
-        shown.GetPointData().SetScalars(rgb)
-        mesh.ShallowCopy(shown)
+            self._actors[level] = self._offscreen.add_dots(cloud, lit=not self._flat)
+            self._actors[level].position = tuple(self._corner.tolist())
+            self._actors[level].prop.point_size = size * self._offscreen.samples
+        self._actors[level].mapper.dataset = cloud
+        self._actors[level].visibility = True
 
 
 def samples_of(size: tuple[int, int], count: int, largest: float) -> int:

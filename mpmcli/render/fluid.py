@@ -12,13 +12,13 @@ import numpy as np
 from mpmcli.frames.frame import Frame
 from mpmcli.render.colliders import ColliderActors
 from mpmcli.render.dots import OVERLAP, SMALLEST, depth_shaded
-from mpmcli.render.lighting import lights_of
+from mpmcli.render.lighting import lights_of, linear
 from mpmcli.render.liquid_surface import NOTHING, Liquid, Surface, layers_of, surface_of, window_of
 from mpmcli.render.occlusion import Background, occlusion_by
 from mpmcli.render.offscreen import OffscreenRenderer
 from mpmcli.render.particle_grid import sampled
 from mpmcli.render.render_scene import Appearance, Finish, Group, RenderScene, groups_of
-from mpmcli.render.settings import Theme, rgb, rgb_bytes
+from mpmcli.render.settings import Theme, rgb_bytes
 from mpmcli.render.view import View
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class FluidPainter:
                 here + np.where(far < front, 0, cover) * (wet - here)
                 for here, (_, far) in zip(shown, samples, strict=True)
             ]
-        return (displayed(_mean(shown)) * 255 + 0.5).astype(np.uint8)
+        return (np.clip(_mean(shown), 0, 1) ** np.float32(1 / 2.2) * 255 + 0.5).astype(np.uint8)
 
     def _things(self, groups: list[Group], frame: Frame) -> tuple[np.ndarray, ...]:
         """Draw lines, colliders and the groups as dots.
@@ -126,8 +126,8 @@ class FluidPainter:
         actor.SetVisibility(True)
         # Dots of one group have one size, that of those in the middle.
         distance = max(float(np.median(self._view.pixels(group.position)[:, 2])), self._view.near)
-        scale = self._view.pixels_per_metre * (1.0 if self._view.parallel else self._view.distance / distance)
-        actor.prop.point_size = max(OVERLAP * group.distance * scale, SMALLEST) * SAMPLES
+        size = OVERLAP * group.distance * float(self._view.scale_at(np.array(distance)))
+        actor.prop.point_size = max(size, SMALLEST) * SAMPLES
 
     def _liquid(self, group: Group, frame: Frame) -> Liquid:
         """Return those particles of a liquid that may be seen."""
@@ -209,16 +209,6 @@ def optics_of(appearance: Appearance) -> Optics:
     return FINISHES.get(appearance.finish, FINISHES["matte"])
 
 
-def linear(color: np.ndarray) -> np.ndarray:
-    """Return displayed values from 0 to 1 as amounts of light."""
-    return np.asarray(color, np.float32) ** np.float32(2.2)
-
-
-def displayed(light: np.ndarray) -> np.ndarray:
-    """Return amounts of light as displayed values from 0 to 1."""
-    return np.clip(light, 0, 1) ** np.float32(1 / 2.2)
-
-
 @dataclass(frozen=True)
 class FluidLights:
     """What lights a scene: a lamp, a sky and the floor, in amounts of light; directions (3,) are in camera axes."""
@@ -243,7 +233,7 @@ class FluidLights:
 
 def fluid_lights(theme: Theme, lamp: np.ndarray, up: np.ndarray) -> FluidLights:
     """Return the lights of a theme, for a lamp in a direction."""
-    floor = linear(np.array(rgb(theme.floor)))
+    floor = linear(theme.floor)
     if theme.name == "dark":
         around, strengths = ([0.10, 0.15, 0.24], [0.30, 0.36, 0.46], 0.6 * floor), (0.95, 0.36)
     else:
@@ -257,7 +247,7 @@ def transmitted(appearance: Appearance, thickness: np.ndarray, length: float) ->
     The liquid takes what its optics say over the `length` of the scene, m: so a beaker and a reservoir look alike.
     """
     optics = optics_of(appearance)
-    loss = -np.log(np.clip(linear(np.array(rgb(appearance.color))), 1e-3, 0.98))
+    loss = -np.log(np.clip(linear(appearance.color), 1e-3, 0.98))
     loss = loss / loss.max() * optics.depths + optics.milk
     return np.exp(-(thickness[..., None] + np.float32(SKIN * length)) * (loss / length).astype(np.float32))
 
@@ -277,7 +267,7 @@ def shaded(
     `transmitted`, `behind` the light (n, 3) from what lies behind, and `hollow` (n,) as of `liquid_surface.Surface`.
     """
     optics = optics_of(appearance)
-    color = linear(np.array(rgb(appearance.color)))
+    color = linear(appearance.color)
     facing = np.clip(np.einsum("ij,ij->i", normal, towards), 0, 1)[:, None]
     lit = normal @ lights.lamp
     # Light that has been scattered inside wraps around the edges of its shadow.

@@ -48,7 +48,7 @@ def lights_of(scene: RenderScene, view: View, theme: Theme) -> dict[str, np.ndar
 
 def linear(color: str) -> np.ndarray:
     """Return "#rrggbb" in linear light, (3,): the inverse of a display's gamma of 2.2."""
-    return np.array(rgb(color)) ** 2.2
+    return np.array(rgb(color), np.float32) ** np.float32(2.2)
 
 
 def vertex_code() -> tuple[str, str]:

@@ -209,14 +209,10 @@ def _thickness_at(view: View, position: np.ndarray, distance: float, points: np.
     Particles (n, 3) are counted in coarse cells of the picture: their volume over the area of a cell at their depth.
     """
     seen, wanted = view.pixels(position), view.pixels(points)
-    near = max(float(seen[:, 2].mean()), 1e-12)
-    scale = view.pixels_per_metre * (1.0 if view.parallel else view.distance / near)
-    edge = max(FINEST, COARSENESS * distance * scale)
+    edge = max(FINEST, COARSENESS * distance * float(np.median(view.scale_at(seen[:, 2]))))
     shape = (math.ceil(view.size[1] / edge) + 2, math.ceil(view.size[0] / edge) + 2)
-    area = (edge / view.pixels_per_metre) ** 2
-    if not view.parallel:
-        area = area * (seen[:, 2] / view.distance) ** 2
-    total = deposited(seen[:, :2] / edge + 0.5, np.broadcast_to(distance**3 / area, len(seen)), shape)
+    area = (edge / view.scale_at(seen[:, 2])) ** 2
+    total = deposited(seen[:, :2] / edge + 0.5, distance**3 / area, shape)
     total = blurred_along(blurred_along(total, 0), 1)
     return map_coordinates(total, wanted[:, 1::-1].T / edge + 0.5, order=1, mode="nearest")
 
