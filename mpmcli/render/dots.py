@@ -22,7 +22,8 @@ OVERLAP = 1.15
 SMALLEST = 1.5  # smallest diameter of a dot, pixels, so that a single particle is visible
 SMOOTHED = 400_000  # up to this number of particles, each pixel is the average of four, which makes round edges smooth
 DOT_MAX = 255  # largest diameter of a dot that is drawn, pixels
-LEVEL = 0.04  # logarithm of the ratio of the sizes in which dots are drawn
+# Logarithm of the ratio of the sizes in which dots are drawn, in perspective and in parallel, where they are few.
+LEVEL, FINE_LEVEL = 0.04, 1e-4
 FARTHEST = 16  # maximum number of squares on each side in which dots that hide another are sought
 STRENGTH = 0.55  # fraction of the light that a deep gap absorbs
 DEEP = 4.0  # depth of a deep gap, in diameters of a dot
@@ -62,12 +63,13 @@ class DotsPainter:
             seen = ~self._hidden(points, sizes)
             points, colors, sizes = points[seen], colors[seen], sizes[seen]
         # One actor for each size, the same in all frames.
-        level_of = np.rint(np.log(sizes) / LEVEL).astype(int)
+        step = FINE_LEVEL if self._view.parallel else LEVEL
+        level_of = np.rint(np.log(sizes) / step).astype(int)
         for actor in self._actors.values():
             actor.visibility = False
         for level in np.unique(level_of).tolist():
             chosen = level_of == level
-            self._set(level, points[chosen], colors[chosen], math.exp(LEVEL * level))
+            self._set(level, points[chosen], colors[chosen], math.exp(step * level))
         if not self._flat:
             self._colliders.pose(frame)
         self._offscreen.render()
