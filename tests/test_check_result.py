@@ -70,7 +70,8 @@ def test_an_unbroken_result_is_stable_in_every_form(run, checked, form):
 
 @pytest.mark.slow
 def test_double_precision_is_held_to_its_own_rounding(tmp_path):
-    check = check_result(stored_run(tmp_path, 'solver.precision="f64"').directory)
+    """Without shifts, which change the momentum of the drop by 4e-6 of what moves (docs/theory.md, 5.12)."""
+    check = check_result(stored_run(tmp_path, 'solver.precision="f64"', "solver.redistribute=false").directory)
     assert check.findings == ()
     assert check.figures["momentum_drift"] < 1e-12
 
