@@ -127,9 +127,12 @@ def expected_steps(facts: SceneFacts) -> int:
     return round(whole * before + mixed + max(0, frames - whole - 1) * after)
 
 
-def damped_step(facts: SceneFacts, body: BodyFacts, step: float) -> float:
-    """Return the step (s) whose damping a body has in steps of `step`: its own if that is longer."""
-    return max(step, OWN_STEP * own_limit(body.body, body.law, facts.scene))
+def damped_step(facts: SceneFacts, body: BodyFacts, step: float, shorter: float = 1.0) -> float:
+    """Return the step (s) whose damping a body has in steps of `step`: its own if that is longer.
+
+    shorter: ratio of its own step then to that at the start.
+    """
+    return max(step, OWN_STEP * shorter * own_limit(body.body, body.law, facts.scene))
 
 
 def wave_loss(thickness: float, spacing: float, step: float, settings: SolverSettings = USUAL) -> float:

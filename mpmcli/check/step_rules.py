@@ -144,7 +144,8 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         return
     waves = math.sqrt(body.stiffness / body.body.material.density)
     h, mach = scene.domain.spacing, speed / waves
-    courant = waves * damped_step(facts, body, scene.time.end / steps_at(facts, facts.step_expected)) / h
+    step, shorter = scene.time.end / steps_at(facts, facts.step_expected), facts.step_expected / facts.step_at_start
+    courant = waves * damped_step(facts, body, step, shorter) / h
     if not (courant > 0 and math.isfinite(speed)):
         return
     length, share = chord(body.body.shape.form, velocity / speed), _flat_share(body.body.shape.form, h, mach)
