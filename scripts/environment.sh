@@ -1,4 +1,4 @@
-# Sourced by demo and test: makes .venv in this checkout, once, and installs the package into it.
+# Sourced by demo, test and gpu: makes .venv in this checkout, once, and installs the package into it.
 # Defines `require_libraries PACKAGE...` and `prepare_environment EXTRA`, EXTRA being "" or an extra of pyproject.toml.
 
 find_python() {
@@ -79,7 +79,7 @@ prepare_environment() {
     .venv/bin/python -m pip --version >/dev/null 2>&1 || make_venv || return 1
     stamp=$(installation_stamp)
     [ "$(cat "$stamp_file" 2>/dev/null)" = "$stamp" ] && return 0
-    # The test extra has all that the others have.
+    # The test extra has all that the package alone needs.
     [ "$extra" != test ] && [ "$(cat .venv/installed-test 2>/dev/null)" = "$stamp" ] && return 0
     echo "Installing mpmcli and its dependencies into .venv. The first time takes a minute or two." >&2
     if ! .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e "$target" >&2; then

@@ -251,7 +251,7 @@ def test_a_file_may_hold_only_those_that_are_there(
     assert check_result(Path("out")).passes(strict=True), check_result(Path("out")).text()
     result = open_result(Path("out"))
     for k, (whole, row) in enumerate(jet):
-        frame, ids = result.numbered_frame(k)
+        frame, ids = result.frame(k), result.stored(k)["id"]
         there = np.flatnonzero(whole.fields["status"] == 1)
         assert ids.tolist() == there.tolist() and len(there) == result.particle_counts[k]
         assert frame.position.tobytes() == whole.position[there].tobytes()

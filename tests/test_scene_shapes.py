@@ -11,8 +11,6 @@ from scipy.spatial import KDTree
 
 from mpmcli.scene import Ball, Box, Capsule, Cylinder, Polygon
 
-IN_2D, IN_3D = {"dimension": 2}, {"dimension": 3}
-
 
 def make(model, dimension, **values):
     return model.model_validate(values, context={"dimension": dimension})

@@ -38,7 +38,7 @@ FRAME_SECONDS = 0.0005
 DISK_BYTES_PER_SECOND = 4e8
 # A frame is written once as a segment, read, written into the packed file, and compared: four passes.
 DISK_PASSES = 4
-# During a run each frame is a file; more than this take hours to write.
+# More than this take hours to write.
 MOST_FRAMES = 100_000
 # While the frames are packed, two copies are on the disk.
 COPIES = 2
@@ -184,7 +184,7 @@ def output_findings(facts: SceneFacts, plan: Plan, forecast: Forecast, directory
         fix = f"Set time.frames to {max(1, int(scene.time.end / facts.step_at_start))} or fewer."
         yield Finding("note", "frames", what, fix, facts.interval)
     if scene.time.frames > MOST_FRAMES:
-        what = f"The run stores {forecast.frames:,} frames, each a file while it goes on."
+        what = f"The run stores {forecast.frames:,} frames, which take longer to write than most runs to compute."
         yield Finding("warning", "frames", what, f"Set time.frames to {MOST_FRAMES:,} or fewer.", forecast.frames)
     # The directory need not exist yet.
     there = next(place for place in (directory.absolute(), *directory.absolute().parents) if place.exists())

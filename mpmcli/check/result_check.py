@@ -134,13 +134,13 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings) -> dict[str, fl
     size = 0
     for entry in opened.entries:
         try:
-            frame, ids = entry.read()
+            frame = entry.read()
         except InputError as error:
             what = f"Frame {entry.number} cannot be read ({first_line(error)})"
             findings.add("error", "unreadable", entry.number, what, RUN_AGAIN)
             momentum.lost()
             continue
-        arrays = (ids, frame.position, frame.velocity, frame.body, frame.material, *frame.fields.values())
+        arrays = (frame.position, frame.velocity, frame.body, frame.material, *frame.fields.values())
         size += sum(array.nbytes for array in arrays)
         # Values that are not finite have one finding, and must not cause others.
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):

@@ -7,8 +7,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mpmcli.check.finding import FrameFindings, Severity
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
@@ -46,8 +44,8 @@ class Entry:
     time: float
     row: LedgerRow
     count: int
-    # Reads the frame and its ids; InputError: it is damaged.
-    read: Callable[[], tuple[Frame, np.ndarray]]
+    # Reads the frame; InputError: it is damaged.
+    read: Callable[[], Frame]
 
 
 @dataclass(frozen=True)
@@ -80,9 +78,8 @@ class OpenedResult:
 
 def kept_entries(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[LedgerRow]) -> OpenedResult:
     """Return the frames of a run in memory that has finished, with the rows of its ledger."""
-    # Ids are those of the rows, as many as labels of bodies.
     entries = [
-        Entry(frame.index, frame.time, row, len(frame.body), lambda frame=frame: (frame, frame.body))
+        Entry(frame.index, frame.time, row, len(frame.body), lambda frame=frame: frame)
         for frame, row in zip(frames, ledger, strict=True)
     ]
     return OpenedResult(Path(), "memory", header, {"status": "finished"}, entries)
@@ -109,7 +106,7 @@ def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
         header = header if entries else result.header
         numbers = range(first, first + result.frame_count) if segments else result.numbers.tolist()
         columns = zip(numbers, result.times.tolist(), result.ledger, result.particle_counts.tolist(), strict=True)
-        entries += [Entry(*facts, partial(result.numbered_frame, k)) for k, facts in enumerate(columns)]
+        entries += [Entry(*facts, partial(result.frame, k)) for k, facts in enumerate(columns)]
         path, kind = (path, kind) if segments else (result.path, result.kind)
     return OpenedResult(path, kind, header, read_record(_directory(path)) or {}, entries)
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @plugin_option
 @click.option("--no-probe", is_flag=True, help="Skip the run of two seconds that measures the time of a step.")
 @click.option("--strict", is_flag=True, help="Treat warnings as errors.")
-@click.option("--threads", type=COUNT, help="CPU threads; all of them by default.")
+@click.option("--threads", type=COUNT, help="CPU threads; as many as simulate takes by default.")
 @json_option
 def check_command(path: Path, strict: bool, as_json: bool, **of_scene: object) -> int:
     """Check a scene (PATH.toml): the stable step and its cause, likely faults, and the cost of the run.

@@ -358,7 +358,7 @@ class Vtkhdf(Format):
             (each.particle_count, each.frame_count) == (each.source.particle_count, each.source.frame_count)
             for each in self.trajectories
         )
-        note = "The headers and ledgers stay those of the whole runs: mpmcli check finds frames or particles missing."
+        note = "The headers and ledgers stay those of the whole runs: mpmcli check finds frames missing."
         return {}, [] if whole else [note]
 
 

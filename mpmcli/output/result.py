@@ -95,11 +95,6 @@ class Result(ABC):
             fields = (*fields, STATUS)
         return self.frame(k, fields).of_present
 
-    def numbered_frame(self, k: int) -> tuple[Frame, np.ndarray]:
-        """Read the k-th frame with all fields, and the number of each row: 0, 1, 2, ... unless the file has changed."""
-        stored = self.stored(k)
-        return self._frame(k, stored), stored["id"]
-
     def stored(self, k: int) -> dict[str, np.ndarray]:
         """Read all arrays of the k-th frame in the form of the file, (n,) or (n, components)."""
         return self._read(k, [POSITION, *STANDARD, *self.field_names])

@@ -49,7 +49,7 @@ class SegmentStore:
         hold: float = 0.0,
         colliders: Sequence[Collider] | None = None,
     ) -> None:
-        """Begin in a directory that `prepare_directory` made; nothing is written before the first frame."""
+        """Begin in a directory that `take_directory` made; nothing is written before the first frame."""
         self._colliders = RunHeader.read(header).colliders if colliders is None else tuple(colliders)
         self._directory = Path(directory)
         self.place = self._directory / SEGMENTS

@@ -1,7 +1,7 @@
 """Closed-form bounds on the time step of MLS-MPM with leapfrog, one function per bound (docs/theory.md, 6).
 
 The wave bound is exact for an isolated particle, which is the least stable configuration: particles that share nodes
-allow steps 1.0 to 1.4 times larger with APIC and quadratic B-splines. `transfer_factors.step_inertia` extends the bound
+allow steps up to 1.7 times larger with APIC and quadratic B-splines. `transfer_factors.step_inertia` extends the bound
 to the other transfer schemes.
 """
 

@@ -23,7 +23,7 @@ def field(frame: Frame, name: str) -> np.ndarray:
 
 
 def damped_step(scene: Scene, step: float) -> float:
-    """Return the step, s, whose damping a lone body has at steps of `step`: its own where that is shorter."""
+    """Return the step, s, whose damping a lone body has at steps of `step`: its own where that is longer."""
     return step * max(1.0, OWN_STEP / scene.time.safety)
 
 

@@ -21,10 +21,6 @@ AMPLITUDE = 1e-7
 GROWTH, STORED_GROWTH = 1e6, 100.0
 # Steps between two readings at most; the first ones are as close as the growth of a strong instability needs.
 MOST_UNREAD = 100
-# Steps of one trial, and the relative width at which a bisection stops.
-TRIAL_STEPS, WIDTH = 3000, 0.004
-# Ratios at which a bisection gives up looking for stability below and for a blow-up above.
-LEAST_RATIO, MOST_RATIO = 0.2, 4.0
 
 
 @dataclass(frozen=True)
@@ -42,26 +38,6 @@ class Run:
     blew_up: bool
     largest: float
     late: float
-
-
-@dataclass(frozen=True)
-class Measured:
-    """One row of the study.
-
-    Attributes:
-        scene: what was run; particles: how many.
-        predicted: the solver's own bound, safety 1, s; limit: its name.
-        ratio: step of the blow-up over the predicted one, inf where none was found up to MOST_RATIO.
-        below: the run at 0.98 of the predicted step; above: the one at 1.02.
-    """
-
-    scene: BlowUpScene
-    particles: int
-    predicted: float
-    limit: str
-    ratio: float
-    below: Run
-    above: Run
 
 
 class Trial:
@@ -164,32 +140,6 @@ class Trial:
             group.replace(x=x - cells * SPACING)
             self.solver.state_was_replaced()
 
-    def blow_up_ratio(self, steps: int = TRIAL_STEPS) -> float:
-        """Bisect the step between stable and unstable over so many steps; return it over the predicted one.
-
-        The search goes out from the predicted step by tenths, so that the boundary nearest to it is found.
-        Returns 0 or inf where everything down to LEAST_RATIO or up to MOST_RATIO is unstable or stable.
-        """
-
-        def unstable(ratio: float) -> bool:
-            return self.run(ratio * self.predicted, steps).blew_up
-
-        low = high = 1.0
-        if unstable(1.0):
-            while unstable(low):
-                low, high = low / 1.1, low
-                if low < LEAST_RATIO:
-                    return 0.0
-        else:
-            while not unstable(high):
-                low, high = high, high * 1.1
-                if high > MOST_RATIO:
-                    return math.inf
-        while high - low > WIDTH * low:
-            middle = (low + high) / 2
-            low, high = (low, middle) if unstable(middle) else (middle, high)
-        return (low + high) / 2
-
 
 def _scene_of(scene: BlowUpScene, knobs: Mapping[str, object]) -> Scene:
     """Return the scene: one body whose particles are given, in a box with slip walls, without gravity."""
@@ -204,17 +154,3 @@ def _scene_of(scene: BlowUpScene, knobs: Mapping[str, object]) -> Scene:
         },
         laws=parameter_models(),
     ).scene
-
-
-def measure_scene(scene: BlowUpScene, backend: Backend, long_steps: int) -> Measured:
-    """Bisect one scene, and run it at 0.98 of its predicted step for `long_steps` and at 1.02 for TRIAL_STEPS."""
-    trial = Trial(scene, backend)
-    return Measured(
-        scene,
-        trial.count,
-        trial.predicted,
-        trial.limit.name,
-        trial.blow_up_ratio(),
-        trial.run(0.98 * trial.predicted, long_steps),
-        trial.run(1.02 * trial.predicted, TRIAL_STEPS),
-    )

@@ -30,7 +30,7 @@ class HardCase:
     """One row of the catalogue.
 
     Attributes:
-        name: its name there, "H1" to "H24"; title: in a few words.
+        name: "H1" to "H24"; title: in a few words.
         scene: what is computed, in words; criterion: what must come of it.
         slow: whether it takes more than a few seconds.
         run: compute it, on a backend of its own.

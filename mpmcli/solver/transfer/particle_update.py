@@ -1,6 +1,6 @@
 """What a step does with one particle: P2G and G2P as a GPU takes them, and parts of both that the CPU takes, too.
 
-MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015), PIC or AFLIP; see docs/theory.md, 2.
+MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015), or AFLIP; see docs/theory.md, 2.
 """
 
 from collections.abc import Sequence
