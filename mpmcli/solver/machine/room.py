@@ -5,11 +5,13 @@ from dataclasses import replace
 
 from mpmcli.boundaries.colliders import ColliderKind
 
-# Entries, and colliders, up to which there is room for as many; cells along an axis are multiples of this.
-FEWEST, FEWEST_COLLIDERS, CELLS = 64, 4, 4
-# Entries by which sizes above that many are off from multiples of powers of two: arrays of such sizes, one after the
-# other, begin in the same set of lines of a cache, and steps in 2D take a fifth longer.
-SKEW, SKEWED_FROM = 336, 1024
+# Entries, and colliders, up to which there is room for as many.
+FEWEST, FEWEST_COLLIDERS = 1024, 4
+# Cells along an axis are multiples of these in 2D and 3D where they are few, and of the third otherwise.
+FEW_CELLS, FEW_TIMES, CELLS = 64, {2: 16, 3: 8}, 4
+# Entries by which more are off from multiples of powers of two: arrays of such sizes, one after the other, begin in the
+# same set of lines of a cache, and steps in 2D take a fifth longer.
+SKEW = 336
 
 
 def power_of_two(count: int) -> int:
@@ -19,14 +21,15 @@ def power_of_two(count: int) -> int:
 
 def in_steps(count: int) -> int:
     """Return room for so many entries, in eighths of a power of two: none, or `FEWEST` at least."""
-    if count > SKEWED_FROM:
+    if count > FEWEST:
         return _multiple(count - SKEW, power_of_two(count - SKEW) // 16) + SKEW
-    return max(FEWEST, _multiple(count, power_of_two(count) // 16)) if count else 0
+    return FEWEST if count else 0
 
 
 def roomy_cells(cells: Sequence[int]) -> tuple[int, ...]:
-    """Return the cells per axis for which a dense grid has nodes, in sixteenths of a power of two."""
-    return tuple(_multiple(n, max(CELLS, power_of_two(n) // 32)) for n in cells)
+    """Return the cells per axis for which a dense grid has nodes, in sixteenths of a power of two above 64."""
+    few = FEW_TIMES[len(cells)]
+    return tuple(_multiple(n, few if n <= FEW_CELLS else max(CELLS, power_of_two(n) // 32)) for n in cells)
 
 
 def roomy_colliders(kind: ColliderKind) -> ColliderKind:
