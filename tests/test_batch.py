@@ -88,8 +88,6 @@ def colliders(dimension: int, k: int) -> list[dict]:
 USUAL = {
     "colliders": (1,),
     "two laws, two bodies of one": (1,),
-    "forces on one body of two": (1,),
-    "periodic, a wall moves": (1,),
 }
 Output = list[tuple[Frame, LedgerRow]]
 
