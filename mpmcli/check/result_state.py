@@ -294,14 +294,15 @@ class CrowdCheck(FrameCheck):
         rows = self._flows[frame.material]
         if not rows.any():
             return
-        cells = np.floor((frame.position[rows] - header.origin) / header.spacing).astype(np.int64)
+        cells = np.floor((frame.position[rows] - header.origin) / header.spacing)
         # Cells around the material, of which those of the middle have whole windows.
         margin = 2 * WINDOW
         first = cells.min(axis=0) - margin
         shape = cells.max(axis=0) - first + 1 + margin
-        if np.prod(shape.astype(float)) > MOST_CELLS:
+        if np.prod(shape) > MOST_CELLS:
             return
-        places = np.ravel_multi_index((cells - first).T, shape)
+        first, shape = first.astype(int), shape.astype(int)
+        places = np.ravel_multi_index((cells.astype(int) - first).T, shape)
         filled = np.bincount(places, self._share[frame.body[rows]], int(np.prod(shape))).reshape(shape)
         # Means over the cells of the domain alone, as nothing can be behind its walls; axes take turns as the last one.
         around, ends = filled, np.round((header.upper - header.origin) / header.spacing)

@@ -12,7 +12,7 @@ from mpmcli.errors import InputError, NoRoomError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.collider_files import write_collider_files
-from mpmcli.output.durable import Unsealed, is_full, require_free_space, sync_directory
+from mpmcli.output.durable import Unsealed, is_full, require_free_space, sync_directory, temporary_of
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameIndex, FrameLayout
 from mpmcli.output.pack import pack_segments
@@ -72,6 +72,8 @@ class SegmentStore:
         self._layout = index.layout
         self.frames_written = self._kept = len(index.times)
         self._start()
+        # A process that was killed while it packed has left one.
+        temporary_of(self._directory / PACKED).unlink(missing_ok=True)
         self._sealed = {path.name for path in sealed_segments(self._directory)}
         self._counts = index.counts.tolist()
 

@@ -78,16 +78,26 @@ def _render_beside(
     job: Job, ks: Sequence[int], count: int, watch: Callable[[int, Any], None], stop: Callable[[], bool]
 ) -> None:
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(count, SPAWN, _begin, (job, max(1, available_cores() // count)))
+    # Libraries read these where they are loaded, which the job is with.
+    share = str(max(1, available_cores() // count))
+    threads = {name: share for name in THREADS if name not in os.environ}
+    pool = ProcessPoolExecutor(count, SPAWN, _begin, (job,))
     try:
-        with interrupts_blocked():
-            waiting = {pool.submit(_render, k): k for k in ks}
+        os.environ.update(threads)
+        try:
+            with interrupts_blocked():
+                waiting = {pool.submit(_render, k): k for k in ks}
+        finally:
+            for name in threads:
+                del os.environ[name]
         while waiting:
             if stop():
                 raise KeyboardInterrupt
             for future in wait(waiting, PAUSE, FIRST_COMPLETED).done:
                 watch(waiting.pop(future), future.result())
     except BrokenProcessPool:
+        if stop():
+            raise KeyboardInterrupt from None
         raise RunError(
             "A process that rendered frames was ended, or crashed; frames that are done are kept, and fewer --workers "
             "need less memory."
@@ -114,13 +124,12 @@ _job: Job
 _render_frame: Callable[[int], Any] | None = None
 
 
-def _begin(job: Job, threads: int) -> None:
-    """Prepare a process, before it loads what renders."""
+def _begin(job: Job) -> None:
+    """Prepare a process."""
     global _job
     _job = job
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
-    os.environ.update({name: str(threads) for name in THREADS if name not in os.environ})
     silent = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silent, 1)
     os.dup2(silent, 2)

@@ -108,7 +108,9 @@ class FluidPainter:
         if groups:
             dots = self._colliders.depth_without(self._offscreen) if self._colliders.meshes else None
             size = OVERLAP * max(group.distance for group in groups)
-            shade = LINEAR[depth_shaded(np.full_like(self._bare, 255), depth, size, self._view, SAMPLES, dots)]
+            shade = LINEAR[
+                depth_shaded(np.full(self._bare.shape, 255, np.uint8), depth, size, self._view, SAMPLES, dots)
+            ]
         return picture, depth, shade
 
     def _show(self, group: Group) -> None:

@@ -63,8 +63,8 @@ def digest_of(path: Path) -> str | None:
             return image.info.get(KEYWORD, "")
     except (FileNotFoundError, NotADirectoryError):
         return None
-    # A damaged file makes Pillow raise a SyntaxError too.
-    except (OSError, ValueError, SyntaxError):
+    # Of a damaged or a huge file Pillow raises almost anything.
+    except Exception:
         return ""
 
 

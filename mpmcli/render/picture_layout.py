@@ -251,7 +251,7 @@ def ticks_of(colors: Coloring, most: int) -> tuple[list[float], list[str], str]:
         factor = 10.0**power
         unit = f"10{str(power).translate(SUPERSCRIPTS)} {unit}".strip()
     shown, near = np.array(places) / factor, 1e-6 * (high - low) / factor
-    digits = next((n for n in range(DIGITS_MAX) if np.abs(shown.round(n) - shown).max() < near), DIGITS_MAX)
+    digits = next((n for n in range(15) if np.abs(shown.round(n) - shown).max() < near), 15)
     return places, [f"{number:.{digits}f}".replace("-", "\u2212") for number in shown], unit
 
 

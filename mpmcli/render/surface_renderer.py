@@ -221,7 +221,7 @@ def _texture(picture: np.ndarray) -> Any:
     import pyvista as pv
 
     texture = pv.Texture(picture)
-    texture.mipmap = False
+    texture.mipmap, texture.interpolate = False, True
     texture.wrap = pv.Texture.WrapType.CLAMP_TO_EDGE
     return texture
 

@@ -1,8 +1,8 @@
 """The OpenGL window with which VTK draws without a screen."""
 
+import ctypes
 import os
 import sys
-from ctypes.util import find_library
 
 from mpmcli.errors import InputError
 
@@ -10,6 +10,7 @@ from mpmcli.errors import InputError
 SETTING = "VTK_DEFAULT_OPENGL_WINDOW"
 # VTK takes the second where the first cannot be had, and ends the process at the first picture without its library.
 EGL, OSMESA = "vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"
+OSMESA_LIBRARIES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
 
 
 def choose_window() -> str:
@@ -31,8 +32,16 @@ def choose_window() -> str:
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     name = vtkRenderWindow().GetClassName()
     vtkLogger.SetStderrVerbosity(said)
-    if name == OSMESA and not find_library("OSMesa"):
+    if name == OSMESA and not any(map(_loads, OSMESA_LIBRARIES)):
         remedy = "install Mesa's software renderer, on Debian and Ubuntu by `apt-get install libegl1 libgl1-mesa-dri`"
         remedy = f"unset {SETTING}" if given else remedy
         raise InputError(f"nothing can be drawn here, since no OpenGL window opens: {remedy}.")
     return name
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True

@@ -1,6 +1,7 @@
 """Points and triangles from a file, by its ending: STL, OBJ and PLY by trimesh, and all others by PyVista.
 
-VTK ends the process where a binary PLY is cut off; trimesh raises.
+VTK ends the process where a binary PLY is cut off; trimesh raises. It refuses faces of different lengths in one, which
+meshio takes.
 """
 
 import io
@@ -80,13 +81,29 @@ def _quiet() -> Iterator[None]:
 def _by_trimesh(path: Path) -> Geometry:
     import trimesh
 
-    found = trimesh.load(path, process=False, skip_materials=True)
+    try:
+        found = trimesh.load(path, process=False, skip_materials=True)
+    except ValueError:
+        return _by_meshio(path)
     if isinstance(found, trimesh.Scene):
         found = found.to_mesh()
-    points, triangles = np.array(found.vertices, np.float64), getattr(found, "faces", np.empty((0, 3), np.int64))
-    if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
+    vertices, triangles = np.array(found.vertices, np.float64), getattr(found, "faces", np.empty((0, 3), np.int64))
+    if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(vertices):
         raise ValueError("a corner is no vertex")
-    return Geometry(points, points, np.array(triangles))
+    # Corners of STL, and those of OBJ that have several texture coordinates, are one point.
+    first = np.unique(vertices, axis=0, return_index=True)[1]
+    points = vertices if path.suffix.lower() == ".ply" else vertices[np.sort(first)]
+    return Geometry(points, vertices, np.array(triangles))
+
+
+def _by_meshio(path: Path) -> Geometry:
+    """Return what a binary PLY holds whose faces have different numbers of corners, each as a fan of triangles."""
+    from meshio import ply
+
+    mesh = ply.read(path)
+    fans = [block.data[:, [0, k, k + 1]] for block in mesh.cells for k in range(1, block.data.shape[1] - 1)]
+    points = np.array(mesh.points, np.float64)
+    return Geometry(points, points, np.concatenate(fans).astype(np.int64))
 
 
 def _by_vtk(path: Path) -> Geometry:

@@ -239,7 +239,7 @@ def distance_grid(form: Form, spacing: float, margin: float) -> tuple[np.ndarray
         margin: m; the grid reaches at least as far beyond the bounding box.
 
     Returns:
-        values: float32, (n1, ..., nd), m, negative inside.
+        values: float32, (n1, ..., nd), m, negative inside; for a mesh see `ClosedSurface.signed_distance`.
         origin: place of the first node, (d,), m.
         spacing: as given; node i lies at origin + i spacing.
     """

@@ -9,6 +9,9 @@ import numpy as np
 # Points, and pairs of a point and a triangle, that are looked at together: bounds the memory, keeps pairs in the cache.
 POINTS_AT_ONCE = 200_000
 _PAIRS_AT_ONCE = 50_000
+# Points of which VTK tells the distance at once. It searches longer for farther ones: of more than _FEW triangles
+# it does up to a part of the extent, and others are measured from points that are another part apart.
+_VTK_AT_ONCE, _FEW, _NEAR, _FINE = 10_000, 2_000, 0.15, 0.02
 # Bins per axis of the raster that finds the triangles over a point.
 _BINS = 1024
 
@@ -59,22 +62,48 @@ class ClosedSurface:
         return found
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of each point (n, 3) from the surface, (n,), m; negative inside."""
+        """Return the distance of each point (n, 3) from the surface, (n,), m; negative inside.
+
+        It is exact up to a tenth of the extent, and beyond, of more than 2,000 triangles, too large by 0.3 % of the
+        extent at most.
+        """
         from vtkmodules.util.numpy_support import numpy_to_vtk
         from vtkmodules.vtkCommonCore import vtkDoubleArray
 
-        found = vtkDoubleArray()
-        self._vtk_distance.FunctionValue(numpy_to_vtk(np.ascontiguousarray(points, dtype=np.float64)), found)
-        return np.where(self.winding(points) > 0, -1.0, 1.0) * np.abs(np.array(found))
+        if len(self.triangles) > _FEW:
+            found = self._tree.query(points, workers=-1)[0]
+            near = np.flatnonzero(found < _NEAR * np.ptp(self.bounds(), axis=0).max())
+        else:
+            found, near = np.empty(len(points)), np.arange(len(points))
+        # A signal is seen between two calls.
+        for some in np.array_split(near, len(near) // _VTK_AT_ONCE + 1):
+            exact = vtkDoubleArray()
+            self._vtk_distance.FunctionValue(numpy_to_vtk(np.ascontiguousarray(points[some], np.float64)), exact)
+            found[some] = np.abs(np.array(exact))
+        return np.where(self.winding(points) > 0, -found, found)
+
+    @cached_property
+    def _vtk(self) -> Any:
+        import pyvista as pv
+
+        return pv.PolyData(self.vertices, np.insert(self.triangles, 0, 3, axis=1))
 
     @cached_property
     def _vtk_distance(self) -> Any:
-        import pyvista as pv
         from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
 
         function = vtkImplicitPolyDataDistance()
-        function.SetInput(pv.PolyData(self.vertices, np.insert(self.triangles, 0, 3, axis=1)))
+        function.SetInput(self._vtk)
         return function
+
+    @cached_property
+    def _tree(self) -> Any:
+        """Points all over the surface, _FINE of the extent apart."""
+        from scipy.spatial import KDTree
+
+        edge = _FINE * float(np.ptp(self.bounds(), axis=0).max())
+        points = np.array(self._vtk.subdivide_adaptive(max_edge_len=edge, max_n_passes=20).points)
+        return KDTree(points[np.unique(np.floor(points / edge), axis=0, return_index=True)[1]])
 
     def crossings(self, lines: np.ndarray) -> Crossings:
         """Return where lines along z at some x, y, (n, 2), meet the surface; n and the crossings have to fit in memory.
