@@ -71,7 +71,7 @@ def kernels_in(folder: Path) -> list[Path]:
     return [path for path in folder.glob("*.tic") if b"launch_" in path.read_bytes()]
 
 
-def test_a_kernel_is_stored_and_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kernel_is_stored_and_found(folder: Path) -> None:
     """The same bytes from a kernel compiled and stored, for other particles, on one thread and two."""
     scene = drop()
     fresh = outcome(scene, compile_cache=False)
@@ -84,8 +84,6 @@ def test_a_kernel_is_stored_and_found(folder: Path, monkeypatch: pytest.MonkeyPa
     assert outcome(scene.model_copy(update={"bodies": (body,)})).stored
     assert outcome(scene, 2) == fresh
     assert outcome(scene, 2) == replace(fresh, stored=True)
-    monkeypatch.setenv(kernel_store.SWITCH, "off")
-    assert outcome(scene) == fresh
 
 
 def test_a_sparse_grid_that_grows_has_kernels_of_its_own(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,6 +40,8 @@ class FlatColliders:
         self._rim = RIM * view.size[1] / 720.0
         color, ground = np.array(rgb(theme.solid)), np.array(rgb(theme.ground))
         self._fill, self._dark = ground + FILLED * (color - ground), (1.0 - DARKER) * color
+        if not scene.colliders:
+            return
         x, y = (np.arange(size) + 0.5 for size in view.size)
         low, high = np.sort(view.pixels(plane.corners(scene))[:, :2], axis=0)
         across, up = (np.clip(np.minimum(a - low[k], high[k] - a) + 0.5, 0.0, 1.0) for k, a in enumerate((x, y)))
