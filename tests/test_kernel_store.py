@@ -274,7 +274,8 @@ def test_processes_at_once_store_the_same_kernel(folder: Path) -> None:
     assert outcome(drop()) == replace(fresh, stored=True)
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [1, 200])
 def test_a_killed_process_leaves_no_other_code(folder: Path, kills: int) -> None:
     """Killed at any moment of a run and of its end, it leaves files with which the bytes are the same."""
     fresh = outcome(drop(), compile_cache=False)

@@ -159,8 +159,16 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("path", ["cpu", "gpu in fixed point"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("kind", "path"),
+    [
+        *((kind, "cpu") for kind in KINDS),
+        *(
+            pytest.param(kind, "gpu in fixed point", marks=[pytest.mark.slow] * (kind != "periodic, two laws"))
+            for kind in KINDS
+        ),
+    ],
+)
 def test_a_shift_is_that_of_its_formulas(backend_of: Callable, kind: str, path: str) -> None:
     """To the rounding of places, and of sums in fixed point."""
     walls, options = KINDS[kind]
@@ -352,7 +360,7 @@ def far_apart(dimension: int, grid: str) -> Scene:
     )
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_sparse_grid_shifts_as_a_dense_one(backend_of: Callable, dimension: int) -> None:
     """Over several intervals, with images behind walls and across the domain in blocks of their own, to rounding."""
     found = []
@@ -364,6 +372,7 @@ def test_a_sparse_grid_shifts_as_a_dense_one(backend_of: Callable, dimension: in
     assert np.abs(found[1].position - found[0].position).max() < 1e-9 * run.scene.domain.spacing
 
 
+@pytest.mark.slow
 @pytest.mark.gpu
 def test_a_gpu_shifts_as_the_cpu_does(backend_of: Callable) -> None:
     """Over two intervals to rounding, and with equal bytes where it adds in fixed point."""

@@ -138,7 +138,7 @@ def test_a_grid_grows_with_what_particles_reach(backend_of: Callable, monkeypatc
     assert len(grown) >= 2
 
 
-@pytest.mark.parametrize("room", [5, 5_000])
+@pytest.mark.parametrize("room", [pytest.param(5, marks=pytest.mark.slow), 5_000])
 def test_a_loaded_run_goes_on_with_the_same_bytes(
     backend_of: Callable, monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
