@@ -419,6 +419,23 @@ def test_verification_catches_a_corrupted_pack(tmp_path, monkeypatch, name):
     assert open_result(tmp_path).kind == "packed"
 
 
+def test_a_segment_that_was_changed_meanwhile_is_not_packed(tmp_path):
+    store = fill(tmp_path, [make_frame(k, 20, 3) for k in range(3)], finish=False)
+    with h5py.File(sealed_segments(tmp_path)[1], "r+") as f:
+        f["VTKHDF/Points"][7] += 1
+    with pytest.raises(RunError, match="Points of frame 1"):
+        store.finish()
+    assert [path.name for path in tmp_path.iterdir()] == ["segments"] and len(sealed_segments(tmp_path)) == 3
+
+
+def test_an_unfinished_packed_file_goes_when_a_run_goes_on(tmp_path):
+    fill(tmp_path, [make_frame(k, 20, 3) for k in range(3)], finish=False)
+    unfinished = tmp_path / "particles.vtkhdf.tmp"
+    unfinished.write_bytes(b"0")
+    SegmentStore(tmp_path, HEADER).go_on_after(open_result(tmp_path).index)
+    assert not unfinished.exists() and len(sealed_segments(tmp_path)) == 3
+
+
 def test_a_damaged_or_foreign_segment_is_not_packed(tmp_path):
     store = fill(tmp_path, [make_frame(k, 20, 3) for k in range(2)], finish=False)
     last = sealed_segments(tmp_path)[-1]
