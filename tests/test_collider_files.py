@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from drawn_results import WATER, frame, header, row
 
-from mpmcli.output import SegmentStore, open_result, prepare_directory
+from mpmcli.output import SegmentStore, open_result
 from mpmcli.output.collider_files import MOVING, RESTING, RESTING_PIECE, SERIES
+from mpmcli.output.directory import take_directory
 from mpmcli.output.series import write_series
 from mpmcli.scene import surface as scene_surface
 from mpmcli.scene.colliders import Collider
@@ -93,7 +94,7 @@ def test_a_series_lists_both_and_overwrite_takes_all_away(tmp_path: Path) -> Non
     assert set(paddle.cell_data["collider"].tolist()) == {0}
     assert (tmp_path / RESTING_PIECE).exists()
     # The record that a run leaves makes the directory one of results.
-    prepare_directory(tmp_path, overwrite=True)
+    take_directory(tmp_path, overwrite=True).release()
     assert not list(tmp_path.glob("colliders*"))
 
 

@@ -10,9 +10,17 @@ import pytest
 from test_output_frames import make_frame, make_row
 
 from mpmcli.errors import InputError
-from mpmcli.output import RunRecord, SegmentStore, open_result, prepare_directory, read_record
+from mpmcli.output import RunRecord, SegmentStore, open_result, read_record
+from mpmcli.output.directory import take_directory
 from mpmcli.output.durable import sealed, write_text
 from mpmcli.output.series import write_series
+
+
+def taken(directory: Path, overwrite: bool) -> Path:
+    """Take a directory, leave it to others at once, and return it."""
+    lock = take_directory(directory, overwrite)
+    lock.release()
+    return lock.path
 
 
 def write_result(directory: Path, *, finish: bool) -> None:
@@ -27,25 +35,25 @@ def write_result(directory: Path, *, finish: bool) -> None:
 
 
 def test_a_new_directory_is_made_with_its_parents(tmp_path):
-    assert prepare_directory(tmp_path / "a/b", overwrite=False) == tmp_path / "a/b"
+    assert taken(tmp_path / "a/b", overwrite=False) == tmp_path / "a/b"
     assert (tmp_path / "a/b").is_dir() and not os.listdir(tmp_path / "a/b")
-    assert prepare_directory(tmp_path / "a/b", overwrite=False)
+    assert taken(tmp_path / "a/b", overwrite=False)
 
 
 def test_a_directory_with_something_in_it_is_refused(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"not empty.*--overwrite"):
-        prepare_directory(tmp_path, overwrite=False)
+        taken(tmp_path, overwrite=False)
     with pytest.raises(InputError, match="is a file"):
-        prepare_directory(tmp_path / "file", overwrite=True)
+        taken(tmp_path / "file", overwrite=True)
     with pytest.raises(InputError, match="cannot be made"):
-        prepare_directory(tmp_path / "file/a/b", overwrite=False)
+        taken(tmp_path / "file/a/b", overwrite=False)
     assert os.listdir(tmp_path) == ["file"]
 
 
 def test_nothing_is_made_on_error(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="cannot be made"):
-        prepare_directory(tmp_path / "a" / ("b" * 300), overwrite=False)
+        taken(tmp_path / "a" / ("b" * 300), overwrite=False)
     assert os.listdir(tmp_path) == []
 
     # Permission bits do not bind the administrator, who may run the tests: the answer is imitated.
@@ -55,7 +63,7 @@ def test_nothing_is_made_on_error(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
     for place in (tmp_path, tmp_path / "a/b"):
         with pytest.raises(InputError, match=r"cannot be written \(Permission denied\)"):
-            prepare_directory(place, overwrite=False)
+            taken(place, overwrite=False)
     assert os.listdir(tmp_path) == []
 
 
@@ -70,9 +78,9 @@ def test_overwrite_removes_a_result_and_nothing_else(tmp_path, series, finish):
         (tmp_path / name).write_text("mine")
     (tmp_path / "particles.vtkhdf.tmp").touch()
     with pytest.raises(InputError, match="not empty"):
-        prepare_directory(tmp_path, overwrite=False)
+        taken(tmp_path, overwrite=False)
     assert open_result(tmp_path).frame_count == 2
-    prepare_directory(tmp_path, overwrite=True)
+    taken(tmp_path, overwrite=True)
     assert sorted(os.listdir(tmp_path)) == sorted(foreign)
     write_result(tmp_path, finish=finish)
     assert open_result(tmp_path).frame_count == 2
@@ -82,7 +90,7 @@ def test_overwrite_spares_a_scene_of_the_user(tmp_path):
     """`mpmcli simulate scene.toml -o . --overwrite` must not remove its own input."""
     (tmp_path / "scene.toml").write_text("title = 'mine'\n")
     with pytest.raises(InputError, match=r"scene\.toml was not written by mpmcli"):
-        prepare_directory(tmp_path, overwrite=True)
+        taken(tmp_path, overwrite=True)
     assert (tmp_path / "scene.toml").read_text() == "title = 'mine'\n"
 
 
@@ -90,7 +98,7 @@ def test_overwrite_does_not_remove_directories(tmp_path):
     (tmp_path / "particles.vtkhdf").mkdir()
     (tmp_path / "run.json").write_text('{"program": "mpmcli"}')
     with pytest.raises(InputError, match="is a directory where mpmcli writes a file"):
-        prepare_directory(tmp_path, overwrite=True)
+        taken(tmp_path, overwrite=True)
     assert len(os.listdir(tmp_path)) == 2
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mpmcli.errors import InputError
-from mpmcli.output import RunRecord, prepare_directory
+from mpmcli.output import RunRecord
 from mpmcli.output.directory import take_directory
 from mpmcli.output.lock import LOCK, Owner, lock_is_held, process_start, take_lock
 from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
@@ -43,7 +43,7 @@ def test_the_holder_is_named_and_nothing_changes(tmp_path: Path) -> None:
     RunRecord(tmp_path).write()
     with hold(tmp_path) as process:
         before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-        for take in (take_lock, lambda place: prepare_directory(place, overwrite=True)):
+        for take in (take_lock, lambda place: take_directory(place, overwrite=True)):
             with pytest.raises(InputError, match=rf"being written by process {process.pid} on .* since 20"):
                 take(tmp_path)
         assert lock_is_held(tmp_path)
@@ -63,7 +63,7 @@ def test_a_killed_holder_does_not_keep_the_directory(tmp_path: Path) -> None:
     process.wait()
     process.stdin.close()
     process.stdout.close()
-    prepare_directory(tmp_path, overwrite=False)
+    take_directory(tmp_path, overwrite=False).release()
     assert list(tmp_path.iterdir()) == []
 
 

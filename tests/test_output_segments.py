@@ -23,10 +23,11 @@ from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 from vtkmodules.vtkIOHDF import vtkHDFReader
 
 from mpmcli.errors import InputError, RunError
-from mpmcli.output import SegmentStore, open_result, prepare_directory
+from mpmcli.output import SegmentStore, open_result
 from mpmcli.output import durable as durable_module
 from mpmcli.output import pack as pack_module
 from mpmcli.output import store as store_module
+from mpmcli.output.directory import take_directory
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.segments import sealed_segments
 
@@ -486,6 +487,6 @@ def test_what_others_put_beside_the_segments_stays(tmp_path):
 
 
 def test_the_stores_work_in_a_prepared_directory(tmp_path):
-    directory = prepare_directory(tmp_path / "a/b", overwrite=False)
+    take_directory(directory := tmp_path / "a/b", overwrite=False).release()
     fill(directory, [make_frame(0, 20, 3)])
     assert open_result(directory).frame_count == 1

@@ -1,6 +1,6 @@
 """Frames on disk: the stores that write them, the results that read them, the record of a run."""
 
-from mpmcli.output.directory import check_directory, prepare_directory
+from mpmcli.output.directory import check_directory
 from mpmcli.output.result import Result, open_result
 from mpmcli.output.run_record import RunRecord, read_record
 from mpmcli.output.store import SegmentStore
@@ -11,6 +11,5 @@ __all__ = [
     "SegmentStore",
     "check_directory",
     "open_result",
-    "prepare_directory",
     "read_record",
 ]

@@ -76,13 +76,6 @@ def take_directory(directory: Path, overwrite: bool, *, resume: bool = False) ->
     return TakenDirectory(directory, lock, tuple(made))
 
 
-def prepare_directory(directory: Path, overwrite: bool) -> Path:
-    """Do what `take_directory` does, leave the directory to others at once, and return it."""
-    taken = take_directory(directory, overwrite)
-    taken.release()
-    return taken.path
-
-
 def check_directory(directory: Path, overwrite: bool, *, resume: bool = False, locked: bool = False) -> None:
     """Refuse a directory as `take_directory` does, and change nothing; `locked`: this process has its lock."""
     directory = Path(directory)

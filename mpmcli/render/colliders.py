@@ -36,20 +36,29 @@ class FlatColliders:
     """Covers the pixels of a view of a plane by the signed distances of colliders, within the domain."""
 
     def __init__(self, scene: RenderScene, view: View, theme: Theme, plane: Slice) -> None:
-        self._scene, self._view = scene, view
+        self._scene, self._view, self._plane = scene, view, plane
         self._rim = RIM * view.size[1] / 720.0
         color, ground = np.array(rgb(theme.solid)), np.array(rgb(theme.ground))
         self._fill, self._dark = ground + FILLED * (color - ground), (1.0 - DARKER) * color
-        if not scene.colliders:
-            return
-        x, y = (np.arange(size) + 0.5 for size in view.size)
-        low, high = np.sort(view.pixels(plane.corners(scene))[:, :2], axis=0)
-        across, up = (np.clip(np.minimum(a - low[k], high[k] - a) + 0.5, 0.0, 1.0) for k, a in enumerate((x, y)))
-        self._inside = (up[:, None] * across).astype(np.float32)
-        self._points = view.rays(x[None, :], y[:, None])[0]
-        if plane.normal is not None:
-            self._points[..., plane.normal] = plane.place
+        self._middles = [np.arange(size) + 0.5 for size in view.size]
         self._kept: dict[int, np.ndarray] = {}
+
+    @cached_property
+    def _inside(self) -> np.ndarray:
+        """The share of each pixel that lies in the domain, (h, w)."""
+        low, high = np.sort(self._view.pixels(self._plane.corners(self._scene))[:, :2], axis=0)
+        shares = (np.minimum(a - low[k], high[k] - a) + 0.5 for k, a in enumerate(self._middles))
+        across, up = (np.clip(share, 0.0, 1.0) for share in shares)
+        return (up[:, None] * across).astype(np.float32)
+
+    @cached_property
+    def _points(self) -> np.ndarray:
+        """The points of the plane in the middles of the pixels, (h, w, 3), m."""
+        x, y = self._middles
+        points = self._view.rays(x[None, :], y[:, None])[0]
+        if self._plane.normal is not None:
+            points[..., self._plane.normal] = self._plane.place
+        return points
 
     def draw(self, picture: np.ndarray, frame: Frame, free: np.ndarray | float = 1.0) -> None:
         """Draw the colliders of a frame over a picture (h, w, 3) from 0 to 1, in the `free` share (h, w) of pixels."""

@@ -65,7 +65,7 @@ def read_geometry(path: Path) -> Geometry:
     try:
         with _quiet():
             return _by_trimesh(path) if path.suffix.lower() in _BY_TRIMESH else _by_vtk(path)
-    # Of a damaged file readers raise almost anything; meshio, which PyVista asks, even ends the process.
+    # Of a damaged file readers raise almost anything; meshio even ends the process.
     except (Exception, SystemExit):
         raise GeometryFileError from None
 
@@ -84,6 +84,8 @@ def _by_trimesh(path: Path) -> Geometry:
     try:
         found = trimesh.load(path, process=False, skip_materials=True)
     except ValueError:
+        if path.suffix.lower() != ".ply":
+            raise
         return _by_meshio(path)
     if isinstance(found, trimesh.Scene):
         found = found.to_mesh()

@@ -26,7 +26,8 @@ def read_points(path: Path, d: int, velocity: str | Sequence[str] | None) -> tup
     """Return the points in a file, (n, d), and the velocities it is asked for, (n, d), or None; or a PointFileError.
 
     It is a CSV whose first line names the columns, x, y (and z) among them; an NPY of named columns, or of d or 2 d
-    unnamed ones, x, y, z, vx, vy, vz; or what PyVista reads. `velocity` names the d columns of a table, or an array.
+    unnamed ones, x, y, z, vx, vy, vz; or what `read_geometry` reads. `velocity` names the d columns of a table, or an
+    array of a file that PyVista reads.
     """
     if fault := absence(path):
         raise PointFileError(fault)
@@ -156,7 +157,7 @@ class Points(Table, Solid):
     velocity: str | tuple[str, ...] | None = Field(
         None,
         description='Velocities in the file, added to that of the body: names of columns, such as ["vx", "vy"], of '
-        "CSV and NPY, else the name of an array. Default: none.",
+        "CSV and NPY, or the name of an array of VTU, VTP and VTK. Default: none.",
     )
     scale: Positive = Field(1.0, description="Metres per unit of the file; velocities are taken as they are.")
     translate: Vector = Field(None, validate_default=True, description="What is added to all points after scaling, m.")

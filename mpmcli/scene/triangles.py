@@ -9,9 +9,11 @@ import numpy as np
 # Points, and pairs of a point and a triangle, that are looked at together: bounds the memory, keeps pairs in the cache.
 POINTS_AT_ONCE = 200_000
 _PAIRS_AT_ONCE = 50_000
-# Points of which VTK tells the distance at once. It searches longer for farther ones: of more than _FEW triangles
-# it does up to a part of the extent, and others are measured from points that are another part apart.
-_VTK_AT_ONCE, _FEW, _NEAR, _FINE = 10_000, 2_000, 0.15, 0.02
+# Points whose distance VTK computes in one call.
+_VTK_AT_ONCE = 10_000
+# VTK's search is slow for distant points. With more than _FEW triangles, points beyond _NEAR of the extent are measured
+# from samples of the surface that lie _FINE of the extent apart.
+_FEW, _NEAR, _FINE = 2_000, 0.15, 0.02
 # Bins per axis of the raster that finds the triangles over a point.
 _BINS = 1024
 
