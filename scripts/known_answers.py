@@ -91,6 +91,17 @@ def block_slide_2d(result: Result) -> str:
     return f"slides {distance:.3f} m, {percent(distance / expected - 1)} off v²/(2 μ g)"
 
 
+def stack_2d(result: Result) -> str:
+    """Compare the flight of the ball with its parabola, and say how far the blocks of the tower end apart."""
+    frame = next(frame for frame in result.frames([]) if frame.time >= 0.22)
+    ball = frame.position[frame.body == 5].mean(axis=0, dtype=np.float64)
+    flown = np.array([4.0, 2.0]) * frame.time - [0.0, 9.81 * frame.time**2 / 2]
+    error = np.abs(ball - [0.4, 0.6] - flown).max() / np.linalg.norm(flown)
+    last = result.frame(len(result.times) - 1)
+    places = [last.position[last.body == k, 0].mean(dtype=np.float64) for k in range(5)]
+    return f"flight of the ball {percent(error)} off; the blocks end {max(places) - min(places):.2f} m apart"
+
+
 def couette_2d(result: Result) -> str:
     """Compare the velocity with the series at four times: see `mpmcli.validation.cases.channel`."""
     width, speed, viscosity, n = 0.1, 0.1, 0.01, np.arange(1, 100)
@@ -317,6 +328,7 @@ KNOWN_ANSWERS = {
     "block_slide_2d": block_slide_2d,
     "couette_2d": couette_2d,
     "rubber_bounce_2d": rubber_bounce_2d,
+    "stack_2d": stack_2d,
     "snowball_wall_2d": snowball_wall,
     "snowball_wall_3d": snowball_wall,
     "sand_column_2d": sand_column_2d,

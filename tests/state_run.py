@@ -35,10 +35,11 @@ SCENES = {name: ((name,), 2, {}) for name in MATERIALS} | {
     "several bodies, FLIP": (("fluid", "fluid"), 2, {"solver": {"transfer": "aflip", "flip": 0.9}}),
     "total": (("neo_hookean", "neo_hookean"), 2, {"solver": {"solids": "total"}}),
     "forces": (("fluid", "neo_hookean"), 2, {"forces": [{"acceleration": ["3*sin(20*t) - 5*x", "2*X"]}]}),
+    "contact": (("neo_hookean", "neo_hookean"), 2, {"contact": {"default": "separate", "friction": 0.3}}),
 }
 NAMES = tuple(SCENES)
 # Scenes that are loaded into another run, too.
-TWICE = ("snow", "several bodies, FLIP", "forces")
+TWICE = ("snow", "several bodies, FLIP", "forces", "contact")
 
 
 def laws_in(name: str) -> set[str]:
@@ -50,8 +51,8 @@ def scene_named(name: str) -> Scene:
     """Return blocks that fall side by side onto a floor, fast enough to meet it within the run."""
     materials, d, more = SCENES[name]
     width = 0.8 / len(materials)
-    # Bodies on grids of their own begin apart, and fly at each other.
-    total = "solids" in more.get("solver", {})
+    # Bodies that meet where they are begin apart, and fly at each other.
+    total = "solids" in more.get("solver", {}) or "contact" in more
     bodies = [
         {
             "name": f"body {k}",

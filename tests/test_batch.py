@@ -46,6 +46,7 @@ SCENES = (
         ),
         "colliders": (("sand",), 2, {"colliders": True}),
         "colliders, 3D": (("neo_hookean",), 3, {"colliders": True}),
+        "contact": (("neo_hookean", "fixed_corotated", "fluid", "snow"), 2, {"contact": 0.3}),
         "slip and stick": (("sand",), 2, {"domain": {"walls": {"default": "slip", "y_min": "stick"}}}),
     }
     | dict.fromkeys(DRIVEN)
@@ -128,6 +129,8 @@ def scene_named(name: str, other: bool = False) -> Scene:
         "forces": [{"acceleration": a} | ({"body": body} if body else {}) for body, a in forces],
         "solver": more.get("solver", {}),
     }
+    if "contact" in more:
+        data["contact"] = {"default": "separate", "friction": more["contact"] + 0.1 * other}
     scene = parse_scene(data, laws=parameter_models(), source=name).scene
     # They stand in the material, where they meet it at once.
     return with_colliders(scene, colliders(d, 1 + other) if more.get("colliders") else [])

@@ -51,6 +51,7 @@ def test_these_are_the_scenes():
         "silo_3d",
         "snowball_wall_2d",
         "snowball_wall_3d",
+        "stack_2d",
         "stirred_tank_2d",
     ]
 

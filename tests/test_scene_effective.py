@@ -162,6 +162,10 @@ bulk_viscosity = 0.0
 tension_cutoff = true
 volume_correction = true
 
+[contact]
+default = "stick"
+friction = 0.0
+
 [output]
 fields = ["velocity", "density", "pressure"]
 drop_retired = false

@@ -18,8 +18,8 @@ from mpmcli.solver.engine.build import build_run
 RUN = Path(state_run.__file__)
 
 
-# The scenes of the default suite: two laws, forces and expressions; two bodies that collide.
-USUAL = ("total", "forces")
+# The scenes of the default suite: two laws, forces and expressions; two bodies that collide, in both ways.
+USUAL = ("total", "forces", "contact")
 
 
 @pytest.mark.parametrize(

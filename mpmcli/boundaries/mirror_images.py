@@ -49,6 +49,14 @@ class MirrorImages:
         images.walls = self.walls.along(axes)
         return images
 
+    def in_layer(self, layer: object) -> "MirrorImages":
+        """Return the images of a layer of nodes, each of which presses on walls and rubs on its own."""
+        images = copy(self)
+        images.walls = copy(self.walls)
+        images.walls.first_plane = self.walls.first_plane + layer * len(self.walls.separating)
+        images.walls.first_rough = self.walls.first_rough + layer * len(self.walls.rough)
+        return images
+
     @property
     def kinds(self) -> tuple["MirrorImages", ...]:
         """The kinds of nodes, see `kind`: for each axis those near its walls alone, which are most, and all others."""

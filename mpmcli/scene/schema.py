@@ -347,6 +347,18 @@ def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:
     return fields
 
 
+class Contact(Table):
+    """What bodies do to each other where they meet."""
+
+    default: Literal["stick", "separate"] = Field(
+        "stick",
+        description='"stick": bodies share one velocity field, meet up to two cells before they touch, and do not '
+        'slide. "separate": each elastic body has a velocity field of its own; they meet where their surfaces are, '
+        "slide with friction, and part. Liquids, grains and bodies that yield stick to all others.",
+    )
+    friction: NotNegative = Field(0.0, description='Coefficient of Coulomb friction between bodies that "separate".')
+
+
 class Output(Table):
     """What is stored of each particle, besides its position, body and material."""
 
@@ -382,6 +394,7 @@ class Scene(Table):
     impulses: tuple[Impulse, ...] = Field(
         (), description="Pushes on what is near a place, at a time or over an interval."
     )
+    contact: Contact = Field(Contact(), description="What bodies do to each other. Default: they stick.")
     output: Output = Field(Output(), description="What is stored.")
     solver: SolverSettings = Field(SolverSettings(), description="How it is computed.")
 

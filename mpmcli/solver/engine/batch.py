@@ -15,6 +15,7 @@ from mpmcli.boundaries.mirror_images import MirrorImages
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls, faces_on_grid
 from mpmcli.errors import InputError, RunError
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.contact.body_contact import BodyContact
 from mpmcli.solver.drive.forces import DriveValues, Gravity, push_on
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.cpu_launch import CpuLaunch
@@ -103,6 +104,7 @@ class Batch:
                 averaged=shares,
                 slips=slips_in(kind.settings, kind.rough),
                 comes_and_goes=kind.inflow.any,
+                layers=kind.layers.count,
             )
             for law, shares, room, bodies, forces in zip(
                 kind.members, averaged, kind.particles, kind.bodies, kind.drives.forces, strict=True
@@ -117,7 +119,7 @@ class Batch:
             group.repeat(period)
         friction, moving = RoughFaces(kind.rough, runs), MovingFaces(kind.moving, d, runs)
         faces = faces_on_grid(kind.faces, kind.settings)
-        walls = Walls(faces, PAD, grid.cells, grid.shape, runs, friction, moving)
+        walls = Walls(faces, PAD, grid.cells, grid.shape, runs * grid.layers, friction, moving)
         images = MirrorImages(walls, scheme.spline.on_node, on_cpu=on_cpu)
         if deterministic:
             grid.fixed = FixedPoint(grid, groups, backend.arch)
@@ -147,6 +149,7 @@ class Batch:
             colliders,
             motion,
             Emission(kind.inflow, d, runs) if kind.inflow.groups else None,
+            BodyContact(groups, orders, grid, kind.layers, runs, backend.threads) if grid.layers > 1 else None,
             ti.field(int, shape=(2 * runs, d)) if on_cpu else None,
             sorts,
         )
@@ -197,6 +200,7 @@ class Batch:
             period=period,
             opens=kind.inflow.opens,
             deterministic=deterministic,
+            layers=kind.layers.count,
             **sparse,
         )
         if kind.fine:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from mpmcli.scene import BodyParticles, Scene, estimate_particles, sample_bodies
+from mpmcli.solver.contact.layers import require_contact_possible
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.run import Run
@@ -66,5 +67,6 @@ def build_run(
     Raises:
         InputError: a particle is not in the domain, or the backend cannot compute the scene.
     """
+    require_contact_possible(scene, backend)
     particles = particles or sample_bodies(scene)
     return Run(Batch(CompiledKind.of(scene, particles).roomy(), backend), 0, scene, particles, force=force)

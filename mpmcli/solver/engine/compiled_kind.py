@@ -9,6 +9,7 @@ from mpmcli.materials.law import Law
 from mpmcli.materials.registry import laws
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.scene.schema import SolverSettings
+from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.drive.forces import Drives
 from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.plan import members_of
@@ -35,6 +36,7 @@ class CompiledKind:
         colliders: their forms, and which of them move.
         drives: gravity that varies, forces, and motions of colliders.
         inflow: what lets particles come and go.
+        layers: of nodes, for bodies with velocity fields of their own.
         members: the laws.
     """
 
@@ -55,6 +57,7 @@ class CompiledKind:
     colliders: ColliderKind
     drives: Drives
     inflow: Inflow
+    layers: Layers
     members: tuple[Law, ...] = field(compare=False, repr=False)
 
     @staticmethod
@@ -84,6 +87,7 @@ class CompiledKind:
             ColliderKind.of(scene),
             Drives.of(scene, places)[0],
             Inflow.of(scene, names),
+            Layers.of(scene),
             members,
         )
 

@@ -202,8 +202,10 @@ class CpuLaunch:
         low = ti.Vector([2**30] * self.dimension)
         high = ti.Vector([-1] * self.dimension)
         self.emission.count_active(w, counts)
+        if ti.static(self.phases.separates):
+            self.device.contact.surfaces.forget(w)
         h, inverse, scale, box, last, extent = self.phases.view_numbers(w, numbers, counts)
-        _grid, _nodes, _particles, orders, _groups = ti.static(
+        _grid, _nodes, _particles, orders, groups = ti.static(
             views(self.device, w, h, inverse, scale, box, last, extent)
         )
         if ti.static(self.device.particles.touches):
@@ -213,6 +215,9 @@ class CpuLaunch:
             for p in range(first, first + own):
                 base = orders[g].first_node_of(p)
                 low, high = ti.min(low, base), ti.max(high, base)
+                if ti.static(self.phases.separates):
+                    layer = w * ti.static(self.device.grid.layers) + groups[g].layer_of(p)
+                    self.device.contact.surfaces.widen(layer, base)
             if ti.static(self.phases.shared):
                 self.phases.places.divide(g, own)
         if ti.static(self.device.comes_and_goes):
@@ -234,6 +239,11 @@ class CpuLaunch:
             first, last = box_of(self.device.grid, a, low, high, drift, last_wall)
             self.device.grid.box[w * 2, a] = first
             self.device.grid.box[w * 2 + 1, a] = last - first + 1
+        if ti.static(self.phases.separates):
+            walls = ti.Vector.zero(int, self.dimension)
+            for a in ti.static(range(self.dimension)):
+                walls[a] = PAD + counts[w, self.count.cells[a]]
+            self.device.contact.surfaces.find_box(self.device.grid, w, drift, walls)
         if ti.static(self.phases.shared and not self.device.grid.sparse):
             self.phases.places.divide_rows()
 

@@ -7,16 +7,16 @@ own for Taichi as well (`ti.real_func`). Such a function knows nothing of its ca
 asks for the numbers of the run anew.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 from mpmcli.boundaries.mirror_images import find_friction
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.engine.cpu_contact import CpuContact
+from mpmcli.solver.engine.cpu_parts import KICK, MOVED, RELAXED, SPEED, VECTORS, Part, PartKind
 from mpmcli.solver.engine.cpu_regions import CpuRegions
 from mpmcli.solver.engine.device import Device, views
 from mpmcli.solver.engine.phases import Phase, sorted_fields
 from mpmcli.solver.engine.run_numbers import Layout
 from mpmcli.solver.frames.reader import show_range
+from mpmcli.solver.grid.grid import clear_blocks, clear_rows
 from mpmcli.solver.grid.sparse_grid import BLOCKS, PENCILS
 from mpmcli.solver.particles.sort import count_tiles, keep_all, place_particles, scratch_offset, share_start, take_all
 from mpmcli.solver.particles.state_bounds import NOTHING
@@ -24,8 +24,6 @@ from mpmcli.solver.transfer.cpu_transfers import (
     advance_range,
     advance_tiles,
     average_pencils,
-    clear_blocks,
-    clear_rows,
     scatter_pencils,
     scatter_range,
     update_blocks,
@@ -41,48 +39,10 @@ RunInts = ti.types.ndarray(ti.i32, 2)
 Shown = ti.types.ndarray(ndim=2)
 # Parts of a loop over the particles or the nodes of a region; on a sparse grid, where parts are whole pencils.
 SHARES, SPARSE_SHARES = 4, 16
-# Numbers of a step: its size and its kick, s, the time over which volumes relax, s, and the largest speed squared.
-MOVED, KICK, RELAXED, SPEED, VECTORS = range(5)
-
-
-class PartKind(NamedTuple):
-    """The parts of some phases that have one body.
-
-    name: of the phases; group: number of the group of particles. first, after: number of the first phase, and the
-    one after the last. body: name of the method. item: what that does for each node or particle, where it says nothing.
-    """
-
-    name: str
-    group: int
-    first: int
-    after: int
-    body: str
-    item: Callable | None
-
-
-class Part:
-    """A part that a thread does, with the view that its run has of the device.
-
-    Attributes:
-        grid, nodes, particles, order, group: see `views`; the last two are those of a group of particles.
-        item: what is done for each node or particle; atomic: whether sums need atomics, False.
-        g: number of the group; w: of the run; turn: of the phase among those of its kind.
-        region, part: of the part; t: of the thread.
-        numbers, counts, shown: see `Batch`.
-    """
-
-    atomic = False
-
-    def __init__(self, run: tuple, kind: PartKind, *variables: object) -> None:
-        """Keep a view, and variables of a kernel."""
-        g, self.item = kind.group, kind.item
-        self.grid, self.nodes, self.particles, orders, groups = run
-        self.g, self.group, self.order = g, groups[g], orders[g] if orders else None
-        self.w, self.turn, self.region, self.part, self.t, self.numbers, self.counts, self.shown = variables
 
 
 @ti.data_oriented
-class CpuPhases:
+class CpuPhases(CpuContact):
     """The phases of the runs of a batch, w being the number of a run, region and part those of a part.
 
     A step begins with `first_of_step`, a sort with `sorts`, the end of what comes before a frame is `showing`.
@@ -109,7 +69,7 @@ class CpuPhases:
         self.rates = VECTORS + self.dimension
         self.values = ti.field(float, shape=(device.runs, self.rates + 2 * len(device.groups)))
         self.colours = device.orders[0].colours
-        self.moves = device.motion is not None
+        self.moves, self.separates = device.motion is not None, device.contact is not None
         # What has come in since the sort follows all colours, on one thread.
         self.passes = self.colours + device.comes_and_goes
         self.kinds: tuple[PartKind, ...] = ()
@@ -279,7 +239,7 @@ class CpuPhases:
         last_axis = ti.static(self.dimension - 1)
         for row in range(first, after):
             node = at.grid.row_start(row)
-            for _ in range(at.grid.row_length()):
+            for _ in range(at.grid.row_length(node)):
                 ti.static(at.item)(at, node, self.values[at.w, RELAXED])
                 node[last_axis] += 1
 
@@ -315,7 +275,15 @@ class CpuPhases:
         else:
             first, after = self.places.rows_of(at.grid, at.region)
             first, after = self.share(first, after, at.part)
-            clear_rows(at.grid, first, after)
+            for layer in range(at.grid.layers):
+                own = self.used_by(at, layer)
+                (inner,) = ti.static((at.in_layer(layer, own),))
+                clear_rows(inner.grid, first, after)
+            if ti.static(self.separates):
+                box = self.near_bodies(at)
+                (near,) = ti.static((at.grid.within(box),))
+                first, after = self.rows_near_bodies(near, at)
+                self.device.contact.surfaces.clear_rows(near, at.w, first, after)
 
     @ti.func
     def pencils(self, order: ti.template(), colour: int, region: int, part: int):
@@ -379,19 +347,27 @@ class CpuPhases:
     def find_contact(self, at: ti.template()):
         """Find where walls that let go are pressed."""
         gravity_step = self.gravity_step(at.w)
-        first, after = self.places.even_part(at.nodes.images.plane_nodes(at.grid), at.region)
-        first, after = self.share(first, after, at.part)
-        for q in range(first, after):
-            at.nodes.images.find_contact(at.grid, q, gravity_step)
+        for layer in range(at.grid.layers):
+            own = self.used_by(at, layer)
+            (inner,) = ti.static((at.in_layer(layer, own),))
+            (grid,) = ti.static((inner.grid.within(own) if at.grid.layers > 1 else at.grid,))
+            first, after = self.places.even_part(inner.nodes.images.plane_nodes(grid), at.region)
+            first, after = self.share(first, after, at.part)
+            for q in range(first, after):
+                inner.nodes.images.find_contact(grid, q, gravity_step)
 
     @ti.func
     def find_friction(self, at: ti.template()):
         """Find the friction of walls."""
         gravity_step = self.gravity_step(at.w)
-        first, after = self.places.even_part(at.nodes.images.plane_nodes(at.grid), at.region)
-        first, after = self.share(first, after, at.part)
-        for q in range(first, after):
-            find_friction(at.nodes.images, at.grid, q, gravity_step)
+        for layer in range(at.grid.layers):
+            own = self.used_by(at, layer)
+            (inner,) = ti.static((at.in_layer(layer, own),))
+            (grid,) = ti.static((inner.grid.within(own) if at.grid.layers > 1 else at.grid,))
+            first, after = self.places.even_part(inner.nodes.images.plane_nodes(grid), at.region)
+            first, after = self.share(first, after, at.part)
+            for q in range(first, after):
+                find_friction(inner.nodes.images, grid, q, gravity_step)
 
     @ti.func
     def update(self, at: ti.template()):
@@ -405,7 +381,10 @@ class CpuPhases:
         else:
             first, after = self.places.rows_of(at.grid, at.region)
             first, after = self.share(first, after, at.part)
-            ti.atomic_max(self.values[at.w, SPEED], update_rows(at, first, after, self.gravity_step(at.w)))
+            for layer in range(at.grid.layers):
+                own = self.used_by(at, layer)
+                (inner,) = ti.static((at.in_layer(layer, own),))
+                ti.atomic_max(self.values[at.w, SPEED], update_rows(inner, first, after, self.gravity_step(at.w)))
 
     @ti.func
     def advance(self, at: ti.template()):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from mpmcli.boundaries.colliders import ColliderMotion, Colliders
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.contact.body_contact import BodyContact
 from mpmcli.solver.drive.forces import DriveValues, Gravity
 from mpmcli.solver.engine.phases import Phase, step_phases
 from mpmcli.solver.grid.grid import Grid
@@ -28,6 +29,7 @@ class Device:
         colliders, motion: those of each run, and how they move; None where there are none.
         values, gravity: numbers that expressions read, and gravity where it varies.
         emission: the mouths of emitters, None where there are none.
+        contact: of bodies with layers of nodes of their own, None where all share one.
         stencils: (2 runs, d) int, of each run the first and the last node per axis at which a stencil began when
             particles were sorted; None on a GPU.
         sorts: whether particles are sorted; several small runs on a GPU use all nodes of their domains instead.
@@ -49,6 +51,7 @@ class Device:
     colliders: Colliders | None = None
     motion: ColliderMotion | None = None
     emission: Emission | None = None
+    contact: BodyContact | None = None
     stencils: ti.Field | None = None
     sorts: bool = True
 
@@ -68,6 +71,7 @@ class Device:
             deterministic=self.grid.deterministic,
             loads=self.grid.deterministic and self.nodes.collides,
             shifts=self.grid.dimension if self.grid.fine else 0,
+            layers=self.grid.layers,
         )
 
 
@@ -95,14 +99,14 @@ def views(
         inverse_spacing=inverse,
         gradient_scale=scale,
         box=box,
-        first_node=w * device.grid.node_count,
+        first_node=w * (device.grid.layers * device.grid.node_count),
         period=device.grid.period.seen_from(w),
     )
     friction = _changed(device.friction, first=w * len(device.friction.faces))
     moving = _changed(device.moving, first=w * len(device.moving.faces))
     walls = _changed(device.walls, last=last, friction=friction, moving=moving)
-    walls.first_plane = w * len(walls.separating)
-    walls.first_rough = w * len(walls.rough)
+    walls.first_plane = w * (device.grid.layers * len(walls.separating))
+    walls.first_rough = w * (device.grid.layers * len(walls.rough))
     images = _changed(device.nodes.images, walls=walls)
     colliders = device.colliders
     if colliders is not None:

@@ -27,7 +27,7 @@ class CpuEmission:
 
     def __init__(self, device: Device, layout: Layout, stencils: ti.Field) -> None:
         """Prepare; `stencils` has of each run and axis the first and the last node at which a stencil began."""
-        self.stencils = stencils
+        self.stencils, self.separates = stencils, device.contact is not None
         self.device, self.real, self.count = device, layout.real, layout.count
         self.emission = device.emission
         self.needed = device.emission is not None
@@ -79,6 +79,9 @@ class CpuEmission:
         for a in ti.static(range(self.device.grid.dimension)):
             self.stencils[w * 2, a] = ti.min(self.stencils[w * 2, a], base[a])
             self.stencils[w * 2 + 1, a] = ti.max(self.stencils[w * 2 + 1, a], base[a])
+        if ti.static(self.separates):
+            # What comes in is in layer 0.
+            self.device.contact.surfaces.widen(w * ti.static(self.device.grid.layers), base)
 
     @ti.func
     def is_left(self, e: ti.template(), w: int, numbers: ti.template(), counts: ti.template()):

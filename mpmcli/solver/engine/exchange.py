@@ -40,7 +40,8 @@ def write_constants(batch: Batch, slot: int, scene: Scene, counts: Sequence[int]
     slot: place of the run; counts: particles of each source.
     """
     h, device = scene.domain.spacing, batch.device
-    for data in (device.friction, device.moving, device.grid.period, device.colliders, device.motion):
+    walls, colliders = (device.friction, device.moving, device.grid.period), (device.colliders, device.motion)
+    for data in (*walls, *colliders, device.contact):
         if data is not None:
             data.write(scene, slot)
     numbers, row_counts, real, count = batch.numbers[slot], batch.counts[slot], batch.layout.real, batch.layout.count

@@ -8,6 +8,8 @@ from mpmcli.errors import InputError
 from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import BodyParticles, Scene
+from mpmcli.solver.contact.layers import Layers
+from mpmcli.solver.contact.surfaces import rest_surface
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.machine.plan import members_of
 from mpmcli.solver.particles.state_bounds import floor_of
@@ -23,17 +25,22 @@ def table_of(law: Law, particles: Sequence[BodyParticles]) -> np.ndarray:
 
 
 def initial_states(
-    law: Law, particles: Sequence[BodyParticles], first_ids: Sequence[int], origin: np.ndarray
+    law: Law,
+    particles: Sequence[BodyParticles],
+    first_ids: Sequence[int],
+    origin: np.ndarray,
+    surfaces: Sequence[np.ndarray],
 ) -> Iterator[tuple[int, dict[str, np.ndarray], np.ndarray]]:
     """Yield the particles of some bodies, PART at a time, which bounds the memory.
 
-    first_ids: id of the first particle of each body; origin: of the domain, (d,), m. Yields the number of those before,
-    and what `ParticleArrays.write` takes; its rows count from the first body.
+    first_ids: id of the first particle of each body; origin: of the domain, (d,), m; surfaces: what the particles of
+    each body carry, see `rest_surface`, empty where they carry nothing. Yields the number of those before, and what
+    `ParticleArrays.write` takes; its rows count from the first body.
     """
     rest = np.ones(1) if law.deformation == "J" else np.eye(len(origin))[None]
     at_rest = [float(variable.at_rest) for variable in law.internal]
     before = 0
-    for place, (body, first_id) in enumerate(zip(particles, first_ids, strict=True)):
+    for place, (body, first_id, surface) in enumerate(zip(particles, first_ids, surfaces, strict=True)):
         count = len(body.position)
         for first in range(0, count, PART):
             own = slice(first, min(first + PART, count))
@@ -48,6 +55,7 @@ def initial_states(
                 "internal": np.tile(at_rest, (n, 1)),
                 "id": first_id + np.arange(first, own.stop),
                 "activity": 0 if body.waits else 1,
+                "surface": surface[own],
             }
             yield before + first, found, np.full(n, place)
         before += count
@@ -118,18 +126,20 @@ class RunGroup:
         whole[self.first : self.first + self.count] = values
         field.from_numpy(whole)
 
-    def fill(self, states: Iterable[tuple[int, Mapping[str, np.ndarray], np.ndarray]]) -> None:
-        """Fill the device with particles, see `initial_states`."""
+    def fill(self, states: Iterable[tuple[int, Mapping[str, np.ndarray], np.ndarray]], layers: Layers) -> None:
+        """Fill the device with particles, see `initial_states`, in the layers of their bodies."""
         for first, found, row in states:
             self.arrays.write(self.first + first, found, self.row + row)
         for i, row in enumerate(self.rows):
             self.arrays.table[self.row + i] = row.tolist()
+        for i, body in enumerate(self.bodies if self.arrays.layers > 1 else ()):
+            self.arrays.layer[self.row + i] = layers.numbers[body]
 
 
 def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyParticles]) -> list[RunGroup]:
     """Put the particles of a run, one entry per source, on the device; return its groups, one for each law."""
     first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
-    lost, groups = batch.device.particles.lost, []
+    lost, groups, layers = batch.device.particles.lost, [], Layers.of(scene)
     counts, count_of = batch.counts[slot], batch.layout.count
     for g, shared in enumerate(batch.kind.members):
         bodies = members_of(scene, shared.name)
@@ -139,7 +149,14 @@ def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyPar
         counts[count_of.particles[g]] = sum(len(b.position) for b in own if not b.waits)
         counts[count_of.capacity[g]] = group.count
         group.floor = floor_of(scene, law, bodies)
-        group.fill(initial_states(law, own, [int(first_ids[i]) for i in bodies], np.array(scene.domain.origin)))
+        surfaces = [
+            rest_surface(scene.sources[i], particles[i], scene.domain.spacing if layers.has_own(i) else None)
+            if group.arrays.surfaced
+            else np.empty(0)
+            for i in bodies
+        ]
+        first, origin = [int(first_ids[i]) for i in bodies], np.array(scene.domain.origin)
+        group.fill(initial_states(law, own, first, origin, surfaces), layers)
         groups.append(group)
         if lost[slot * len(batch.kind.members) + g] != NOT_LOST:
             lost[slot * len(batch.kind.members) + g] = NOT_LOST

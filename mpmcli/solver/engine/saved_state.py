@@ -171,6 +171,8 @@ def _fields(batch: Batch) -> dict[str, ti.Field]:
         found["colliders.taken"] = device.colliders.taken
     if device.motion is not None:
         found["colliders.pose"] = device.motion.pose
+    if device.contact is not None:
+        found |= {"layers.low": device.contact.surfaces.low, "layers.high": device.contact.surfaces.high}
     return found | ({} if device.particles.contact is None else device.particles.contact.fields())
 
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 
@@ -40,7 +41,7 @@ def node_width(dimension: int, *, on_cpu: bool) -> int:
 class LinearNodes:
     """Nodes of a box addressed by one linear index, with `strides` per axis; `first_node` is that of node 0."""
 
-    sparse = False
+    sparse, layers = False, 1
     dimension: int
     strides: tuple[int, ...]
     first_node: int
@@ -74,6 +75,7 @@ class Grid(LinearNodes):
         tile: edge of a tile, cells; tiles: per axis; tile_count: of all of them.
         shape: nodes per axis, margins included, a multiple of `tile`.
         planes: of a stencil, normal to the first axis, 1 in 2D; runs: whose nodes it has, one after the other.
+        layers: of nodes of a run, one after the other, each with a velocity field; layer 0 where bodies share one.
         width: numbers per node.
         nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update; from number `kept`
             on the same of the shares that bodies keep, without stress and forces of this step, in schemes that do so.
@@ -88,8 +90,11 @@ class Grid(LinearNodes):
         fixed: sums in fixed point, from which `FixedPoint.settle` sets the fields; None where P2G adds to these itself.
             deterministic: whether there are such sums; then there are no `means`.
         fine: the grid by which particles are shifted (`redistribution.FineGrid`), None where they are not.
-        box: (2, d) ints: first node in use and number of nodes in use, per axis.
+        box: (2, d) ints: first node in use and number of nodes in use, per axis. own: the same of a layer, whose rows
+            are those of the box; None where it has the box of all, and is not `narrow`.
     """
+
+    own, narrow = None, False
 
     def __init__(
         self,
@@ -106,6 +111,7 @@ class Grid(LinearNodes):
         period: Period,
         opens: Sequence[tuple[int, int]],
         deterministic: bool,
+        layers: int = 1,
     ) -> None:
         """Allocate nodes for a number of runs; `averaged` says of each group whether it averages volumes over cells."""
         self.dimension, self.kept = dimension, width
@@ -121,7 +127,8 @@ class Grid(LinearNodes):
         self.planes = scheme.spline.nodes if dimension == 3 else 1
         self.runs, self.opens, self.first_node = runs, tuple(opens), 0
         self.node_count = self.stored_nodes()
-        count = runs * self.node_count
+        self.layers = layers
+        count = runs * layers * self.node_count
         self.nodes = ti.Vector.field(self.width, float, shape=count)
         self.keeps_filling = keeps_filling
         self.filling = ti.Vector.field(width, float, shape=count) if keeps_filling else None
@@ -133,6 +140,18 @@ class Grid(LinearNodes):
         self.period = period
         self.deterministic, self.fixed, self.fine = deterministic, None, None
         self.box = ti.field(int, shape=(2 * runs, dimension))
+
+    def in_layer(self, layer: object, own: object) -> "Grid":
+        """Return the view of a layer, by its number and what it has in use, variables of a kernel."""
+        view = copy(self)
+        view.first_node, view.own, view.narrow = self.first_node + layer * self.node_count, own, True
+        return view
+
+    def within(self, box: object) -> "Grid":
+        """Return the view in which a smaller box is in use, a variable of a kernel."""
+        view = copy(self)
+        view.box = box
+        return view
 
     def stored_nodes(self) -> int:
         """Return the number of nodes of a run that memory is allocated for."""
@@ -209,12 +228,23 @@ class Grid(LinearNodes):
             a = ti.static(self.dimension - 2 - b)
             start[a] = self.box[0, a] + rest % self.box[1, a]
             rest = rest // self.box[1, a]
-        start[ti.static(self.dimension - 1)] = self.box[0, ti.static(self.dimension - 1)]
+        last = ti.static(self.dimension - 1)
+        start[last] = self.box[0, last]
+        if ti.static(self.narrow):
+            start[last] = self.own[0, last]
         return start
 
     @ti.func
-    def row_length(self):
-        return self.box[1, ti.static(self.dimension - 1)]
+    def row_length(self, start: ti.template()):
+        """Return the number of nodes in use of a row, by the first of them."""
+        last = ti.static(self.dimension - 1)
+        length = self.box[1, last]
+        if ti.static(self.narrow):
+            length = self.own[1, last]
+            for a in ti.static(range(last)):
+                if start[a] < self.own[0, a] or start[a] >= self.own[0, a] + self.own[1, a]:
+                    length = 0
+        return length
 
     @ti.func
     def box_nodes(self):
@@ -252,3 +282,18 @@ def box_of(grid: ti.template(), axis: ti.template(), low: int, high: int, drift:
         elif last >= last_wall - REACH:
             last = last_wall + REACH
     return first, last
+
+
+@ti.func
+def clear_rows(grid: ti.template(), first: int, last: int):
+    for row in range(first, last):
+        start = grid.row_start(row)
+        node = grid.linear_index(start)
+        for k in range(grid.row_length(start)):
+            grid.clear(node + k)
+
+
+@ti.func
+def clear_blocks(grid: ti.template(), first: int, after: int):
+    for node in range(first * ti.static(grid.block), after * ti.static(grid.block)):
+        grid.clear(node)

@@ -267,7 +267,7 @@ class SparseGrid(BlockNodes, Grid):
         return self.place_of(ti.static(self.block) + row * ti.static(self.tile))
 
     @ti.func
-    def row_length(self):
+    def row_length(self, _start: ti.template()):
         return self.tile
 
     @ti.func

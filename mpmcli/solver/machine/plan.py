@@ -17,6 +17,7 @@ from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body, has_expressions
 from mpmcli.scene.sheets import sheets_of
+from mpmcli.solver.contact.layers import Layers, require_contact_possible
 from mpmcli.solver.drive.forces import forces_on, needs_initial
 from mpmcli.solver.engine.phases import step_phases
 from mpmcli.solver.frames.columns import FrameColumns
@@ -74,6 +75,8 @@ WORDS = {
     "average": "average volumes of {}",
     "scatter": "scatter {}",
     "settle": "read sums in fixed point",
+    "find_bodies": "find bodies that meet",
+    "exchange": "let bodies push each other",
     "find_contact": "find contact",
     "find_friction": "find friction",
     "book_loads": "add up loads",
@@ -165,6 +168,7 @@ def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = Fal
         friction=bool(_rough_axes(scene)),
         deterministic=deterministic,
         loads=deterministic and bool(scene.colliders),
+        layers=Layers.of(scene).count,
     )
     forces = [" with forces" * bool(forces_on(scene, members_of(scene, law.name))) for law in members]
     words = WORDS | {"update": "update grid" + " with colliders" * bool(scene.colliders)}
@@ -195,6 +199,8 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         laws()[name]([scene.sources[i].material for i in members_of(scene, name)], dimension) for name in sorted(bodies)
     ]
     averaged = [averages_volume(scene.solver, law) for law in members]
+    require_contact_possible(scene, backend)
+    layers = Layers.of(scene).count
     groups = tuple(
         LawPlan(
             name,
@@ -209,6 +215,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 total=scene.solver.solids == "total",
                 slips=slips_in(scene.solver, rough_faces(scene)),
                 comes_and_goes=scene.comes_and_goes,
+                surfaced=layers > 1 and laws()[name].elastic,
             ),
         )
         for name, shares in zip(sorted(bodies), averaged, strict=True)
@@ -233,11 +240,13 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         node_bytes += FixedPoint.bytes_needed(numbers, shared) + FixedPoint.bytes_needed(1, 0) * fine
         # In their place.
         node_bytes -= real * 3 * shared
+    # In each layer, and where bodies meet.
+    node_bytes = layers * node_bytes + (layers > 1) * (8 + 4 * len(groups))
     all_tiles, bins = all_nodes // tile**dimension, 0
     tables = len(groups) * TileOrder.bytes_needed(blocks if sparse else all_tiles, backend.threads)
     if sparse:
         tables += SparseGrid.table_bytes(all_tiles, blocks, dimension)
-    tables += _contact_bytes(scene, all_nodes, tile, Grid.tile_counts(cells, tile), real)
+    tables += layers * _contact_bytes(scene, all_nodes, tile, Grid.tile_counts(cells, tile), real)
     if scene.solver.solids == "total" and len(scene.sources) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(map(in_steps, counts.values())))
         bins = 2 * math.prod(bins_along(cells))
@@ -251,7 +260,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     shown = sum(map(in_steps, counts.values())) * frame_columns(scene, members)
     sorted_entries = max(map(in_steps, counts.values())) * max(len(groups), widest // real)
     counted = (blocks if sparse else all_tiles) * backend.threads
-    entries = max(nodes * max(fine, 1), all_tiles, bins, shown, sorted_entries, counted)
+    entries = max(nodes * max(fine, layers), all_tiles, bins, shown, sorted_entries, counted)
     return Plan(groups, nodes, widest + 8, node_bytes, grid_bytes, host_bytes, passes, backend.arch, sparse, entries)
 
 

@@ -33,6 +33,7 @@ def particle_fields(
     total: bool = False,
     slips: bool = False,
     comes_and_goes: bool = False,
+    surfaced: bool = False,
 ) -> dict[str, tuple[type, int, int]]:
     """Return the fields of particles by name: float or int, rows and columns; options as of `ParticleArrays`."""
     d = dimension
@@ -48,6 +49,7 @@ def particle_fields(
     fields |= {"volume_to_mean": (float, 1, 1), "cell": (int, 1, 1)} if averaged else {}
     fields |= {"volume_growth": (float, 1, 1)} if averaged and not total else {}
     fields |= {"slip": (float, d, 1)} if slips else {}
+    fields |= {"surface": (float, d + 1, 1)} if surfaced else {}
     fields |= {"id": (int, 1, 1)} | ({"body": (int, 1, 1)} if several else {})
     return fields | ({"activity": (int, 1, 1)} if comes_and_goes else {})
 
@@ -86,6 +88,9 @@ class ParticleArrays:
             particles change cells they take the mean growth of their cell in G2P.
         slip: how far a particle has slipped on the wall that pushes it, (n) Vector(d), m, where there is friction
             (`slips`), see `reference_grid`.
+        carried: (n) Vector(d + 1), the normal to the nearest face of the body at rest, and the depth below it, m, of
+            groups whose bodies may have layers of their own (`surfaced`), see `contact.surfaces`.
+        layers: of the grid; layer: per row of the table, the layer of nodes of its body.
         activity: (n) int, whether each waits, takes part or has left (`particles.sort`); None where all take part
             always (`comes_and_goes` is false).
         force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
@@ -107,6 +112,7 @@ class ParticleArrays:
         averaged: bool = False,
         slips: bool = False,
         comes_and_goes: bool = False,
+        layers: int = 1,
     ) -> None:
         """Allocate for `count` particles, and a table of these rows and columns."""
         self.law, self.capacity = law, count
@@ -116,6 +122,7 @@ class ParticleArrays:
         self.several, self.serial, self.total, self.averaged = several, serial, total, averaged
         self.keeps_initial, self.evened = keeps_initial or total, averaged and not total
         self.slips, self.comes_and_goes = slips, comes_and_goes
+        self.layers, self.surfaced = layers, layers > 1 and law.elastic
         wanted = particle_fields(
             law.deformation,
             names := [variable.name for variable in law.internal],
@@ -127,12 +134,13 @@ class ParticleArrays:
             total=total,
             slips=slips,
             comes_and_goes=comes_and_goes,
+            surfaced=self.surfaced,
         )
         made = {name: _field(count, *shape) for name, shape in wanted.items()}
         self.x, self.v, self.gradient = made["position"], made["velocity"], made["velocity_gradient"]
         self.displacement_gradient, self.J_minus_1 = made.get("deformation_gradient"), made.get("volume_ratio")
         self.internal = tuple(made[name] for name in names)
-        self.initial, self.slip = made.get("initial_position"), made.get("slip")
+        self.initial, self.slip, self.carried = (made.get(name) for name in ("initial_position", "slip", "surface"))
         self.cell, self.to_mean, self.growth = (made.get(name) for name in ("cell", "volume_to_mean", "volume_growth"))
         self.id, self.body, self.activity = made["id"], made.get("body"), made.get("activity")
         self.pushed, self.force, self.run = False, None, 0
@@ -140,6 +148,7 @@ class ParticleArrays:
         self.period: Period | None = None
         self.table = ti.Vector.field(table[1], float, shape=table[0])
         self.kept = ti.field(float, shape=table[0])
+        self.layer = ti.field(int, shape=table[0]) if layers > 1 else None
         # Taichi lays fields out one after the other: what is read beyond the last particle lies in the next ones.
         self.spare = ti.field(float, shape=SPARE)
 
@@ -162,7 +171,7 @@ class ParticleArrays:
         """Every real field that the sort must move."""
         initial = () if self.initial is None else (self.initial,)
         deformation = self.J_minus_1 if self.displacement_gradient is None else self.displacement_gradient
-        more = tuple(field for field in (self.slip, self.growth) if field is not None)
+        more = tuple(field for field in (self.slip, self.growth, self.carried) if field is not None)
         return (self.x, self.v, self.gradient, deformation, *self.internal, *initial, *more)
 
     @property
@@ -179,6 +188,7 @@ class ParticleArrays:
         """Return every field of the particles that changes during a run or is sorted, by name."""
         names = ["position", "velocity", "velocity_gradient", "deformation", *(v.name for v in self.law.internal)]
         initial = ["initial_position"] * self.keeps_initial + ["slip"] * self.slips + ["volume_growth"] * self.evened
+        initial += ["surface"] * self.surfaced
         labels = ["id"] + ["body"] * (self.body is not None) + ["activity"] * self.comes_and_goes
         return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
 
@@ -217,6 +227,8 @@ class ParticleArrays:
         parts = (found["x"], found["v"], found["C"], found["deformation"] - rest, found["internal"])
         if self.keeps_initial:
             parts = (*parts, found["initial"])
+        if self.surfaced:
+            parts = (*parts, found["surface"])
         reals = np.concatenate([part.reshape(count, -1).astype(self.real) for part in parts], axis=1)
         labels = np.stack([found["id"], row, np.broadcast_to(found.get("activity", 1), count)], axis=1).astype(np.int32)
         self._write(first, np.ascontiguousarray(reals), np.ascontiguousarray(labels))
@@ -285,6 +297,9 @@ class ParticleArrays:
                     self.slip[p][c] = 0.0
             if ti.static(self.evened):
                 self.growth[p] = 0.0
+            if ti.static(self.surfaced):
+                for c in ti.static(range(d + 1)):
+                    self.carried[p][c] = reals[q, reals.shape[1] - ti.static(d + 1) + c]
             self.id[p] = labels[q, 0]
             if ti.static(self.several):
                 self.body[p] = labels[q, 1]
@@ -385,3 +400,11 @@ class ParticleArrays:
         if ti.static(self.several):
             row = self.body[p]
         return row
+
+    @ti.func
+    def layer_of(self, p: int):
+        """Return the layer of nodes of particle p."""
+        layer = 0
+        if ti.static(self.layers > 1):
+            layer = self.layer[self.row_number(p)]
+        return layer

@@ -16,6 +16,7 @@ from mpmcli.solver.transfer.lanes import (
     load_deformation,
     load_entry,
     load_lanes,
+    load_layers,
     load_rows,
     load_vectors,
     matrix_of,
@@ -74,7 +75,7 @@ def scatter_range(
     first_node, weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(nodes * d))
     middles, slopes = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
     keeps = ti.static(grid.scheme.keeps_before)
-    shares = ti.Vector.zero(float, LANES)
+    shares, behind = ti.Vector.zero(float, LANES), ti.Vector.zero(int, LANES)
     if ti.static(not group.several):
         load_rows(group, first, 1, rows)
     begin = first
@@ -92,6 +93,7 @@ def scatter_range(
             repeat_first(x, count)
             repeat_first(v, count)
             repeat_first(here, count)
+        load_layers(behind, grid, group, begin, count)
         more = ti.static(group.averaged or particles.touches or group.slips or group.pushed or keeps)
         for lane in range(ti.static(LANES * more)):
             # What reads more than arrays: lanes beyond the last particle repeat it.
@@ -154,7 +156,7 @@ def scatter_range(
                 C = C @ state
                 stress = pulled_back(stress, state)
             base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
-            first_node[lane] = near.linear_index(base)
+            first_node[lane] = near.linear_index(base) + behind[lane]
             w = grid.scheme.spline.weights(distance)
             for k in ti.static(range(nodes)):
                 for a in ti.static(range(d)):
@@ -250,7 +252,7 @@ def advance_range(
     # Of particles whose body keeps a share of its motion.
     keeps, kept = ti.static((grid.scheme.keeps_before, grid.kept))
     v, affine = zero_lanes(ti.static(d if keeps else 1)), zero_lanes(ti.static(d * d if keeps else 1))
-    shares = ti.Vector.zero(float, LANES)
+    shares, behind = ti.Vector.zero(float, LANES), ti.Vector.zero(int, LANES)
     moments = ti.Matrix.zero(float, LANES, ti.static(d * width))
     speeds, gradients, rates = zero_lanes(d), zero_lanes(ti.static(d * d)), ti.Vector.zero(float, LANES)
     moved, beyond, after = zero_lanes(d), ti.Vector.zero(float, LANES), zero_lanes(ti.static(stored_entries(group)))
@@ -281,10 +283,11 @@ def advance_range(
             repeat_first(x, count)
             repeat_first(here, count)
             repeat_first(deformation, count)
+        load_layers(behind, grid, group, begin, count)
 
         for lane in range(LANES):
             base, distance = grid.scheme.spline.stencil(vector_of(x, 0, d, lane), grid.inverse_spacing)
-            first_node[lane] = near.linear_index(base)
+            first_node[lane] = near.linear_index(base) + behind[lane]
             w = grid.scheme.spline.weights(distance)
             for a in ti.static(range(d)):
                 distances[a, lane] = distance[a]
@@ -399,20 +402,6 @@ def advance_range(
 
 
 @ti.func
-def clear_rows(grid: ti.template(), first: int, last: int):
-    for row in range(first, last):
-        node = grid.linear_index(grid.row_start(row))
-        for k in range(grid.box[1, ti.static(grid.dimension - 1)]):
-            grid.clear(node + k)
-
-
-@ti.func
-def clear_blocks(grid: ti.template(), first: int, after: int):
-    for node in range(first * ti.static(grid.block), after * ti.static(grid.block)):
-        grid.clear(node)
-
-
-@ti.func
 def average_pencils(at: ti.template(), first: int, last: int):
     """Add the particles in pencils first to last - 1 of a colour to their cells."""
     for r in range(first, last):
@@ -470,7 +459,7 @@ def update_rows(at: ti.template(), first: int, last: int, gravity_step: ti.templ
     for row in range(first, last):
         node = at.grid.row_start(row)
         index = at.grid.linear_index(node)
-        for k in range(at.grid.box[1, d - 1]):
+        for k in range(at.grid.row_length(node)):
             squared = at.nodes.update(node, index + k, gravity_step)
             # Not `ti.max`, which takes twice as long for its care of NaN, at every node without mass.
             if squared > speed_squared:

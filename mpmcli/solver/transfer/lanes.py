@@ -110,6 +110,15 @@ def load_rows(group: ti.template(), begin: int, count: int, rows: ti.template())
 
 
 @ti.func
+def load_layers(behind: ti.template(), grid: ti.template(), group: ti.template(), begin: int, count: int):
+    """Find how far behind those of layer 0 the nodes of `count` particles from `begin` on lie."""
+    if ti.static(group.layers > 1):
+        for lane in range(LANES):
+            # What lies beyond the last particle is no row of the table.
+            behind[lane] = group.layer_of(begin + ti.min(lane, count - 1)) * ti.static(grid.node_count)
+
+
+@ti.func
 def matrix_of(lanes: ti.template(), d: ti.template(), lane: int):
     result = ti.Matrix.zero(float, d, d)
     for i, j in ti.static(ti.ndrange(d, d)):

@@ -1,5 +1,7 @@
 """What a step does at the nodes of the grid between P2G and G2P: fold, velocity, constrain, unfold."""
 
+from copy import copy
+
 from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.mirror_images import MirrorImages
 from mpmcli.boundaries.walls import REACH
@@ -20,6 +22,12 @@ class NodeUpdate:
         self.grid, self.dimension, self.images = grid, grid.dimension, images
         self.needs_contact, self.needs_friction = images.needs_contact, images.needs_friction
         self.collides, self.colliders = colliders is not None, colliders
+
+    def in_layer(self, grid: Grid, layer: object) -> "NodeUpdate":
+        """Return the update of a layer of nodes, by its number, a variable of a kernel."""
+        view = copy(self)
+        view.grid, view.images = grid, self.images.in_layer(layer)
+        return view
 
     @ti.func
     def update(self, node: ti.template(), index: int, gravity_step: ti.template()):

@@ -54,7 +54,7 @@ def add_linear(
 @ti.func
 def origin_of(first: ti.template(), grid: ti.template()):
     """Return `stencil_at` the first node of a stencil, `bounded` where a dense grid has few enough nodes."""
-    if ti.static(not grid.sparse and grid.runs * grid.node_count <= LOW_BITS):
+    if ti.static(not grid.sparse and grid.runs * grid.layers * grid.node_count <= LOW_BITS):
         return bounded(first)
     else:
         return first

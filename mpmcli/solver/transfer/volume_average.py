@@ -46,6 +46,15 @@ def cell_of(grid: ti.template(), x: ti.template()):
 
 
 @ti.func
+def cell_of_particle(grid: ti.template(), group: ti.template(), p: int):
+    """Return the linear index of the first node of the cell of a particle, in the layer of its body."""
+    cell = cell_of(grid, group.on_grid(p))
+    if ti.static(group.layers > 1):
+        cell += group.layer_of(p) * ti.static(grid.node_count)
+    return cell
+
+
+@ti.func
 def log_volume(H: ti.template()):
     """Return ln J from F - I, finite where a particle is crushed or inverted, too."""
     return log(1.0 + ti.max(volume_strain(H), ti.static(SMALLEST - 1.0)))
@@ -74,6 +83,8 @@ def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), f
         for lane in range(LANES):
             logs[lane] = log_volume(matrix_of(deformation, d, lane))
             cells[lane] = cell_of(grid, vector_of(x, 0, d, lane))
+            if ti.static(group.layers > 1):
+                cells[lane] += group.layer_of(begin + ti.min(lane, count - 1)) * ti.static(grid.node_count)
         for lane in range(count):
             group.cell[begin + lane] = cells[lane]
             group.to_mean[begin + lane] = logs[lane]
@@ -92,7 +103,7 @@ def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: i
     if ti.static(group.evened):
         growth = group.growth[p]
     group.to_mean[p] = own
-    volume, cell = group.row(p)[VOLUME], cell_of(grid, group.on_grid(p))
+    volume, cell = group.row(p)[VOLUME], cell_of_particle(grid, group, p)
     group.cell[p] = cell
     if ti.static(grid.deterministic):
         grid.fixed.add_mean(g, cell, volume, own, growth)
@@ -106,7 +117,7 @@ def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: i
 @ti.func
 def clear_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
     """Set the sums of the cell of particle p, and of its images, to zero."""
-    cell = cell_of(grid, group.on_grid(p))
+    cell = cell_of_particle(grid, group, p)
     clear_cell(grid, g, cell)
     if ti.static(len(grid.period.axes) > 0):
         for images in range(1, ti.static(2**grid.dimension)):

@@ -1,0 +1,87 @@
+"""Which bodies of a scene have velocity fields of their own, and what pairs of them do where they meet."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mpmcli.errors import InputError
+from mpmcli.materials.registry import laws
+from mpmcli.scene import Body, Scene
+from mpmcli.scene.domain import PERIODIC
+from mpmcli.scene.points import Points
+from mpmcli.scene.sampling import points_per_cell
+from mpmcli.scene.schema import Emitter
+from mpmcli.solver.grid.sparse_grid import wants_sparse
+from mpmcli.solver.machine.backend import Backend
+
+# A node keeps the numbers of the layers that have mass there in bytes.
+MOST_LAYERS = 255
+# In place of a coefficient of friction: the two have one velocity at nodes that both reach.
+STICKS = -1.0
+
+
+@dataclass(frozen=True)
+class Layers:
+    """The layers of nodes of a run: each body that separates from others has one, and with it a velocity field.
+
+    Attributes:
+        count: of layers, 1 where all bodies share one velocity field.
+        shares: whether layer 0 belongs to all bodies that have none of their own.
+        per_axis: the most particles of a body with a layer of its own along the edge of a cell.
+        numbers: the layer of each source.
+    """
+
+    count: int
+    shares: bool
+    per_axis: int
+    numbers: tuple[int, ...] = field(compare=False)
+
+    @staticmethod
+    def of(scene: Scene) -> "Layers":
+        """Return the layers of a scene."""
+        own = [has_surface(source) and scene.contact.default == "separate" for source in scene.sources]
+        if sum(own) < 2:
+            return Layers(1, True, 1, (0,) * len(own))
+        shares = not all(own)
+        numbers = tuple(shares + sum(own[:i]) if one else 0 for i, one in enumerate(own))
+        separate = [source for source in scene.sources if has_surface(source)]
+        densest = max(points_per_cell(body, scene.domain.spacing) for body in separate)
+        return Layers(shares + sum(own), shares, math.ceil(densest ** (1 / scene.dimension)), numbers)
+
+    def has_own(self, source: int) -> bool:
+        """Return whether a source has a layer of its own."""
+        return self.count > 1 and (self.numbers[source] > 0 or not self.shares)
+
+    def frictions(self, scene: Scene) -> np.ndarray:
+        """Return the coefficient of friction of each pair of layers, (count, count); `STICKS` for those that stick."""
+        result = np.full((self.count, self.count), scene.contact.friction)
+        if self.shares:
+            result[0] = result[:, 0] = STICKS
+        return result
+
+
+def has_surface(source: Body | Emitter) -> bool:
+    """Return whether particles can carry the surface of a source: it stays elastic, and its shape is known."""
+    return (
+        isinstance(source, Body) and laws()[source.material.law].elastic and not isinstance(source.shape.form, Points)
+    )
+
+
+def require_contact_possible(scene: Scene, backend: Backend) -> None:
+    """Refuse a scene whose bodies separate, and whose grid or backend has one velocity field only.
+
+    Raises:
+        InputError: says what the scene or the backend has that contact is not available with.
+    """
+    count = Layers.of(scene).count
+    reasons = {
+        f"with --arch {backend.arch}": not backend.on_cpu,
+        'with solver.solids = "total"': scene.solver.solids == "total",
+        "on a sparse grid": wants_sparse(scene),
+        "in a domain with periodic walls": any(PERIODIC in pair for pair in scene.domain.walls.faces(scene.dimension)),
+        f"for more than {MOST_LAYERS} bodies": count > MOST_LAYERS,
+    }
+    for reason, applies in reasons.items():
+        if applies and count > 1:
+            raise InputError(f'contact.default = "separate" is not available {reason}; set it to "stick".')

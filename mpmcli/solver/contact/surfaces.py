@@ -1,0 +1,286 @@
+"""What bodies with velocity fields of their own show each other near nodes that two of them reach: their surfaces.
+
+Each particle carries the depth D below the nearest face of its body at rest, and the normal N of that face. Under F
+they become d = D / |F^-T N| and n = F^-T N / |F^-T N|, and x + d n is a point of the surface. Particles that show
+something are put into bins, one for each node at which stencils begin.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mpmcli.quick_taichi import ti
+from mpmcli.scene import Body
+from mpmcli.scene.sampling import BodyParticles, lattice_spacing
+from mpmcli.solver.contact.layers import Layers
+from mpmcli.solver.grid.grid import Grid, box_of
+from mpmcli.solver.particles.arrays import ParticleArrays
+from mpmcli.solver.particles.sort import TileOrder, stay_rolled
+
+# Depth below a surface up to which particles count for its normal, cells.
+BAND = 1.5
+# In place of the first particle of a bin: none. In place of the layer of a particle: it shows nothing.
+EMPTY, HIDDEN = -1, -1
+# In place of the depth of a particle that shows nothing.
+BELOW_ALL = 1e30
+# Parts of the distance of particles: by how much a point is moved off edges between faces that are equally near, of
+# which one is taken, and the step of the difference that finds the normal.
+ASIDE, STEP = 1e-4, 1e-6
+
+
+def rest_surface(body: Body, particles: BodyParticles, spacing: float | None) -> np.ndarray:
+    """Return the unit normal N, outwards, and the depth D, m, that particles carry, (n, d + 1).
+
+    A body that starts deformed has its shape then: N is along F^T n, and D = d / |F^T n|. spacing: of the grid, m; None
+    of a body that shows no surface, whose particles are all too deep.
+    """
+    position, d = particles.position, particles.position.shape[1]
+    if spacing is None:
+        return np.full((len(position), d + 1), BELOW_ALL)
+    form, distance = body.shape.form, lattice_spacing(body, spacing)
+    # Away from the middle, so that a mirror image has the mirror images of normals.
+    away = np.where(position < np.mean(form.bounds(), axis=0), -1.0, 1.0)
+    place = position + ASIDE * distance * away * [1.0, 0.618, 0.414][:d]
+    steps = STEP * distance * np.eye(d)
+    slope = [form.signed_distance(place + step) - form.signed_distance(place - step) for step in steps]
+    normal = np.stack(slope, axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    if particles.deformation is not None:
+        normal = np.einsum("pji,pj->pi", particles.deformation, normal)
+    size = np.linalg.norm(normal, axis=1)
+    depth = np.maximum(-form.signed_distance(position), 0.0)
+    return np.column_stack([normal / size[:, None], depth / size])
+
+
+@ti.data_oriented
+class BodySurfaces:
+    """What the bodies of a batch show each other, and where they meet; w is the number of a run.
+
+    Attributes:
+        layers: of each run; groups, orders: of particles; surfaced: numbers of those that carry surfaces.
+        low, high: of each layer of each run, the range of the nodes at which stencils began at the last sort.
+        used: of each of them, the nodes in use, as `Grid.box`; box: of each run, those that two layers may reach.
+        drift: of each run, cells that particles may have moved since the sort.
+        present: of each node of a run in that box the layers that have mass there, increased by 1, a byte each.
+        first: of each node and surfaced group, the first particle that shows something whose stencil begins there, or
+            EMPTY; following: of each particle, the next one.
+        shown: of each particle its layer, or HIDDEN; surface: the normal n of its body, and the depth d below it, m.
+    """
+
+    def __init__(
+        self, groups: Sequence[ParticleArrays], orders: Sequence[TileOrder], grid: Grid, layers: Layers, runs: int
+    ) -> None:
+        d = self.dimension = grid.dimension
+        self.layers, self.shares = layers.count, layers.shares
+        self.groups, self.orders = tuple(groups), tuple(orders)
+        self.surfaced = tuple(g for g, group in enumerate(groups) if group.surfaced)
+        self.node_count, count = grid.node_count, runs * layers.count
+        self.low, self.high = (ti.Vector.field(d, int, shape=count) for _ in range(2))
+        self.used, self.box = ti.field(int, shape=(2 * count, d)), ti.field(int, shape=(2 * runs, d))
+        self.drift = ti.field(int, shape=runs)
+        self.present = ti.field(ti.i64, shape=runs * grid.node_count)
+        self.first, self.following, self.shown, self.surface = {}, {}, {}, {}
+        for g in self.surfaced:
+            room = groups[g].capacity
+            self.first[g] = ti.field(int, shape=runs * grid.node_count)
+            self.following[g], self.shown[g] = ti.field(int, shape=room), ti.field(int, shape=room)
+            self.surface[g] = ti.Vector.field(d + 1, float, shape=room)
+
+    # Where bodies may meet.
+
+    @ti.func
+    def forget(self, w: int):
+        """Forget where the bodies of a run are, before their particles are seen anew."""
+        for layer in range(w * self.layers, (w + 1) * self.layers):
+            for a in ti.static(range(self.dimension)):
+                self.low[layer][a], self.high[layer][a] = 2**30, -(2**30)
+
+    @ti.func
+    def widen(self, layer: int, base: ti.template()):
+        """Let the range of a layer, counted over all runs, include a stencil."""
+        for a in ti.static(range(self.dimension)):
+            self.low[layer][a] = ti.min(self.low[layer][a], base[a])
+            self.high[layer][a] = ti.max(self.high[layer][a], base[a])
+
+    @ti.func
+    def find_box(self, grid: ti.template(), w: int, drift: int, last: ti.template()):
+        """Find the nodes that layers use, and those that two of them may reach, `drift` cells after the sort."""
+        d, reach, begin = ti.static((self.dimension, grid.scheme.spline.nodes - 1, w * self.layers))
+        self.drift[w] = drift
+        for layer in range(begin, begin + self.layers):
+            for a in ti.static(range(d)):
+                first, end = box_of(grid, a, self.low[layer][a], self.high[layer][a], drift, last[a])
+                # What flows in, and what other bodies share with it, is anywhere in the box of all.
+                if ti.static(self.shares):
+                    if layer == begin:
+                        first, end = grid.box[2 * w, a], grid.box[2 * w, a] + grid.box[2 * w + 1, a] - 1
+                self.used[2 * layer, a], self.used[2 * layer + 1, a] = first, ti.max(end - first + 1, 0)
+        low, high = ti.Vector([2**30] * d), ti.Vector([-1] * d)
+        for c in range(begin + 1, begin + self.layers):
+            for a in range(begin, c):
+                # With the nodes at which their stencils begin.
+                first = ti.max(self.low[a], self.low[c]) - drift - reach
+                end = ti.min(self.high[a], self.high[c]) + drift + reach
+                if (end - first).min() >= reach:
+                    low, high = ti.min(low, first), ti.max(high, end)
+        for a in ti.static(range(d)):
+            first = ti.max(low[a], grid.box[2 * w, a])
+            end = ti.min(high[a], grid.box[2 * w, a] + grid.box[2 * w + 1, a] - 1)
+            self.box[2 * w, a], self.box[2 * w + 1, a] = first, ti.max(end - first + 1, 0)
+
+    @ti.func
+    def place_of(self, grid: ti.template(), w: int, index: int):
+        """Return the place in `present` and in `first` of a node, by its linear index in layer 0."""
+        return index - grid.first_node + w * ti.static(self.node_count)
+
+    @ti.func
+    def clear_rows(self, grid: ti.template(), w: int, first: int, after: int):
+        """Forget who is present at rows of nodes of the box, which is that of the grid here and below."""
+        for row in range(first, after):
+            node = grid.row_start(row)
+            place = self.place_of(grid, w, grid.linear_index(node))
+            for k in range(grid.row_length(node)):
+                self.present[place + k] = 0
+                for g in ti.static(self.surfaced):
+                    self.first[g][place + k] = EMPTY
+
+    @ti.func
+    def find_rows(self, grid: ti.template(), w: int, first: int, after: int):
+        """Find which layers have mass at rows of nodes."""
+        last = ti.static(self.dimension - 1)
+        for layer in range(self.layers):
+            used, behind = 2 * (w * self.layers + layer), layer * ti.static(self.node_count)
+            begin = ti.max(self.used[used, last], grid.box[0, last])
+            end = ti.min(self.used[used, last] + self.used[used + 1, last], grid.box[0, last] + grid.box[1, last])
+            for row in range(first, after):
+                node = grid.row_start(row)
+                inside = True
+                for a in ti.static(range(last)):
+                    beyond = node[a] - self.used[used, a]
+                    inside = inside and beyond >= 0 and beyond < self.used[used + 1, a]
+                if inside:
+                    index = grid.linear_index(node) - node[last]
+                    place = self.place_of(grid, w, index)
+                    for k in range(begin, end):
+                        stay_rolled(self.orders[0].buffers.real, place + k)
+                        if grid.nodes[index + behind + k][last + 1] > 0.0:
+                            self.present[place + k] = 256 * self.present[place + k] + layer + 1
+
+    @ti.func
+    def meets(self, grid: ti.template(), w: int, base: ti.template()):
+        """Return whether two bodies are at a node of the stencil that begins at a node."""
+        n = ti.static(grid.scheme.spline.nodes)
+        meet = False
+        for q in range(ti.static(n**self.dimension)):
+            node, rest, inside = base, q, True
+            for a in ti.static(range(self.dimension)):
+                after = ti.raw_div(rest, n)
+                node[a] += rest - after * n
+                inside = inside and node[a] < grid.box[0, a] + grid.box[1, a]
+                rest = after
+            if inside:
+                place = self.place_of(grid, w, grid.linear_index(node))
+                stay_rolled(self.orders[0].buffers.real, place)
+                meet = meet or self.bodies_at(place) > 1
+        return meet
+
+    @ti.func
+    def bodies_at(self, place: int):
+        """Return how many bodies with layers of their own are present at a node."""
+        bodies, rest = 0, self.present[place]
+        while rest > 0:
+            bodies += ti.cast((rest & 255) > ti.static(int(self.shares)), int)
+            rest = rest >> 8
+        return bodies
+
+    @ti.func
+    def stencil_before(self, grid: ti.template(), node: ti.template(), q: int):
+        """Return how far before a node the stencil begins whose q-th node it is, and whether that is in the box."""
+        n = ti.static(grid.scheme.spline.nodes)
+        before, rest, inside = 0, q, True
+        for b in ti.static(range(self.dimension)):
+            a = ti.static(self.dimension - 1 - b)
+            after = ti.raw_div(rest, n)
+            along = rest - after * n
+            before += along * ti.static(grid.strides[a])
+            inside = inside and node[a] - along >= grid.box[0, a]
+            rest = after
+        return before, inside
+
+    # What they show.
+
+    @ti.func
+    def tiles(self, grid: ti.template(), w: int):
+        """Return the first tile per axis, and how many along it have particles whose stencils may begin in the box."""
+        first, count = ti.Vector.zero(int, self.dimension), ti.Vector.zero(int, self.dimension)
+        for a in ti.static(range(self.dimension)):
+            first[a] = ti.max(grid.box[0, a] - self.drift[w], 0) // grid.tile
+            last = (grid.box[0, a] + grid.box[1, a] - 1 + self.drift[w]) // grid.tile
+            if grid.box[1, a] > 0:
+                count[a] = ti.min(last, ti.static(grid.tiles[a] - 1)) - first[a] + 1
+        return first, count
+
+    @ti.func
+    def tile_count(self, grid: ti.template(), w: int):
+        _, count = self.tiles(grid, w)
+        product = 1
+        for a in ti.static(range(self.dimension)):
+            product *= count[a]
+        return product
+
+    @ti.func
+    def particles_in(self, grid: ti.template(), order: ti.template(), w: int, q: int):
+        """Return the first particle of the q-th of these tiles, and the one after the last."""
+        first, count = self.tiles(grid, w)
+        place, rest, tile = first, q, 0
+        for b in ti.static(range(self.dimension)):
+            a = ti.static(self.dimension - 1 - b)
+            place[a] += rest % count[a]
+            rest = rest // count[a]
+        for a in ti.static(range(self.dimension)):
+            tile = tile * ti.static(grid.tiles[a]) + place[a]
+        tile += w * ti.static(order.bins + 1)
+        return order.start[tile], order.start[tile + 1]
+
+    @ti.func
+    def bin_of(self, grid: ti.template(), w: int, base: ti.template()):
+        """Return the bin of the stencils that begin at a node, -1 outside the box."""
+        place = self.place_of(grid, w, grid.linear_index(base))
+        for a in ti.static(range(self.dimension)):
+            if base[a] < grid.box[0, a] or base[a] >= grid.box[0, a] + grid.box[1, a]:
+                place = -1
+        return place
+
+    @ti.func
+    def show(self, g: ti.template(), grid: ti.template(), w: int, q: int):
+        """Find what the particles of the g-th group in the q-th tile show."""
+        d, group = ti.static((self.dimension, self.groups[g]))
+        begin, end = self.particles_in(grid, self.orders[g], w, q)
+        for p in range(begin, end):
+            base, _ = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
+            shown = HIDDEN
+            if self.bin_of(grid, w, base) >= 0:
+                N = ti.Vector.zero(float, d)
+                for c in ti.static(range(d)):
+                    N[c] = group.carried[p][c]
+                n = group.stored(p).inverse().transpose() @ N
+                size = n.norm()
+                depth = group.carried[p][d] / size
+                if depth < BAND * grid.spacing:
+                    if self.meets(grid, w, base):
+                        shown = group.layer_of(p)
+                        for c in ti.static(range(d)):
+                            self.surface[g][p][c] = n[c] / size
+                        self.surface[g][p][d] = depth
+            self.shown[g][p] = shown
+
+    @ti.func
+    def link(self, g: ti.template(), grid: ti.template(), w: int, q: int):
+        """Put the particles of the g-th group in the q-th tile that show something into their bins."""
+        begin, end = self.particles_in(grid, self.orders[g], w, q)
+        for p in range(begin, end):
+            if self.shown[g][p] != HIDDEN:
+                base, _ = grid.scheme.spline.stencil(self.groups[g].x[p], grid.inverse_spacing)
+                place = self.bin_of(grid, w, base)
+                self.following[g][p] = self.first[g][place]
+                self.first[g][place] = p

@@ -1,0 +1,298 @@
+"""Bodies with velocity fields of their own meet where their surfaces are, slide with friction, and part."""
+
+import math
+from collections.abc import Callable
+
+import contact_reference as contact
+import mpm_reference as reference
+import numpy as np
+import pytest
+from solver_state import bodies_of, scene_of
+
+from mpmcli.errors import InputError
+from mpmcli.scene import Scene, sample_bodies
+from mpmcli.solver.contact.layers import STICKS, Layers, require_contact_possible
+from mpmcli.solver.contact.surfaces import rest_surface
+from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.machine.backend import Backend
+
+E, NU, DENSITY, H = 1e5, 0.3, 1000.0, 0.05
+MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
+G = 9.81
+
+
+def jelly(**more: object) -> dict:
+    """Return a material."""
+    return {"law": "neo_hookean", "density": DENSITY, "youngs_modulus": E, "poissons_ratio": NU, **more}
+
+
+def body(name: str, low: list[float], high: list[float], **more: object) -> dict:
+    """Return a box of jelly; coordinates in cells."""
+    shape = {"box": {"min": [H * x for x in low], "max": [H * x for x in high]}}
+    return {"name": name, "shape": shape, "material": jelly()} | more
+
+
+def scene(bodies: list[dict], friction: float = 0.0, end: float = 1.0, frames: int = 1, **tables: object) -> Scene:
+    """Return bodies that separate, away from the faces of a domain of up to 64 x 32 cells whose floor sticks."""
+    domain = {"size": [64 * H, 32 * H], "spacing": H, "walls": {"default": "separate", "y_min": "stick"}}
+    return scene_of(
+        domain=domain | {"gravity": ["0*t", "0*t"]} | tables.pop("domain", {}),
+        time=tables.pop("time", {"end": end, "frames": frames}),
+        bodies=bodies,
+        contact=tables.pop("contact", {"default": "separate", "friction": friction}),
+        solver={"precision": "f64"} | tables.pop("solver", {}),
+        **tables,
+    )
+
+
+# What bodies carry, and which of them have fields of their own.
+
+
+def test_particles_carry_the_surface_of_their_shape() -> None:
+    """Depth and normal of a box are those of its nearest face, of a ball those of its radius."""
+    ball = {"name": "ball", "shape": {"ball": {"center": [1.5, 0.8], "radius": 0.3}}, "material": jelly()}
+    both = scene([body("box", [2, 2], [12, 8]), ball])
+    boxed, round_ = sample_bodies(both)
+    found = rest_surface(both.bodies[0], boxed, H)
+    to_faces = np.stack([boxed.position - 2 * H, np.array([12 * H, 8 * H]) - boxed.position], axis=2).reshape(-1, 4)
+    assert found[:, 2] == pytest.approx(to_faces.min(axis=1), abs=1e-12)
+    outwards = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]])[to_faces.argmin(axis=1)]
+    nearest = np.sort(to_faces, axis=1)
+    alone = nearest[:, 1] - nearest[:, 0] > 1e-9
+    assert found[alone, :2] == pytest.approx(outwards[alone], abs=1e-9)
+    found, away = rest_surface(both.bodies[1], round_, H), round_.position - [1.5, 0.8]
+    assert found[:, 2] == pytest.approx(0.3 - np.linalg.norm(away, axis=1), abs=1e-9)
+    assert found[:, :2] == pytest.approx(away / np.linalg.norm(away, axis=1)[:, None], abs=1e-3)
+
+
+def test_a_body_that_starts_deformed_has_its_shape_then() -> None:
+    """F^-T N / |F^-T N| is the normal of the shape, D / |F^-T N| the depth below it."""
+    F = np.array([[1.2, 0.3], [-0.1, 0.8]])
+    still, bent = (
+        scene([body("a", [2, 2], [12, 8], **more), body("b", [20, 2], [30, 8])])
+        for more in ({}, {"deformation": F.tolist()})
+    )
+    expected = rest_surface(still.bodies[0], sample_bodies(still)[0], H)
+    found = rest_surface(bent.bodies[0], sample_bodies(bent)[0], H)
+    carried = found[:, :2] @ np.linalg.inv(F)
+    size = np.linalg.norm(carried, axis=1)
+    assert carried / size[:, None] == pytest.approx(expected[:, :2], abs=1e-9)
+    assert found[:, 2] / size == pytest.approx(expected[:, 2], abs=1e-12)
+
+
+def test_elastic_bodies_have_layers_of_their_own() -> None:
+    """All others share layer 0, and stick; where fewer than two bodies separate there is one layer."""
+    water = body("water", [2, 2], [4, 4], material={"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5})
+    a, b = body("a", [6, 2], [8, 4]), body("b", [10, 2], [12, 4])
+    mixed = scene([a, water, b], friction=0.3)
+    assert Layers.of(mixed).numbers == (1, 0, 2)
+    s = STICKS
+    assert Layers.of(mixed).frictions(mixed).tolist() == [[s, s, s], [s, 0.3, 0.3], [s, 0.3, 0.3]]
+    assert Layers.of(scene([a, b])) == Layers(2, False, 2, (0, 1))
+    assert Layers.of(scene([a, water])).count == 1
+    assert Layers.of(scene([a, b], contact={})).count == 1
+
+
+@pytest.mark.parametrize(
+    ("tables", "arch", "reason"),
+    [
+        ({}, "vulkan", "with --arch vulkan"),
+        ({"solver": {"solids": "total"}, "domain": {"walls": "separate"}}, "cpu", 'with solver.solids = "total"'),
+        ({"solver": {"grid": "sparse"}}, "cpu", "on a sparse grid"),
+        ({"domain": {"walls": {"x_min": "periodic", "x_max": "periodic"}}}, "cpu", "in a domain with periodic walls"),
+    ],
+)
+def test_what_has_one_velocity_field_is_refused(tables: dict, arch: str, reason: str) -> None:
+    two = scene([body("a", [2, 2], [8, 8]), body("b", [12, 2], [18, 8])], **tables)
+    with pytest.raises(InputError, match=f'contact.default = "separate" is not available {reason}; set it to "stick"'):
+        require_contact_possible(two, Backend(arch, 1, "f32", False))
+
+
+# The exchange at nodes.
+
+
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> None:
+    """Two bodies that move and are deformed at random, one pressed into the other, in one step."""
+    d = dimension
+    low, middle, high, top = ([x, y, z][:d] for x, y, z in ((6, 6, 6), (9, 8, 8), (7, 8, 6), (10, 10, 8)))
+    both = scene(
+        [body("a", low, middle), body("b", high, top)],
+        0.3,
+        domain={"size": [16 * H] * d, "gravity": [0.0] * d, "walls": "slip"},
+    )
+    run = build_run(both, backend_of("f64", 1))
+    group, rng = run.groups[0], np.random.default_rng(0)
+    before = group.read()
+    n = len(before["x"])
+    x = before["x"] + rng.uniform(-0.1, 0.1, (n, d)) * H
+    x[before["body"] == 1, 1] -= 0.15 * H
+    v, C = rng.uniform(-1, 1, (n, d)), rng.uniform(-3, 3, (n, d, d))
+    v[:, 1] += np.where(before["body"] == 0, 1.0, -1.0)
+    F = np.eye(d) + rng.uniform(-0.05, 0.05, (n, d, d))
+    group.replace(x=x, v=v, C=C, deformation=F)
+    run.state_was_replaced()
+    carried = group.arrays.carried.to_numpy()[:n]
+    dt = kick = 1e-3
+    box = reference.Box((16,) * d, H, np.zeros(d), [("slip", "slip")] * d)
+    stress = reference.neo_hookean_stress(np.full(n, MU), np.full(n, LAMBDA))
+    bodies, surfaces, momenta, masses = [], [], [], []
+    for k, sample in enumerate(sample_bodies(both)):
+        own = before["body"] == k
+        full = [np.full(own.sum(), value) for value in (sample.mass, sample.volume)]
+        bodies.append(reference.Particles(x[own], v[own], C[own], F[own], *full, stress))
+        shown = carried[own]
+        surfaces.append(contact.Surface.of(x[own], F[own], shown[:, :d], shown[:, d], H / 2, LAMBDA + 2 * MU, DENSITY))
+        for kept, part in zip((momenta, masses), reference.scatter(bodies[-1:], box, kick / 2), strict=True):
+            kept.append(part)
+    assert contact.exchange(momenta, masses, surfaces, box, dt, 0.3) > 4
+    run.step(dt)
+    found = bodies_of(run)
+    for k, particles in enumerate(bodies):
+        velocity = reference.update(momenta[k], masses[k], box, kick / 2)
+        (after,) = reference.gather([particles], velocity, box, dt)
+        state = found[both.bodies[k].name]
+        assert np.abs(state.v - after.v).max() < 1e-12 * np.abs(after.v).max()
+        assert np.abs(state.C - after.C).max() < 1e-11 * np.abs(after.C).max()
+
+
+# What bodies do.
+
+
+def bars(shift: float) -> Scene:
+    """Two bars of 16 x 6 cells that fly at each other at 0.02 m/s each, 4 cells apart; no lateral strain."""
+    material = jelly(poissons_ratio=0.0)
+    x, y = 8 + shift, 8 + shift
+    return scene(
+        [
+            body("a", [x, y], [x + 16, y + 6], material=material, velocity=[0.02, 0.0]),
+            body("b", [x + 20, y], [x + 36, y + 6], material=material, velocity=[-0.02, 0.0]),
+        ],
+        end=2 * H / 0.02 + 3 * 16 * H / math.sqrt(E / DENSITY),
+        frames=400,
+    )
+
+
+@pytest.mark.parametrize("shift", [0.3, pytest.param(0.0, marks=pytest.mark.slow)])
+def test_bars_meet_where_their_ends_are(backend_of: Callable, shift: float) -> None:
+    """They touch within 0.03 cells of their ends, stay for 2 L / c, and part at the speed of approach less 7 %."""
+    frames = list(build_run(bars(shift), backend_of("f64", 1)).frames())
+    time = np.array([row.time for _, row in frames])
+    moves = np.array([frame.velocity[frame.body == 0, 0].mean() for frame, _ in frames]) / 0.02
+    begins, ends = time[np.argmax(moves < 0.95)], time[np.argmax(moves < moves[-1] + 0.05)]
+    length = 2 * 16 * H / math.sqrt(E / DENSITY)
+    # A twentieth of the change is there after 0.025 of the time in contact.
+    early = (2 * H / 0.02 + 0.025 * length - begins) * 2 * 0.02 / H
+    assert abs(early) < 0.03
+    assert (ends - begins) / (0.95 * length) == pytest.approx(1.0, abs=0.08)
+    assert -1 < moves[-1] < -0.93
+    momentum = np.array([row.linear_momentum for _, row in frames])
+    assert np.abs(momentum).max() < 1e-12 * frames[0][1].mass * 0.02
+
+
+def on_slope(degrees: float, friction: float, shift: float = 0.3, time: float = 0.4) -> Scene:
+    """A block on a base that a wall holds, gravity turned; the weight comes on in a quarter of the time."""
+    slope, ramp = math.radians(degrees), f"clamp(t/{0.25 * time},0,1)"
+    along = f"{G * math.sin(slope)!r}*clamp((t-{0.25 * time})*1e6,0,1)"
+    down = f"{-G * math.cos(slope)!r}*{ramp}*{ramp}*(3-2*{ramp})"
+    material = jelly(youngs_modulus=4e6)
+    y = 6 + shift
+    return scene(
+        [
+            body("base", [6 + shift, 0], [46 + shift, y], material=material),
+            body("block", [10 + shift, y], [20 + shift, y + 6], material=material),
+        ],
+        friction,
+        end=time,
+        frames=50,
+        domain={"gravity": [along, down]},
+    )
+
+
+def slides(run: object) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times of frames, and the velocity of the block along the base."""
+    frames = [(frame.time, frame.velocity[frame.body == 1, 0].mean()) for frame, _ in run.frames()]
+    return tuple(np.array(frames).T)
+
+
+@pytest.mark.parametrize(
+    ("friction", "shift"),
+    [(0.3, 0.3), (0.0, 0.3), *(pytest.param(0.3, shift, marks=pytest.mark.slow) for shift in (0.0, 0.5))],
+)
+def test_a_block_slides_with_the_friction_that_was_asked_for(
+    backend_of: Callable, friction: float, shift: float
+) -> None:
+    """On 30 degrees: g (sin - mu cos)."""
+    time, speed = slides(build_run(on_slope(30, friction, shift), backend_of("f64", 1)))
+    late = time > 0.16
+    acceleration = np.polyfit(time[late], speed[late], 1)[0]
+    slope = math.radians(30)
+    found = (G * math.sin(slope) - acceleration) / (G * math.cos(slope))
+    assert found == pytest.approx(friction, abs=0.002 if friction else 5e-4)
+
+
+@pytest.mark.slow
+def test_a_block_below_the_angle_of_friction_stays(backend_of: Callable) -> None:
+    """It creeps by less than 1e-4 of its length in a second."""
+    frames = [frame for frame, _ in build_run(on_slope(12, 0.3, time=2.0), backend_of("f64", 1)).frames()]
+    late = [(frame.time, frame.position[frame.body == 1, 0].mean()) for frame in frames if frame.time > 0.7]
+    assert abs(np.polyfit(*np.array(late).T, 1)[0]) < 1e-4 * 10 * H
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3])
+def test_bodies_that_touch_are_left_alone(backend_of: Callable, shift: float) -> None:
+    """Their gap is 0 to 5e-4 h, beside edges too: the energy that they get is 1e-5 of that of a gap of h at most."""
+    x, y = 20 + shift, 8 + shift
+    touch = scene([body("a", [x, y], [x + 10, y + 6]), body("b", [x, y + 6], [x + 10, y + 12])], 0.3, 0.05, 5)
+    rows = [row for _, row in build_run(touch, backend_of("f64", 1)).frames()]
+    assert 0 < max(row.kinetic + row.elastic for row in rows) < 1e-5 * (LAMBDA + 2 * MU) * H**2
+
+
+def thrown(mirrored: bool = False, turned: bool = False, names: str = "abc", safety: float = 0.8) -> Scene:
+    """Boxes that meet in the air at a third of their wave speed; `turned`: in another order."""
+
+    def place(x: float) -> float:
+        return 64 - x if mirrored else x
+
+    sign = -1 if mirrored else 1
+    made = [
+        body(name, [min(place(x), place(x + 6)), y], [max(place(x), place(x + 6)), y + 6], velocity=[sign * u, w])
+        for name, x, y, u, w in (("a", 10, 12, 4.0, 0.0), ("b", 17.3, 15.4, 0.0, -1.0), ("c", 18, 8.5, -2.0, 2.0))
+    ]
+    made = [one for one in made if one["name"] in names]
+    return scene(made[::-1] if turned else made, 0.3, time={"end": 0.15, "frames": 6, "safety": safety})
+
+
+def test_half_the_step_changes_little(backend_of: Callable) -> None:
+    """By then they have flown apart by several cells."""
+    (_, whole), (_, half) = (
+        [frame for frame, _ in build_run(thrown(names="ac", safety=safety), backend_of("f64", 1)).frames()][::6]
+        for safety in (0.8, 0.4)
+    )
+    for k in range(2):
+        centres = [frame.position[frame.body == k].mean(axis=0) for frame in (whole, half)]
+        assert centres[1] == pytest.approx(centres[0], abs=0.04 * H)
+
+
+def test_three_bodies_keep_what_they_have(backend_of: Callable) -> None:
+    """Momentum and angular momentum stay; energy does not grow; a mirror changes nothing, the order little."""
+    runs = [
+        list(build_run(thrown(**how), backend_of("f64", 1)).frames())
+        for how in ({}, {"mirrored": True}, {"turned": True})
+    ]
+    frames = runs[0]
+    first, speeds = frames[0][1], [frame.velocity[frame.body == 0].mean(axis=0) for frame, _ in frames]
+    assert np.linalg.norm(speeds[-1] - speeds[0]) > 0.5
+    momenta = np.array([row.linear_momentum for _, row in frames])
+    turns = np.array([row.angular_momentum for _, row in frames])
+    assert np.abs(momenta - momenta[0]).max() < 1e-12 * first.mass * 4
+    assert np.abs(turns - turns[0]).max() < 1e-12 * first.mass * 4 * 3
+    energy = np.array([row.kinetic + row.elastic for _, row in frames])
+    assert energy.max() <= energy[0] * (1 + 1e-9)
+    for (frame, _), (mirror, _), (other, _) in zip(*runs, strict=True):
+        for k in range(3):
+            centre = frame.position[frame.body == k].mean(axis=0)
+            image = mirror.position[mirror.body == k].mean(axis=0) * [-1, 1] + [64 * H, 0]
+            assert image == pytest.approx(centre, abs=1e-9)
+            # At nodes of three bodies pairs come one after the other.
+            assert other.position[other.body == 2 - k].mean(axis=0) == pytest.approx(centre, abs=0.05 * H)
