@@ -87,10 +87,40 @@ def test_elastic_bodies_have_layers_of_their_own() -> None:
     mixed = scene([a, water, b], friction=0.3)
     assert Layers.of(mixed).numbers == (1, 0, 2)
     s = STICKS
-    assert Layers.of(mixed).frictions(mixed).tolist() == [[s, s, s], [s, 0.3, 0.3], [s, 0.3, 0.3]]
+    assert Layers.of(mixed).frictions(mixed).tolist() == [[s, s, s], [s, s, 0.3], [s, 0.3, s]]
     assert Layers.of(scene([a, b])) == Layers(2, False, 2, (0, 1))
     assert Layers.of(scene([a, water])).count == 1
     assert Layers.of(scene([a, b], contact={})).count == 1
+
+
+def test_pairs_do_what_they_say() -> None:
+    """Only those that are named separate from each other, or all but those that stick."""
+    a, b, c = (body(name, [x, 2], [x + 2, 4]) for name, x in (("a", 2), ("b", 6), ("c", 10)))
+    s, slides = STICKS, {"between": ["a", "c"], "friction": 0.5}
+    one = scene([a, b, c], contact={"pairs": [slides]})
+    assert Layers.of(one).numbers == (1, 0, 2)
+    assert Layers.of(one).frictions(one).tolist() == [[s, s, s], [s, s, 0.5], [s, 0.5, s]]
+    glued = {"default": "separate", "friction": 0.2, "pairs": [slides, {"between": ["b", "a"], "friction": "stick"}]}
+    all_but = scene([a, b, c], contact=glued)
+    assert Layers.of(all_but).numbers == (0, 1, 2)
+    assert Layers.of(all_but).frictions(all_but).tolist() == [[s, s, 0.5], [s, s, 0.2], [0.5, 0.2, s]]
+
+
+@pytest.mark.parametrize(
+    ("pairs", "said"),
+    [
+        ([["a", "d"]], 'pairs[0].between: no body has the name "d"; the bodies are a, b and water'),
+        ([["a", "a"]], 'pairs[0].between: names "a" twice; a pair has two bodies'),
+        ([["a", "b"], ["b", "a"]], "pairs[1].between: names the bodies of contact.pairs[0]; leave one of them out"),
+        ([["a", "water"]], 'pairs[0].between: "water" has no surface that its particles know'),
+    ],
+)
+def test_pairs_that_cannot_be_are_one_sentence(pairs: list, said: str) -> None:
+    water = body("water", [2, 10], [4, 12], material={"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5})
+    listed = {"pairs": [{"between": pair, "friction": 0.1} for pair in pairs]}
+    with pytest.raises(InputError) as raised:
+        scene([body("a", [2, 2], [4, 4]), body("b", [6, 2], [8, 4]), water], contact=listed)
+    assert str(raised.value).count("\n") == 0 and said in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +134,7 @@ def test_elastic_bodies_have_layers_of_their_own() -> None:
 )
 def test_what_has_one_velocity_field_is_refused(tables: dict, arch: str, reason: str) -> None:
     two = scene([body("a", [2, 2], [8, 8]), body("b", [12, 2], [18, 8])], **tables)
-    with pytest.raises(InputError, match=f'contact.default = "separate" is not available {reason}; set it to "stick"'):
+    with pytest.raises(InputError, match=f"bodies that separate are not available {reason}; give "):
         require_contact_possible(two, Backend(arch, 1, "f32", False))
 
 

@@ -165,6 +165,7 @@ volume_correction = true
 [contact]
 default = "stick"
 friction = 0.0
+pairs = []
 
 [output]
 fields = ["velocity", "density", "pressure"]

@@ -234,7 +234,7 @@ def problems_in(scene: Scene) -> list[Problem]:
     unstarted = [] if outside or empty else list(_initial(scene))
     colliding = [] if outside or empty else list(collider_problems(scene))
     where = [*_repeated_names(scene), *outside, *_overlaps(scene), *empty, *_too_large_to_relax(scene)]
-    found = [*where, *unstarted, *colliding, *_pushed(scene), *_unstored(scene), *_total(scene)]
+    found = [*where, *unstarted, *colliding, *_pushed(scene), *_paired(scene), *_unstored(scene), *_total(scene)]
     return [*found, *gravity_problems(scene), *emitter_problems(scene)]
 
 
@@ -367,6 +367,27 @@ def _pushed(scene: Scene) -> Iterator[Problem]:
             if force.body is not None and force.body not in names:
                 hint = hint_at(force.body, names, f"the bodies are {listed(names, 'and')}")
                 yield Problem((table, k, "body"), f'no body has the name "{force.body}"; {hint}')
+
+
+def _paired(scene: Scene) -> Iterator[Problem]:
+    sources = {body.name: body for body in scene.sources}
+    seen: dict[frozenset[str], int] = {}
+    for k, pair in enumerate(scene.contact.pairs):
+        path = ("contact", "pairs", k, "between")
+        unknown = [name for name in pair.between if name not in sources]
+        for name in unknown:
+            hint = hint_at(name, list(sources), f"the bodies are {listed(list(sources), 'and')}")
+            yield Problem(path, f'no body has the name "{name}"; {hint}')
+        first, second = pair.between
+        if first == second:
+            yield Problem(path, f'names "{first}" twice; a pair has two bodies')
+        earlier = seen.setdefault(frozenset(pair.between), k)
+        if earlier != k:
+            yield Problem(path, f"names the bodies of contact.pairs[{earlier}]; leave one of them out")
+        for name in () if pair.friction == "stick" or unknown else pair.between:
+            if not sources[name].has_surface:
+                said = f'"{name}" has no surface that its particles know: bodies of an elastic law and a shape have; '
+                yield Problem(path, said + 'give friction = "stick"')
 
 
 def _total(scene: Scene) -> Iterator[Problem]:

@@ -1,7 +1,7 @@
 """What a scene may say: one frozen model per table, each key with its unit, range and default."""
 
 from functools import lru_cache
-from typing import Annotated, Any, Literal, Union, get_args
+from typing import Annotated, Any, ClassVar, Literal, Union, get_args
 
 from pydantic import (
     AfterValidator,
@@ -86,6 +86,8 @@ class Emitter(Table):
     The mouth is the section of the shape through its centre, across the velocity. Particles move with the velocity, in
     sheets: a layer as thick as their distance enters as one sheet, or as eight.
     """
+
+    has_surface: ClassVar[bool] = False
 
     name: str = Field(pattern=NAME, description="Name of the emitter, used in messages and --set.")
     material: Material
@@ -328,6 +330,11 @@ class Body(Table):
     particles_per_cell: ParticlesPerCell = None  # type: ignore[assignment]
     seed: Integer = Field(0, ge=0, le=2**63 - 1, description="Seed of the random positions; unused by lattices.")
 
+    @property
+    def has_surface(self) -> bool:
+        """Whether particles can carry its surface: it stays elastic, and its shape is known."""
+        return self.material.elastic and self.shape.points is None
+
 
 class Force(Table):
     """An acceleration that acts on one body, or on all of them."""
@@ -347,6 +354,15 @@ def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:
     return fields
 
 
+class ContactPair(Table):
+    """What two bodies do to each other where they meet, whatever others do."""
+
+    between: tuple[str, str] = Field(description="Names of the two bodies.")
+    friction: NotNegative | Literal["stick"] = Field(
+        description='Coefficient of Coulomb friction between them, so that they separate; "stick": they do not.'
+    )
+
+
 class Contact(Table):
     """What bodies do to each other where they meet."""
 
@@ -357,6 +373,7 @@ class Contact(Table):
         "slide with friction, and part. Liquids, grains and bodies that yield stick to all others.",
     )
     friction: NotNegative = Field(0.0, description='Coefficient of Coulomb friction between bodies that "separate".')
+    pairs: tuple[ContactPair, ...] = Field((), description="Pairs of bodies that do something else.")
 
 
 class Output(Table):
@@ -402,6 +419,14 @@ class Scene(Table):
     def dimension(self) -> int:
         """Return 2 or 3."""
         return len(self.domain.size)
+
+    def friction_between(self, first: "Body | Emitter", second: "Body | Emitter") -> float | None:
+        """Return the coefficient of friction of two bodies, None where they stick to each other."""
+        for pair in self.contact.pairs:
+            if set(pair.between) == {first.name, second.name}:
+                return None if pair.friction == "stick" else pair.friction
+        separate = self.contact.default == "separate" and first.has_surface and second.has_surface
+        return self.contact.friction if separate else None
 
     @property
     def sources(self) -> "tuple[Body | Emitter, ...]":

@@ -6,12 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mpmcli.errors import InputError
-from mpmcli.materials.registry import laws
-from mpmcli.scene import Body, Scene
+from mpmcli.scene import Scene
 from mpmcli.scene.domain import PERIODIC
-from mpmcli.scene.points import Points
 from mpmcli.scene.sampling import points_per_cell
-from mpmcli.scene.schema import Emitter
 from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.backend import Backend
 
@@ -23,7 +20,7 @@ STICKS = -1.0
 
 @dataclass(frozen=True)
 class Layers:
-    """The layers of nodes of a run: each body that separates from others has one, and with it a velocity field.
+    """The layers of nodes of a run: each body that separates from another has one, and with it a velocity field.
 
     Attributes:
         count: of layers, 1 where all bodies share one velocity field.
@@ -40,13 +37,16 @@ class Layers:
     @staticmethod
     def of(scene: Scene) -> "Layers":
         """Return the layers of a scene."""
-        own = [has_surface(source) and scene.contact.default == "separate" for source in scene.sources]
-        if sum(own) < 2:
+        sources = scene.sources
+        own = [
+            any(scene.friction_between(one, other) is not None for other in sources if other is not one)
+            for one in sources
+        ]
+        if not any(own):
             return Layers(1, True, 1, (0,) * len(own))
         shares = not all(own)
         numbers = tuple(shares + sum(own[:i]) if one else 0 for i, one in enumerate(own))
-        separate = [source for source in scene.sources if has_surface(source)]
-        densest = max(points_per_cell(body, scene.domain.spacing) for body in separate)
+        densest = max(points_per_cell(sources[i], scene.domain.spacing) for i, one in enumerate(own) if one)
         return Layers(shares + sum(own), shares, math.ceil(densest ** (1 / scene.dimension)), numbers)
 
     def has_own(self, source: int) -> bool:
@@ -55,17 +55,14 @@ class Layers:
 
     def frictions(self, scene: Scene) -> np.ndarray:
         """Return the coefficient of friction of each pair of layers, (count, count); `STICKS` for those that stick."""
-        result = np.full((self.count, self.count), scene.contact.friction)
-        if self.shares:
-            result[0] = result[:, 0] = STICKS
+        result = np.full((self.count, self.count), STICKS)
+        for i, one in enumerate(scene.sources):
+            for k, other in enumerate(scene.sources[:i]):
+                friction = scene.friction_between(one, other)
+                if friction is not None:
+                    a, c = self.numbers[i], self.numbers[k]
+                    result[a, c] = result[c, a] = friction
         return result
-
-
-def has_surface(source: Body | Emitter) -> bool:
-    """Return whether particles can carry the surface of a source: it stays elastic, and its shape is known."""
-    return (
-        isinstance(source, Body) and laws()[source.material.law].elastic and not isinstance(source.shape.form, Points)
-    )
 
 
 def require_contact_possible(scene: Scene, backend: Backend) -> None:
@@ -84,4 +81,6 @@ def require_contact_possible(scene: Scene, backend: Backend) -> None:
     }
     for reason, applies in reasons.items():
         if applies and count > 1:
-            raise InputError(f'contact.default = "separate" is not available {reason}; set it to "stick".')
+            raise InputError(
+                f'bodies that separate are not available {reason}; give contact.default = "stick" and no pairs.'
+            )
