@@ -9,6 +9,8 @@ friction. See docs/theory.md, 2.8.
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from mpmcli.materials.elementary import exp, log
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
@@ -17,7 +19,7 @@ from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.contact.surfaces import BodySurfaces
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
-from mpmcli.solver.particles.sort import TileOrder
+from mpmcli.solver.particles.sort import TileOrder, stay_rolled
 from mpmcli.solver.transfer.lanes import LANES, zero_lanes
 from mpmcli.solver.transfer.splines import PAD, bounded
 
@@ -36,7 +38,8 @@ LARGEST, SMALLEST = 80.0, 1e-37
 APART = 9.0
 # Numbers of a layer: P-wave modulus, Pa, sharpness, 1/m, factor of a sum over a flat surface, distance of particles, m,
 # density, kg/m^3.
-MODULUS, SHARPNESS, FLAT, DISTANCE, DENSITY = range(5)
+# From FRICTION on the coefficient of friction with each layer, `STICKS` for one that sticks.
+MODULUS, SHARPNESS, FLAT, DISTANCE, DENSITY, FRICTION = range(6)
 
 
 @ti.data_oriented
@@ -46,7 +49,6 @@ class BodyContact:
     Attributes:
         surfaces: what they show; layers: of each run; room: surface points near a node, of each body.
         rows: of each layer of each run its numbers, see MODULUS.
-        frictions: of each pair of layers of each run the coefficient of friction, `STICKS` for those that stick.
         points: of each thread and of two bodies, row by row, of surface points near a node the way to it, m, by how
             much farther away than along an axis they count, m, their normals and their weights; of the second body ways
             and normals with the opposite sign.
@@ -65,30 +67,25 @@ class BodyContact:
         self.dimension, self.layers, self.node_count = grid.dimension, layers.count, grid.node_count
         # Two layers of particles, at four times the density of those at rest.
         self.room = 8 * math.ceil((grid.scheme.spline.nodes * layers.per_axis) ** (grid.dimension - 1))
-        self.rows = ti.Vector.field(5, float, shape=runs * layers.count)
-        self.frictions = ti.field(float, shape=(runs * layers.count, layers.count))
+        self.rows = ti.field(float, shape=(runs * layers.count, FRICTION + layers.count))
         self.share = (2 * grid.dimension + 2) * self.room
         self.points = ti.field(float, shape=2 * max(runs, threads) * self.share + LANES)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set what a run has: its bodies, and the friction between them."""
         layers, h = Layers.of(scene), scene.domain.spacing
-        for a, row in enumerate(layers.frictions(scene)):
-            for c, friction in enumerate(row):
-                self.frictions[run * self.layers + a, c] = friction
+        self.surfaces.count[run] = layers.count
+        rows = np.zeros((layers.count, FRICTION))
         for source, layer in enumerate(layers.numbers):
             if layers.has_own(source):
                 material, distance = scene.sources[source].material, lattice_spacing(scene.sources[source], h)
                 beta = SHARP / distance
                 width = math.sqrt(2 * math.pi * BALL * h / beta) / distance
                 modulus = material.lame_lambda + 2 * material.shear_modulus
-                self.rows[run * self.layers + layer] = [
-                    modulus,
-                    beta,
-                    width ** (1 - self.dimension),
-                    distance,
-                    material.density,
-                ]
+                rows[layer] = [modulus, beta, width ** (1 - self.dimension), distance, material.density]
+        for layer, row in enumerate(np.hstack([rows, layers.frictions(scene)])):
+            for k, number in enumerate(row):
+                self.rows[run * self.layers + layer, k] = number
 
     @ti.func
     def exchange_rows(self, grid: ti.template(), w: int, thread: int, first: int, after: int, dt: float):
@@ -117,7 +114,7 @@ class BodyContact:
         d = ti.static(self.dimension)
         at_a, at_c = index + a * ti.static(self.node_count), index + c * ti.static(self.node_count)
         m_a, m_c = grid.nodes[at_a][d], grid.nodes[at_c][d]
-        reduced, friction = m_a * m_c / (m_a + m_c), self.frictions[w * self.layers + a, c]
+        reduced, friction = m_a * m_c / (m_a + m_c), self.rows[w * self.layers + a, FRICTION + c]
         u, J = ti.Vector.zero(float, d), ti.Vector.zero(float, d)
         for b in ti.static(range(d)):
             u[b] = grid.nodes[at_c][b] / m_c - grid.nodes[at_a][b] / m_a
@@ -155,9 +152,9 @@ class BodyContact:
         """
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
         away, weight = u.dot(n), spline(middle * grid.inverse_spacing)
-        modulus = 2.0 / (1.0 / self.rows[row + a][MODULUS] + 1.0 / self.rows[row + c][MODULUS])
+        modulus = 2.0 / (1.0 / self.rows[row + a, MODULUS] + 1.0 / self.rows[row + c, MODULUS])
         # As much as nodes on flat faces that touch have: those with less, and that is at edges, push less.
-        mass = 0.5 * h**d / (1.0 / self.rows[row + a][DENSITY] + 1.0 / self.rows[row + c][DENSITY])
+        mass = 0.5 * h**d / (1.0 / self.rows[row + a, DENSITY] + 1.0 / self.rows[row + c, DENSITY])
         stiffness = modulus * h ** ti.static(d - 2) * weight * ti.min(1.0, reduced / mass)
         kappa = stiffness * dt**2 / reduced
         push = reduced * ti.max(0.0, -away - ti.max(gap, -DEEPEST * h) / dt) * kappa / (1.0 + kappa)
@@ -176,19 +173,22 @@ class BodyContact:
         if counts.min() > 0 and n_a.dot(n_c) < ALIKE:
             axes, gaps, mean = ti.Matrix.zero(float, 4, d), ti.Vector.zero(float, 3), unit(n_a - n_c)
             for side in range(2):
+                stay_rolled(self.points, thread + side)
                 met = self.normal_along((2 * thread + side) * self.share, counts[side], mean)
                 for b in ti.static(range(d)):
                     axes[side, b], axes[2, b] = met[b], mean[b]
             for j in range(4):
+                stay_rolled(self.points, thread + j)
                 axis, far = ti.Vector.zero(float, d), ti.Vector.zero(float, 2)
                 for b in ti.static(range(d)):
                     axis[b] = axes[j, b]
                 for side in range(2):
+                    stay_rolled(self.points, thread + side)
                     layer = row + ti.select(side == 0, a, c)
-                    first, beta = (2 * thread + side) * self.share, self.rows[layer][SHARPNESS]
+                    first, beta = (2 * thread + side) * self.share, self.rows[layer, SHARPNESS]
                     inverse_width = ti.static(0.5 / BALL) * grid.inverse_spacing
                     total = self.sum_points(first, counts[side], axis, beta, inverse_width)
-                    far[side] = -log(ti.max(total * self.rows[layer][FLAT], SMALLEST)) / beta
+                    far[side] = -log(ti.max(total * self.rows[layer, FLAT], SMALLEST)) / beta
                 gap, middle = far[0] + far[1], 0.5 * (far[0] - far[1])
                 if j < 3:
                     gaps[j] = gap
@@ -230,7 +230,7 @@ class BodyContact:
                             else:
                                 n_c += weight * n
                             depth = self.surfaces.surface[g][p][d]
-                            near = depth < self.rows[w * self.layers + layer][DISTANCE]
+                            near = depth < self.rows[w * self.layers + layer, DISTANCE]
                             if near and counts[side] < self.room:
                                 way -= depth * n
                                 at = (2 * thread + side) * self.share + counts[side]

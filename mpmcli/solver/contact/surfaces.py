@@ -77,7 +77,7 @@ class BodySurfaces:
         self.node_count, count = grid.node_count, runs * layers.count
         self.low, self.high = (ti.Vector.field(d, int, shape=count) for _ in range(2))
         self.used, self.box = ti.field(int, shape=(2 * count, d)), ti.field(int, shape=(2 * runs, d))
-        self.drift = ti.field(int, shape=runs)
+        self.drift, self.count = ti.field(int, shape=runs), ti.field(int, shape=runs)
         self.present = ti.field(ti.i64, shape=runs * grid.node_count)
         self.first, self.following, self.shown, self.surface = {}, {}, {}, {}
         for g in self.surfaced:
@@ -91,7 +91,7 @@ class BodySurfaces:
     @ti.func
     def forget(self, w: int):
         """Forget where the bodies of a run are, before their particles are seen anew."""
-        for layer in range(w * self.layers, (w + 1) * self.layers):
+        for layer in range(w * self.layers, w * self.layers + self.count[w]):
             for a in ti.static(range(self.dimension)):
                 self.low[layer][a], self.high[layer][a] = 2**30, -(2**30)
 
@@ -107,7 +107,8 @@ class BodySurfaces:
         """Find the nodes that layers use, and those that two of them may reach, `drift` cells after the sort."""
         d, reach, begin = ti.static((self.dimension, grid.scheme.spline.nodes - 1, w * self.layers))
         self.drift[w] = drift
-        for layer in range(begin, begin + self.layers):
+        for layer in range(begin, begin + self.count[w]):
+            stay_rolled(self.orders[0].buffers.real, layer)
             for a in ti.static(range(d)):
                 first, end = box_of(grid, a, self.low[layer][a], self.high[layer][a], drift, last[a])
                 # What flows in, and what other bodies share with it, is anywhere in the box of all.
@@ -116,8 +117,9 @@ class BodySurfaces:
                         first, end = grid.box[2 * w, a], grid.box[2 * w, a] + grid.box[2 * w + 1, a] - 1
                 self.used[2 * layer, a], self.used[2 * layer + 1, a] = first, ti.max(end - first + 1, 0)
         low, high = ti.Vector([2**30] * d), ti.Vector([-1] * d)
-        for c in range(begin + 1, begin + self.layers):
+        for c in range(begin + 1, begin + self.count[w]):
             for a in range(begin, c):
+                stay_rolled(self.orders[0].buffers.real, a)
                 # With the nodes at which their stencils begin.
                 first = ti.max(self.low[a], self.low[c]) - drift - reach
                 end = ti.min(self.high[a], self.high[c]) + drift + reach
@@ -140,6 +142,7 @@ class BodySurfaces:
             node = grid.row_start(row)
             place = self.place_of(grid, w, grid.linear_index(node))
             for k in range(grid.row_length(node)):
+                stay_rolled(self.orders[0].buffers.real, place + k)
                 self.present[place + k] = 0
                 for g in ti.static(self.surfaced):
                     self.first[g][place + k] = EMPTY
@@ -148,7 +151,7 @@ class BodySurfaces:
     def find_rows(self, grid: ti.template(), w: int, first: int, after: int):
         """Find which layers have mass at rows of nodes."""
         last = ti.static(self.dimension - 1)
-        for layer in range(self.layers):
+        for layer in range(self.count[w]):
             used, behind = 2 * (w * self.layers + layer), layer * ti.static(self.node_count)
             begin = ti.max(self.used[used, last], grid.box[0, last])
             end = ti.min(self.used[used, last] + self.used[used + 1, last], grid.box[0, last] + grid.box[1, last])
@@ -214,8 +217,8 @@ class BodySurfaces:
         """Return the first tile per axis, and how many along it have particles whose stencils may begin in the box."""
         first, count = ti.Vector.zero(int, self.dimension), ti.Vector.zero(int, self.dimension)
         for a in ti.static(range(self.dimension)):
-            first[a] = ti.max(grid.box[0, a] - self.drift[w], 0) // grid.tile
-            last = (grid.box[0, a] + grid.box[1, a] - 1 + self.drift[w]) // grid.tile
+            first[a] = ti.raw_div(ti.max(grid.box[0, a] - self.drift[w], 0), ti.static(grid.tile))
+            last = ti.raw_div(grid.box[0, a] + grid.box[1, a] - 1 + self.drift[w], ti.static(grid.tile))
             if grid.box[1, a] > 0:
                 count[a] = ti.min(last, ti.static(grid.tiles[a] - 1)) - first[a] + 1
         return first, count
@@ -235,8 +238,9 @@ class BodySurfaces:
         place, rest, tile = first, q, 0
         for b in ti.static(range(self.dimension)):
             a = ti.static(self.dimension - 1 - b)
-            place[a] += rest % count[a]
-            rest = rest // count[a]
+            after = ti.raw_div(rest, count[a])
+            place[a] += rest - after * count[a]
+            rest = after
         for a in ti.static(range(self.dimension)):
             tile = tile * ti.static(grid.tiles[a]) + place[a]
         tile += w * ti.static(order.bins + 1)
@@ -279,6 +283,7 @@ class BodySurfaces:
         """Put the particles of the g-th group in the q-th tile that show something into their bins."""
         begin, end = self.particles_in(grid, self.orders[g], w, q)
         for p in range(begin, end):
+            stay_rolled(self.orders[0].buffers.real, p)
             if self.shown[g][p] != HIDDEN:
                 base, _ = grid.scheme.spline.stencil(self.groups[g].x[p], grid.inverse_spacing)
                 place = self.bin_of(grid, w, base)

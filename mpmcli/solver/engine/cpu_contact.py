@@ -9,6 +9,14 @@ class CpuContact:
     """A part of `CpuPhases`."""
 
     @ti.func
+    def layer_count(self, at: ti.template()):
+        """Return the number of layers: one that compilers do not know, as they would repeat what is done for each."""
+        count = 1
+        if ti.static(self.separates):
+            count = self.device.contact.surfaces.count[at.w]
+        return count
+
+    @ti.func
     def used_by(self, at: ti.template(), layer: int):
         """Return what a layer has in use, as `Grid.box`."""
         own = ti.Matrix.zero(int, 2, self.dimension)

@@ -275,7 +275,7 @@ class CpuPhases(CpuContact):
         else:
             first, after = self.places.rows_of(at.grid, at.region)
             first, after = self.share(first, after, at.part)
-            for layer in range(at.grid.layers):
+            for layer in range(self.layer_count(at)):
                 own = self.used_by(at, layer)
                 (inner,) = ti.static((at.in_layer(layer, own),))
                 clear_rows(inner.grid, first, after)
@@ -347,7 +347,7 @@ class CpuPhases(CpuContact):
     def find_contact(self, at: ti.template()):
         """Find where walls that let go are pressed."""
         gravity_step = self.gravity_step(at.w)
-        for layer in range(at.grid.layers):
+        for layer in range(self.layer_count(at)):
             own = self.used_by(at, layer)
             (inner,) = ti.static((at.in_layer(layer, own),))
             (grid,) = ti.static((inner.grid.within(own) if at.grid.layers > 1 else at.grid,))
@@ -360,7 +360,7 @@ class CpuPhases(CpuContact):
     def find_friction(self, at: ti.template()):
         """Find the friction of walls."""
         gravity_step = self.gravity_step(at.w)
-        for layer in range(at.grid.layers):
+        for layer in range(self.layer_count(at)):
             own = self.used_by(at, layer)
             (inner,) = ti.static((at.in_layer(layer, own),))
             (grid,) = ti.static((inner.grid.within(own) if at.grid.layers > 1 else at.grid,))
@@ -381,7 +381,7 @@ class CpuPhases(CpuContact):
         else:
             first, after = self.places.rows_of(at.grid, at.region)
             first, after = self.share(first, after, at.part)
-            for layer in range(at.grid.layers):
+            for layer in range(self.layer_count(at)):
                 own = self.used_by(at, layer)
                 (inner,) = ti.static((at.in_layer(layer, own),))
                 ti.atomic_max(self.values[at.w, SPEED], update_rows(inner, first, after, self.gravity_step(at.w)))
