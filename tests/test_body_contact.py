@@ -15,6 +15,8 @@ from mpmcli.solver.contact.layers import STICKS, Layers, require_contact_possibl
 from mpmcli.solver.contact.surfaces import rest_surface
 from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.machine.backend import Backend
+from mpmcli.validation.case import Setting
+from mpmcli.validation.cases.two_disks import SPEED, SeparateDisks
 
 E, NU, DENSITY, H = 1e5, 0.3, 1000.0, 0.05
 MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
@@ -276,6 +278,15 @@ def test_bodies_that_touch_are_left_alone(backend_of: Callable, shift: float) ->
     touch = scene([body("a", [x, y], [x + 10, y + 6]), body("b", [x, y + 6], [x + 10, y + 12])], 0.3, 0.05, 5)
     rows = [row for _, row in build_run(touch, backend_of("f64", 1)).frames()]
     assert 0 < max(row.kinetic + row.elastic for row in rows) < 1e-5 * (LAMBDA + 2 * MU) * H**2
+
+
+@pytest.mark.slow
+def test_single_precision_bears_nodes_of_hardly_any_mass(backend_of: Callable) -> None:
+    """The product of the masses of two bodies at a node is 0 there, and what they do to each other finite."""
+    tables = SeparateDisks().scene_tables(80, Setting(precision="f32"))
+    frames = list(build_run(scene_of(**tables), backend_of("f32", 1)).frames())
+    momentum = np.array([row.linear_momentum for _, row in frames])
+    assert np.abs(momentum).max() < 1e-5 * frames[0][1].mass * SPEED
 
 
 def thrown(mirrored: bool = False, turned: bool = False, names: str = "abc", safety: float = 0.8) -> Scene:

@@ -114,7 +114,8 @@ class BodyContact:
         d = ti.static(self.dimension)
         at_a, at_c = index + a * ti.static(self.node_count), index + c * ti.static(self.node_count)
         m_a, m_c = grid.nodes[at_a][d], grid.nodes[at_c][d]
-        reduced, friction = m_a * m_c / (m_a + m_c), self.rows[w * self.layers + a, FRICTION + c]
+        # In this order: the product of two masses may be too small for single precision.
+        reduced, friction = m_a * (m_c / (m_a + m_c)), self.rows[w * self.layers + a, FRICTION + c]
         u, J = ti.Vector.zero(float, d), ti.Vector.zero(float, d)
         for b in ti.static(range(d)):
             u[b] = grid.nodes[at_c][b] / m_c - grid.nodes[at_a][b] / m_a
@@ -155,8 +156,7 @@ class BodyContact:
         modulus = 2.0 / (1.0 / self.rows[row + a, MODULUS] + 1.0 / self.rows[row + c, MODULUS])
         # As much as nodes on flat faces that touch have: those with less, and that is at edges, push less.
         mass = 0.5 * h**d / (1.0 / self.rows[row + a, DENSITY] + 1.0 / self.rows[row + c, DENSITY])
-        stiffness = modulus * h ** ti.static(d - 2) * weight * ti.min(1.0, reduced / mass)
-        kappa = stiffness * dt**2 / reduced
+        kappa = modulus * h ** ti.static(d - 2) * weight * dt**2 / ti.max(reduced, mass)
         push = reduced * ti.max(0.0, -away - ti.max(gap, -DEEPEST * h) / dt) * kappa / (1.0 + kappa)
         along = u - away * n
         slip, rub = along.norm(), 0.0
