@@ -30,15 +30,14 @@ SHARP = 12.0
 # Sharpness of the mean normal of the faces that an axis meets. Bodies whose normals have a larger product look the same
 # way, and not at each other.
 FACING, ALIKE = 16.0, 0.7
-# Differences of gaps over which axes are blended, and the deepest overlap that pushes, cells.
+# Differences of gaps over which axes are blended, and the overlap beyond which the push stays the same, cells.
 BLEND, DEEPEST = 0.02, 1.0
 # Exponents beyond which single precision has no number; in place of a sum of no exponentials.
 LARGEST, SMALLEST = 80.0, 1e-37
 # The gap of bodies of which one shows no surface, cells: they do not meet.
 APART = 9.0
 # Numbers of a layer: P-wave modulus, Pa, sharpness, 1/m, factor of a sum over a flat surface, distance of particles, m,
-# density, kg/m^3.
-# From FRICTION on the coefficient of friction with each layer, `STICKS` for one that sticks.
+# density, kg/m^3, and from FRICTION on the coefficient of friction with each layer, `STICKS` for one that sticks.
 MODULUS, SHARPNESS, FLAT, DISTANCE, DENSITY, FRICTION = range(6)
 
 

@@ -12,7 +12,7 @@ from mpmcli.scene.sampling import points_per_cell
 from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.backend import Backend
 
-# A node keeps the numbers of the layers that have mass there in bytes.
+# A node keeps the numbers of the layers that have mass there in bytes; of more than eight the first are forgotten.
 MOST_LAYERS = 255
 # In place of a coefficient of friction: the two have one velocity at nodes that both reach.
 STICKS = -1.0
