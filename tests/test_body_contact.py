@@ -11,10 +11,13 @@ from solver_state import bodies_of, scene_of
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene, sample_bodies
+from mpmcli.scene.schema import Contact
 from mpmcli.solver.contact.layers import STICKS, Layers, require_contact_possible
 from mpmcli.solver.contact.surfaces import rest_surface
 from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.machine.plan import make_plan
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases.two_disks import SPEED, SeparateDisks
 
@@ -95,6 +98,20 @@ def test_elastic_bodies_have_layers_of_their_own() -> None:
     assert Layers.of(scene([a, b], contact={})).count == 1
 
 
+def test_the_plan_counts_layers() -> None:
+    """Nodes and what finds walls once for each, and what bodies show; nodes keep volumes beside a liquid."""
+    two = scene([body("a", [2, 2], [12, 8]), body("b", [20, 2], [30, 8])])
+    one = two.model_copy(update={"contact": Contact()})
+    backend = Backend("cpu", 1, "f64", False)
+    plans = [make_plan(asked, backend) for asked in (one, two)]
+    assert plans[1].bytes_per_node == 2 * plans[0].bytes_per_node
+    assert plans[1].laws[0].fields.keys() - plans[0].laws[0].fields.keys() == {"surface"}
+    water = body("water", [2, 12], [12, 14], material={"law": "fluid", "density": DENSITY, "bulk_modulus": 1e5})
+    for contact_, keeps in ((SEPARATE, True), ({}, False)):
+        mixed = scene([body("a", [2, 2], [12, 8]), body("b", [20, 2], [30, 8]), water], contact=contact_)
+        assert CompiledKind.of(mixed, sample_bodies(mixed)).keeps_filling is keeps
+
+
 def test_pairs_do_what_they_say() -> None:
     """Only those that are named separate from each other, or all but those that stick."""
     a, b, c = (body(name, [x, 2], [x + 2, 4]) for name, x in (("a", 2), ("b", 6), ("c", 10)))
@@ -114,7 +131,7 @@ def test_pairs_do_what_they_say() -> None:
         ([["a", "d"]], 'pairs[0].between: no body has the name "d"; the bodies are a, b and water'),
         ([["a", "a"]], 'pairs[0].between: names "a" twice; a pair has two bodies'),
         ([["a", "b"], ["b", "a"]], "pairs[1].between: names the bodies of contact.pairs[0]; leave one of them out"),
-        ([["a", "water"]], 'pairs[0].between: "water" has no surface that its particles know'),
+        ([["a", "water"]], 'pairs[0].between: "water" cannot separate: only a body of an elastic law'),
     ],
 )
 def test_pairs_that_cannot_be_are_one_sentence(pairs: list, said: str) -> None:
@@ -191,33 +208,40 @@ def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> 
 # What bodies do.
 
 
-def bars(shift: float) -> Scene:
-    """Two bars of 16 x 6 cells that fly at each other at 0.02 m/s each, 4 cells apart; no lateral strain."""
+def bars(shift: float, n: int) -> Scene:
+    """Two bars of n x 6 cells that fly at each other at 0.02 m/s each, 4 cells apart; no lateral strain."""
     material = jelly(poissons_ratio=0.0)
     x, y = 8 + shift, 8 + shift
     return scene(
         [
-            body("a", [x, y], [x + 16, y + 6], material=material, velocity=[0.02, 0.0]),
-            body("b", [x + 20, y], [x + 36, y + 6], material=material, velocity=[-0.02, 0.0]),
+            body("a", [x, y], [x + n, y + 6], material=material, velocity=[0.02, 0.0]),
+            body("b", [x + n + 4, y], [x + 2 * n + 4, y + 6], material=material, velocity=[-0.02, 0.0]),
         ],
-        end=2 * H / 0.02 + 3 * 16 * H / math.sqrt(E / DENSITY),
+        end=2 * H / 0.02 + 3 * n * H / math.sqrt(E / DENSITY),
         frames=400,
+        domain={"size": [(2 * n + 32) * H, 32 * H]},
     )
 
 
-@pytest.mark.parametrize("shift", [0.3, pytest.param(0.0, marks=pytest.mark.slow)])
-def test_bars_meet_where_their_ends_are(backend_of: Callable, shift: float) -> None:
-    """They touch within 0.03 cells of their ends, stay for 2 L / c, and part at the speed of approach less 7 %."""
-    frames = list(build_run(bars(shift), backend_of("f64", 1)).frames())
+@pytest.mark.parametrize(
+    ("shift", "n", "off", "lost"),
+    [
+        (0.3, 16, 0.08, 0.07),
+        *(pytest.param(*figures, marks=pytest.mark.slow) for figures in ((0.0, 16, 0.08, 0.07), (0.3, 32, 0.03, 0.04))),
+    ],
+)
+def test_bars_meet_where_their_ends_are(backend_of: Callable, shift: float, n: int, off: float, lost: float) -> None:
+    """They touch within 0.03 cells of their ends, stay for 2 L / c, and part at nearly the speed of approach."""
+    frames = list(build_run(bars(shift, n), backend_of("f64", 1)).frames())
     time = np.array([row.time for _, row in frames])
     moves = np.array([frame.velocity[frame.body == 0, 0].mean() for frame, _ in frames]) / 0.02
     begins, ends = time[np.argmax(moves < 0.95)], time[np.argmax(moves < moves[-1] + 0.05)]
-    length = 2 * 16 * H / math.sqrt(E / DENSITY)
+    length = 2 * n * H / math.sqrt(E / DENSITY)
     # A twentieth of the change is there after 0.025 of the time in contact.
     early = (2 * H / 0.02 + 0.025 * length - begins) * 2 * 0.02 / H
     assert abs(early) < 0.03
-    assert (ends - begins) / (0.95 * length) == pytest.approx(1.0, abs=0.08)
-    assert -1 < moves[-1] < -0.93
+    assert (ends - begins) / (0.95 * length) == pytest.approx(1.0, abs=off)
+    assert -1 < moves[-1] < lost - 1
     momentum = np.array([row.linear_momentum for _, row in frames])
     assert np.abs(momentum).max() < 1e-12 * frames[0][1].mass * 0.02
 
@@ -271,6 +295,35 @@ def test_a_block_below_the_angle_of_friction_stays(backend_of: Callable) -> None
     assert abs(np.polyfit(*np.array(late).T, 1)[0]) < 1e-4 * 10 * H
 
 
+@pytest.mark.slow
+def test_a_disc_rolls_or_slides_down_an_elastic_slope(backend_of: Callable) -> None:
+    """On 20 degrees: 2/3 g sin where it rolls; with mu = 0.05 it slides with g (sin - mu cos), and spins by mu."""
+    slope, y, r = math.radians(20), 6.3, 8
+    along, down = f"{G * math.sin(slope)!r}*clamp((t-0.3)*1e6,0,1)", f"{-G * math.cos(slope)!r}*clamp(t/0.18,0,1)"
+    shape = {"ball": {"center": [18.3 * H, (y + r) * H], "radius": r * H}}
+    base = body("base", [6, 0], [66, y], material=jelly(youngs_modulus=4e6))
+    disc = {"name": "disc", "shape": shape, "material": jelly(youngs_modulus=4e6)}
+    for friction in (0.5, 0.05):
+        asked = scene([base, disc], friction, 0.7, 70, domain={"size": [76 * H, 32 * H], "gravity": [along, down]})
+        found = []
+        for frame, _ in build_run(asked, backend_of("f64", 1)).frames():
+            x, v = (
+                values[frame.body == 1] - values[frame.body == 1].mean(axis=0)
+                for values in (frame.position, frame.velocity)
+            )
+            spin = (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0]).sum() / (x**2).sum()
+            found.append((frame.time, frame.velocity[frame.body == 1, 0].mean(), spin))
+        time, speed, spin = np.array(found).T
+        late = time > 0.42
+        acceleration, turning = (np.polyfit(time[late], values[late], 1)[0] for values in (speed, spin))
+        if friction == 0.5:
+            assert acceleration / (2 / 3 * G * math.sin(slope)) == pytest.approx(1.0, abs=0.03)
+        else:
+            # 8 % and 2 % off.
+            assert (math.sin(slope) - acceleration / G) / math.cos(slope) == pytest.approx(0.05, rel=0.1)
+            assert -turning * r * H / (2 * G * math.cos(slope)) == pytest.approx(0.05, rel=0.05)
+
+
 @pytest.mark.parametrize("shift", [0.0, 0.3])
 def test_bodies_that_touch_are_left_alone(backend_of: Callable, shift: float) -> None:
     """Their gap is 0 to 5e-4 h, beside edges too: the energy that they get is 1e-5 of that of a gap of h at most."""
@@ -289,7 +342,16 @@ def test_single_precision_bears_nodes_of_hardly_any_mass(backend_of: Callable) -
     assert np.abs(momentum).max() < 1e-5 * frames[0][1].mass * SPEED
 
 
-def thrown(mirrored: bool = False, turned: bool = False, names: str = "abc", safety: float = 0.8) -> Scene:
+SEPARATE = {"default": "separate", "friction": 0.3}
+
+
+def thrown(
+    mirrored: bool = False,
+    turned: bool = False,
+    names: str = "abc",
+    safety: float = 0.8,
+    contact: dict | None = None,
+) -> Scene:
     """Boxes that meet in the air at a third of their wave speed; `turned`: in another order."""
 
     def place(x: float) -> float:
@@ -300,8 +362,9 @@ def thrown(mirrored: bool = False, turned: bool = False, names: str = "abc", saf
         body(name, [min(place(x), place(x + 6)), y], [max(place(x), place(x + 6)), y + 6], velocity=[sign * u, w])
         for name, x, y, u, w in (("a", 10, 12, 4.0, 0.0), ("b", 17.3, 15.4, 0.0, -1.0), ("c", 18, 8.5, -2.0, 2.0))
     ]
-    made = [one for one in made if one["name"] in names]
-    return scene(made[::-1] if turned else made, 0.3, time={"end": 0.15, "frames": 6, "safety": safety})
+    made = [one for one in made if one["name"] in names] + ([body("far", [54, 24], [60, 30])] if "far" in names else [])
+    time = {"end": 0.15, "frames": 6, "safety": safety}
+    return scene(made[::-1] if turned else made, 0.3, time=time, contact=contact or SEPARATE)
 
 
 def test_half_the_step_changes_little(backend_of: Callable) -> None:
@@ -313,6 +376,17 @@ def test_half_the_step_changes_little(backend_of: Callable) -> None:
     for k in range(2):
         centres = [frame.position[frame.body == k].mean(axis=0) for frame in (whole, half)]
         assert centres[1] == pytest.approx(centres[0], abs=0.04 * H)
+
+
+def test_a_bystander_changes_nothing(backend_of: Callable) -> None:
+    """Two bodies do the same beside a third one far away, whether they separate, or stick as on one velocity field."""
+    stick = SEPARATE | {"pairs": [{"between": ["a", "c"], "friction": "stick"}]}
+    for alone, beside in ((SEPARATE, SEPARATE), ({"default": "stick"}, stick)):
+        asked = thrown(names="ac", contact=alone), thrown(names="ac far", contact=beside)
+        ends = [list(build_run(one, backend_of("f64", 1)).frames())[-1][0] for one in asked]
+        for k in range(2):
+            found, expected = (frame.position[frame.body == k] for frame in reversed(ends))
+            assert found == pytest.approx(expected, abs=1e-9)
 
 
 def test_three_bodies_keep_what_they_have(backend_of: Callable) -> None:

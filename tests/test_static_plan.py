@@ -23,6 +23,7 @@ MODULES = {
     "moving walls": {"boundaries.walls.MovingFaces"},
     "periodic faces": {"solver.grid.period.Period"},
     "shifts": {"solver.transfer.redistribution"},
+    "bodies that separate": {"solver.contact.body_contact", "solver.contact.surfaces"},
     # Not asked for by the scene with features either.
     "grids of distances": {"boundaries.distances.GridDistance"},
     "means of volume": {"solver.transfer.volume_average"},
@@ -129,7 +130,7 @@ def test_a_scene_with_features_has_their_modules(backend_of: Callable, given: Co
     step(asked, backend)
     for feature, own in MODULES.items():
         found = among(given, own)
-        if feature in ("grids of distances", "means of volume"):
+        if feature in ("bodies that separate", "grids of distances", "means of volume"):
             assert not found
         else:
             assert found == own

@@ -384,9 +384,9 @@ def _paired(scene: Scene) -> Iterator[Problem]:
         earlier = seen.setdefault(frozenset(pair.between), k)
         if earlier != k:
             yield Problem(path, f"names the bodies of contact.pairs[{earlier}]; leave one of them out")
-        for name in () if pair.friction == "stick" or unknown else pair.between:
-            if not sources[name].has_surface:
-                said = f'"{name}" has no surface that its particles know: bodies of an elastic law and a shape have; '
+        for name in pair.between:
+            if pair.friction != "stick" and name in sources and not sources[name].has_surface:
+                said = f'"{name}" cannot separate: only a body of an elastic law, and not one of points, can; '
                 yield Problem(path, said + 'give friction = "stick"')
 
 

@@ -32,7 +32,7 @@ SHARP = 12.0
 FACING, ALIKE = 16.0, 0.7
 # Differences of gaps over which axes are blended, and the overlap beyond which the push stays the same, cells.
 BLEND, DEEPEST = 0.02, 1.0
-# Exponents beyond which single precision has no number; in place of a sum of no exponentials.
+# Exponents beyond which single precision has no number; in place of 0 where it divides, or its logarithm is taken.
 LARGEST, SMALLEST = 80.0, 1e-37
 # The gap of bodies of which one shows no surface, cells: they do not meet.
 APART = 9.0
@@ -170,7 +170,7 @@ class BodyContact:
         gap, middle, normal = APART * h, 0.0, ti.Vector.zero(float, d)
         n_a, n_c, counts = self.collect(grid, w, thread, node, index, a, c)
         if counts.min() > 0 and n_a.dot(n_c) < ALIKE:
-            axes, gaps, mean = ti.Matrix.zero(float, 4, d), ti.Vector.zero(float, 3), unit(n_a - n_c)
+            axes, gaps, mean = ti.Matrix.zero(float, 4, d), ti.Vector.zero(float, 3), (n_a - n_c).normalized(SMALLEST)
             for side in range(2):
                 stay_rolled(self.points, thread + side)
                 met = self.normal_along((2 * thread + side) * self.share, counts[side], mean)
@@ -198,7 +198,7 @@ class BodyContact:
                         share = exp(ti.max((gaps[i] - best) * grid.inverse_spacing / BLEND, -LARGEST))
                         for b in ti.static(range(d)):
                             blend[b] += share * axes[i, b]
-                    normal = unit(blend)
+                    normal = blend.normalized(SMALLEST)
                     for b in ti.static(range(d)):
                         axes[3, b] = normal[b]
         return gap, middle, normal
@@ -240,7 +240,7 @@ class BodyContact:
                                 self.points[at + ti.static(2 * d + 1) * self.room] = weight
                                 counts[side] += 1
                         p = self.surfaces.following[g][p]
-        return unit(n_a), unit(n_c), counts
+        return n_a.normalized(SMALLEST), n_c.normalized(SMALLEST), counts
 
     @ti.func
     def sum_points(self, first: int, count: int, axis: ti.template(), beta: float, inverse_width: float):
@@ -278,7 +278,7 @@ class BodyContact:
                 for b in ti.static(range(d)):
                     total[b] += found[lane] * points[b, lane]
             begin += LANES
-        return unit(total)
+        return total.normalized(SMALLEST)
 
     @ti.func
     def load(self, origin: int, points: ti.template()):
@@ -287,16 +287,6 @@ class BodyContact:
         for k in ti.static(range(points.n)):
             for lane in range(LANES):
                 points[k, lane] = self.points[first + k * self.room + lane]
-
-
-@ti.func
-def unit(v: ti.template()):
-    """Return a vector of length 1, or 0 of one that is 0."""
-    size = v.norm()
-    result = v
-    if size > 0.0:
-        result /= size
-    return result
 
 
 @ti.func

@@ -86,6 +86,11 @@ class BodySurfaces:
             self.following[g], self.shown[g] = ti.field(int, shape=room), ti.field(int, shape=room)
             self.surface[g] = ti.Vector.field(d + 1, float, shape=room)
 
+    @staticmethod
+    def bytes_needed(nodes: int, particles: Sequence[int], surface: int) -> int:
+        """Return the bytes for so many nodes, and particles of each group that carries surfaces; of one, `surface`."""
+        return nodes * (8 + 4 * len(particles)) + sum(particles) * (8 + surface)
+
     # Where bodies may meet.
 
     @ti.func

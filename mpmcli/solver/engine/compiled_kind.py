@@ -80,7 +80,7 @@ class CompiledKind:
             tuple(scene.domain.cells),
             tuple(sum(len(particles[i].position) for i in own) for own in places),
             tuple(len(own) for own in places),
-            needs_filling(scene, members),
+            needs_filling(scene, members, Layers.of(scene).count),
             fine_nodes(scene, members),
             keeps_motion(scene, members),
             wants_sparse(scene),

@@ -346,19 +346,16 @@ class CpuPhases(CpuContact):
     @ti.func
     def find_contact(self, at: ti.template()):
         """Find where walls that let go are pressed."""
-        gravity_step = self.gravity_step(at.w)
-        for layer in range(self.layer_count(at)):
-            own = self.used_by(at, layer)
-            (inner,) = ti.static((at.in_layer(layer, own),))
-            (grid,) = ti.static((inner.grid.within(own) if at.grid.layers > 1 else at.grid,))
-            first, after = self.places.even_part(inner.nodes.images.plane_nodes(grid), at.region)
-            first, after = self.share(first, after, at.part)
-            for q in range(first, after):
-                inner.nodes.images.find_contact(grid, q, gravity_step)
+        self.each_plane_node(at, False)
 
     @ti.func
     def find_friction(self, at: ti.template()):
         """Find the friction of walls."""
+        self.each_plane_node(at, True)
+
+    @ti.func
+    def each_plane_node(self, at: ti.template(), rubs: ti.template()):
+        """Find friction, or else contact, at the nodes in use of the planes of faces."""
         gravity_step = self.gravity_step(at.w)
         for layer in range(self.layer_count(at)):
             own = self.used_by(at, layer)
@@ -367,7 +364,10 @@ class CpuPhases(CpuContact):
             first, after = self.places.even_part(inner.nodes.images.plane_nodes(grid), at.region)
             first, after = self.share(first, after, at.part)
             for q in range(first, after):
-                find_friction(inner.nodes.images, grid, q, gravity_step)
+                if ti.static(rubs):
+                    find_friction(inner.nodes.images, grid, q, gravity_step)
+                else:
+                    inner.nodes.images.find_contact(grid, q, gravity_step)
 
     @ti.func
     def update(self, at: ti.template()):

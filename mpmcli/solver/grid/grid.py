@@ -91,10 +91,10 @@ class Grid(LinearNodes):
             deterministic: whether there are such sums; then there are no `means`.
         fine: the grid by which particles are shifted (`redistribution.FineGrid`), None where they are not.
         box: (2, d) ints: first node in use and number of nodes in use, per axis. own: the same of a layer, whose rows
-            are those of the box; None where it has the box of all, and is not `narrow`.
+            are those of the box; None where it has the box of all.
     """
 
-    own, narrow = None, False
+    own = None
 
     def __init__(
         self,
@@ -144,7 +144,7 @@ class Grid(LinearNodes):
     def in_layer(self, layer: object, own: object) -> "Grid":
         """Return the view of a layer, by its number and what it has in use, variables of a kernel."""
         view = copy(self)
-        view.first_node, view.own, view.narrow = self.first_node + layer * self.node_count, own, True
+        view.first_node, view.own = self.first_node + layer * self.node_count, own
         return view
 
     def within(self, box: object) -> "Grid":
@@ -152,6 +152,11 @@ class Grid(LinearNodes):
         view = copy(self)
         view.box = box
         return view
+
+    @property
+    def narrow(self) -> bool:
+        """Whether a layer has less in use than the box; Taichi cannot compare with None."""
+        return self.own is not None
 
     def stored_nodes(self) -> int:
         """Return the number of nodes of a run that memory is allocated for."""

@@ -18,6 +18,7 @@ from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body, has_expressions
 from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.contact.layers import Layers, require_contact_possible
+from mpmcli.solver.contact.surfaces import BodySurfaces
 from mpmcli.solver.drive.forces import forces_on, needs_initial
 from mpmcli.solver.engine.phases import step_phases
 from mpmcli.solver.frames.columns import FrameColumns
@@ -229,9 +230,9 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     if sparse:
         blocks = room_for_blocks(sum(map(in_steps, counts.values())))
         nodes = blocks * tile**dimension
-    filling, deterministic = needs_filling(scene, members), scene.solver.deterministic and not backend.on_cpu
-    numbers = width * (1 + scheme.keeps_before + filling)
-    node_bytes = real * (numbers + 3 * sum(averaged))
+    filling, deterministic = needs_filling(scene, members, layers), scene.solver.deterministic and not backend.on_cpu
+    numbers = layers * width * (1 + scheme.keeps_before + filling)
+    node_bytes = real * (numbers + layers * 3 * sum(averaged))
     # Nothing where that is 0.
     fine = fine_nodes(scene, members) ** dimension
     node_bytes += real * fine
@@ -240,12 +241,12 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         node_bytes += FixedPoint.bytes_needed(numbers, shared) + FixedPoint.bytes_needed(1, 0) * fine
         # In their place.
         node_bytes -= real * 3 * shared
-    # In each layer, and where bodies meet.
-    node_bytes = layers * node_bytes + (layers > 1) * (8 + 4 * len(groups))
     all_tiles, bins = all_nodes // tile**dimension, 0
     tables = len(groups) * TileOrder.bytes_needed(blocks if sparse else all_tiles, backend.threads)
     if sparse:
         tables += SparseGrid.table_bytes(all_tiles, blocks, dimension)
+    surfaced = [in_steps(counts[law.name]) for law in members if layers > 1 and law.elastic]
+    tables += BodySurfaces.bytes_needed(nodes, surfaced, real * (dimension + 1)) if surfaced else 0
     tables += layers * _contact_bytes(scene, all_nodes, tile, Grid.tile_counts(cells, tile), real)
     if scene.solver.solids == "total" and len(scene.sources) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(map(in_steps, counts.values())))

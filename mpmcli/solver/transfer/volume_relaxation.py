@@ -14,9 +14,13 @@ from mpmcli.solver.particles.state_bounds import volume_ratio
 from mpmcli.solver.transfer.splines import PAD
 
 
-def needs_filling(scene: Scene, laws: Sequence[Law]) -> bool:
-    """Return whether nodes keep the volume scattered to them: with one density alone it follows from their mass."""
-    return any(law.relaxes for law in laws) and len({body.material.density for body in scene.sources}) > 1
+def needs_filling(scene: Scene, laws: Sequence[Law], layers: int) -> bool:
+    """Return whether nodes keep the volume scattered to them, that of all layers in layer 0.
+
+    With one density and one layer alone it follows from their mass.
+    """
+    alike = len({body.material.density for body in scene.sources}) == 1 and layers == 1
+    return any(law.relaxes for law in laws) and not alike
 
 
 @ti.func
