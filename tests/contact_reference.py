@@ -1,5 +1,6 @@
-"""Contact of two bodies at the nodes that both reach, in plain numpy, from the formulas of docs/theory.md, 2.8."""
+"""Contact of two bodies, or of one and an obstacle, in plain numpy, from the formulas of docs/theory.md, 2.8."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -51,11 +52,41 @@ def distance_to(surface: Surface, weights: np.ndarray, node: np.ndarray, axis: n
     return -np.log(np.exp(-beta * q).sum() / row) / beta
 
 
+def distance_from(r: np.ndarray, axis: np.ndarray, beta: float, h: float) -> float:
+    """Return the distance of a node from points of an obstacle, from which r (n, d) lead to it, along an axis, m."""
+    along = r @ axis
+    q = along + ((r**2).sum(1) - along**2) / (6 * h)
+    return -np.log(np.exp(-beta * q).sum() / (1 + (len(r) - 1) * np.exp(-beta * h / 6))) / beta
+
+
 def normal_along(surface: Surface, weights: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """Return the mean normal of the points of a surface that look along an axis most."""
     shown = (weights > 0) & (surface.depth < surface.distance)
     n = surface.n[shown]
     return unit((weights[shown] * np.exp(16 * (n @ axis - 1))) @ n)
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """What bodies meet: its distance (m) from a place, its normal there, its velocity there (m/s), and its friction."""
+
+    distance: Callable[[np.ndarray], float]
+    normal: Callable[[np.ndarray], np.ndarray]
+    velocity: Callable[[np.ndarray], np.ndarray]
+    friction: float
+
+    def points(self, node: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return points on it, the nearest one and those nearest to places a cell aside, and the normals there."""
+
+        def nearest(x: np.ndarray) -> np.ndarray:
+            return x - self.distance(x) * self.normal(x)
+
+        n, first = self.normal(node), nearest(node)
+        least = int(np.argmin(np.abs(n)))
+        tangents = [np.array([-n[1], n[0]])] if len(n) == 2 else [unit(np.eye(3)[least] - n[least] * n)]
+        tangents += [np.cross(n, tangents[0])] if len(n) == 3 else []
+        places = [node, *(first + side * h * t for t in tangents for side in (-1, 1))]
+        return np.array([nearest(x) for x in places]), np.array([self.normal(x) for x in places])
 
 
 def exchange(
@@ -75,7 +106,7 @@ def exchange(
             continue
         node = (np.array(at) - MARGIN) * h
         w = [near(surface, node, h) for surface in surfaces]
-        if not all(((weights > 0) & (s.depth < s.distance)).any() for weights, s in zip(w, surfaces, strict=True)):
+        if not all(shows(surface, weights) for surface, weights in zip(surfaces, w, strict=True)):
             continue
         n_a, n_c = (unit(weights @ surface.n) for weights, surface in zip(w, surfaces, strict=True))
 
@@ -86,20 +117,82 @@ def exchange(
             continue
         mean = unit(n_a - n_c)
         axes = [normal_along(a, w[0], mean), -normal_along(c, w[1], -mean), mean]
-        gaps = np.array([sum(far(axis)) for axis in axes])
-        n = unit(np.exp((gaps - gaps.max()) / (0.02 * h)) @ np.array(axes))
-        far_a, far_c = far(n)
-        reduced = m[0] * m[1] / m.sum()
+        if axes[0] @ axes[1] > 0.999:
+            axes = [unit(axes[0] + axes[1])]
         u = momenta[1][at] / m[1] - momenta[0][at] / m[0]
-        modulus = 2 / (1 / a.modulus + 1 / c.modulus)
-        share = min(1.0, reduced / (0.5 * h ** len(node) / (1 / a.density + 1 / c.density)))
-        kappa = modulus * h ** (len(node) - 2) * quadratic((far_a - far_c) / (2 * h)) * share * dt**2 / reduced
-        gap = max(far_a + far_c, -h)
-        push = reduced * max(0.0, -u @ n - gap / dt) * kappa / (1 + kappa)
-        along = u - (u @ n) * n
-        slip = np.linalg.norm(along)
-        J = push * n - min(friction * push, reduced * slip) * along / slip
+        inverse = 1 / a.modulus + 1 / c.modulus, 1 / a.density + 1 / c.density
+        J = impulse(axes, far, u, m[0] * m[1] / m.sum(), inverse, h, dt, friction)
         momenta[0][at] -= J
         momenta[1][at] += J
-        pushed += push > 0
+        pushed += (J != 0).any()
     return pushed
+
+
+def stop(
+    momentum: np.ndarray,
+    mass: np.ndarray,
+    surface: Surface,
+    obstacle: Obstacle,
+    box: Box,
+    dt: float,
+    gravity_step: np.ndarray,
+) -> tuple[int, np.ndarray]:
+    """Let an obstacle push a body; return at how many nodes, and the impulse that the obstacle takes, N s."""
+    h, pushed, taken = box.spacing, 0, np.zeros(momentum.shape[-1])
+    for at in product(*(range(n) for n in mass.shape)):
+        node = (np.array(at) - MARGIN) * h
+        D = obstacle.distance(node)
+        if mass[at] == 0 or 1.5 * h <= D:
+            continue
+        w, facing = near(surface, node, h), obstacle.normal(node)
+        if not shows(surface, w) or unit(w @ surface.n) @ facing >= 0.7:
+            continue
+
+        points, normals = obstacle.points(node, h)
+
+        def far(axis: np.ndarray, w: np.ndarray = w, node: np.ndarray = node, r: np.ndarray = node - points) -> tuple:
+            return distance_to(surface, w, node, axis, h), distance_from(r, -axis, 12 / surface.distance, h)
+
+        mean = unit(unit(w @ surface.n) - facing)
+        shares = np.exp(16 * (-normals @ mean - 1))
+        u = obstacle.velocity(node) - gravity_step - momentum[at] / mass[at]
+        inverse = 1 / surface.modulus, 1 / surface.density
+        axes = [normal_along(surface, w, mean), -unit(shares @ normals), mean]
+        if (normals @ facing > 0.9).all():
+            axes = [-facing]
+        elif axes[0] @ axes[1] > 0.999:
+            axes = [unit(axes[0] + axes[1])]
+        J = impulse(axes, far, u, mass[at], inverse, h, dt, obstacle.friction)
+        momentum[at] -= J
+        taken += J
+        pushed += (J != 0).any()
+    return pushed, taken
+
+
+def shows(surface: Surface, weights: np.ndarray) -> bool:
+    return bool(((weights > 0) & (surface.depth < surface.distance)).any())
+
+
+def impulse(
+    axes: list[np.ndarray],
+    far: Callable,
+    u: np.ndarray,
+    reduced: float,
+    inverse: tuple[float, float],
+    h: float,
+    dt: float,
+    friction: float,
+) -> np.ndarray:
+    """Return the impulse along the best axis; inverse: of the modulus and of the density, summed over both."""
+    d = len(u)
+    gaps = np.array([sum(far(axis)) for axis in axes])
+    n = unit(np.exp((gaps - gaps.max()) / (0.02 * h)) @ np.array(axes))
+    far_a, far_c = far(n)
+    share = min(1.0, reduced / (0.5 * h**d / inverse[1]))
+    kappa = 2 / inverse[0] * h ** (d - 2) * quadratic((far_a - far_c) / (2 * h)) * share * dt**2 / reduced
+    gap, away = far_a + far_c, u @ n
+    push = max(0.0, -away - max(gap, -0.3 * h) / dt) * kappa / (1 + kappa)
+    push = reduced * max(push, -away * np.clip((-gap / h - 0.1) / 0.1, 0, 1))
+    along = u - away * n
+    slip = np.linalg.norm(along)
+    return push * n - min(friction * push, reduced * slip) * along / slip

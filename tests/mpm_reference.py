@@ -35,7 +35,10 @@ class Particles:
 
 @dataclass(frozen=True)
 class Box:
-    """The domain: cells per axis, spacing, gravity, the words of the (lower, upper) faces per axis, and the knobs."""
+    """The domain: cells per axis, spacing, gravity, the words of the (lower, upper) faces per axis, and the knobs.
+
+    Faces whose word is "open" do nothing.
+    """
 
     cells: tuple[int, ...]
     spacing: float
@@ -131,7 +134,7 @@ def update_both(
         found = []
         for a, n in enumerate(box.cells):
             for side, depth in ((0, node[a]), (1, n - node[a])):
-                if depth > MARGIN:
+                if depth > MARGIN or box.faces[a][side] == "open":
                     continue
                 if box.faces[a][side] == "separate":
                     plane = list(inner)
@@ -192,9 +195,9 @@ def update_both(
                 v, u = (np.where(sign(axis, side) < 0, 0.0, w) for w in (v, u))
         for a, n in enumerate(box.cells):
             held = {axis for axis, _, _ in faces}
-            if a not in held and node[a] <= 0:
+            if a not in held and node[a] <= 0 and box.faces[a][0] != "open":
                 v[a] = max(v[a], 0.0)
-            if a not in held and node[a] >= n:
+            if a not in held and node[a] >= n and box.faces[a][1] != "open":
                 v[a] = min(v[a], 0.0)
         for at, flip in images:
             velocity[at], velocity_before[at] = flip * v, flip * u

@@ -46,7 +46,7 @@ SCENES = (
         ),
         "colliders": (("sand",), 2, {"colliders": True}),
         "colliders, 3D": (("neo_hookean",), 3, {"colliders": True}),
-        "contact": (("neo_hookean", "fixed_corotated", "fluid", "snow"), 2, {"contact": 0.3}),
+        "contact": (("neo_hookean", "fixed_corotated", "fluid", "snow"), 2, {"contact": 0.3, "colliders": True}),
         "slip and stick": (("sand",), 2, {"domain": {"walls": {"default": "slip", "y_min": "stick"}}}),
     }
     | dict.fromkeys(DRIVEN)
@@ -116,7 +116,11 @@ def scene_named(name: str, other: bool = False) -> Scene:
         for k, law in enumerate(materials)
     ]
     cells = (17 if other else 20) if d == 2 else (11 if other else 12)
-    rough = {"friction": {"y_min": 0.4 - 0.1 * other, "x_max": 0.3 + 0.1 * other}} if "rough" in name else {}
+    rough = (
+        {"friction": {"y_min": 0.4 - 0.1 * other, "x_max": 0.3 + 0.1 * other}}
+        if "rough" in name or "contact" in more
+        else {}
+    )
     if "a wall moves" in name:
         rough = {"friction": {"y_min": 0.4 - 0.1 * other}, "wall_velocity": {"y_min": [2.0 + other, 0.0]}}
     data = {

@@ -7,6 +7,7 @@ import contact_reference as contact
 import mpm_reference as reference
 import numpy as np
 import pytest
+from contact_scenes import DENSITY, LAMBDA, MU, SEPARATE, E, G, H, body, jelly, scene
 from solver_state import bodies_of, scene_of
 
 from mpmcli.errors import InputError
@@ -20,35 +21,6 @@ from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.machine.plan import make_plan
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases.two_disks import SPEED, SeparateDisks
-
-E, NU, DENSITY, H = 1e5, 0.3, 1000.0, 0.05
-MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
-G = 9.81
-
-
-def jelly(**more: object) -> dict:
-    """Return a material."""
-    return {"law": "neo_hookean", "density": DENSITY, "youngs_modulus": E, "poissons_ratio": NU, **more}
-
-
-def body(name: str, low: list[float], high: list[float], **more: object) -> dict:
-    """Return a box of jelly; coordinates in cells."""
-    shape = {"box": {"min": [H * x for x in low], "max": [H * x for x in high]}}
-    return {"name": name, "shape": shape, "material": jelly()} | more
-
-
-def scene(bodies: list[dict], friction: float = 0.0, end: float = 1.0, frames: int = 1, **tables: object) -> Scene:
-    """Return bodies that separate, away from the faces of a domain of up to 64 x 32 cells whose floor sticks."""
-    domain = {"size": [64 * H, 32 * H], "spacing": H, "walls": {"default": "separate", "y_min": "stick"}}
-    return scene_of(
-        domain=domain | {"gravity": ["0*t", "0*t"]} | tables.pop("domain", {}),
-        time=tables.pop("time", {"end": end, "frames": frames}),
-        bodies=bodies,
-        contact=tables.pop("contact", {"default": "separate", "friction": friction}),
-        solver={"precision": "f64"} | tables.pop("solver", {}),
-        **tables,
-    )
-
 
 # What bodies carry, and which of them have fields of their own.
 
@@ -86,7 +58,7 @@ def test_a_body_that_starts_deformed_has_its_shape_then() -> None:
 
 
 def test_elastic_bodies_have_layers_of_their_own() -> None:
-    """All others share layer 0, and stick; where fewer than two bodies separate there is one layer."""
+    """All others share layer 0, and stick."""
     water = body("water", [2, 2], [4, 4], material={"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5})
     a, b = body("a", [6, 2], [8, 4]), body("b", [10, 2], [12, 4])
     mixed = scene([a, water, b], friction=0.3)
@@ -94,8 +66,9 @@ def test_elastic_bodies_have_layers_of_their_own() -> None:
     s = STICKS
     assert Layers.of(mixed).frictions(mixed).tolist() == [[s, s, s], [s, s, 0.3], [s, 0.3, s]]
     assert Layers.of(scene([a, b])) == Layers(2, False, 2, (0, 1))
-    assert Layers.of(scene([a, water])).count == 1
-    assert Layers.of(scene([a, b], contact={})).count == 1
+    assert Layers.of(scene([a, water])) == Layers(2, True, 2, (1, 0))
+    alone, glued = Layers.of(scene([a])), Layers.of(scene([a, b], contact={}))
+    assert (alone.count, alone.separate, glued.count, glued.separate) == (1, True, 1, False)
 
 
 def test_the_plan_counts_layers() -> None:
@@ -162,13 +135,31 @@ def test_what_has_one_velocity_field_is_refused(tables: dict, arch: str, reason:
 
 @pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> None:
-    """Two bodies that move and are deformed at random, one pressed into the other, in one step."""
+    """One step of two bodies that move and are deformed at random, between a rough floor and a ball that moves.
+
+    One is pressed into the other, and into the floor, the other into the ball; the ball takes what it gives.
+    """
     d = dimension
-    low, middle, high, top = ([x, y, z][:d] for x, y, z in ((6, 6, 6), (9, 8, 8), (7, 8, 6), (10, 10, 8)))
+    low, middle, high, top = ([x, y, z][:d] for x, y, z in ((6, 0, 6), (9, 2, 8), (7, 2, 6), (10, 4, 8)))
+    centre, pace, spin = [8.2 * H, 5.2 * H, 7 * H][:d], [0.3, -3.0, 0.2][:d], 2.0
     both = scene(
         [body("a", low, middle), body("b", high, top)],
         0.3,
-        domain={"size": [16 * H] * d, "gravity": [0.0] * d, "walls": "slip"},
+        domain={
+            "size": [16 * H] * d,
+            "gravity": [1.0, -9.0, 2.0][:d],
+            "walls": {"default": "slip", "y_min": "separate"},
+            "friction": {"y_min": 0.2},
+        },
+        colliders=[
+            {
+                "name": "ball",
+                "shape": {"ball": {"center": centre, "radius": 1.5 * H}},
+                "velocity": pace,
+                "angular_velocity": spin,
+                "friction": 0.4,
+            }
+        ],
     )
     run = build_run(both, backend_of("f64", 1))
     group, rng = run.groups[0], np.random.default_rng(0)
@@ -177,13 +168,14 @@ def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> 
     x = before["x"] + rng.uniform(-0.1, 0.1, (n, d)) * H
     x[before["body"] == 1, 1] -= 0.15 * H
     v, C = rng.uniform(-1, 1, (n, d)), rng.uniform(-3, 3, (n, d, d))
-    v[:, 1] += np.where(before["body"] == 0, 1.0, -1.0)
+    v[:, 1] -= np.where(before["body"] == 0, 0.5, 2.0)
     F = np.eye(d) + rng.uniform(-0.05, 0.05, (n, d, d))
     group.replace(x=x, v=v, C=C, deformation=F)
     run.state_was_replaced()
     carried = group.arrays.carried.to_numpy()[:n]
     dt = kick = 1e-3
-    box = reference.Box((16,) * d, H, np.zeros(d), [("slip", "slip")] * d)
+    gravity = np.array(both.domain.gravity)
+    box = reference.Box((16,) * d, H, gravity, [("slip", "slip"), ("open", "slip"), ("slip", "slip")][:d])
     stress = reference.neo_hookean_stress(np.full(n, MU), np.full(n, LAMBDA))
     bodies, surfaces, momenta, masses = [], [], [], []
     for k, sample in enumerate(sample_bodies(both)):
@@ -195,6 +187,23 @@ def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> 
         for kept, part in zip((momenta, masses), reference.scatter(bodies[-1:], box, kick / 2), strict=True):
             kept.append(part)
     assert contact.exchange(momenta, masses, surfaces, box, dt, 0.3) > 4
+
+    up = np.eye(d)[1]
+    floor = contact.Obstacle(lambda node: node[1], lambda _: up, lambda _: np.zeros(d), 0.2)
+    # Chords of the circle that points of the ball go along in the step.
+    turn = np.zeros((d, d))
+    turn[:2, :2] = [[math.cos(dt * spin) - 1, -math.sin(dt * spin)], [math.sin(dt * spin), math.cos(dt * spin) - 1]]
+    ball = contact.Obstacle(
+        lambda node: np.linalg.norm(node - centre) - 1.5 * H,
+        lambda node: contact.unit(node - centre),
+        lambda node: pace + turn @ (node - centre) / dt,
+        0.4,
+    )
+    taken = np.zeros(d)
+    for k, obstacle in ((0, floor), (1, floor), (0, ball), (1, ball)):
+        pushed, impulse = contact.stop(momenta[k], masses[k], surfaces[k], obstacle, box, dt, kick / 2 * gravity)
+        assert pushed > 2 or (k == 0) == (obstacle is ball)
+        taken += impulse if obstacle is ball else 0.0
     run.step(dt)
     found = bodies_of(run)
     for k, particles in enumerate(bodies):
@@ -203,6 +212,8 @@ def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> 
         state = found[both.bodies[k].name]
         assert np.abs(state.v - after.v).max() < 1e-12 * np.abs(after.v).max()
         assert np.abs(state.C - after.C).max() < 1e-11 * np.abs(after.C).max()
+    booked = run.batch.device.colliders.taken.to_numpy().sum(0)
+    assert booked[:d] == pytest.approx(taken, rel=1e-12)
 
 
 # What bodies do.
@@ -330,7 +341,7 @@ def test_bodies_that_touch_are_left_alone(backend_of: Callable, shift: float) ->
     x, y = 20 + shift, 8 + shift
     touch = scene([body("a", [x, y], [x + 10, y + 6]), body("b", [x, y + 6], [x + 10, y + 12])], 0.3, 0.05, 5)
     rows = [row for _, row in build_run(touch, backend_of("f64", 1)).frames()]
-    assert 0 < max(row.kinetic + row.elastic for row in rows) < 1e-5 * (LAMBDA + 2 * MU) * H**2
+    assert max(row.kinetic + row.elastic for row in rows) < 1e-5 * (LAMBDA + 2 * MU) * H**2
 
 
 @pytest.mark.slow
@@ -340,9 +351,6 @@ def test_single_precision_bears_nodes_of_hardly_any_mass(backend_of: Callable) -
     frames = list(build_run(scene_of(**tables), backend_of("f32", 1)).frames())
     momentum = np.array([row.linear_momentum for _, row in frames])
     assert np.abs(momentum).max() < 1e-5 * frames[0][1].mass * SPEED
-
-
-SEPARATE = {"default": "separate", "friction": 0.3}
 
 
 def thrown(

@@ -105,6 +105,8 @@ class Colliders:
         turns: numbers of a torque: 1 in 2D, 3 in 3D; loads: of a force and a torque.
         rows: rows of nodes of a run, along the last axis; run: whose colliders act; spacing: h, m.
         taken: impulse, N s, and angular impulse about the pivot, N m s, of each collider, by rows of nodes.
+        layered: whether some bodies meet those that separate by their surfaces; then these act here where `own` is 0,
+            a number or a variable of a kernel.
         deterministic: whether the nodes of a row are added up in their order; then `given` is the impulse that each
             node gives each collider in a step, N s, else None.
     """
@@ -124,6 +126,7 @@ class Colliders:
         d, n = dimension, runs * kind.count
         self.kind, self.dimension, self.shape, self.first, self.on_cpu = kind, d, tuple(shape), first, on_cpu
         self.room, self.run, self.spacing = kind.count, 0, 0.0
+        self.layered, self.own = False, 0
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.turns = 1 if d == 2 else 3
         self.loads = d + self.turns
@@ -289,6 +292,8 @@ class Colliders:
             near = True
             for a in ti.static(range(d)):
                 near = near and arm[a] >= self.reach[i][0, a] and arm[a] <= self.reach[i][1, a]
+            if ti.static(self.layered):
+                near = near and (self.own == 0 or self.wall[i] != SEPARATE)
             if near:
                 for face in range(self.faces_of(i)):
                     phi, normal = self.distance(i, arm, face)

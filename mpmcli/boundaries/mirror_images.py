@@ -50,9 +50,14 @@ class MirrorImages:
         return images
 
     def in_layer(self, layer: object) -> "MirrorImages":
-        """Return the images of a layer of nodes, each of which presses on walls and rubs on its own."""
+        """Return the images of a layer of nodes, each of which presses on walls and rubs on its own.
+
+        Layer 0 is that of bodies that share one, unless none does.
+        """
         images = copy(self)
         images.walls = copy(self.walls)
+        if images.walls.shut == 0:
+            images.walls.shut = -REACH * ti.min(layer, 1)
         images.walls.first_plane = self.walls.first_plane + layer * len(self.walls.separating)
         images.walls.first_rough = self.walls.first_rough + layer * len(self.walls.rough)
         return images

@@ -116,6 +116,8 @@ class Walls:
             friction adds to a column of nodes that slides; along the normal 1 where the column sticks, else 0.
         first_rough: row of `impulse` of the first rough face.
         moving: velocities of the faces that move; moves: whether any does.
+        shut: depth from which on nothing moves through a wall that has let go, a number or a variable of a kernel:
+            that of the wall, or REACH behind it where bodies meet it by their surfaces (`contact.obstacles`).
     """
 
     def __init__(
@@ -134,7 +136,7 @@ class Walls:
         self.periodic = tuple(a for a, pair in enumerate(self.faces) if PERIODIC in pair)
         self.reach = PERIODIC_REACH if self.periodic else REACH
         self.moving, self.moves = moving, len(moving.faces) > 0
-        self.first = first
+        self.first, self.shut = first, 0
         self.last = tuple(first + n for n in cells)
         self.separating = tuple(
             (a, side) for a in range(self.dimension) for side in (0, 1) if self.faces[a][side] == "separate"
@@ -168,7 +170,7 @@ class Walls:
         """Return the velocity of a node after the walls.
 
         On a wall that acts there is no normal part, and none at all where it sticks. On and behind a wall that has let
-        go nothing moves through it.
+        go nothing moves through it, see `shut`.
         """
         result = velocity
         if self.distance(node) <= 0:
@@ -192,7 +194,7 @@ class Walls:
         for a in ti.static(self.axes):
             if acts[a] == 1 and depth[a] == 0:
                 result = self.stopped(result, a, holds, upper, 1.0)
-            elif depth[a] <= 0:
+            elif depth[a] <= self.shut:
                 inward = result[a] if upper[a] == 0 else -result[a]
                 if inward < 0:
                     result[a] = 0.0

@@ -369,8 +369,9 @@ class Contact(Table):
     default: Literal["stick", "separate"] = Field(
         "stick",
         description='"stick": bodies share one velocity field, meet up to two cells before they touch, and do not '
-        'slide. "separate": each elastic body has a velocity field of its own; they meet where their surfaces are, '
-        "slide with friction, and part. Liquids, grains and bodies that yield stick to all others.",
+        'slide. "separate": each elastic body has a velocity field of its own; they meet each other, and walls and '
+        "colliders that separate, where their surfaces are, slide with friction, and part. Liquids, grains and bodies "
+        "that yield stick to all others.",
     )
     friction: NotNegative = Field(0.0, description='Coefficient of Coulomb friction between bodies that "separate".')
     pairs: tuple[ContactPair, ...] = Field((), description="Pairs of bodies that do something else.")
@@ -427,6 +428,11 @@ class Scene(Table):
                 return None if pair.friction == "stick" else pair.friction
         separate = self.contact.default == "separate" and first.has_surface and second.has_surface
         return self.contact.friction if separate else None
+
+    def separates(self, source: "Body | Emitter") -> bool:
+        """Return whether a body has a velocity field of its own: its surface meets others, walls and colliders."""
+        named = any(source.name in pair.between and pair.friction != "stick" for pair in self.contact.pairs)
+        return source.has_surface and (named or self.contact.default == "separate")
 
     @property
     def sources(self) -> "tuple[Body | Emitter, ...]":

@@ -1,4 +1,4 @@
-"""Contact of bodies with velocity fields of their own: impulses at the nodes that two of them reach.
+"""Contact of bodies with velocity fields of their own: impulses at nodes that two of them, or one and a wall reach.
 
 At a node the surface of each body is a distance along an axis, by the logarithm of a sum of exponentials over the
 points of the surface around. Of three axes, the mean of both normals and the normals of the faces that it meets, that
@@ -16,6 +16,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import lattice_spacing
 from mpmcli.solver.contact.layers import Layers
+from mpmcli.solver.contact.obstacles import FAR, REACH
 from mpmcli.solver.contact.surfaces import BodySurfaces
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
@@ -30,8 +31,16 @@ SHARP = 12.0
 # Sharpness of the mean normal of the faces that an axis meets. Bodies whose normals have a larger product look the same
 # way, and not at each other.
 FACING, ALIKE = 16.0, 0.7
+# Products of normals from which on one axis is tried only: of the faces of two bodies, and of an obstacle.
+SAME, SMOOTH = 0.999, 0.9
 # Differences of gaps over which axes are blended, and the overlap beyond which the push stays the same, cells.
-BLEND, DEEPEST = 0.02, 1.0
+BLEND, DEEPEST = 0.02, 0.3
+# Overlaps between which bodies are stopped more and more, whatever the spring does, cells.
+STOPS = (0.1, 0.2)
+# From the nearest point of an obstacle to where others are looked for, and back to its surface at the most, cells.
+FAR_ASIDE = 3.0
+# Nodes of a row that are skipped at most.
+FARTHEST = 1e6
 # Exponents beyond which single precision has no number; in place of 0 where it divides, or its logarithm is taken.
 LARGEST, SMALLEST = 80.0, 1e-37
 # The gap of bodies of which one shows no surface, cells: they do not meet.
@@ -43,7 +52,7 @@ MODULUS, SHARPNESS, FLAT, DISTANCE, DENSITY, FRICTION = range(6)
 
 @ti.data_oriented
 class BodyContact:
-    """What the bodies of a batch do to each other; w is the number of a run.
+    """What the bodies of a batch do to each other, and obstacles to them; w is the number of a run.
 
     Attributes:
         surfaces: what they show; layers: of each run; room: surface points near a node, of each body.
@@ -87,76 +96,133 @@ class BodyContact:
                 self.rows[run * self.layers + layer, k] = number
 
     @ti.func
-    def exchange_rows(self, grid: ti.template(), w: int, thread: int, first: int, after: int, dt: float):
-        """Let bodies exchange momentum at rows of nodes of the box, in a step of dt seconds."""
+    def exchange_rows(
+        self,
+        grid: ti.template(),
+        obstacles: ti.template(),
+        w: int,
+        thread: int,
+        first: int,
+        after: int,
+        dt: float,
+        gravity_step: ti.template(),
+    ):
+        """Let bodies exchange momentum at rows of nodes of the box, and then obstacles push them.
+
+        dt: of the step, s; gravity_step: change of velocity by gravity in it, m/s.
+        """
         last = ti.static(self.dimension - 1)
         for row in range(first, after):
             node = grid.row_start(row)
             index = grid.linear_index(node)
+            # The node along the row up to which no obstacle is near.
+            far = node[last]
             for _ in range(grid.row_length(node)):
-                # Layers in descending order.
-                rest = self.surfaces.present[self.surfaces.place_of(grid, w, index)]
-                while rest > 255:
-                    c, others = ti.cast(rest & 255, int) - 1, rest >> 8
-                    while others > 0:
-                        self.exchange(grid, w, thread, node, index, ti.cast(others & 255, int) - 1, c, dt)
-                        others = others >> 8
-                    rest = rest >> 8
+                present = self.surfaces.present[self.surfaces.place_of(grid, w, index)]
+                # Layers in descending order: pairs of them, then each and the obstacles, whose numbers follow theirs.
+                turns, nearest = 1, FARTHEST
+                if ti.static(obstacles.any):
+                    if present > ti.static(int(self.surfaces.shares)) and node[last] >= far:
+                        turns = 2
+                for turn in range(turns):
+                    rest = present
+                    while rest > 255 or (turn == 1 and rest > ti.static(int(self.surfaces.shares))):
+                        c, others, o = ti.cast(rest & 255, int) - 1, rest >> 8, 0
+                        while (turn == 0 and others > 0) or (turn == 1 and o < obstacles.count()):
+                            a = ti.select(turn == 0, ti.cast(others & 255, int) - 1, c)
+                            met = ti.select(turn == 0, c, self.layers + o)
+                            way = self.exchange(grid, obstacles, w, thread, node, index, a, met, dt, gravity_step)
+                            nearest = ti.min(nearest, way * grid.inverse_spacing)
+                            others, o = others >> 8, o + 1
+                        rest = rest >> 8
+                if turns == 2:
+                    far = node[last] + ti.cast(ti.max(nearest - REACH, 0.0), int)
                 node[last] += 1
                 index += 1
 
     @ti.func
     def exchange(
-        self, grid: ti.template(), w: int, thread: int, node: ti.template(), index: int, a: int, c: int, dt: float
+        self,
+        grid: ti.template(),
+        obstacles: ti.template(),
+        w: int,
+        thread: int,
+        node: ti.template(),
+        index: int,
+        a: int,
+        c: int,
+        dt: float,
+        gravity_step: ti.template(),
     ):
-        """Let layers a and c exchange momentum at a node, which has a linear index in layer 0."""
-        d = ti.static(self.dimension)
+        """Let layer a exchange momentum with layer c, or obstacle c - layers, at a node, by its index in layer 0.
+
+        Return how far the node is from the obstacle, m, see `Obstacles.at`.
+        """
+        h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
         at_a, at_c = index + a * ti.static(self.node_count), index + c * ti.static(self.node_count)
-        m_a, m_c = grid.nodes[at_a][d], grid.nodes[at_c][d]
-        # In this order: the product of two masses may be too small for single precision.
-        reduced, friction = m_a * (m_c / (m_a + m_c)), self.rows[w * self.layers + a, FRICTION + c]
-        u, J = ti.Vector.zero(float, d), ti.Vector.zero(float, d)
-        for b in ti.static(range(d)):
-            u[b] = grid.nodes[at_c][b] / m_c - grid.nodes[at_a][b] / m_a
+        m_a, bodies, way, agree = grid.nodes[at_a][d], c < self.layers, FAR, 0.0
+        reduced, friction = m_a, 0.0
+        # The inverse of the modulus and of the density of both.
+        soft, light = 1.0 / self.rows[row + a, MODULUS], 1.0 / self.rows[row + a, DENSITY]
+        u, J, facing = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
+        if bodies:
+            m_c = grid.nodes[at_c][d]
+            # In this order: the product of two masses may be too small for single precision.
+            reduced, friction = m_a * (m_c / (m_a + m_c)), self.rows[row + a, FRICTION + c]
+            soft += 1.0 / self.rows[row + c, MODULUS]
+            light += 1.0 / self.rows[row + c, DENSITY]
+            for b in ti.static(range(d)):
+                u[b] = grid.nodes[at_c][b] / m_c - grid.nodes[at_a][b] / m_a
+        if ti.static(obstacles.any):
+            if not bodies:
+                distance, normal, velocity, rough, same = self.collect_obstacle(
+                    obstacles, thread, c - self.layers, place_of(node, h)
+                )
+                way, friction, agree = distance, rough, same
+                for b in ti.static(range(d)):
+                    facing[b] = normal[b]
+                    u[b] = velocity[b] - gravity_step[b] - grid.nodes[at_a][b] / m_a
         if friction < 0.0:
             for b in ti.static(range(d)):
                 J[b] = -reduced * u[b]
-        else:
-            gap, middle, n = self.separation(grid, w, thread, node, index, a, c)
-            if gap < APART * grid.spacing:
-                pushed = self.impulse(grid, w, a, c, friction, gap, middle, n, u, reduced, dt)
+        elif bodies or way < REACH * h:
+            gap, middle, n = self.separation(grid, w, thread, node, index, a, c, facing, agree)
+            if gap < APART * h:
+                # As much as nodes on flat faces that touch have: those with less, and that is at edges, push less.
+                mass = ti.max(reduced, 0.5 * h**d / light)
+                kappa = 2.0 / soft * h ** ti.static(d - 2) * spline(middle * grid.inverse_spacing) * dt**2 / mass
+                pushed = self.impulse(gap / h, u, n, kappa, reduced, h / dt, friction)
                 for b in ti.static(range(d)):
                     J[b] = pushed[b]
         for b in ti.static(range(d)):
             grid.nodes[at_a][b] -= J[b]
-            grid.nodes[at_c][b] += J[b]
+            if bodies:
+                grid.nodes[at_c][b] += J[b]
+        if ti.static(obstacles.any):
+            if not bodies:
+                obstacles.take(c - self.layers, node, place_of(node, h), J)
+        return way
 
     @ti.func
     def impulse(
         self,
-        grid: ti.template(),
-        w: int,
-        a: int,
-        c: int,
-        friction: float,
         gap: float,
-        middle: float,
-        n: ti.template(),
         u: ti.template(),
+        n: ti.template(),
+        kappa: float,
         reduced: float,
-        dt: float,
+        speed: float,
+        friction: float,
     ):
-        """Return the impulse that layer c gets and layer a gives at a node, N s.
+        """Return the impulse that c gets and a gives at a node, N s.
 
-        gap, middle, n: see `separation`; u: velocity of c relative to a, m/s; reduced: m_a m_c / (m_a + m_c), kg.
+        gap: cells; u: velocity of c relative to a, m/s; n: normal from a to c; kappa: k dt^2 / m of the spring;
+        reduced: m_a m_c / (m_a + m_c), kg; speed: one cell in the step, m/s.
         """
-        h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
-        away, weight = u.dot(n), spline(middle * grid.inverse_spacing)
-        modulus = 2.0 / (1.0 / self.rows[row + a, MODULUS] + 1.0 / self.rows[row + c, MODULUS])
-        # As much as nodes on flat faces that touch have: those with less, and that is at edges, push less.
-        mass = 0.5 * h**d / (1.0 / self.rows[row + a, DENSITY] + 1.0 / self.rows[row + c, DENSITY])
-        kappa = modulus * h ** ti.static(d - 2) * weight * dt**2 / ti.max(reduced, mass)
-        push = reduced * ti.max(0.0, -away - ti.max(gap, -DEEPEST * h) / dt) * kappa / (1.0 + kappa)
+        away = u.dot(n)
+        push = ti.max(0.0, -away - ti.max(gap, -DEEPEST) * speed) * kappa / (1.0 + kappa)
+        # What is faster than the spring can stop is stopped.
+        push = reduced * ti.max(push, -away * ti.min(ti.max((-gap - STOPS[0]) / (STOPS[1] - STOPS[0]), 0.0), 1.0))
         along = u - away * n
         slip, rub = along.norm(), 0.0
         if slip > 0.0:
@@ -164,30 +230,67 @@ class BodyContact:
         return push * n - rub * along
 
     @ti.func
-    def separation(self, grid: ti.template(), w: int, thread: int, node: ti.template(), index: int, a: int, c: int):
-        """Return the gap of two bodies at a node, m, how far it is from their middle, m, and the normal from a to c."""
+    def separation(
+        self,
+        grid: ti.template(),
+        w: int,
+        thread: int,
+        node: ti.template(),
+        index: int,
+        a: int,
+        c: int,
+        facing: ti.template(),
+        agree: float,
+    ):
+        """Return the gap of a and c at a node, m, how far the node is from their middle, m, and the normal from a to c.
+
+        a: layer of a body; c: of another one, or of an obstacle, whose points are collected, and of which `facing` and
+        `agree` are what `collect_obstacle` returns.
+        """
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
-        gap, middle, normal = APART * h, 0.0, ti.Vector.zero(float, d)
+        gap, middle, normal, smooth = APART * h, 0.0, ti.Vector.zero(float, d), agree > SMOOTH
         n_a, n_c, counts = self.collect(grid, w, thread, node, index, a, c)
+        if c >= self.layers:
+            n_c, counts[1] = facing, 2 * d - 1
         if counts.min() > 0 and n_a.dot(n_c) < ALIKE:
-            axes, gaps, mean = ti.Matrix.zero(float, 4, d), ti.Vector.zero(float, 3), (n_a - n_c).normalized(SMALLEST)
-            for side in range(2):
-                stay_rolled(self.points, thread + side)
-                met = self.normal_along((2 * thread + side) * self.share, counts[side], mean)
+            normal = (n_a - n_c).normalized(SMALLEST)
+            if smooth:
+                normal = -n_c
+            axes, gaps, first_axis = ti.Matrix.zero(float, 4, d), ti.Vector.zero(float, 3), 3
+            if not smooth:
+                alike = 0.0
+                for side in range(2):
+                    stay_rolled(self.points, thread + side)
+                    met = self.normal_along((2 * thread + side) * self.share, counts[side], normal)
+                    for b in ti.static(range(d)):
+                        axes[side, b] = met[b]
+                        alike += axes[0, b] * axes[1, b]
                 for b in ti.static(range(d)):
-                    axes[side, b], axes[2, b] = met[b], mean[b]
-            for j in range(4):
+                    axes[2, b] = normal[b]
+                if alike < SAME:
+                    first_axis = 0
+                else:
+                    # Not the mean of both normals, which tilts beside edges.
+                    for b in ti.static(range(d)):
+                        normal[b] = axes[0, b] + axes[1, b]
+                    normal = normal.normalized()
+            for b in ti.static(range(d)):
+                axes[3, b] = normal[b]
+            for j in range(first_axis, 4):
                 stay_rolled(self.points, thread + j)
                 axis, far = ti.Vector.zero(float, d), ti.Vector.zero(float, 2)
                 for b in ti.static(range(d)):
                     axis[b] = axes[j, b]
                 for side in range(2):
                     stay_rolled(self.points, thread + side)
-                    layer = row + ti.select(side == 0, a, c)
+                    layer = row + ti.select(side == 0 or c >= self.layers, a, c)
                     first, beta = (2 * thread + side) * self.share, self.rows[layer, SHARPNESS]
                     inverse_width = ti.static(0.5 / BALL) * grid.inverse_spacing
                     total = self.sum_points(first, counts[side], axis, beta, inverse_width)
-                    far[side] = -log(ti.max(total * self.rows[layer, FLAT], SMALLEST)) / beta
+                    flat = self.rows[layer, FLAT]
+                    if side == 1 and c >= self.layers:
+                        flat = 1.0 / (1.0 + ti.static(2 * (d - 1)) * exp(-beta * h * ti.static(0.5 / BALL)))
+                    far[side] = -log(ti.max(total * flat, SMALLEST)) / beta
                 gap, middle = far[0] + far[1], 0.5 * (far[0] - far[1])
                 if j < 3:
                     gaps[j] = gap
@@ -243,6 +346,35 @@ class BodyContact:
         return n_a.normalized(SMALLEST), n_c.normalized(SMALLEST), counts
 
     @ti.func
+    def collect_obstacle(self, obstacles: ti.template(), thread: int, o: int, x: ti.template()):
+        """Store points of an obstacle near a place as `collect` does those of a second body, if it is in reach.
+
+        They are the nearest one, and those nearest to what lies a cell aside of it, two along each tangent. Return what
+        `Obstacles.at` does, and the least product of the normals of the others with that of the nearest one.
+        """
+        h, d = ti.static((obstacles.spacing, self.dimension))
+        place, nearest, facing, velocity = x, x, ti.Vector.zero(float, d), ti.Vector.zero(float, d)
+        way, friction, agree, count, k = FAR, 0.0, 1.0, 1, 0
+        while k < count:
+            if k > 0:
+                place = nearest + ti.select(k % 2 == 0, h, -h) * tangent(facing, ti.raw_div(k - 1, 2))
+            distance, normal, pace, rough = obstacles.at(o, place, ti.select(k == 0, REACH, FAR_ASIDE))
+            point = place - distance * normal
+            if k == 0:
+                nearest, facing, way, velocity, friction = point, normal, distance, pace, rough
+                if way < REACH * h:
+                    count = 2 * d - 1
+            agree = ti.min(agree, normal.dot(facing))
+            at = (2 * thread + 1) * self.share + k
+            for b in ti.static(range(d)):
+                self.points[at + b * self.room] = point[b] - x[b]
+                self.points[at + ti.static(d + 1 + b) * self.room] = -normal[b]
+            self.points[at + d * self.room] = (x - point).norm_sqr() * (0.5 / BALL) / h
+            self.points[at + ti.static(2 * d + 1) * self.room] = 1.0
+            k += 1
+        return way, facing, velocity, friction, agree
+
+    @ti.func
     def sum_points(self, first: int, count: int, axis: ti.template(), beta: float, inverse_width: float):
         """Return the sum of exponentials of the distances of a node from surface points along an axis, outwards."""
         d = ti.static(self.dimension)
@@ -287,6 +419,31 @@ class BodyContact:
         for k in ti.static(range(points.n)):
             for lane in range(LANES):
                 points[k, lane] = self.points[first + k * self.room + lane]
+
+
+@ti.func
+def place_of(node: ti.template(), spacing: float):
+    """Return where a node is, from the lower corner, m."""
+    return ti.cast(node - PAD, float) * spacing
+
+
+@ti.func
+def tangent(normal: ti.template(), k: int):
+    """Return the k-th of d - 1 unit vectors that are normal to a unit vector, and to each other."""
+    result = ti.Vector.zero(float, normal.n)
+    if ti.static(normal.n == 2):
+        result[0], result[1] = -normal[1], normal[0]
+    else:
+        # From the axis that is farthest from the normal.
+        least = normal.norm_sqr()
+        for a in ti.static(range(3)):
+            if normal[a] ** 2 < least:
+                least = normal[a] ** 2
+                result = ti.Vector.unit(3, a, float) - normal[a] * normal
+        result = result.normalized()
+        if k == 1:
+            result = normal.cross(result)
+    return result
 
 
 @ti.func

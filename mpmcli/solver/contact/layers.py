@@ -23,7 +23,7 @@ class Layers:
     """The layers of nodes of a run: each body that separates from another has one, and with it a velocity field.
 
     Attributes:
-        count: of layers, 1 where all bodies share one velocity field.
+        count: of layers, 1 where all bodies share one velocity field, or there is one body.
         shares: whether layer 0 belongs to all bodies that have none of their own.
         per_axis: the most particles of a body with a layer of its own along the edge of a cell.
         numbers: the layer of each source.
@@ -37,11 +37,7 @@ class Layers:
     @staticmethod
     def of(scene: Scene) -> "Layers":
         """Return the layers of a scene."""
-        sources = scene.sources
-        own = [
-            any(scene.friction_between(one, other) is not None for other in sources if other is not one)
-            for one in sources
-        ]
+        sources, own = scene.sources, [scene.separates(source) for source in scene.sources]
         if not any(own):
             return Layers(1, True, 1, (0,) * len(own))
         shares = not all(own)
@@ -49,9 +45,14 @@ class Layers:
         densest = max(points_per_cell(sources[i], scene.domain.spacing) for i, one in enumerate(own) if one)
         return Layers(shares + sum(own), shares, math.ceil(densest ** (1 / scene.dimension)), numbers)
 
+    @property
+    def separate(self) -> bool:
+        """Whether any body has a layer of its own, and meets others, walls and colliders by its surface."""
+        return self.count > 1 or not self.shares
+
     def has_own(self, source: int) -> bool:
         """Return whether a source has a layer of its own."""
-        return self.count > 1 and (self.numbers[source] > 0 or not self.shares)
+        return self.numbers[source] > 0 or not self.shares
 
     def frictions(self, scene: Scene) -> np.ndarray:
         """Return the coefficient of friction of each pair of layers, (count, count); `STICKS` for those that stick."""
@@ -71,16 +72,16 @@ def require_contact_possible(scene: Scene, backend: Backend) -> None:
     Raises:
         InputError: says what the scene or the backend has that contact is not available with.
     """
-    count = Layers.of(scene).count
+    layers = Layers.of(scene)
     reasons = {
         f"with --arch {backend.arch}": not backend.on_cpu,
         'with solver.solids = "total"': scene.solver.solids == "total",
         "on a sparse grid": wants_sparse(scene),
         "in a domain with periodic walls": any(PERIODIC in pair for pair in scene.domain.walls.faces(scene.dimension)),
-        f"for more than {MOST_LAYERS} bodies": count > MOST_LAYERS,
+        f"for more than {MOST_LAYERS} bodies": layers.count > MOST_LAYERS,
     }
     for reason, applies in reasons.items():
-        if applies and count > 1:
+        if applies and layers.separate:
             raise InputError(
                 f'bodies that separate are not available {reason}; give contact.default = "stick" and no pairs.'
             )

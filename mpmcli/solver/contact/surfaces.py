@@ -1,4 +1,4 @@
-"""What bodies with velocity fields of their own show each other near nodes that two of them reach: their surfaces.
+"""What bodies with velocity fields of their own show each other, walls and colliders near nodes where they meet.
 
 Each particle carries the depth D below the nearest face of its body at rest, and the normal N of that face. Under F
 they become d = D / |F^-T N| and n = F^-T N / |F^-T N|, and x + d n is a point of the surface. Particles that show
@@ -13,12 +13,16 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Body
 from mpmcli.scene.sampling import BodyParticles, lattice_spacing
 from mpmcli.solver.contact.layers import Layers
+from mpmcli.solver.contact.obstacles import REACH
 from mpmcli.solver.grid.grid import Grid, box_of
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.sort import TileOrder, stay_rolled
+from mpmcli.solver.transfer.splines import PAD
 
 # Depth below a surface up to which particles count for its normal, cells.
 BAND = 1.5
+# Stretch of the smallest principal axis, inverse, up to which particles are found.
+CRUSHED = 4.0
 # In place of the first particle of a bin: none. In place of the layer of a particle: it shows nothing.
 EMPTY, HIDDEN = -1, -1
 # In place of the depth of a particle that shows nothing.
@@ -59,11 +63,14 @@ class BodySurfaces:
     Attributes:
         layers: of each run; groups, orders: of particles; surfaced: numbers of those that carry surfaces.
         low, high: of each layer of each run, the range of the nodes at which stencils began at the last sort.
-        used: of each of them, the nodes in use, as `Grid.box`; box: of each run, those that two layers may reach.
+        used: of each of them, the nodes in use, as `Grid.box`; box: of each run, those where layers meet each other
+            or an obstacle.
+        pairs: as box, of two layers alone.
         drift: of each run, cells that particles may have moved since the sort.
         present: of each node of a run in that box the layers that have mass there, increased by 1, a byte each.
         first: of each node and surfaced group, the first particle that shows something whose stencil begins there, or
             EMPTY; following: of each particle, the next one.
+        end: of each tile, the particle after the last one that may show something.
         shown: of each particle its layer, or HIDDEN; surface: the normal n of its body, and the depth d below it, m.
     """
 
@@ -76,20 +83,22 @@ class BodySurfaces:
         self.surfaced = tuple(g for g, group in enumerate(groups) if group.surfaced)
         self.node_count, count = grid.node_count, runs * layers.count
         self.low, self.high = (ti.Vector.field(d, int, shape=count) for _ in range(2))
-        self.used, self.box = ti.field(int, shape=(2 * count, d)), ti.field(int, shape=(2 * runs, d))
+        self.used = ti.field(int, shape=(2 * count, d))
+        self.box, self.pairs = (ti.field(int, shape=(2 * runs, d)) for _ in range(2))
         self.drift, self.count = ti.field(int, shape=runs), ti.field(int, shape=runs)
         self.present = ti.field(ti.i64, shape=runs * grid.node_count)
-        self.first, self.following, self.shown, self.surface = {}, {}, {}, {}
+        self.first, self.following, self.shown, self.surface, self.end = {}, {}, {}, {}, {}
         for g in self.surfaced:
             room = groups[g].capacity
             self.first[g] = ti.field(int, shape=runs * grid.node_count)
             self.following[g], self.shown[g] = ti.field(int, shape=room), ti.field(int, shape=room)
+            self.end[g] = ti.field(int, shape=orders[g].start.shape)
             self.surface[g] = ti.Vector.field(d + 1, float, shape=room)
 
     @staticmethod
-    def bytes_needed(nodes: int, particles: Sequence[int], surface: int) -> int:
-        """Return the bytes for so many nodes, and particles of each group that carries surfaces; of one, `surface`."""
-        return nodes * (8 + 4 * len(particles)) + sum(particles) * (8 + surface)
+    def bytes_needed(nodes: int, tiles: int, particles: Sequence[int], surface: int) -> int:
+        """Return the bytes for so many nodes, tiles, and particles per group of which each shows so many bytes."""
+        return nodes * 8 + (nodes + tiles) * 4 * len(particles) + sum(particles) * (8 + surface)
 
     # Where bodies may meet.
 
@@ -108,8 +117,11 @@ class BodySurfaces:
             self.high[layer][a] = ti.max(self.high[layer][a], base[a])
 
     @ti.func
-    def find_box(self, grid: ti.template(), w: int, drift: int, last: ti.template()):
-        """Find the nodes that layers use, and those that two of them may reach, `drift` cells after the sort."""
+    def find_box(self, grid: ti.template(), obstacles: ti.template(), w: int, drift: int, last: ti.template()):
+        """Find the nodes that layers use, and those where they may meet, `drift` cells after the sort.
+
+        Among these are the nodes at which the stencils begin of what meets there.
+        """
         d, reach, begin = ti.static((self.dimension, grid.scheme.spline.nodes - 1, w * self.layers))
         self.drift[w] = drift
         for layer in range(begin, begin + self.count[w]):
@@ -125,15 +137,37 @@ class BodySurfaces:
         for c in range(begin + 1, begin + self.count[w]):
             for a in range(begin, c):
                 stay_rolled(self.orders[0].buffers.real, a)
-                # With the nodes at which their stencils begin.
                 first = ti.max(self.low[a], self.low[c]) - drift - reach
                 end = ti.min(self.high[a], self.high[c]) + drift + reach
                 if (end - first).min() >= reach:
                     low, high = ti.min(low, first), ti.max(high, end)
-        for a in ti.static(range(d)):
+        self.set_box(self.pairs, grid, w, low, high)
+        if ti.static(obstacles.any):
+            for o in range(obstacles.count()):
+                first_met, last_met = obstacles.range(o)
+                for layer in range(begin + ti.static(int(self.shares)), begin + self.count[w]):
+                    first = ti.max(self.low[layer] - drift, first_met) - reach
+                    end = ti.min(self.high[layer] + drift + reach, last_met)
+                    if (end - first).min() >= reach:
+                        middle, radius = self.ball_of(first, end, obstacles.spacing)
+                        distance, _n, _v, _f = obstacles.at(o, middle, radius / obstacles.spacing + REACH)
+                        if distance < radius + REACH * obstacles.spacing:
+                            low, high = ti.min(low, first), ti.max(high, end)
+        self.set_box(self.box, grid, w, low, high)
+
+    @ti.func
+    def set_box(self, box: ti.template(), grid: ti.template(), w: int, low: ti.template(), high: ti.template()):
+        """Set a box from its first to its last node, as far as nodes are in use."""
+        for a in ti.static(range(self.dimension)):
             first = ti.max(low[a], grid.box[2 * w, a])
             end = ti.min(high[a], grid.box[2 * w, a] + grid.box[2 * w + 1, a] - 1)
-            self.box[2 * w, a], self.box[2 * w + 1, a] = first, ti.max(end - first + 1, 0)
+            box[2 * w, a], box[2 * w + 1, a] = first, ti.max(end - first + 1, 0)
+
+    @ti.func
+    def ball_of(self, first: ti.template(), last: ti.template(), spacing: float):
+        """Return the middle and the radius of the ball around a box of nodes, m."""
+        low, high = ti.cast(first - PAD, float), ti.cast(last - PAD, float)
+        return 0.5 * spacing * (low + high), 0.5 * spacing * (high - low).norm()
 
     @ti.func
     def place_of(self, grid: ti.template(), w: int, index: int):
@@ -237,8 +271,8 @@ class BodySurfaces:
         return product
 
     @ti.func
-    def particles_in(self, grid: ti.template(), order: ti.template(), w: int, q: int):
-        """Return the first particle of the q-th of these tiles, and the one after the last."""
+    def tile_at(self, grid: ti.template(), order: ti.template(), w: int, q: int):
+        """Return the number of the q-th of these tiles in `order.start`, and its place per axis."""
         first, count = self.tiles(grid, w)
         place, rest, tile = first, q, 0
         for b in ti.static(range(self.dimension)):
@@ -248,8 +282,22 @@ class BodySurfaces:
             rest = after
         for a in ti.static(range(self.dimension)):
             tile = tile * ti.static(grid.tiles[a]) + place[a]
-        tile += w * ti.static(order.bins + 1)
-        return order.start[tile], order.start[tile + 1]
+        return tile + w * ti.static(order.bins + 1), place
+
+    @ti.func
+    def may_meet(self, grid: ti.template(), obstacles: ti.template(), w: int, place: ti.template()):
+        """Return whether particles of a tile may meet other bodies, and whether they may meet an obstacle."""
+        bodies, beside = True, False
+        first, last = place * grid.tile - self.drift[w], (place + 1) * grid.tile + self.drift[w]
+        for a in ti.static(range(self.dimension)):
+            low, high = self.pairs[2 * w, a], self.pairs[2 * w, a] + self.pairs[2 * w + 1, a]
+            bodies = bodies and first[a] < high and last[a] > low
+        if ti.static(obstacles.any):
+            # With the stencils of its particles.
+            middle, radius = self.ball_of(first, last + ti.static(grid.scheme.spline.nodes), grid.spacing)
+            reach = radius + REACH * grid.spacing
+            beside = obstacles.nearest(middle, reach * grid.inverse_spacing) < reach
+        return bodies, beside
 
     @ti.func
     def bin_of(self, grid: ti.template(), w: int, base: ti.template()):
@@ -261,14 +309,18 @@ class BodySurfaces:
         return place
 
     @ti.func
-    def show(self, g: ti.template(), grid: ti.template(), w: int, q: int):
+    def show(self, g: ti.template(), grid: ti.template(), obstacles: ti.template(), w: int, q: int):
         """Find what the particles of the g-th group in the q-th tile show."""
         d, group = ti.static((self.dimension, self.groups[g]))
-        begin, end = self.particles_in(grid, self.orders[g], w, q)
-        for p in range(begin, end):
+        tile, place = self.tile_at(grid, self.orders[g], w, q)
+        bodies, beside = self.may_meet(grid, obstacles, w, place)
+        begin, end = self.orders[g].start[tile], self.orders[g].start[tile + 1]
+        self.end[g][tile] = ti.select(bodies or beside, end, begin)
+        for p in range(begin, self.end[g][tile]):
             base, _ = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
             shown = HIDDEN
-            if self.bin_of(grid, w, base) >= 0:
+            # What lies deeper at rest is farther from the surface than the band, unless it is crushed.
+            if self.bin_of(grid, w, base) >= 0 and group.carried[p][d] < CRUSHED * BAND * grid.spacing:
                 N = ti.Vector.zero(float, d)
                 for c in ti.static(range(d)):
                     N[c] = group.carried[p][c]
@@ -276,7 +328,7 @@ class BodySurfaces:
                 size = n.norm()
                 depth = group.carried[p][d] / size
                 if depth < BAND * grid.spacing:
-                    if self.meets(grid, w, base):
+                    if beside or self.meets(grid, w, base):
                         shown = group.layer_of(p)
                         for c in ti.static(range(d)):
                             self.surface[g][p][c] = n[c] / size
@@ -286,8 +338,8 @@ class BodySurfaces:
     @ti.func
     def link(self, g: ti.template(), grid: ti.template(), w: int, q: int):
         """Put the particles of the g-th group in the q-th tile that show something into their bins."""
-        begin, end = self.particles_in(grid, self.orders[g], w, q)
-        for p in range(begin, end):
+        tile, _ = self.tile_at(grid, self.orders[g], w, q)
+        for p in range(self.orders[g].start[tile], self.end[g][tile]):
             stay_rolled(self.orders[0].buffers.real, p)
             if self.shown[g][p] != HIDDEN:
                 base, _ = grid.scheme.spline.stencil(self.groups[g].x[p], grid.inverse_spacing)

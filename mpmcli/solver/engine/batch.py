@@ -12,6 +12,7 @@ import numpy as np
 
 from mpmcli.boundaries.colliders import ColliderMotion, Colliders
 from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.walls import REACH as WALLS_REACH
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls, faces_on_grid
 from mpmcli.errors import InputError, RunError
 from mpmcli.quick_taichi import ti
@@ -105,6 +106,7 @@ class Batch:
                 slips=slips_in(kind.settings, kind.rough),
                 comes_and_goes=kind.inflow.any,
                 layers=kind.layers.count,
+                surfaced=kind.layers.separate and law.elastic,
             )
             for law, shares, room, bodies, forces in zip(
                 kind.members, averaged, kind.particles, kind.bodies, kind.drives.forces, strict=True
@@ -120,6 +122,7 @@ class Batch:
         friction, moving = RoughFaces(kind.rough, runs), MovingFaces(kind.moving, d, runs)
         faces = faces_on_grid(kind.faces, kind.settings)
         walls = Walls(faces, PAD, grid.cells, grid.shape, runs * grid.layers, friction, moving)
+        walls.shut = 0 if kind.layers.shares else -WALLS_REACH
         images = MirrorImages(walls, scheme.spline.on_node, on_cpu=on_cpu)
         if deterministic:
             grid.fixed = FixedPoint(grid, groups, backend.arch)
@@ -129,6 +132,7 @@ class Batch:
         colliders = motion = None
         if kind.colliders.count:
             colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, on_cpu=on_cpu, deterministic=deterministic)
+            colliders.layered, colliders.own = kind.layers.separate, int(not kind.layers.shares)
             motion = ColliderMotion(colliders, runs) if kind.colliders.moving else None
         self.device = Device(
             runs,
@@ -149,7 +153,7 @@ class Batch:
             colliders,
             motion,
             Emission(kind.inflow, d, runs) if kind.inflow.groups else None,
-            BodyContact(groups, orders, grid, kind.layers, runs, backend.threads) if grid.layers > 1 else None,
+            BodyContact(groups, orders, grid, kind.layers, runs, backend.threads) if kind.layers.separate else None,
             ti.field(int, shape=(2 * runs, d)) if on_cpu else None,
             sorts,
         )

@@ -1,7 +1,8 @@
 """The phases on the CPU in which bodies with velocity fields of their own meet, see `contact.body_contact`."""
 
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.engine.cpu_parts import MOVED
+from mpmcli.solver.contact.obstacles import Obstacles
+from mpmcli.solver.engine.cpu_parts import MOVED, Part
 
 
 @ti.data_oriented
@@ -27,7 +28,7 @@ class CpuContact:
 
     @ti.func
     def near_bodies(self, at: ti.template()):
-        """Return the box of the nodes that two bodies may reach, as `Grid.box`."""
+        """Return the box of the nodes where bodies may meet, as `Grid.box`."""
         box = ti.Matrix.zero(int, 2, self.dimension)
         for i, a in ti.static(ti.ndrange(2, self.dimension)):
             box[i, a] = self.device.contact.surfaces.box[at.w * 2 + i, a]
@@ -35,7 +36,7 @@ class CpuContact:
 
     @ti.func
     def rows_near_bodies(self, grid: ti.template(), at: ti.template()):
-        """Return the first of a part of the rows of nodes that two bodies may reach, and the one after the last."""
+        """Return the first of a part of the rows of nodes where bodies may meet, and the one after the last."""
         first, after = self.places.even_part(grid.row_count(), at.region)
         return self.share(first, after, at.part)
 
@@ -49,13 +50,13 @@ class CpuContact:
 
     @ti.func
     def show_surface(self, at: ti.template()):
-        """Find what particles of the g-th group show to other bodies."""
+        """Find what particles of the g-th group show."""
         box = self.near_bodies(at)
-        (grid,) = ti.static((at.grid.within(box),))
+        grid, obstacles = ti.static((at.grid.within(box), obstacles_of(at)))
         first, after = self.places.even_part(self.device.contact.surfaces.tile_count(grid, at.w), at.region)
         first, after = self.share(first, after, at.part)
         for q in range(first, after):
-            self.device.contact.surfaces.show(at.g, grid, at.w, q)
+            self.device.contact.surfaces.show(at.g, grid, obstacles, at.w, q)
 
     @ti.func
     def link_surfaces(self, at: ti.template()):
@@ -69,9 +70,16 @@ class CpuContact:
 
     @ti.func
     def exchange(self, at: ti.template()):
-        """Let bodies that meet at nodes exchange momentum."""
-        box = self.near_bodies(at)
-        (grid,) = ti.static((at.grid.within(box),))
+        """Let bodies that meet at nodes exchange momentum, and walls and colliders push them."""
+        box, gravity_step = self.near_bodies(at), self.gravity_step(at.w)
+        grid, obstacles = ti.static((at.grid.within(box), obstacles_of(at)))
         first, after = self.rows_near_bodies(grid, at)
         thread = at.w * ti.static(self.regions) + at.t
-        self.device.contact.exchange_rows(grid, at.w, thread, first, after, self.values[at.w, MOVED])
+        self.device.contact.exchange_rows(
+            grid, obstacles, at.w, thread, first, after, self.values[at.w, MOVED], gravity_step
+        )
+
+
+def obstacles_of(at: Part) -> Obstacles:
+    """Return the walls and colliders of the run of a part."""
+    return Obstacles(at.nodes.images.walls, at.nodes.colliders, at.grid.spacing)

@@ -10,6 +10,7 @@ from collections import Counter
 import numpy as np
 
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.contact.obstacles import Obstacles
 from mpmcli.solver.engine.cpu_phases import CpuPhases, RunInts, RunReals, Shown
 from mpmcli.solver.engine.cpu_threads import LOOKS_IN_VAIN, CpuThreads
 from mpmcli.solver.engine.device import Device, views
@@ -163,6 +164,8 @@ class CpuLaunch:
             relaxed = self.steps.relaxed_in(w, dt, numbers, counts)
             self.find_box(w, numbers, counts)
             self.phases.begin_step(w, dt, kick, relaxed, numbers)
+            if ti.static(self.phases.separates):
+                self.find_meetings(w, numbers, counts)
         return dt > 0
 
     @ti.func
@@ -239,13 +242,19 @@ class CpuLaunch:
             first, last = box_of(self.device.grid, a, low, high, drift, last_wall)
             self.device.grid.box[w * 2, a] = first
             self.device.grid.box[w * 2 + 1, a] = last - first + 1
-        if ti.static(self.phases.separates):
-            walls = ti.Vector.zero(int, self.dimension)
-            for a in ti.static(range(self.dimension)):
-                walls[a] = PAD + counts[w, self.count.cells[a]]
-            self.device.contact.surfaces.find_box(self.device.grid, w, drift, walls)
         if ti.static(self.phases.shared and not self.device.grid.sparse):
             self.phases.places.divide_rows()
+
+    @ti.func
+    def find_meetings(self, w: int, numbers: ti.template(), counts: ti.template()):
+        """Find where bodies may meet in the step, with colliders where they are in it."""
+        drift = ti.cast(ti.ceil(numbers[w, self.real.drift]), int)
+        h, inverse, scale, box, last, extent = self.phases.view_numbers(w, numbers, counts)
+        _grid, nodes, _particles, _orders, _groups = ti.static(
+            views(self.device, w, h, inverse, scale, box, last, extent)
+        )
+        (obstacles,) = ti.static((Obstacles(nodes.images.walls, nodes.colliders, h),))
+        self.device.contact.surfaces.find_box(self.device.grid, obstacles, w, drift, last)
 
     @ti.func
     def enter(self, w: int, numbers: ti.template(), counts: ti.template()):

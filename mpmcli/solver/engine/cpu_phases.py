@@ -357,7 +357,11 @@ class CpuPhases(CpuContact):
     def each_plane_node(self, at: ti.template(), rubs: ti.template()):
         """Find friction, or else contact, at the nodes in use of the planes of faces."""
         gravity_step = self.gravity_step(at.w)
-        for layer in range(self.layer_count(at)):
+        layers = 1
+        if ti.static(rubs):
+            # Where bodies meet walls by their surfaces walls do not find whether they press.
+            layers = self.layer_count(at)
+        for layer in range(layers):
             own = self.used_by(at, layer)
             (inner,) = ti.static((at.in_layer(layer, own),))
             (grid,) = ti.static((inner.grid.within(own) if at.grid.layers > 1 else at.grid,))

@@ -66,12 +66,12 @@ class Device:
         return step_phases(
             [group.law for group in self.groups],
             [group.averaged for group in self.groups],
-            contact=self.nodes.needs_contact,
+            contact=self.nodes.needs_contact and (self.contact is None or self.contact.surfaces.shares),
             friction=self.nodes.needs_friction,
             deterministic=self.grid.deterministic,
             loads=self.grid.deterministic and self.nodes.collides,
             shifts=self.grid.dimension if self.grid.fine else 0,
-            layers=self.grid.layers,
+            separates=self.contact is not None,
         )
 
 

@@ -63,13 +63,13 @@ def step_phases(
     deterministic: bool = False,
     loads: bool = False,
     shifts: int = 0,
-    layers: int = 1,
+    separates: bool = False,
 ) -> tuple[Phase, ...]:
     """Return the phases of a step; neighbours of one name that add nothing to nodes may be carried out at once.
 
     averaged: whether the particles of each law share their change of volume; contact, friction: whether walls let go,
     or rub; deterministic: whether P2G is in fixed point; loads: whether there are colliders, too; shifts: the
-    dimension where particles are shifted, else 0; layers: of nodes, whose bodies meet.
+    dimension where particles are shifted, else 0; separates: whether bodies meet by their surfaces.
     """
     groups = range(len(laws))
     return (
@@ -79,10 +79,10 @@ def step_phases(
         *(Phase("scatter", "particles", g, adds=True) for g in groups),
         *[Phase("settle", "nodes")] * deterministic,
         *(Phase("relax", "particles", g) for g in groups if laws[g].relaxes),
-        *[Phase("find_bodies", "nodes")] * (layers > 1),
-        *(Phase("show_surface", "particles", g) for g in groups if layers > 1 and laws[g].elastic),
-        *[Phase("link_surfaces", "particles")] * (layers > 1),
-        *[Phase("exchange", "nodes")] * (layers > 1),
+        *[Phase("find_bodies", "nodes")] * separates,
+        *(Phase("show_surface", "particles", g) for g in groups if separates and laws[g].elastic),
+        *[Phase("link_surfaces", "particles")] * separates,
+        *[Phase("exchange", "nodes")] * separates,
         *[Phase("find_contact", "planes")] * contact,
         *[Phase("find_friction", "planes")] * friction,
         Phase("update", "nodes"),

@@ -162,14 +162,15 @@ def bytes_of_fields(law: type[Law], dimension: int, precision: str, **asked: boo
 
 def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = False) -> tuple[str, ...]:
     """Return the loops of one step; `deterministic` where P2G is in fixed point."""
+    layers = Layers.of(scene)
     phases = step_phases(
         members,
         [averages_volume(scene.solver, law) for law in members],
-        contact=bool(_separating_axes(scene)),
+        contact=layers.shares and bool(_separating_axes(scene)),
         friction=bool(_rough_axes(scene)),
         deterministic=deterministic,
         loads=deterministic and bool(scene.colliders),
-        layers=Layers.of(scene).count,
+        separates=layers.separate,
     )
     forces = [" with forces" * bool(forces_on(scene, members_of(scene, law.name))) for law in members]
     words = WORDS | {"update": "update grid" + " with colliders" * bool(scene.colliders)}
@@ -201,7 +202,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     ]
     averaged = [averages_volume(scene.solver, law) for law in members]
     require_contact_possible(scene, backend)
-    layers = Layers.of(scene).count
+    separate, layers = Layers.of(scene).separate, Layers.of(scene).count
     groups = tuple(
         LawPlan(
             name,
@@ -216,7 +217,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 total=scene.solver.solids == "total",
                 slips=slips_in(scene.solver, rough_faces(scene)),
                 comes_and_goes=scene.comes_and_goes,
-                surfaced=layers > 1 and laws()[name].elastic,
+                surfaced=separate and laws()[name].elastic,
             ),
         )
         for name, shares in zip(sorted(bodies), averaged, strict=True)
@@ -245,8 +246,8 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     tables = len(groups) * TileOrder.bytes_needed(blocks if sparse else all_tiles, backend.threads)
     if sparse:
         tables += SparseGrid.table_bytes(all_tiles, blocks, dimension)
-    surfaced = [in_steps(counts[law.name]) for law in members if layers > 1 and law.elastic]
-    tables += BodySurfaces.bytes_needed(nodes, surfaced, real * (dimension + 1)) if surfaced else 0
+    surfaced = [in_steps(counts[law.name]) for law in members if separate and law.elastic]
+    tables += BodySurfaces.bytes_needed(nodes, all_tiles, surfaced, real * (dimension + 1)) if surfaced else 0
     tables += layers * _contact_bytes(scene, all_nodes, tile, Grid.tile_counts(cells, tile), real)
     if scene.solver.solids == "total" and len(scene.sources) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(map(in_steps, counts.values())))

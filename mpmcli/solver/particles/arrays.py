@@ -113,6 +113,7 @@ class ParticleArrays:
         slips: bool = False,
         comes_and_goes: bool = False,
         layers: int = 1,
+        surfaced: bool = False,
     ) -> None:
         """Allocate for `count` particles, and a table of these rows and columns."""
         self.law, self.capacity = law, count
@@ -122,7 +123,7 @@ class ParticleArrays:
         self.several, self.serial, self.total, self.averaged = several, serial, total, averaged
         self.keeps_initial, self.evened = keeps_initial or total, averaged and not total
         self.slips, self.comes_and_goes = slips, comes_and_goes
-        self.layers, self.surfaced = layers, layers > 1 and law.elastic
+        self.layers, self.surfaced = layers, surfaced
         wanted = particle_fields(
             law.deformation,
             names := [variable.name for variable in law.internal],

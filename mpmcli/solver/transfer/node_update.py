@@ -27,6 +27,9 @@ class NodeUpdate:
         """Return the update of a layer of nodes, by its number, a variable of a kernel."""
         view = copy(self)
         view.grid, view.images = grid, self.images.in_layer(layer)
+        if view.collides and not view.colliders.own:
+            view.colliders = copy(self.colliders)
+            view.colliders.own = layer
         return view
 
     @ti.func

@@ -1,0 +1,179 @@
+"""Bodies with velocity fields of their own meet walls and colliders where their surfaces are, slide, roll and part."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from contact_scenes import DENSITY, E, G, H, body, jelly, scene
+
+from mpmcli.scene import Scene
+from mpmcli.solver.engine.build import build_run
+
+C = math.sqrt(E / DENSITY)
+STIFF = jelly(youngs_modulus=4e6)
+
+
+def on_one(way: str, at: list[float], normal: list[float], friction: float = 0.0, **motion: object) -> dict:
+    """Return the tables of a wall (the floor), or of a collider with a plane face through a place, in cells."""
+    if way == "wall":
+        walls = {"default": "slip", "y_min": "separate"}
+        speed = {"wall_velocity": {"y_min": motion["velocity"]}} if motion else {}
+        return {"domain": {"walls": walls, "friction": {"y_min": friction}, **speed}}
+    place, n = H * np.array(at), np.array(normal)
+    shape = {"plane": {"point": place.tolist(), "normal": normal}}
+    if way == "box":
+        along = np.array([n[1], -n[0]]) * 80 * H
+        corners = [place - along, place + along, place + along - 40 * H * n, place - along - 40 * H * n]
+        shape = {"polygon": {"vertices": [corner.tolist() for corner in corners]}}
+    collider = {"name": "stop", "shape": shape, "friction": friction, **motion}
+    return {"colliders": [collider], "domain": {"walls": "slip"}}
+
+
+def speeds(run: object, way: list[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times of the frames, and the mean velocity along a way at each."""
+    found = [(frame.time, (frame.velocity @ np.array(way)).mean()) for frame, _ in run.frames()]
+    return np.array(found).T
+
+
+def falling(way: str, shift: float, n: int, speed: float = 2e-3, **tables: object) -> Scene:
+    """A bar of 6 x n cells without lateral strain that flies at a floor, 4 cells away, at `speed` of its wave speed."""
+    floor, pace = 0.0 if way == "wall" else 5.0 + shift, speed * C
+    y = floor + 4 + (shift if way == "wall" else 0.0)
+    bar = body("bar", [10.3, y], [16.3, y + n], material=jelly(poissons_ratio=0.0), velocity=[0.0, -pace])
+    asked = on_one(way, [10, floor], [0.0, 1.0])
+    gap = (y - floor) * H
+    asked["domain"]["size"] = [64 * H, (2 * n + 16) * H]
+    return scene([bar], end=gap / pace + 3 * n * H / C, frames=200, **asked, **tables)
+
+
+@pytest.mark.parametrize(
+    ("way", "shift"), [("wall", 0.3), pytest.param("wall", 0.0, marks=pytest.mark.slow), ("plane", 0.3)]
+)
+def test_a_bar_meets_a_wall_where_it_is(backend_of: Callable, way: str, shift: float) -> None:
+    """It touches within 0.03 cells, stays for 2 L / c, and leaves with nearly the speed that it came with."""
+    n, pace = 16, 2e-3 * C
+    asked = falling(way, shift, n)
+    time, moves = speeds(build_run(asked, backend_of("f64", 1)), [0.0, 1.0])
+    moves /= pace
+    begins, ends = time[np.argmax(moves > -0.95)], time[np.argmax(moves > moves[-1] - 0.05)]
+    length, gap = 2 * n * H / C, (4 + (shift if way == "wall" else 0.0)) * H
+    assert abs(gap / pace + 0.025 * length - begins) * pace / H < 0.03
+    assert (ends - begins) / (0.95 * length) == pytest.approx(1.0, abs=0.1)
+    assert 0.93 < moves[-1] < 1.0
+
+
+@pytest.mark.parametrize("way", ["wall", "plane"])
+def test_nothing_passes_at_the_speed_of_waves(backend_of: Callable, way: str) -> None:
+    """What is too fast for the spring of contact is stopped less than a cell behind; no energy is made."""
+    asked = falling(way, 0.3, 16, 1.0)
+    frames = list(build_run(asked, backend_of("f32", 1)).frames())
+    floor = 0.0 if way == "wall" else 5.3 * H
+    assert min(frame.position[:, 1].min() for frame, _ in frames) > floor - 0.75 * H
+    assert frames[-1][0].velocity[:, 1].mean() > 0.2 * C
+    energy = np.array([row.kinetic + row.elastic for _, row in frames])
+    assert energy.max() <= energy[0] * (1 + 1e-6)
+
+
+def turned_block(way: str, degrees: float, friction: float, shift: float, time: float = 0.4) -> tuple[Scene, list]:
+    """A block on a floor that is turned, with gravity 30 degrees to it, which comes on in a quarter of the time."""
+    angle, slope = math.radians(degrees), math.radians(30)
+    t, n = np.array([math.cos(angle), -math.sin(angle)]), np.array([math.sin(angle), math.cos(angle)])
+    start = np.array([16 + shift, 0.0 if way == "wall" else 24 + shift])
+    corners = [start + a * t + b * n for a, b in ((0, 0), (16, 0), (16, 8), (0, 8))]
+    ramp = f"clamp(t/{0.25 * time},0,1)"
+    rise = f"{ramp}*{ramp}*(3-2*{ramp})"
+    step = f"clamp((t-{0.25 * time})*1e6,0,1)"
+    pulls = zip((G * math.sin(slope) * t).tolist(), (-G * math.cos(slope) * n).tolist(), strict=True)
+    asked = on_one(way, start.tolist(), n.tolist(), friction)
+    asked["domain"]["gravity"] = [f"{along!r}*{step}+{down!r}*{rise}" for along, down in pulls]
+    asked["domain"]["size"] = [64 * H, 64 * H]
+    block = {"name": "block", "shape": {"polygon": {"vertices": [(H * x).tolist() for x in corners]}}}
+    return scene([block | {"material": STIFF}], end=time, frames=40, **asked), t.tolist()
+
+
+@pytest.mark.parametrize(
+    ("way", "degrees", "friction", "off"),
+    [
+        ("wall", 0.0, 0.3, 3e-3),
+        ("wall", 0.0, 0.0, 1e-3),
+        *(
+            pytest.param(*how, marks=pytest.mark.slow)
+            for how in (("plane", 0.0, 0.3, 3e-3), ("box", 17.0, 0.3, 5e-3), ("plane", 17.0, 0.0, 2e-3))
+        ),
+    ],
+)
+def test_a_block_slides_with_the_friction_of_the_floor(
+    backend_of: Callable, way: str, degrees: float, friction: float, off: float
+) -> None:
+    asked, along = turned_block(way, degrees, friction, 0.3)
+    time, speed = speeds(build_run(asked, backend_of("f64", 1)), along)
+    late = time > 0.2
+    acceleration = np.polyfit(time[late], speed[late], 1)[0]
+    slope = math.radians(30)
+    assert (math.sin(slope) - acceleration / G) / math.cos(slope) == pytest.approx(friction, abs=off)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("friction", [0.5, 0.05])
+def test_a_disc_rolls_or_slides_down_a_wall(backend_of: Callable, friction: float) -> None:
+    """16 cells across, on 20 degrees: it rolls with 2/3 g sin, or slides with 2 mu g cos / R of spin; 5 % and 8 %."""
+    slope, r = math.radians(20), 8.0
+    asked = on_one("wall", [0, 0], [0.0, 1.0], friction)
+    asked["domain"] |= {
+        "size": [160 * H, 32 * H],
+        "gravity": [f"{G * math.sin(slope)!r}*clamp((t-0.4)*10,0,1)", f"{-G * math.cos(slope)!r}*clamp(t/0.4,0,1)"],
+    }
+    disc = {"name": "disc", "shape": {"ball": {"center": [16.3 * H, r * H], "radius": r * H}}, "material": STIFF}
+    found = []
+    for frame, _ in build_run(scene([disc], end=1.2, frames=60, **asked), backend_of("f64", 1)).frames():
+        x, v = (values - values.mean(axis=0) for values in (frame.position, frame.velocity))
+        spin = (x[:, 0] * v[:, 1] - x[:, 1] * v[:, 0]).sum() / (x**2).sum()
+        found.append((frame.time, frame.velocity[:, 0].mean(), spin))
+    time, speed, spin = np.array(found).T
+    late = time > 0.6
+    acceleration, turning = (np.polyfit(time[late], values[late], 1)[0] for values in (speed, spin))
+    if friction == 0.5:
+        assert acceleration / (2 / 3 * G * math.sin(slope)) == pytest.approx(1.0, abs=0.05)
+        assert -turning * r * H / acceleration == pytest.approx(1.0, abs=0.05)
+    else:
+        assert (math.sin(slope) - acceleration / G) / math.cos(slope) == pytest.approx(0.05, rel=0.08)
+        assert -turning * r * H / (2 * G * math.cos(slope)) == pytest.approx(0.05, rel=0.08)
+
+
+@pytest.mark.parametrize("way", ["wall", "box"])
+def test_a_belt_carries_a_block(backend_of: Callable, way: str) -> None:
+    """It slides with mu g until it has the velocity of the belt, and keeps that."""
+    friction, pace = 0.4, 0.8
+    floor = 0.0 if way == "wall" else 6.3
+    asked = on_one(way, [20, floor], [0.0, 1.0], friction, velocity=[pace, 0.0])
+    asked["domain"] |= {"gravity": [0.0, -G], "size": [64 * H, 32 * H]}
+    block = body("block", [10.3, floor], [20.3, floor + 5], material=STIFF)
+    time, speed = speeds(build_run(scene([block], end=0.4, frames=40, **asked), backend_of("f64", 1)), [1.0, 0.0])
+    slides = (time > 0.02) & (time < 0.8 * pace / (friction * G))
+    assert np.polyfit(time[slides], speed[slides], 1)[0] == pytest.approx(friction * G, rel=0.03)
+    assert speed[time > 0.35] == pytest.approx(pace, rel=0.01)
+
+
+@pytest.mark.parametrize("way", ["wall", "plane"])
+def test_jelly_rests_on_the_floor(backend_of: Callable, way: str) -> None:
+    """Its lowest row is as far above it as when surfaces touch, 0.03 cells off; 0.15 at its corners.
+
+    Water beside it changes nothing, and meets the floor as water does.
+    """
+    floor = 0.0 if way == "wall" else 6.3
+    asked = on_one(way, [20, floor], [0.0, 1.0], 0.3)
+    asked["domain"] |= {"gravity": [0.0, f"{-G}*clamp(t/0.3,0,1)"], "size": [64 * H, 32 * H]}
+    block = body("block", [10.3, floor], [18.3, floor + 8])
+    liquid = {"law": "fluid", "density": DENSITY, "bulk_modulus": 1e5}
+    water = body("water", [40, floor + 1], [64, floor + 5], material=liquid)
+    places = []
+    for bodies in ([block], [block, water]):
+        *_, (frame, _) = build_run(scene(bodies, end=0.6, **asked), backend_of("f64", 1)).frames()
+        own = frame.position[frame.body == 0]
+        row = np.sort(own[:, 1])[:16] / H - floor
+        assert np.median(row) == pytest.approx(0.25, abs=0.03) and row.min() > 0.1
+        places.append(own.mean(axis=0))
+        if len(bodies) == 2:
+            assert frame.position[frame.body == 1, 1].min() / H - floor < 1.0
+    assert places[1] == pytest.approx(places[0], abs=1e-3 * H)
