@@ -102,6 +102,17 @@ def stack_2d(result: Result) -> str:
     return f"flight of the ball {percent(error)} off; the blocks end {max(places) - min(places):.2f} m apart"
 
 
+def rolling_3d(result: Result) -> str:
+    """Compare how far the balls come with 5/7 g sin a t^2 / 2 and g sin a t^2 / 2."""
+    first, last = result.frame(0), result.frame(len(result.times) - 1)
+    said = []
+    for k, share in enumerate((5 / 7, 1.0)):
+        way = [frame.position[frame.body == k, 0].mean(dtype=np.float64) for frame in (first, last)]
+        expected = share * 2.539 * last.time**2 / 2
+        said.append(percent((way[1] - way[0]) / expected - 1))
+    return f"way of a rigid ball that rolls {said[0]} off, of one that slides {said[1]}"
+
+
 def couette_2d(result: Result) -> str:
     """Compare the velocity with the series at four times: see `mpmcli.validation.cases.channel`."""
     width, speed, viscosity, n = 0.1, 0.1, 0.01, np.arange(1, 100)
@@ -329,6 +340,7 @@ KNOWN_ANSWERS = {
     "couette_2d": couette_2d,
     "rubber_bounce_2d": rubber_bounce_2d,
     "stack_2d": stack_2d,
+    "rolling_3d": rolling_3d,
     "snowball_wall_2d": snowball_wall,
     "snowball_wall_3d": snowball_wall,
     "sand_column_2d": sand_column_2d,

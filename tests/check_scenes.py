@@ -26,6 +26,7 @@ def loaded(
     time: dict[str, Any] | None = None,
     solver: dict[str, Any] | None = None,
     output: dict[str, Any] | None = None,
+    contact: dict[str, Any] | None = None,
     **body: Any,
 ) -> LoadedScene:
     """Return a scene: by default a block of 16 x 16 cells of fluid on the floor of 64 x 64 cells, h = 1/64 m."""
@@ -35,6 +36,7 @@ def loaded(
         time={"end": 0.5, "frames": 10} | (time or {}),
         solver=solver or {},
         output=output or {},
+        contact=contact or {},
         bodies=bodies or [block],
     )
     return LoadedScene(scene, (), "scene.toml")

@@ -12,22 +12,25 @@ from mpm_reference import MARGIN, Box, quadratic
 class Surface:
     """What the particles of a body show: places x, normals n (n, d) and depths (n) of the deformed surface.
 
-    distance: of its particles at rest, m; modulus: its P-wave modulus, Pa; density: at rest, kg/m^3.
+    slope: dv/dn, (n, d), 1/s; distance: of its particles at rest, m; modulus: its P-wave modulus, Pa; density: at rest,
+    kg/m^3.
     """
 
     x: np.ndarray
     n: np.ndarray
     depth: np.ndarray
+    slope: np.ndarray
     distance: float
     modulus: float
     density: float
 
     @staticmethod
-    def of(x: np.ndarray, F: np.ndarray, N: np.ndarray, D: np.ndarray, *numbers: float) -> "Surface":
-        """Carry normals N (n, d) and depths D (n) at rest with F (n, d, d)."""
+    def of(x: np.ndarray, C: np.ndarray, F: np.ndarray, N: np.ndarray, D: np.ndarray, *numbers: float) -> "Surface":
+        """Carry normals N (n, d) and depths D (n) at rest with F (n, d, d); C is the gradient of the velocity."""
         normal = np.stack([np.linalg.inv(f).T @ each for f, each in zip(F, N, strict=True)])
         size = np.linalg.norm(normal, axis=1)
-        return Surface(x, normal / size[:, None], D / size, *numbers)
+        normal /= size[:, None]
+        return Surface(x, normal, D / size, np.einsum("pij,pj->pi", C, normal), *numbers)
 
 
 def unit(v: np.ndarray) -> np.ndarray:
@@ -121,7 +124,10 @@ def exchange(
             axes = [unit(axes[0] + axes[1])]
         u = momenta[1][at] / m[1] - momenta[0][at] / m[0]
         inverse = 1 / a.modulus + 1 / c.modulus, 1 / a.density + 1 / c.density
-        J = impulse(axes, far, u, m[0] * m[1] / m.sum(), inverse, h, dt, friction)
+        slopes = np.array(
+            [weights @ surface.slope / weights.sum() for surface, weights in zip(surfaces, w, strict=True)]
+        )
+        J = impulse(axes, far, u, slopes, m[0] * m[1] / m.sum(), inverse, h, dt, friction)
         momenta[0][at] -= J
         momenta[1][at] += J
         pushed += (J != 0).any()
@@ -155,14 +161,15 @@ def stop(
 
         mean = unit(unit(w @ surface.n) - facing)
         shares = np.exp(16 * (-normals @ mean - 1))
-        u = obstacle.velocity(node) - gravity_step - momentum[at] / mass[at]
+        slopes = np.array([w @ surface.slope / w.sum(), np.zeros(len(node))])
+        u = obstacle.velocity(points[0]) - gravity_step - momentum[at] / mass[at]
         inverse = 1 / surface.modulus, 1 / surface.density
         axes = [normal_along(surface, w, mean), -unit(shares @ normals), mean]
         if (normals @ facing > 0.9).all():
             axes = [-facing]
         elif axes[0] @ axes[1] > 0.999:
             axes = [unit(axes[0] + axes[1])]
-        J = impulse(axes, far, u, mass[at], inverse, h, dt, obstacle.friction)
+        J = impulse(axes, far, u, slopes, mass[at], inverse, h, dt, obstacle.friction)
         momentum[at] -= J
         taken += J
         pushed += (J != 0).any()
@@ -177,13 +184,17 @@ def impulse(
     axes: list[np.ndarray],
     far: Callable,
     u: np.ndarray,
+    slopes: np.ndarray,
     reduced: float,
     inverse: tuple[float, float],
     h: float,
     dt: float,
     friction: float,
 ) -> np.ndarray:
-    """Return the impulse along the best axis; inverse: of the modulus and of the density, summed over both."""
+    """Return the impulse along the best axis.
+
+    slopes: dv/dn of both, a row each; inverse: of the modulus and of the density, summed over both.
+    """
     d = len(u)
     gaps = np.array([sum(far(axis)) for axis in axes])
     n = unit(np.exp((gaps - gaps.max()) / (0.02 * h)) @ np.array(axes))
@@ -193,6 +204,7 @@ def impulse(
     gap, away = far_a + far_c, u @ n
     push = max(0.0, -away - max(gap, -0.3 * h) / dt) * kappa / (1 + kappa)
     push = reduced * max(push, -away * np.clip((-gap / h - 0.1) / 0.1, 0, 1))
-    along = u - away * n
+    along = u + far_a * slopes[0] - far_c * slopes[1]
+    along -= (along @ n) * n
     slip = np.linalg.norm(along)
     return push * n - min(friction * push, reduced * slip) * along / slip

@@ -177,13 +177,13 @@ def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> 
     gravity = np.array(both.domain.gravity)
     box = reference.Box((16,) * d, H, gravity, [("slip", "slip"), ("open", "slip"), ("slip", "slip")][:d])
     stress = reference.neo_hookean_stress(np.full(n, MU), np.full(n, LAMBDA))
-    bodies, surfaces, momenta, masses = [], [], [], []
+    bodies, surfaces, momenta, masses, numbers = [], [], [], [], (H / 2, LAMBDA + 2 * MU, DENSITY)
     for k, sample in enumerate(sample_bodies(both)):
         own = before["body"] == k
         full = [np.full(own.sum(), value) for value in (sample.mass, sample.volume)]
         bodies.append(reference.Particles(x[own], v[own], C[own], F[own], *full, stress))
         shown = carried[own]
-        surfaces.append(contact.Surface.of(x[own], F[own], shown[:, :d], shown[:, d], H / 2, LAMBDA + 2 * MU, DENSITY))
+        surfaces.append(contact.Surface.of(x[own], C[own], F[own], shown[:, :d], shown[:, d], *numbers))
         for kept, part in zip((momenta, masses), reference.scatter(bodies[-1:], box, kick / 2), strict=True):
             kept.append(part)
     assert contact.exchange(momenta, masses, surfaces, box, dt, 0.3) > 4

@@ -104,6 +104,22 @@ def test_a_wall_that_is_nearly_touched(cells: float, fires: bool) -> None:
     assert [(one.severity, "y_min" in one.what) for one in findings] == [("note", True)] * fires
 
 
+def test_bodies_that_separate_begin_where_they_like() -> None:
+    """They act on each other, and on walls that separate, where they touch; one of fluid acts on both from afar."""
+    separate = {"contact": {"default": "separate"}, "domain": {"walls": "separate"}}
+    for material, gaps, margins in ((SOLID, 0, 0), (FLUID, 1, 2)):
+        bodies = [
+            block("low", [0.25, 0.5 * H], [0.5, 0.25]) | {"material": SOLID},
+            block("high", [0.25, 0.25 + H], [0.5, 0.75]) | {"material": material},
+            block("far", [0.75, 0.5 * H], [0.9, 0.25]) | {"material": material},
+            block("farther", [0.95, 0.5 * H], [1.0, 0.25]) | {"material": material},
+        ]
+        assert len(found("gap", bodies, **separate)) == gaps
+        assert len(found("wall-margin", bodies, **separate)) == margins
+    sticks = {"walls": {"default": "separate", "y_min": "stick"}}
+    assert len(found("wall-margin", bodies[:1], **(separate | {"domain": sticks}))) == 1
+
+
 @pytest.mark.parametrize(("count", "severity"), [(1, "warning"), (3, "warning"), (4, None), (16, None), (17, "note")])
 def test_particles_per_cell(count: int, severity: str | None) -> None:
     """From 2^d to 4^d."""

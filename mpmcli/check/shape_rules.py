@@ -54,9 +54,9 @@ def _gaps(facts: SceneFacts) -> Iterator[Finding]:
     reach = REACH[facts.scene.solver.kernel]
     for i, j, distance in close_pairs(facts.scene, reach * h):
         cells = distance / h
-        if cells <= TOUCHING or cells >= reach:
-            continue
         first, second = bodies[i], bodies[j]
+        if cells <= TOUCHING or cells >= reach or facts.scene.friction_between(first, second) is not None:
+            continue
         # Bodies with equal velocity would come to rest in contact; those that pass each other are dragged along.
         passing = not np.array_equal(first.velocity, second.velocity)
         what = (
@@ -72,10 +72,12 @@ def _walls(facts: SceneFacts) -> Iterator[Finding]:
     h = domain.spacing
     for body in facts.bodies:
         lower, upper = body.body.shape.form.bounds()
+        words = domain.walls.faces(facts.scene.dimension)
         for a, axis in enumerate(AXES[: facts.scene.dimension]):
             gaps = {f"{axis}_min": lower[a] - domain.origin[a], f"{axis}_max": domain.upper[a] - upper[a]}
-            for face, gap in gaps.items():
-                if not domain.periodic[a] and 1e-3 < gap / h < WALL_REACH * (1 - 1e-6):
+            for (face, gap), word in zip(gaps.items(), words[a], strict=True):
+                meets = word == "separate" and facts.scene.separates(body.body)
+                if not meets and not domain.periodic[a] and 1e-3 < gap / h < WALL_REACH * (1 - 1e-6):
                     begins = f'Body "{body.name}" begins {gap / h:.2g} cells from the wall {face}'
                     what = f"{begins}, which already acts on it."
                     fix = f"Let it touch the wall, or set it {WALL_REACH * h:.3g} m or more from it."

@@ -79,6 +79,16 @@ class _Body(_Facts):
             return None
 
 
+class _Contact(_Facts):
+    default: str = "stick"
+    pairs: tuple[dict[str, Any], ...] = ()
+
+    @property
+    def separates(self) -> bool:
+        """Whether any bodies may separate."""
+        return self.default == "separate" or any(pair.get("friction") != "stick" for pair in self.pairs)
+
+
 class _StoredScene(_Facts):
     """What is read of a complete scene, of which a shape that is read from a file may be gone."""
 
@@ -92,6 +102,7 @@ class _StoredScene(_Facts):
     colliders: tuple[dict[str, Any], ...] = ()
     forces: tuple[Any, ...] = ()
     impulses: tuple[Any, ...] = ()
+    contact: _Contact = _Contact()
 
 
 class LawHeader(_Facts):

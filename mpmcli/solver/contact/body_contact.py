@@ -186,12 +186,12 @@ class BodyContact:
             for b in ti.static(range(d)):
                 J[b] = -reduced * u[b]
         elif bodies or way < REACH * h:
-            gap, middle, n = self.separation(grid, w, thread, node, index, a, c, facing, agree)
+            gap, middle, n, aside = self.separation(grid, w, thread, node, index, a, c, facing, agree)
             if gap < APART * h:
                 # As much as nodes on flat faces that touch have: those with less, and that is at edges, push less.
                 mass = ti.max(reduced, 0.5 * h**d / light)
                 kappa = 2.0 / soft * h ** ti.static(d - 2) * spline(middle * grid.inverse_spacing) * dt**2 / mass
-                pushed = self.impulse(gap / h, u, n, kappa, reduced, h / dt, friction)
+                pushed = self.impulse(gap / h, u, n, aside, kappa, reduced, h / dt, friction)
                 for b in ti.static(range(d)):
                     J[b] = pushed[b]
         for b in ti.static(range(d)):
@@ -209,6 +209,7 @@ class BodyContact:
         gap: float,
         u: ti.template(),
         n: ti.template(),
+        aside: ti.template(),
         kappa: float,
         reduced: float,
         speed: float,
@@ -216,14 +217,15 @@ class BodyContact:
     ):
         """Return the impulse that c gets and a gives at a node, N s.
 
-        gap: cells; u: velocity of c relative to a, m/s; n: normal from a to c; kappa: k dt^2 / m of the spring;
+        gap: cells; u: velocity of c relative to a, m/s; n, aside: see `separation`; kappa: k dt^2 / m of the spring;
         reduced: m_a m_c / (m_a + m_c), kg; speed: one cell in the step, m/s.
         """
         away = u.dot(n)
         push = ti.max(0.0, -away - ti.max(gap, -DEEPEST) * speed) * kappa / (1.0 + kappa)
         # What is faster than the spring can stop is stopped.
         push = reduced * ti.max(push, -away * ti.min(ti.max((-gap - STOPS[0]) / (STOPS[1] - STOPS[0]), 0.0), 1.0))
-        along = u - away * n
+        along = u + aside
+        along -= along.dot(n) * n
         slip, rub = along.norm(), 0.0
         if slip > 0.0:
             rub = ti.min(friction * push, reduced * slip) / slip
@@ -242,14 +244,15 @@ class BodyContact:
         facing: ti.template(),
         agree: float,
     ):
-        """Return the gap of a and c at a node, m, how far the node is from their middle, m, and the normal from a to c.
+        """Return the gap of a and c at a node, m, how far the node is from their middle, m, the normal from a to c, and
+        how much faster c is than a where their surfaces are than at the node, m/s.
 
         a: layer of a body; c: of another one, or of an obstacle, whose points are collected, and of which `facing` and
         `agree` are what `collect_obstacle` returns.
         """
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
         gap, middle, normal, smooth = APART * h, 0.0, ti.Vector.zero(float, d), agree > SMOOTH
-        n_a, n_c, counts = self.collect(grid, w, thread, node, index, a, c)
+        n_a, n_c, counts, slopes = self.collect(grid, w, thread, node, index, a, c)
         if c >= self.layers:
             n_c, counts[1] = facing, 2 * d - 1
         if counts.min() > 0 and n_a.dot(n_c) < ALIKE:
@@ -304,13 +307,21 @@ class BodyContact:
                     normal = blend.normalized(SMALLEST)
                     for b in ti.static(range(d)):
                         axes[3, b] = normal[b]
-        return gap, middle, normal
+        # Of the way from the node to the surface of each, along its normal.
+        aside = ti.Vector.zero(float, d)
+        for b in ti.static(range(d)):
+            aside[b] = (0.5 * gap + middle) * slopes[0, b] - (0.5 * gap - middle) * slopes[1, b]
+        return gap, middle, normal, aside
 
     @ti.func
     def collect(self, grid: ti.template(), w: int, thread: int, node: ti.template(), index: int, a: int, c: int):
-        """Store the surface points of two layers near a node; return their outward normals, and how many points."""
+        """Store the surface points of two layers near a node.
+
+        Return their outward normals, how many points, and dv/dn of both, a row each, 1/s.
+        """
         h, d = ti.static((grid.spacing, self.dimension))
         n_a, n_c, counts = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(int, 2)
+        slopes, weights = ti.Matrix.zero(float, 2, d), ti.Vector.zero(float, 2)
         place = self.surfaces.place_of(grid, w, index)
         for q in range(ti.static(grid.scheme.spline.nodes**d)):
             before, inside = self.surfaces.stencil_before(grid, node, q)
@@ -331,6 +342,9 @@ class BodyContact:
                                 n_a += weight * n
                             else:
                                 n_c += weight * n
+                            weights[side] += weight
+                            for b in ti.static(range(d)):
+                                slopes[side, b] += weight * self.surfaces.surface[g][p][d + 1 + b]
                             depth = self.surfaces.surface[g][p][d]
                             near = depth < self.rows[w * self.layers + layer, DISTANCE]
                             if near and counts[side] < self.room:
@@ -343,7 +357,9 @@ class BodyContact:
                                 self.points[at + ti.static(2 * d + 1) * self.room] = weight
                                 counts[side] += 1
                         p = self.surfaces.following[g][p]
-        return n_a.normalized(SMALLEST), n_c.normalized(SMALLEST), counts
+        for side, b in ti.static(ti.ndrange(2, d)):
+            slopes[side, b] /= ti.max(weights[side], SMALLEST)
+        return n_a.normalized(SMALLEST), n_c.normalized(SMALLEST), counts, slopes
 
     @ti.func
     def collect_obstacle(self, obstacles: ti.template(), thread: int, o: int, x: ti.template()):

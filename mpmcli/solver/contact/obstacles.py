@@ -51,7 +51,8 @@ class Obstacles:
     def at(self, o: int, x: ti.template(), reach: float):
         """Return how far a place is from an obstacle, m, its normal into the material, velocity, m/s, and friction.
 
-        Beyond the reach, cells, the distance is a lower bound, and there is no normal; x: from the lower corner, m.
+        These are those of the nearest point. Beyond the reach, cells, the distance is a lower bound, and there is no
+        normal; x: from the lower corner, m.
         """
         d, h = ti.static((self.dimension, self.spacing))
         distance, friction, normal, velocity = FAR, 0.0, ti.Vector.zero(float, d), ti.Vector.zero(float, d)
@@ -85,7 +86,7 @@ class Obstacles:
                     distance = beyond
                 elif acts:
                     found, own = self.colliders.distance(i, arm, side)
-                    along = self.colliders.velocity[i] + self.colliders.turning[i] @ arm
+                    along = self.colliders.velocity[i] + self.colliders.turning[i] @ (arm - found * own)
                     distance, friction = found, self.colliders.friction[i]
                     for a in ti.static(range(d)):
                         normal[a], velocity[a] = own[a], along[a]

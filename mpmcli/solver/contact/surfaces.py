@@ -71,7 +71,8 @@ class BodySurfaces:
         first: of each node and surfaced group, the first particle that shows something whose stencil begins there, or
             EMPTY; following: of each particle, the next one.
         end: of each tile, the particle after the last one that may show something.
-        shown: of each particle its layer, or HIDDEN; surface: the normal n of its body, and the depth d below it, m.
+        shown: of each particle its layer, or HIDDEN; surface: the normal n of its body, the depth d below it, m,
+            and dv/dn, 1/s.
     """
 
     def __init__(
@@ -93,7 +94,7 @@ class BodySurfaces:
             self.first[g] = ti.field(int, shape=runs * grid.node_count)
             self.following[g], self.shown[g] = ti.field(int, shape=room), ti.field(int, shape=room)
             self.end[g] = ti.field(int, shape=orders[g].start.shape)
-            self.surface[g] = ti.Vector.field(d + 1, float, shape=room)
+            self.surface[g] = ti.Vector.field(2 * d + 1, float, shape=room)
 
     @staticmethod
     def bytes_needed(nodes: int, tiles: int, particles: Sequence[int], surface: int) -> int:
@@ -332,6 +333,10 @@ class BodySurfaces:
                         shown = group.layer_of(p)
                         for c in ti.static(range(d)):
                             self.surface[g][p][c] = n[c] / size
+                            slope = 0.0
+                            for a in ti.static(range(d)):
+                                slope += group.gradient[p][a, c] * n[a] / size
+                            self.surface[g][p][d + 1 + c] = slope
                         self.surface[g][p][d] = depth
             self.shown[g][p] = shown
 

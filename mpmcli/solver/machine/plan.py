@@ -247,7 +247,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     if sparse:
         tables += SparseGrid.table_bytes(all_tiles, blocks, dimension)
     surfaced = [in_steps(counts[law.name]) for law in members if separate and law.elastic]
-    tables += BodySurfaces.bytes_needed(nodes, all_tiles, surfaced, real * (dimension + 1)) if surfaced else 0
+    tables += BodySurfaces.bytes_needed(nodes, all_tiles, surfaced, real * (2 * dimension + 1)) if surfaced else 0
     tables += layers * _contact_bytes(scene, all_nodes, tile, Grid.tile_counts(cells, tile), real)
     if scene.solver.solids == "total" and len(scene.sources) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(map(in_steps, counts.values())))
