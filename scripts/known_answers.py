@@ -102,6 +102,17 @@ def stack_2d(result: Result) -> str:
     return f"flight of the ball {percent(error)} off; the blocks end {max(places) - min(places):.2f} m apart"
 
 
+def billiard_2d(result: Result) -> str:
+    """Say how far the momentum is off before a ball is at a cushion."""
+    low, high = (corner + side * result.header.spacing for corner, side in ((0.0, 1), (result.header.upper, -1)))
+    errors, first = [], np.array(result.ledger[0].linear_momentum)
+    for frame, row in zip(result.frames([]), result.ledger, strict=True):
+        if (frame.position < low).any() or (frame.position > high).any():
+            break
+        errors.append(np.abs(np.array(row.linear_momentum) - first).max() / first.max())
+    return f"momentum {max(errors):.0e} off until a ball is at a cushion, at t = {frame.time:.2f} s"
+
+
 def rolling_3d(result: Result) -> str:
     """Compare how far the balls come with 5/7 g sin a t^2 / 2 and g sin a t^2 / 2."""
     first, last = result.frame(0), result.frame(len(result.times) - 1)
@@ -341,6 +352,7 @@ KNOWN_ANSWERS = {
     "rubber_bounce_2d": rubber_bounce_2d,
     "stack_2d": stack_2d,
     "rolling_3d": rolling_3d,
+    "billiard_2d": billiard_2d,
     "snowball_wall_2d": snowball_wall,
     "snowball_wall_3d": snowball_wall,
     "sand_column_2d": sand_column_2d,

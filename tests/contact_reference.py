@@ -151,7 +151,15 @@ def stop(
         if mass[at] == 0 or 1.5 * h <= D:
             continue
         w, facing = near(surface, node, h), obstacle.normal(node)
+        u = obstacle.velocity(node - D * facing) - gravity_step - momentum[at] / mass[at]
         if not shows(surface, w) or unit(w @ surface.n) @ facing >= 0.7:
+            # Behind the obstacle what shows no surface is stopped.
+            push = mass[at] * max(0.0, u @ facing) * (D <= 0)
+            along = u - (u @ facing) * facing
+            slip = np.linalg.norm(along)
+            J = -push * facing - min(obstacle.friction * push, mass[at] * slip) * along / slip
+            momentum[at] -= J
+            taken += J
             continue
 
         points, normals = obstacle.points(node, h)
@@ -162,7 +170,6 @@ def stop(
         mean = unit(unit(w @ surface.n) - facing)
         shares = np.exp(16 * (-normals @ mean - 1))
         slopes = np.array([w @ surface.slope / w.sum(), np.zeros(len(node))])
-        u = obstacle.velocity(points[0]) - gravity_step - momentum[at] / mass[at]
         inverse = 1 / surface.modulus, 1 / surface.density
         axes = [normal_along(surface, w, mean), -unit(shares @ normals), mean]
         if (normals @ facing > 0.9).all():

@@ -217,4 +217,13 @@ PLASTIC = (
         ("(variables[0] * lost,", "(variables[0] * lost**0.95,", "snow_blocks"),
     ),
 )
-SMALL_PLANTS = (*TRANSFERS, *DRIVES, *WALLS, *ELASTIC, *FLUIDS, *PLASTIC)
+CONTACT = _of(
+    "solver/contact/body_contact.py",
+    ("rub = ti.min(friction * push", "rub = ti.min(1.05 * friction * push", "slope_contact"),
+    ("along = u + aside", "along = u + 0.0 * aside", "rolling_contact"),
+    # Mean normals, which tilt beside edges; no separating axis; the places of particles in place of their surface.
+    ("normal[b] = axes[0, b] + axes[1, b]", "normal[b] = 1.0 * normal[b]", "slope_contact"),
+    ("if alike < SAME:", "if alike < -SAME:", "rolling_contact slope_contact"),
+    ("way -= depth * n", "way -= 0.0 * depth * n", "two_disks_contact"),
+)
+SMALL_PLANTS = (*TRANSFERS, *DRIVES, *WALLS, *CONTACT, *ELASTIC, *FLUIDS, *PLASTIC)

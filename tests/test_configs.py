@@ -24,6 +24,7 @@ SLOW = {
 
 def test_these_are_the_scenes():
     assert [path.stem for path in SCENES] == [
+        "billiard_2d",
         "block_slide_2d",
         "clay_drop_2d",
         "couette_2d",

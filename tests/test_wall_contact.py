@@ -8,6 +8,7 @@ import pytest
 from contact_scenes import DENSITY, E, G, H, body, jelly, scene
 
 from mpmcli.scene import Scene
+from mpmcli.solver.contact.surfaces import BELOW_ALL
 from mpmcli.solver.engine.build import build_run
 
 C = math.sqrt(E / DENSITY)
@@ -73,6 +74,20 @@ def test_nothing_passes_at_the_speed_of_waves(backend_of: Callable, way: str) ->
     assert frames[-1][0].velocity[:, 1].mean() > 0.2 * C
     energy = np.array([row.kinetic + row.elastic for _, row in frames])
     assert energy.max() <= energy[0] * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("way", ["wall", "plane"])
+def test_what_shows_no_surface_is_stopped(backend_of: Callable, way: str) -> None:
+    """As what was torn or crushed, it is stopped within a cell, and flies back."""
+    run = build_run(falling(way, 0.3, 8, 0.1), backend_of("f64", 1))
+    carried = run.groups[0].arrays.carried
+    values = carried.to_numpy()
+    values[:, 2] = BELOW_ALL
+    carried.from_numpy(values)
+    floor = 0.0 if way == "wall" else 5.3 * H
+    frames = [frame for frame, _ in run.frames()]
+    assert abs(min(frame.position[:, 1].min() for frame in frames) - floor) < H
+    assert frames[-1].velocity[:, 1].mean() > 0.05 * C
 
 
 def turned_block(way: str, degrees: float, friction: float, shift: float, time: float = 0.4) -> tuple[Scene, list]:

@@ -187,6 +187,9 @@ class BodyContact:
                 J[b] = -reduced * u[b]
         elif bodies or way < REACH * h:
             gap, middle, n, aside = self.separation(grid, w, thread, node, index, a, c, facing, agree)
+            if gap >= APART * h and way <= 0.0:
+                # Behind an obstacle what shows no surface, as it was torn or crushed, is stopped.
+                gap, middle, n, aside = -h, gap, -facing, 0.0 * facing
             if gap < APART * h:
                 # As much as nodes on flat faces that touch have: those with less, and that is at edges, push less.
                 mass = ti.max(reduced, 0.5 * h**d / light)

@@ -112,7 +112,7 @@ class SeparateDisks(TwoDisks):
 
     text = case_text("two_disks_contact")
     name, title = "two_disks_contact", "Collision of two elastic disks with velocity fields of their own"
-    measures = (Measure(TwoDisks.measures[0].definition, lambda n: 0.3 / n / RADIUS), *TwoDisks.measures[1:])
+    measures = (Measure(TwoDisks.measures[0].definition, lambda n: 0.15 / n / RADIUS), *TwoDisks.measures[1:])
 
     def tables(self, n: int) -> Tables:
         return super().tables(n) | {"contact": {"default": "separate"}}
