@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from contact_scenes import DENSITY, E, G, H, body, jelly, scene
 
+from mpmcli.check.result_ledger import CONTACT_SUSPECT, energy_change
 from mpmcli.scene import Scene
 from mpmcli.solver.contact.surfaces import BELOW_ALL
 from mpmcli.solver.engine.build import build_run
@@ -168,6 +169,51 @@ def test_a_belt_carries_a_block(backend_of: Callable, way: str) -> None:
     slides = (time > 0.02) & (time < 0.8 * pace / (friction * G))
     assert np.polyfit(time[slides], speed[slides], 1)[0] == pytest.approx(friction * G, rel=0.03)
     assert speed[time > 0.35] == pytest.approx(pace, rel=0.01)
+
+
+def thrown_into_a_corner(mirrored: bool = False, safety: float = 0.8) -> Scene:
+    """A block that hits the floor, and then a wall, both rough; or its mirror image."""
+    low, pace = (7.7, -3.0) if mirrored else (50.3, 3.0)
+    block = body("block", [low, 4.3], [low + 6, 10.3], velocity=[pace, -3.0])
+    domain = {"walls": "separate", "friction": 0.3, "gravity": [0.0, -G]}
+    return scene([block], time={"end": 0.3, "frames": 10, "safety": safety}, domain=domain)
+
+
+def test_a_mirror_image_does_the_same_and_half_the_step_nearly(backend_of: Callable) -> None:
+    ends = []
+    for how in ({}, {"mirrored": True}, {"safety": 0.4}):
+        frames = list(build_run(thrown_into_a_corner(**how), backend_of("f64", 1)).frames())
+        energy = np.array([row.kinetic + row.elastic + row.potential for _, row in frames])
+        assert energy.max() <= energy[0] * (1 + 1e-9)
+        ends.append((frames[-1][0].position.mean(axis=0), frames[-1][0].velocity.mean(axis=0)))
+    (place, speed), (image, its_speed), (half, _) = ends
+    # It has met both.
+    assert speed[0] < 0
+    assert image == pytest.approx(place * [-1, 1] + [64 * H, 0], abs=1e-9)
+    assert its_speed == pytest.approx(speed * [-1, 1], abs=1e-8)
+    assert half == pytest.approx(place, abs=0.1 * H)
+
+
+def test_jelly_stays_out_of_a_wedge(backend_of: Callable) -> None:
+    """The edge, of 53 degrees, dents a block of 16 cells that falls on it, and no particle is half a cell inside."""
+    wedge = [[24 * H, 0.0], [36 * H, 0.0], [30 * H, 12 * H]]
+    block = body("block", [22.3, 14], [38.3, 24], material=jelly(youngs_modulus=5e4), velocity=[0.0, -2.0])
+    collider = {"name": "wedge", "shape": {"polygon": {"vertices": wedge}}, "friction": 0.3}
+    asked = scene([block], end=0.2, frames=20, domain={"gravity": [0.0, -G]}, colliders=[collider])
+    frames = [frame for frame, _ in build_run(asked, backend_of("f64", 1)).frames()]
+    form = asked.colliders[0].form
+    assert min(form.signed_distance(frame.position).min() for frame in frames) > -0.5 * H
+    # It has come down around the edge.
+    assert min(frame.position[:, 1].min() for frame in frames) < 11.5 * H
+
+
+def test_the_ledger_lacks_a_part_of_the_energy_of_contact(backend_of: Callable) -> None:
+    """What it seems to gain while a block of 10 cells swings on a floor is less than `check` allows for contact."""
+    block = body("block", [10, 0], [25, 10])
+    asked = scene([block], end=0.5, frames=50, domain={"walls": "separate", "gravity": [0.0, -G]})
+    rows = [row for _, row in build_run(asked, backend_of("f64", 1)).frames()]
+    parts = (np.array([getattr(row, name) for row in rows]) for name in ("kinetic", "potential", "elastic"))
+    assert energy_change(*parts)[0].max() < 0.8 * CONTACT_SUSPECT
 
 
 @pytest.mark.parametrize("way", ["wall", "plane"])

@@ -85,7 +85,7 @@ class _Contact(_Facts):
 
     @property
     def separates(self) -> bool:
-        """Whether any bodies may separate."""
+        """Whether elastic bodies may separate."""
         return self.default == "separate" or any(pair.get("friction") != "stick" for pair in self.pairs)
 
 

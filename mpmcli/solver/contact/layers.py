@@ -20,7 +20,7 @@ STICKS = -1.0
 
 @dataclass(frozen=True)
 class Layers:
-    """The layers of nodes of a run: each body that separates from another has one, and with it a velocity field.
+    """The layers of nodes of a run: each body that separates has one, and with it a velocity field.
 
     Attributes:
         count: of layers, 1 where all bodies share one velocity field, or there is one body.
