@@ -165,6 +165,16 @@ def test_a_number_of_the_ledger_out_of_bounds_is_found(run, checked, name, value
         assert check.figures[name] == value and all(finding.value == value for finding in check.findings)
 
 
+def test_surfaces_that_overlap_by_more_than_a_cell_are_found(run, checked):
+    """Where bodies separate the ledger has how deep."""
+    assert checked().figures["contact_overlap"] is None
+    for deepest, found in ((0.9, []), (1.1, [("overlap", "warning", K)])):
+        rows = [replace(row, contact_overlap=deepest * (k == K), contact_gap=0.1) for k, row in enumerate(run.rows)]
+        check = checked(rows=rows)
+        assert [(f.rule, f.severity, f.frame) for f in check.findings] == found
+        assert (check.figures["contact_overlap"], check.figures["contact_gap"]) == (deepest, 0.1)
+
+
 def test_a_collapsed_step_is_found(run, checked):
     check = checked(rows=run.with_row(K, step_min=1e-3 * run.rows[1].step_max, limit="deformation"))
     finding = the(check, "step-collapse")

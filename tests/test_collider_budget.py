@@ -1,6 +1,7 @@
 """What colliders take: told by check and info, drawn by plot, and not missed in the budget of momentum."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,12 @@ MASS, G, PAUSE, STEP = 2.0, 9.81, 0.01, 1e-3
 FORCES = np.array([[[0.0, 0.0], [0.0, 0.0]], [[1.0, -3.0], [0.5, 0.0]], [[2.0, -5.0], [0.0, 1.0]]])
 
 
-def written(directory: Path, colliders: list[dict[str, Any]], **changes: Any) -> Path:
+def written(
+    directory: Path, colliders: list[dict[str, Any]], contacts: Sequence[list[str]] = (), **changes: Any
+) -> Path:
     """Write a run of three frames whose momentum is what gravity gave less what the colliders took."""
     facts = header((1.0, 1.0), 0.05, [WATER], colliders)
+    facts["contacts"] = list(contacts)
     facts["scene"] = facts["scene"].replace("[domain]", '[domain]\nwalls = "separate"')
     store = SegmentStore(directory, facts)
     for k in range(3):
@@ -111,6 +115,18 @@ def test_plot_adds_up_the_forces_on_many_colliders(tmp_path: Path) -> None:
     with drawn(tmp_path / "run") as panels:
         (line,) = panels["Force on colliders along x"].lines[:-1]
         assert line.get_label() == "all together" and np.allclose(line.get_ydata(), 28.0)
+
+
+def test_plot_shows_the_pairs_with_the_largest_forces(tmp_path: Path) -> None:
+    """Of seven pairs the one that never touched is left out; each has the name of who pushes whom."""
+    contacts = [["base", f"block {k}"] for k in range(7)]
+    forces = tuple((0.1 * k, -float(k)) for k in range(7))
+    written(tmp_path / "run", [], contacts=contacts, contact_force=forces, contact_torque=((0.0,),) * 7)
+    with drawn(tmp_path / "run") as panels:
+        *lines, _level = panels["Force on bodies along y"].lines
+        assert [line.get_label() for line in lines] == [f"block {k} on base" for k in range(1, 7)]
+        assert np.allclose(lines[-1].get_ydata(), -6.0)
+    assert json.loads(run_here("info", tmp_path / "run", "--json").stdout)["contacts"][0] == "base - block 0"
 
 
 def test_info_names_colliders(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import taichi as ti
 from solver_state import bodies_of, scene_of, with_colliders
 
 from mpmcli.boundaries.colliders import ColliderKind, ColliderMotion, Colliders
+from mpmcli.boundaries.loads import Loads
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene
@@ -397,30 +398,26 @@ def test_a_collider_stands_as_it_should_after_many_turns(backend_of: Callable, d
 
 
 @ti.kernel
-def book(colliders: ti.template(), impulses: ti.types.ndarray(), arms: ti.types.ndarray()):
-    """Book all impulses (n, d) at their arms (n, d)."""
+def book(loads: ti.template(), impulses: ti.types.ndarray(), arms: ti.types.ndarray()):
+    """Book all impulses (n, d) at their arms (n, d), each in a row of nodes of its own."""
     ti.loop_config(serialize=True)
     for p in range(impulses.shape[0]):
-        impulse = ti.Vector.zero(float, ti.static(colliders.dimension))
-        arm = ti.Vector.zero(float, ti.static(colliders.dimension))
-        for a in ti.static(range(colliders.dimension)):
+        d = ti.static(loads.dimension)
+        impulse, arm, node = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(int, d)
+        node[d - 2] = p
+        for a in ti.static(range(d)):
             impulse[a], arm[a] = impulses[p, a], arms[p, a]
-        colliders.take(p, 0, impulse, arm)
+        loads.take(0, node, 0, impulse, arm)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_torque_is_the_arm_times_the_force(backend_of: Callable, dimension: int) -> None:
     backend_of("f64", 1)
     d, rng = dimension, np.random.default_rng(0)
-    ball = {"ball": {"center": [0.5] * d, "radius": 0.2}}
-    body = {"name": "b", "material": {"law": "fluid", "density": 1e3, "bulk_modulus": 1e4}, "shape": ball}
-    scene = scene_of(domain={"size": [1.0] * d, "spacing": 0.1}, time={"end": 1.0, "frames": 1}, bodies=[body])
-    scene = with_colliders(scene, [{"name": "c", "shape": ball}])
-    device = Colliders(ColliderKind.of(scene), d, (17,) * d, 3, 1, on_cpu=True)
-    device.write(scene)
+    loads = Loads(1, (17,) * d, 1, on_cpu=True)
     impulses, arms = rng.uniform(-1, 1, (2, 10, d))
-    book(device, impulses, arms)
-    found = device.taken.to_numpy()[:10]
+    book(loads, impulses, arms)
+    found = loads.taken.to_numpy()[:10]
     # In 2D that about the axis out of the plane.
     full_arms, full_impulses = (np.pad(vectors, ((0, 0), (0, 3 - d))) for vectors in (arms, impulses))
     torque = np.cross(full_arms, full_impulses)[:, [2] if d == 2 else [0, 1, 2]]

@@ -120,13 +120,21 @@ def test_walls_that_cannot_be_had_are_refused(tmp_path: Path) -> None:
 def test_forces_of_joined_frames_are_means_over_their_time(tmp_path: Path) -> None:
     """So their integral is that of all frames."""
     rows = [
-        replace(row(time, 2), collider_force=((force, 1.0), (0.0, force)), collider_torque=((force,), (2.0,)))
+        replace(
+            row(time, 2),
+            collider_force=((force, 1.0), (0.0, force)),
+            collider_torque=((force,), (2.0,)),
+            contact_torque=((force,),),
+            contact_overlap=0.1 * force % 0.4,
+        )
         for time, force in ((0.1, 1.0), (0.4, 3.0), (0.5, 5.0))
     ]
     joined = joined_row(rows, 0.0)
     mean = (0.1 * 1 + 0.3 * 3 + 0.1 * 5) / 0.5
     assert np.allclose(joined.collider_force, ((mean, 1.0), (0.0, mean)), rtol=1e-15)
     assert np.allclose(joined.collider_torque, ((mean,), (2.0,)), rtol=1e-15)
+    assert np.allclose(joined.contact_torque, ((mean,),), rtol=1e-15)
+    assert joined.contact_overlap == pytest.approx(0.3) and joined.contact_gap is None
 
 
 def test_walls_inside_of_others_have_no_particles(tmp_path: Path) -> None:

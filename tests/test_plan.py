@@ -131,7 +131,7 @@ def test_the_plan_counts_what_colliders_need(backend_of: Callable, dimension: in
     plain = scene_with("fluid", dimension=dimension)
     scene, backend = with_colliders(plain, [union, plane]), backend_of("f32", 1)
     colliders = build_run(scene, backend).batch.device.colliders
-    fields = 8 * colliders.taken.n * colliders.taken.shape[0] + 4 * colliders.samples.shape[0]
+    fields = 8 * colliders.loads.taken.n * colliders.loads.taken.shape[0] + 4 * colliders.samples.shape[0]
     more = make_plan(scene, backend).device_bytes - make_plan(plain, backend).device_bytes
     assert more == fields > 0
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from mpmcli.boundaries.distances import DISTANCES, BoxDistance, GridDistance, samples_of
 from mpmcli.boundaries.doubles import double_field
+from mpmcli.boundaries.loads import Loads
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider
@@ -57,7 +58,7 @@ class ColliderKind:
 
     def bytes_needed(self, dimension: int, rows: int) -> int:
         """Return the bytes that loads and distances on grids take on the device, with `rows` of nodes (last axis)."""
-        return 8 * self.count * rows * (3 if dimension == 2 else 6) + 4 * self.samples
+        return Loads.bytes_needed(self.count, dimension, rows) + 4 * self.samples
 
     def joined(self, other: "ColliderKind") -> "ColliderKind | None":
         """Return the kind that has room for both, None where they need other kernels."""
@@ -102,9 +103,8 @@ class Colliders:
 
     Attributes:
         kind: what is compiled, with the room for each run.
-        turns: numbers of a torque: 1 in 2D, 3 in 3D; loads: of a force and a torque.
-        rows: rows of nodes of a run, along the last axis; run: whose colliders act; spacing: h, m.
-        taken: impulse, N s, and angular impulse about the pivot, N m s, of each collider, by rows of nodes.
+        run: whose colliders act; spacing: h, m.
+        loads: what each collider takes from the material, about its pivot.
         layered: whether some bodies meet those that separate by their surfaces; then these act here where `own` is 0,
             a number or a variable of a kernel.
         deterministic: whether the nodes of a row are added up in their order; then `given` is the impulse that each
@@ -128,9 +128,7 @@ class Colliders:
         self.room, self.run, self.spacing = kind.count, 0, 0.0
         self.layered, self.own = False, 0
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
-        self.turns = 1 if d == 2 else 3
-        self.loads = d + self.turns
-        self.rows = math.prod(shape[:-1])
+        self.loads = Loads(kind.count, shape, runs, on_cpu=on_cpu)
         self.distances = tuple((code, DISTANCES[FORMS[code]](d)) for code in kind.forms if code != GRID)
         self.numbers = ti.field(float, shape=runs * kind.numbers)
         self.boxes, self.box = BOX in kind.forms, BoxDistance(d)
@@ -151,7 +149,6 @@ class Colliders:
         self.velocity = ti.Vector.field(d, float, shape=n)
         self.turning = ti.Matrix.field(d, d, float, shape=n)
         self.count = ti.field(int, shape=runs)
-        self.taken = ti.Vector.field(self.loads, ti.f64 if on_cpu else float, shape=n * self.rows)
         self.deterministic = deterministic
         self.given = ti.Vector.field(d, float, shape=n * math.prod(shape)) if deterministic else None
 
@@ -179,7 +176,7 @@ class Colliders:
             self.reach[i] = reach_of(collider, h).tolist()
             self.velocity[i] = [0.0] * self.dimension
             self.turning[i] = np.zeros((self.dimension, self.dimension)).tolist()
-        self.clear_taken(run)
+        self.loads.clear(run)
 
     @ti.kernel
     def _write_numbers(self, first: int, numbers: ti.types.ndarray(ndim=1)):
@@ -190,60 +187,6 @@ class Colliders:
     def _write_samples(self, first: int, values: ti.types.ndarray(ti.f32, 1)):
         for k in range(values.shape[0]):
             self.samples[first + k] = values[k]
-
-    @ti.kernel
-    def clear_taken(self, run: int):
-        """Forget what the colliders of a run have taken."""
-        for q in range(self.rows * self.room):
-            self.taken[run * self.rows * self.room + q] = ti.Vector.zero(float, self.loads)
-
-    @ti.func
-    def sum_up(self, run: int, frame: int, column: int, notes: ti.template()):
-        """Store what the colliders of a run have taken in notes[run, frame], from a column on, and forget it."""
-        for k in range(self.room):
-            total = ti.Vector.zero(ti.f64, self.loads)
-            for row in range(self.rows):
-                place = (run * self.rows + row) * self.room + k
-                for a in ti.static(range(self.loads)):
-                    total[a] += self.taken[place][a]
-                    self.taken[place][a] = ti.cast(0, ti.f64)
-            for a in ti.static(range(self.loads)):
-                notes[run, frame, column + k * self.loads + a] = total[a]
-
-    @ti.func
-    def row_of(self, node: ti.template()):
-        """Return the row of a node."""
-        row = 0
-        for a in ti.static(range(self.dimension - 1)):
-            row = row * ti.static(self.shape[a]) + node[a]
-        return row
-
-    @ti.func
-    def take(self, row: int, k: int, impulse: ti.template(), arm: ti.template()):
-        """Book the impulse that collider k has taken, N s, at an arm from its pivot, m."""
-        place = (self.run * self.rows + row) * self.room + k
-        load = self.load_of(impulse, arm)
-        for a in ti.static(range(self.loads)):
-            if ti.static(self.on_cpu):
-                # Parts of a step share no row.
-                self.taken[place][a] = self.taken[place][a] + ti.cast(load[a], ti.f64)
-            else:
-                ti.atomic_add(self.taken[place][a], load[a])
-
-    @ti.func
-    def load_of(self, impulse: ti.template(), arm: ti.template()):
-        """Return an impulse, N s, at an arm, m, with its angular impulse, N m s."""
-        d = ti.static(self.dimension)
-        load = ti.Vector.zero(float, ti.static(self.loads))
-        for a in ti.static(range(d)):
-            load[a] = impulse[a]
-        if ti.static(d == 2):
-            load[2] = arm[0] * impulse[1] - arm[1] * impulse[0]
-        else:
-            for a in ti.static(range(3)):
-                b, c = ti.static((a + 1) % 3), ti.static((a + 2) % 3)
-                load[3 + a] = arm[b] * impulse[c] - arm[c] * impulse[b]
-        return load
 
     @ti.func
     def book_row(self, q: int):
@@ -257,25 +200,22 @@ class Colliders:
             a = ti.static(d - 2 - b)
             x[a] = ti.cast(rest % ti.static(self.shape[a]) - self.first, float) * self.spacing
             rest = rest // ti.static(self.shape[a])
-        i, nodes_before = self.run * self.room + k, self.run * self.rows * nodes
+        i, nodes_before = self.run * self.room + k, self.run * ti.static(self.loads.rows) * nodes
         if k < self.count[self.run]:
             near = True
             for a in ti.static(range(d - 1)):
                 arm = x[a] - self.place[i][a]
                 near = near and arm >= self.reach[i][0, a] and arm <= self.reach[i][1, a]
             if near:
-                total = ti.Vector.zero(float, ti.static(self.loads))
+                total = ti.Vector.zero(float, ti.static(self.loads.width))
                 for n in range(nodes):
                     x[ti.static(d - 1)] = ti.cast(n - self.first, float) * self.spacing
                     given = (nodes_before + first + n) * self.room + k
-                    load = self.load_of(self.given[given], x - self.place[i])
-                    for a in ti.static(range(self.loads)):
-                        total[a] += load[a]
+                    total += self.loads.of(self.given[given], x - self.place[i])
                     for a in ti.static(range(d)):
                         self.given[given][a] = 0.0
-                for a in ti.static(range(self.loads)):
-                    row = self.run * self.rows * self.room + q
-                    self.taken[row][a] = self.taken[row][a] + total[a]
+                row = self.run * self.loads.rows * self.room + q
+                self.loads.taken[row] = self.loads.taken[row] + total
 
     @ti.func
     def constrain(self, node: ti.template(), velocity: ti.template(), mass: float):
@@ -300,12 +240,12 @@ class Colliders:
                     if phi <= REACH * self.spacing:
                         after = self.met(i, arm, normal, result)
                         if ti.static(self.deterministic):
-                            row = self.run * self.rows + self.row_of(node)
+                            row = self.run * self.loads.rows + self.loads.row_of(node)
                             place = (row * ti.static(self.shape[-1]) + node[d - 1]) * self.room + k
                             for a in ti.static(range(d)):
                                 self.given[place][a] = self.given[place][a] + mass * (result[a] - after[a])
                         else:
-                            self.take(self.row_of(node), k, mass * (result - after), arm)
+                            self.loads.take(self.run, node, k, mass * (result - after), arm)
                         for a in ti.static(range(d)):
                             result[a] = after[a]
         return result

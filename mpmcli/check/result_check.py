@@ -30,6 +30,8 @@ TOLD = {
     "volume_ratio_min": "smallest J",
     "volume_ratio_max": "largest J",
     "volume_error": "lasting volume error",
+    "contact_overlap": "deepest overlap of surfaces, cells",
+    "contact_gap": "largest gap that acts, cells",
     "neighbour_distance": "farthest neighbours, cells",
     "densest_cell": "densest cell / meant",
     "empty_cells": "empty cells inside",

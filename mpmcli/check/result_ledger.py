@@ -35,6 +35,8 @@ COLLAPSE = 1e-2
 # Cells per step above which particles leave all nodes that they act on. Impacts near the speed of sound reach 1.7 in
 # single steps without a gain of energy: it is the speed of a node, which particles rarely reach.
 LEFT_BEHIND = 2.0
+# Cells by which surfaces may overlap: more than what is driven by a paddle does, 0.6.
+OVERLAP = 1.0
 LOWER_SAFETY = "Lower time.safety, or refine the domain."
 STIFFER = "Make the material stiffer, the domain finer, or time.safety lower."
 
@@ -90,6 +92,9 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     what = f"Before frame {{number}} something moved {{value:.3g}} cells in a step, {COURANT:g} is safe"
     fix = 'Set time.step = "auto".' if forced else LOWER_SAFETY
     tell("courant", courant, courant > COURANT * MARGIN, courant > LEFT_BEHIND, what, fix)
+    overlap = of.get("contact_overlap", np.zeros(len(rows)))
+    what = "Before frame {number} surfaces that met overlapped by {value:.3g} cells"
+    tell("overlap", overlap, overlap > OVERLAP, False, what, STIFFER)
     low, high = of["volume_ratio_min"], of["volume_ratio_max"]
     what = "In frame {number} a particle has no volume left: the smallest J is {value:.4g}"
     tell("volume", low, low <= 0, True, what, STIFFER)
@@ -118,6 +123,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
         "volume_ratio_max": float(high.max()),
         "volume_error": _volume_error(numbers, of["volume_error"], findings),
         "collider_impulse": _taken(rows),
+        **{name: float(of[name].max()) if name in of else None for name in ("contact_overlap", "contact_gap")},
         **steps,
     }
 

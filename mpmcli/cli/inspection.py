@@ -161,6 +161,7 @@ def _result_facts(path: Path) -> dict:
         "dimension": result.dimension,
         "bodies": list(header.body_names),
         "colliders": list(header.collider_names),
+        "contacts": [" - ".join(pair) for pair in header.contacts],
         "materials": [law.name for law in header.laws],
         "fields": ["velocity", *result.field_names],
         "precision": header.precision,

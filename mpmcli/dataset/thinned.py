@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from mpmcli.dataset.dataset import ALL, Particles, Trajectory
-from mpmcli.frames.ledger import LedgerRow
+from mpmcli.frames.ledger import LOADS, LedgerRow
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
 from mpmcli.scene.colliders import Collider, Motion
@@ -205,8 +205,9 @@ def joined_row(rows: Sequence[LedgerRow], before: float) -> LedgerRow:
         step_max=max(row.step_max for row in rows),
         limit=smallest.limit,
         courant_max=max(row.courant_max for row in rows),
-        collider_force=mean([row.collider_force for row in rows]),
-        collider_torque=mean([row.collider_torque for row in rows]),
+        contact_overlap=max(row.contact_overlap for row in rows) if rows[0].contact_overlap is not None else None,
+        contact_gap=max(row.contact_gap for row in rows) if rows[0].contact_gap is not None else None,
+        **{name: mean([getattr(row, name) for row in rows]) for name in LOADS},
     )
 
 

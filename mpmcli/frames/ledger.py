@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+# Of each collider, and of each pair of bodies that separate.
+LOADS = ("collider_force", "collider_torque", "contact_force", "contact_torque")
+
 
 @dataclass(frozen=True)
 class LedgerRow:
@@ -27,6 +30,10 @@ class LedgerRow:
             hardly any cell is inside.
         collider_force, collider_torque: on each collider, N, and about its pivot, N m: means since the previous frame
             of the momentum that it took from the material (0 at frame 0); per metre of depth in 2D.
+        contact_force, contact_torque: of each pair of bodies of which one has a velocity field of its own, see
+            `Scene.contact_pairs`, on the first by the second, N, and about the origin of the domain, N m: means, too.
+        contact_overlap, contact_gap: deepest overlap of surfaces that met, and their largest gap while they acted on
+            each other, since the previous frame, in cells; None where no body separates.
         emitted, retired: particles that emitters have let in so far, and that left through open faces; emitted_mass,
             retired_mass: theirs, kg. Sums are over those that are there.
         blocked: particles of emitters that found their place occupied so far: they stay out for good, but where they
@@ -54,6 +61,10 @@ class LedgerRow:
     volume_error: float = 0.0
     collider_force: tuple[tuple[float, ...], ...] = ()
     collider_torque: tuple[tuple[float, ...], ...] = ()
+    contact_force: tuple[tuple[float, ...], ...] = ()
+    contact_torque: tuple[tuple[float, ...], ...] = ()
+    contact_overlap: float | None = None
+    contact_gap: float | None = None
     emitted: int | None = None
     emitted_mass: float | None = None
     retired: int | None = None

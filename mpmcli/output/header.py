@@ -128,6 +128,7 @@ class _StoredHeader(_Facts):
     bodies: tuple[str, ...] = ()
     volumes: tuple[float | None, ...] = ()
     emitter_volumes: tuple[float | None, ...] = ()
+    contacts: tuple[tuple[str, str], ...] = ()
     materials: tuple[str, ...] = ()
     laws: tuple[LawHeader, ...] = ()
     precision: Literal["f32", "f64"] = "f32"
@@ -172,6 +173,7 @@ class RunHeader:
         sticking: per axis, whether a face normal to it sticks or has friction.
         periodic: (d,), whether the domain repeats along each axis.
         bodies: in the order of their labels in the frames.
+        contacts: see `Scene.contact_pairs`.
         laws: in the order of the labels in the frames.
         end: s; frames: expected, the initial one included.
         precision: "f32" or "f64"; backend: "arch" and "precision".
@@ -197,6 +199,7 @@ class RunHeader:
     sticking: tuple[bool, ...] | None
     periodic: np.ndarray
     bodies: tuple[BodyHeader, ...]
+    contacts: tuple[tuple[str, str], ...]
     laws: tuple[LawHeader, ...]
     end: float | None
     frames: int | None
@@ -227,6 +230,7 @@ class RunHeader:
                 "scene": text,
             }
             | ({"emitter_volumes": emitted_volumes(scene)} if scene.emitters else {})
+            | ({"contacts": [list(pair) for pair in scene.contact_pairs]} if scene.contact_pairs else {})
         )
 
     @classmethod
@@ -267,6 +271,7 @@ class RunHeader:
             sticking=sticking or None,
             periodic=periodic,
             bodies=_bodies(facts),
+            contacts=facts.contacts,
             laws=tuple(
                 law.model_copy(update={"name": name}) for name, law in zip(facts.materials, facts.laws, strict=True)
             ),

@@ -8,24 +8,22 @@ from dataclasses import fields
 import h5py
 import numpy as np
 
-from mpmcli.frames.ledger import LedgerRow
+from mpmcli.frames.ledger import LOADS, LedgerRow
 
 COLUMNS = tuple(f.name for f in fields(LedgerRow))
 VECTORS = ("linear_momentum", "angular_momentum")
-# Of each collider.
-LOADS = ("collider_force", "collider_torque")
-# Of scenes in which particles come and go; elsewhere they are None, and not stored.
-COMINGS = ("emitted", "emitted_mass", "retired", "retired_mass", "blocked")
+# Of scenes in which particles come and go, or bodies separate; elsewhere they are None, and not stored.
+OPTIONAL = ("emitted", "emitted_mass", "retired", "retired_mass", "blocked", "contact_overlap", "contact_gap")
 INTEGERS = ("steps", "emitted", "retired", "blocked")
 TEXT = "limit"
 # What is read where a file has no such column.
-MISSING = {**dict.fromkeys(LOADS, ()), **dict.fromkeys(COMINGS)}
+MISSING = {**dict.fromkeys(LOADS, ()), **dict.fromkeys(OPTIONAL)}
 # Columns of each frame in the CSV: its number, time steps since the start, particles.
 FRAME_COLUMNS = ("frame", "step", "particles")
 
 
 def ledger_columns(rows: Sequence[LedgerRow]) -> dict[str, np.ndarray]:
-    """Return columns of T rows; momenta are (T, components), loads (T, colliders, components), `limit` is UTF-8."""
+    """Return columns of T rows; momenta are (T, components), loads (T, count, components), `limit` is UTF-8."""
     columns = {}
     for name in _stored(rows):
         values = [getattr(row, name) for row in rows]
@@ -41,8 +39,7 @@ def ledger_columns(rows: Sequence[LedgerRow]) -> dict[str, np.ndarray]:
 
 def _stored(rows: Sequence[LedgerRow]) -> tuple[str, ...]:
     """Return the names of the columns of some rows of one run."""
-    comes_and_goes = bool(rows) and rows[0].emitted is not None
-    return tuple(name for name in COLUMNS if comes_and_goes or name not in COMINGS)
+    return tuple(name for name in COLUMNS if name not in OPTIONAL or (rows and getattr(rows[0], name) is not None))
 
 
 def read_ledger(group: h5py.Group, read: Callable[[str], np.ndarray]) -> list[LedgerRow]:

@@ -1,5 +1,6 @@
 """Draws the ledger of a run: energies, momenta, steps and what bounds them, volumes, speeds, and where matter is."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +19,7 @@ MARKED = 8  # fewer points than this are marked, since a single one makes no lin
 FEW_DECADES = 2.5  # fewer decades than this have numbers at 2 and 5 times their powers, too
 NAME_MAX = 16  # characters of a name in a legend
 TITLE_MAX = 64  # characters of the title of a scene
-COLLIDERS_MAX = 6  # more colliders than this are shown as one
+COLLIDERS_MAX = 6  # more colliders than this are shown as one, and no more pairs of bodies
 AXES = "xyz"
 # The order of the colours is that of the legend.
 LIMITS = ("wave", "speed", "force", "viscosity", "deformation", "forced", "maximum")
@@ -35,7 +36,8 @@ def draw_ledger(figure: "Figure", history: History, theme: ThemeName) -> list[st
     """Draw a run into an empty figure and return the titles of its panels, in the order of its axes."""
     d = history.header.dimension
     # Each row for itself, as they differ in their number of panels.
-    counts = (4, 4, d, d) if history.header.collider_names else (4, 4, d)
+    colliders, contacts = history.header.collider_names, [" on ".join(pair[::-1]) for pair in history.header.contacts]
+    counts = (4, 4, d) + (d,) * bool(colliders) + (d,) * bool(contacts)
     rows = figure.add_gridspec(len(counts), 1)
     places = [cell for row, count in enumerate(counts) for cell in rows[row].subgridspec(1, count)]
     panels = [Panel(figure.add_subplot(place), history.times, THEMES[theme]) for place in places]
@@ -45,8 +47,9 @@ def draw_ledger(figure: "Figure", history: History, theme: ThemeName) -> list[st
     _extremes(panels[6], panels[7], history)
     for axis in range(d):
         _reach(panels[8 + axis], history, axis)
-    for axis, panel in enumerate(panels[8 + d :]):
-        _load(panel, history, axis)
+    for k, panel in enumerate(panels[8 + d :]):
+        what, names = ("colliders", colliders) if colliders and k < d else ("bodies", contacts)
+        _load(panel, history, k % d, what, names)
     for panel in panels:
         panel.finish()
     status = f", {history.status}" if history.status else ""
@@ -246,15 +249,18 @@ def _reach(panel: Panel, history: History, axis: int) -> None:
         panel.level(float(header.upper[axis]))
 
 
-def _load(panel: Panel, history: History, axis: int) -> None:
-    """Draw the mean force on each collider between frames, or on all of them."""
+def _load(panel: Panel, history: History, axis: int, what: str, names: Sequence[str]) -> None:
+    """Draw mean forces between frames, on each collider, of many on all, or of the pairs of bodies with the largest."""
     unit = "N/m" if history.header.dimension == 2 else "N"
-    panel.title(f"Force on colliders along {AXES[axis]}", f"mean since the frame before, {unit}")
-    forces, names = history.columns["collider_force"], history.header.collider_names
+    panel.title(f"Force on {what} along {AXES[axis]}", f"mean since the frame before, {unit}")
+    forces = history.columns["collider_force" if what == "colliders" else "contact_force"]
     if forces.ndim != 3:
         panel.note("not in this ledger")
         return
-    if len(names) > COLLIDERS_MAX:
+    if what == "bodies":
+        chosen = np.sort(np.abs(forces).sum(axis=(0, 2)).argsort()[-COLLIDERS_MAX:])
+        forces, names = forces[:, chosen], [names[k] for k in chosen]
+    elif len(names) > COLLIDERS_MAX:
         forces, names = forces.sum(axis=1, keepdims=True), ("all together",)
     for k, name in enumerate(names):
         panel.steps(forces[:, k, axis], k, one_line(name))

@@ -435,6 +435,13 @@ class Scene(Table):
         return source.has_surface and (named or self.contact.default == "separate")
 
     @property
+    def contact_pairs(self) -> tuple[tuple[str, str], ...]:
+        """Names of each pair of velocity fields, in the order of the ledger: of bodies that separate, each its own."""
+        shared = ", ".join(source.name for source in self.sources if not self.separates(source))
+        names = [shared] * bool(shared) + [source.name for source in self.sources if self.separates(source)]
+        return tuple((first, second) for k, second in enumerate(names) for first in names[:k])
+
+    @property
     def sources(self) -> "tuple[Body | Emitter, ...]":
         """Everything that particles belong to, in the order of their labels: the bodies, then the emitters."""
         return (*self.bodies, *self.emitters)

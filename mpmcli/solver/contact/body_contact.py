@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mpmcli.boundaries.loads import Loads
 from mpmcli.materials.elementary import exp, log
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
@@ -48,6 +49,8 @@ APART = 9.0
 # Numbers of a layer: P-wave modulus, Pa, sharpness, 1/m, factor of a sum over a flat surface, distance of particles, m,
 # density, kg/m^3, and from FRICTION on the coefficient of friction with each layer, `STICKS` for one that sticks.
 MODULUS, SHARPNESS, FLAT, DISTANCE, DENSITY, FRICTION = range(6)
+# Of `LedgerRow`, see `BodyContact.extremes`.
+EXTREMES = ("contact_overlap", "contact_gap")
 
 
 @ti.data_oriented
@@ -57,6 +60,8 @@ class BodyContact:
     Attributes:
         surfaces: what they show; layers: of each run; room: surface points near a node, of each body.
         rows: of each layer of each run its numbers, see MODULUS.
+        loads: what the first layer of each pair takes from the second, about the lower corner, see `Layers.pairs`.
+        extremes: of each run since the last frame the deepest overlap and the largest gap that acted, cells.
         points: of each thread and of two bodies, row by row, of surface points near a node the way to it, m, by how
             much farther away than along an axis they count, m, their normals and their weights; of the second body ways
             and normals with the opposite sign.
@@ -76,6 +81,8 @@ class BodyContact:
         # Two layers of particles, at four times the density of those at rest.
         self.room = 8 * math.ceil((grid.scheme.spline.nodes * layers.per_axis) ** (grid.dimension - 1))
         self.rows = ti.field(float, shape=(runs * layers.count, FRICTION + layers.count))
+        self.loads = Loads(max(1, layers.pairs), grid.shape, runs, on_cpu=True)
+        self.extremes = ti.field(float, shape=(runs, len(EXTREMES)))
         self.share = (2 * grid.dimension + 2) * self.room
         self.points = ti.field(float, shape=2 * max(runs, threads) * self.share + LANES)
 
@@ -94,6 +101,14 @@ class BodyContact:
         for layer, row in enumerate(np.hstack([rows, layers.frictions(scene)])):
             for k, number in enumerate(row):
                 self.rows[run * self.layers + layer, k] = number
+
+    @ti.func
+    def sum_up(self, run: int, frame: int, column: int, notes: ti.template()):
+        """Store the loads and then the extremes of a run in notes[run, frame], from a column on, and forget them."""
+        self.loads.sum_up(run, frame, column, notes)
+        for k in ti.static(range(len(EXTREMES))):
+            notes[run, frame, column + ti.static(self.loads.room * self.loads.width) + k] = self.extremes[run, k]
+            self.extremes[run, k] = 0.0
 
     @ti.func
     def exchange_rows(
@@ -161,7 +176,7 @@ class BodyContact:
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
         at_a, at_c = index + a * ti.static(self.node_count), index + c * ti.static(self.node_count)
         m_a, bodies, way, agree = grid.nodes[at_a][d], c < self.layers, FAR, 0.0
-        reduced, friction = m_a, 0.0
+        reduced, friction, known = m_a, 0.0, True
         # The inverse of the modulus and of the density of both.
         soft, light = 1.0 / self.rows[row + a, MODULUS], 1.0 / self.rows[row + a, DENSITY]
         u, J, facing = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
@@ -189,7 +204,7 @@ class BodyContact:
             gap, middle, n, aside = self.separation(grid, w, thread, node, index, a, c, facing, agree)
             if gap >= APART * h and way <= 0.0:
                 # Behind an obstacle what shows no surface, as it was torn or crushed, is stopped.
-                gap, middle, n, aside = -h, gap, -facing, 0.0 * facing
+                gap, middle, n, aside, known = -h, gap, -facing, 0.0 * facing, False
             if gap < APART * h:
                 # As much as nodes on flat faces that touch have: those with less, and that is at edges, push less.
                 mass = ti.max(reduced, 0.5 * h**d / light)
@@ -197,12 +212,19 @@ class BodyContact:
                 pushed = self.impulse(gap / h, u, n, aside, kappa, reduced, h / dt, friction)
                 for b in ti.static(range(d)):
                     J[b] = pushed[b]
+                if known and pushed.dot(n) > 0.0:
+                    for k, reached in ti.static(enumerate((-gap / h, gap / h))):
+                        # Most are no record, and atomics are slow.
+                        if reached > self.extremes[w, k]:
+                            ti.atomic_max(self.extremes[w, k], reached)
         for b in ti.static(range(d)):
             grid.nodes[at_a][b] -= J[b]
             if bodies:
                 grid.nodes[at_c][b] += J[b]
-        if ti.static(obstacles.any):
-            if not bodies:
+        if ti.abs(J).max() > 0.0:
+            if bodies:
+                self.loads.take(w, node, ti.raw_div(c * (c - 1), 2) + a, -J, place_of(node, h))
+            elif ti.static(obstacles.any):
                 obstacles.take(c - self.layers, node, place_of(node, h), J)
         return way
 

@@ -50,6 +50,11 @@ class Layers:
         """Whether any body has a layer of its own, and meets others, walls and colliders by its surface."""
         return self.count > 1 or not self.shares
 
+    @property
+    def pairs(self) -> int:
+        """How many pairs of layers there are: (0, 1), (0, 2), (1, 2), (0, 3)..."""
+        return math.comb(self.count, 2)
+
     def has_own(self, source: int) -> bool:
         """Return whether a source has a layer of its own."""
         return self.numbers[source] > 0 or not self.shares

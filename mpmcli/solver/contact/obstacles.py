@@ -131,4 +131,4 @@ class Obstacles:
         if ti.static(self.collides):
             k, i = self.collider_of(o)
             if k >= 0:
-                self.colliders.take(self.colliders.row_of(node), k, impulse, x - self.colliders.place[i])
+                self.colliders.loads.take(self.colliders.run, node, k, impulse, x - self.colliders.place[i])

@@ -16,7 +16,7 @@ from mpmcli.boundaries.walls import REACH as WALLS_REACH
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls, faces_on_grid
 from mpmcli.errors import InputError, RunError
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.contact.body_contact import BodyContact
+from mpmcli.solver.contact.body_contact import EXTREMES, BodyContact
 from mpmcli.solver.drive.forces import DriveValues, Gravity, push_on
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.cpu_launch import CpuLaunch
@@ -169,8 +169,9 @@ class Batch:
         self.profile: Counter | None = None
         self.shown = self._room = np.zeros((runs, 1), groups[0].real)
         if on_cpu:
-            loads = kind.colliders.count * colliders.loads if colliders else 0
-            self.notes = np.zeros((runs, MOST_FRAMES, len(NOTES) + len(groups) * sum_entries(d) + loads))
+            noted = [one.loads.room * one.loads.width for one in (colliders, self.device.contact) if one is not None]
+            noted += [len(EXTREMES)] * kind.layers.separate
+            self.notes = np.zeros((runs, MOST_FRAMES, len(NOTES) + len(groups) * sum_entries(d) + sum(noted)))
             self._build_cpu()
         else:
             self.gpu = GpuLaunch(self.device, self.layout, doubles=backend.doubles)

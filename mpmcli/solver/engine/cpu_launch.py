@@ -9,7 +9,9 @@ from collections import Counter
 
 import numpy as np
 
+from mpmcli.boundaries.loads import Loads
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.contact.body_contact import BodyContact
 from mpmcli.solver.contact.obstacles import Obstacles
 from mpmcli.solver.engine.cpu_phases import CpuPhases, RunInts, RunReals, Shown
 from mpmcli.solver.engine.cpu_threads import LOOKS_IN_VAIN, CpuThreads
@@ -282,6 +284,15 @@ class CpuLaunch:
 
     # Frames.
 
+    def takers(self) -> list[tuple[Loads | BodyContact, int]]:
+        """Return what notes on a frame have behind the sums of each group, and from which column on."""
+        device, column = self.device, len(NOTES) + len(self.members) * self.sum_count
+        found = []
+        if device.colliders is not None:
+            found.append((device.colliders.loads, column))
+            column += device.colliders.loads.room * device.colliders.loads.width
+        return found + ([] if device.contact is None else [(device.contact, column)])
+
     @ti.func
     def record(self, w: int, numbers: ti.template(), counts: ti.template(), notes: ti.template()):
         """Note what belongs to a frame that is shown, and aim at the next one if there is one."""
@@ -296,9 +307,8 @@ class CpuLaunch:
                 notes[w, frame, ti.static(len(NOTES) + g * self.sum_count) + k] = sums[k]
             if sums[ti.static(SOUND)] == 0:
                 sound = False
-        if ti.static(self.collides):
-            after_sums = ti.static(len(NOTES) + len(self.members) * self.sum_count)
-            self.device.colliders.sum_up(w, frame, after_sums, notes)
+        for takers, column in ti.static(self.takers()):
+            takers.sum_up(w, frame, column, notes)
         for k, column in ti.static(self.noted):
             notes[w, frame, k] = numbers[w, column]
         for k, column in ti.static(self.counted):

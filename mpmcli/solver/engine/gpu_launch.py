@@ -59,7 +59,7 @@ class GpuLaunch:
         self.steps = StepSize(layout, groups, values, device.grid.scheme, drifts=drifts, shift=shift)
         self.sorts, self.moved = device.sorts, sorted_fields(groups)
         self.averages, self.moves = any(group.averaged for group in groups), device.motion is not None
-        self.loads = device.nodes.colliders.rows * device.nodes.colliders.room if device.nodes.collides else 0
+        self.loads = device.colliders.loads.rows * device.colliders.loads.room if device.nodes.collides else 0
         runs, widest = self.runs, max(entries(group) for group in groups)
         self.counts = ti.field(ti.i32, shape=(runs, layout.counts))
         self.numbers = double_field(runs, layout.reals) if doubles else None

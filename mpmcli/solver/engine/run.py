@@ -12,7 +12,7 @@ from mpmcli.solver.engine.stepped_run import SteppedRun
 from mpmcli.solver.frames.builder import Moment
 from mpmcli.solver.frames.columns import FrameArrays
 from mpmcli.solver.frames.ledger_sums import NO_STEPS, StepsTaken, Sums, sums_of_rows
-from mpmcli.solver.frames.recorder import read_loads, steps_of
+from mpmcli.solver.frames.recorder import steps_of
 from mpmcli.solver.transfer.particle_update import SMALLEST_J
 
 
@@ -98,9 +98,7 @@ class Run(SteppedRun):
         state, columns = self.state, self._builder.columns
         began, processor_began = time.perf_counter(), time.process_time()
         arrays = FrameArrays(columns, np.empty((1, self.particle_count, columns.count), self.groups[0].real))
-        # What reads a frame on the CPU forgets them.
-        loads = self._loads()
-        sums = self._read(arrays)
+        sums, loads = self._read(arrays)
         blocked = self._row.count("blocked")
         moment = Moment(index, state.time, state.step_count, state.last_step, taken, loads, blocked)
         (built,) = self._builder.build([moment], arrays, sums)
@@ -108,12 +106,16 @@ class Run(SteppedRun):
         self.frame_processor_seconds += time.process_time() - processor_began
         return built
 
-    def _read(self, arrays: FrameArrays) -> list[Sums]:
-        """Fill all rows of a frame; return the sums of each group."""
+    def _read(self, arrays: FrameArrays) -> tuple[list[Sums], dict[str, np.ndarray]]:
+        """Fill all rows of a frame; return the sums of each group, and `Moment.loads`."""
+        loads, colliders = {}, self.batch.device.colliders
         if self.backend.on_cpu:
             sums = self._recorder.read_now(arrays, self._launch_alone)
             sound = sums is not None
+            loads = {name: values[0] for name, values in self._recorder.loads(1).items()}
         else:
+            if colliders is not None:
+                loads["collider"] = colliders.loads.read(self.slot, len(self.scene.colliders))
             gpu = self.batch.gpu
             gpu.begin_frame(self.batch.numbers, self.batch.counts)
             for g, group in enumerate(self.groups):
@@ -123,9 +125,4 @@ class Run(SteppedRun):
             sound = (arrays["J"] > SMALLEST_J).all()
         if not sound:
             stop(self, self.last_step)
-        return sums
-
-    def _loads(self) -> np.ndarray | None:
-        """Return what colliders have taken since the last frame, (colliders, k); None where there are none."""
-        colliders = self.batch.device.colliders
-        return None if colliders is None else read_loads(colliders, self.slot, len(self.scene.colliders))
+        return sums, loads

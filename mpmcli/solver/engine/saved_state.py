@@ -168,11 +168,12 @@ def _fields(batch: Batch) -> dict[str, ti.Field]:
     for group in device.groups:
         found |= {f"{group.law.name}.{name}": field for name, field in group.fields().items()}
     if device.colliders is not None:
-        found["colliders.taken"] = device.colliders.taken
+        found["colliders.taken"] = device.colliders.loads.taken
     if device.motion is not None:
         found["colliders.pose"] = device.motion.pose
     if device.contact is not None:
         found |= {"layers.low": device.contact.surfaces.low, "layers.high": device.contact.surfaces.high}
+        found |= {"contact.taken": device.contact.loads.taken, "contact.extremes": device.contact.extremes}
     return found | ({} if device.particles.contact is None else device.particles.contact.fields())
 
 

@@ -1,7 +1,7 @@
 """Builds frames and rows of the ledger from what a device has shown."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -103,7 +103,8 @@ class Moment(NamedTuple):
     Attributes:
         index: its number; time: s; step: steps so far; last_step: the last of them, s.
         taken: the steps since the frame before.
-        loads: impulses, N s, and angular impulses, N m s, that colliders took since then, (colliders, k), or None.
+        loads: impulses, N s, and angular impulses, N m s, that each "collider", and of each pair in "contact" the first
+            body, took since then, (count, k), and `EXTREMES`; each where there are any.
         blocked: particles of emitters that found no room so far.
     """
 
@@ -112,7 +113,7 @@ class Moment(NamedTuple):
     step: int
     last_step: float
     taken: StepsTaken
-    loads: np.ndarray | None = None
+    loads: Mapping[str, np.ndarray] = {}
     blocked: int = 0
 
 
@@ -190,20 +191,18 @@ class FrameBuilder:
         conserved |= totals.entries(constants.masses)
         if status is not None:
             conserved["blocked"] = np.array([moment.blocked for moment in moments])
-        if scene.colliders:
-            conserved["collider_force"], conserved["collider_torque"] = self._collider_loads(moments)
         times, taken = [moment.time for moment in moments], [moment.taken for moment in moments]
+        durations, self.before = np.diff([self.before, *times]), times[-1]
+        for name in moments[0].loads:
+            found = np.array([moment.loads[name] for moment in moments])
+            if found.ndim == 1:
+                conserved[name] = found
+            else:
+                # Nothing acts before frame 0.
+                spans = durations[:, None, None]
+                found = np.divide(found, spans, where=spans > 0, out=np.zeros_like(found))
+                conserved[f"{name}_force"], conserved[f"{name}_torque"] = found[..., :d], found[..., d:]
         return list(zip(frames, ledger_rows(conserved, times, taken), strict=True))
-
-    def _collider_loads(self, moments: Sequence[Moment]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the mean force, N, and torque, N m, on each collider since the frame before, (T, colliders, k)."""
-        d = self._scene.dimension
-        found = []
-        for moment in moments:
-            duration, self.before = moment.time - self.before, moment.time
-            found.append(moment.loads / duration if duration > 0 else np.zeros_like(moment.loads))
-        loads = np.array(found)
-        return loads[..., :d], loads[..., d:]
 
 
 class _Totals:

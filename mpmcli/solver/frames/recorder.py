@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mpmcli.boundaries.colliders import Colliders
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene
+from mpmcli.solver.contact.body_contact import EXTREMES
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.run_numbers import LIMITS, MOST_FRAMES, NOTES, Row
 from mpmcli.solver.frames.builder import FrameBuilder, Moment
@@ -76,14 +76,14 @@ class FrameRecorder:
         if count == 0:
             return []
         moments = []
-        loads = self._loads(count)
+        loads = self.loads(count)
         for n, note in enumerate(self._batch.notes[self._slot, :count, : len(NOTES)].tolist()):
             now, last_step, smallest, courant, largest, largest_courant, limit, steps, blocked = note
             step = before + int(steps)
             taken = NO_STEPS
             if step > self.steps:
                 taken = StepsTaken(step - self.steps, (smallest, courant, LIMITS[int(limit)]), largest, largest_courant)
-            own = None if loads is None else loads[n]
+            own = {name: values[n] for name, values in loads.items()}
             moments.append(Moment(self.index, now, step, last_step, taken, own, int(blocked)))
             self.index, self.steps = self.index + 1, step
         rows = self._batch.shown[self._batch.first_row(self._slot) :][: count * self._particles]
@@ -98,14 +98,18 @@ class FrameRecorder:
         arrays.reals[0] = rows[:, : arrays.columns.count]
         return sums if sound else None
 
-    def _loads(self, count: int) -> np.ndarray | None:
-        """Return what each collider took up to the first frames of the last launch, (count, colliders, k)."""
-        colliders = self._batch.device.colliders
-        if colliders is None:
-            return None
-        first = len(NOTES) + len(self._batch.kind.members) * sum_entries(self._batch.kind.dimension)
-        own = self._batch.notes[self._slot, :count, first:].reshape(count, colliders.room, colliders.loads)
-        return own[:, : colliders.count[self._slot]].copy()
+    def loads(self, count: int) -> dict[str, np.ndarray]:
+        """Return what was taken up to the first frames of the last launch, (count, ...), see `Moment.loads`."""
+        device, kind = self._batch.device, self._batch.kind
+        first, found = len(NOTES) + len(kind.members) * sum_entries(kind.dimension), {}
+        rest = self._batch.notes[self._slot, :count, first:].copy()
+        for name, takers in (("collider", device.colliders), ("contact", device.contact)):
+            if takers is not None:
+                size = takers.loads.room * takers.loads.width
+                number = kind.layers.pairs if name == "contact" else takers.count[self._slot]
+                found[name] = rest[:, :size].reshape(count, -1, takers.loads.width)[:, :number]
+                rest = rest[:, size:]
+        return found if device.contact is None else found | dict(zip(EXTREMES, rest.T, strict=True))
 
     def _sums(self, count: int) -> tuple[list[Sums], bool]:
         """Return the sums of each group at the first frames of the last launch, and whether all were sound."""
@@ -115,14 +119,6 @@ class FrameRecorder:
         parts = np.split(own, groups, axis=1)
         found = [sums_of(part, d) for part in parts]
         return [sums for sums, _ in found], all(sound.all() for _, sound in found)
-
-
-def read_loads(colliders: Colliders, run: int, count: int) -> np.ndarray:
-    """Return the impulses and angular impulses that colliders of a run have taken, (count, k), and forget them."""
-    size = colliders.rows * colliders.room
-    taken = colliders.taken.to_numpy()[run * size : (run + 1) * size].astype(np.float64)
-    colliders.clear_taken(run)
-    return np.cumsum(taken.reshape(colliders.rows, colliders.room, -1), axis=0)[-1][:count]
 
 
 def collider_bound(scene: Scene) -> float:

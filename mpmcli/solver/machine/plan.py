@@ -9,6 +9,7 @@ import numpy as np
 import psutil
 
 from mpmcli.boundaries.colliders import ColliderKind
+from mpmcli.boundaries.loads import Loads
 from mpmcli.boundaries.walls import rough_faces
 from mpmcli.errors import InputError
 from mpmcli.materials.law import Law
@@ -202,7 +203,8 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     ]
     averaged = [averages_volume(scene.solver, law) for law in members]
     require_contact_possible(scene, backend)
-    separate, layers = Layers.of(scene).separate, Layers.of(scene).count
+    fields_of = Layers.of(scene)
+    separate, layers, pairs = fields_of.separate, fields_of.count, fields_of.pairs
     groups = tuple(
         LawPlan(
             name,
@@ -253,6 +255,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         tables += ParticleContact.bytes_needed(cells, sum(map(in_steps, counts.values())))
         bins = 2 * math.prod(bins_along(cells))
     rows = all_nodes // (tile * Grid.tile_counts(cells, tile)[-1])
+    tables += Loads.bytes_needed(max(1, pairs), dimension, rows) if separate else 0
     tables += roomy_colliders(ColliderKind.of(scene)).bytes_needed(dimension, rows)
     if deterministic:
         tables += nodes * roomy_colliders(ColliderKind.of(scene)).count * dimension * real

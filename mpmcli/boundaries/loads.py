@@ -1,0 +1,89 @@
+"""What colliders take from the material, and bodies from each other, between two frames."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from mpmcli.quick_taichi import ti
+
+
+@ti.data_oriented
+class Loads:
+    """Impulses, N s, and angular impulses, N m s, since the last frame, of some takers in each run of a batch.
+
+    Attributes:
+        room: takers of a run; rows: rows of nodes of a run, along the last axis.
+        width: numbers of an impulse and an angular impulse, 3 in 2D, 6 in 3D.
+        taken: of each taker, by rows of nodes: parts of a step share none, so that the sum has an order.
+    """
+
+    def __init__(self, room: int, shape: Sequence[int], runs: int, *, on_cpu: bool) -> None:
+        self.dimension, self.shape, self.room, self.on_cpu = len(shape), tuple(shape), room, on_cpu
+        self.rows, self.width = math.prod(shape[:-1]), 3 if len(shape) == 2 else 6
+        self.taken = ti.Vector.field(self.width, ti.f64 if on_cpu else float, shape=runs * room * self.rows)
+
+    @staticmethod
+    def bytes_needed(room: int, dimension: int, rows: int) -> int:
+        """Return the bytes that they take on a CPU."""
+        return 8 * room * rows * (3 if dimension == 2 else 6)
+
+    @ti.kernel
+    def clear(self, run: int):
+        """Forget what a run has taken."""
+        for q in range(self.rows * self.room):
+            self.taken[run * self.rows * self.room + q] = ti.Vector.zero(float, self.width)
+
+    def read(self, run: int, count: int) -> np.ndarray:
+        """Return what the first takers of a run have taken, (count, width), and forget it."""
+        size = self.rows * self.room
+        taken = self.taken.to_numpy()[run * size : (run + 1) * size].astype(np.float64)
+        self.clear(run)
+        return np.cumsum(taken.reshape(self.rows, self.room, -1), axis=0)[-1][:count]
+
+    @ti.func
+    def sum_up(self, run: int, frame: int, column: int, notes: ti.template()):
+        """Store what the takers of a run have taken in notes[run, frame], from a column on, and forget it."""
+        for k in range(self.room):
+            total = ti.Vector.zero(ti.f64, self.width)
+            for row in range(self.rows):
+                place = (run * self.rows + row) * self.room + k
+                for a in ti.static(range(self.width)):
+                    total[a] += self.taken[place][a]
+                    self.taken[place][a] = ti.cast(0, ti.f64)
+            for a in ti.static(range(self.width)):
+                notes[run, frame, column + k * self.width + a] = total[a]
+
+    @ti.func
+    def row_of(self, node: ti.template()):
+        """Return the row of a node."""
+        row = 0
+        for a in ti.static(range(self.dimension - 1)):
+            row = row * ti.static(self.shape[a]) + node[a]
+        return row
+
+    @ti.func
+    def take(self, run: int, node: ti.template(), k: int, impulse: ti.template(), arm: ti.template()):
+        """Book the impulse that taker k gets at a node, N s, at an arm from its point of reference, m."""
+        place = (run * self.rows + self.row_of(node)) * self.room + k
+        load = self.of(impulse, arm)
+        for a in ti.static(range(self.width)):
+            if ti.static(self.on_cpu):
+                self.taken[place][a] = self.taken[place][a] + ti.cast(load[a], ti.f64)
+            else:
+                ti.atomic_add(self.taken[place][a], load[a])
+
+    @ti.func
+    def of(self, impulse: ti.template(), arm: ti.template()):
+        """Return an impulse, N s, at an arm, m, with its angular impulse, N m s."""
+        d = ti.static(self.dimension)
+        load = ti.Vector.zero(float, ti.static(self.width))
+        for a in ti.static(range(d)):
+            load[a] = impulse[a]
+        if ti.static(d == 2):
+            load[2] = arm[0] * impulse[1] - arm[1] * impulse[0]
+        else:
+            for a in ti.static(range(3)):
+                b, c = ti.static((a + 1) % 3), ti.static((a + 2) % 3)
+                load[3 + a] = arm[b] * impulse[c] - arm[c] * impulse[b]
+        return load
