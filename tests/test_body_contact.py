@@ -14,7 +14,7 @@ from solver_state import bodies_of, scene_of
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.scene.schema import Contact
+from mpmcli.scene.contact import Contact
 from mpmcli.solver.contact.layers import STICKS, Layers, require_contact_possible
 from mpmcli.solver.contact.surfaces import rest_surface
 from mpmcli.solver.engine.build import build_run
@@ -98,6 +98,22 @@ def test_pairs_do_what_they_say() -> None:
     all_but = scene([a, b, c], contact=glued)
     assert Layers.of(all_but).numbers == (0, 1, 2)
     assert Layers.of(all_but).frictions(all_but).tolist() == [[s, s, 0.5], [s, s, 0.2], [0.5, 0.2, s]]
+
+
+def test_friction_is_that_of_the_softer_body_where_none_is_given() -> None:
+    """Presets have one; of bodies as soft as each other the lower counts."""
+    stiff, soft, slick = jelly(surface_friction=0.2), jelly(surface_friction=0.5), jelly()
+    stiff |= {"youngs_modulus": 2 * E}
+    bodies = [
+        body(name, [x, 2], [x + 2, 4], material=made)
+        for name, x, made in zip("abc", (2, 6, 10), (stiff, soft, slick), strict=True)
+    ]
+    one = scene(bodies, contact={"default": "separate"})
+    assert Layers.of(one).frictions(one)[np.tril_indices(3, -1)].tolist() == [0.5, 0.0, 0.0]
+    presets = [body(name, [x, 2], [x + 2, 4], material=name) for name, x in (("jelly", 2), ("rubber", 6))]
+    one = scene(presets, contact={"default": "separate"})
+    assert one.friction_between(*one.bodies) == 0.02
+    assert one.bodies[1].material.surface_friction == 1.0
 
 
 @pytest.mark.parametrize(

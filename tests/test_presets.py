@@ -205,7 +205,7 @@ REFUSED = [
     (
         '{ preset = "rubber", viscosity = 0.5 }',
         'material.viscosity: the law neo_hookean has no parameter "viscosity"; its parameters are "density", '
-        '"poissons_ratio" and "youngs_modulus"',
+        '"poissons_ratio", "surface_friction" and "youngs_modulus"',
     ),
     (
         '{ law = "neo_hookean", density = 1 }',

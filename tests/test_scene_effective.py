@@ -164,7 +164,6 @@ volume_correction = true
 
 [contact]
 default = "stick"
-friction = 0.0
 pairs = []
 
 [output]

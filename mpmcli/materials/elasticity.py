@@ -16,7 +16,7 @@ from mpmcli.materials.law import Law, Mode, StateBound, carried_stiffness, princ
 from mpmcli.materials.tensors import from_principal
 from mpmcli.quick_taichi import ti
 from mpmcli.scene.material import Knob, MaterialParameters, SceneBounds
-from mpmcli.scene.quantity import LARGEST, Positive
+from mpmcli.scene.quantity import LARGEST, NotNegative, Positive
 
 # Lower bound on a stretch, which keeps the logarithm of a flat particle finite.
 STRETCH_MIN = 1e-4
@@ -54,6 +54,18 @@ class ElasticParameters(MaterialParameters):
         """lambda = E nu / ((1 + nu)(1 - 2 nu)), Pa."""
         nu = self.poissons_ratio
         return self.youngs_modulus * nu / ((1 + nu) * (1 - 2 * nu))
+
+
+class SolidParameters(ElasticParameters):
+    """Parameters of a solid that stays elastic."""
+
+    solid = True
+
+    surface_friction: NotNegative = Field(
+        0.0,
+        description='Coefficient of Coulomb friction with bodies that "separate" from it and are no softer, where '
+        "contact gives none.",
+    )
 
 
 class HenckyParameters(ElasticParameters):

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from mpmcli.materials.elasticity import ElasticParameters
+from mpmcli.materials.elasticity import SolidParameters
 from mpmcli.materials.law import Law, Mode, StateBound, principal
 from mpmcli.materials.tensors import from_principal, polar_rotation, principal_stretches, rounding, volume_strain
 from mpmcli.quick_taichi import ti
@@ -17,10 +17,8 @@ MU, LAMBDA = range(2)
 SMALL = 2e-3, 2e-6
 
 
-class FixedCorotatedParameters(ElasticParameters):
+class FixedCorotatedParameters(SolidParameters):
     """Parameters of the fixed corotated solid."""
-
-    solid = True
 
     law: Literal["fixed_corotated"] = "fixed_corotated"
 

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from mpmcli.materials.elasticity import ElasticParameters
+from mpmcli.materials.elasticity import SolidParameters
 from mpmcli.materials.elementary import log
 from mpmcli.materials.law import SMALLEST, Law, Mode, StateBound, carried_stiffness, least_stretch, principal
 from mpmcli.materials.tensors import log_ratio, volume_strain
@@ -15,10 +15,8 @@ from mpmcli.quick_taichi import ti
 MU, LAMBDA = range(2)
 
 
-class NeoHookeanParameters(ElasticParameters):
+class NeoHookeanParameters(SolidParameters):
     """Parameters of the neo-Hookean solid."""
-
-    solid = True
 
     law: Literal["neo_hookean"] = "neo_hookean"
 

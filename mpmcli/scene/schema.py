@@ -14,6 +14,7 @@ from pydantic import (
 )
 
 from mpmcli.scene.colliders import Collider
+from mpmcli.scene.contact import Contact
 from mpmcli.scene.domain import Domain
 from mpmcli.scene.entry import Constants, Entry, PlaceVector, StartDeformation, StartMatrix, StartVector
 from mpmcli.scene.expression import POSITION
@@ -354,29 +355,6 @@ def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:
     return fields
 
 
-class ContactPair(Table):
-    """What two bodies do to each other where they meet, whatever others do."""
-
-    between: tuple[str, str] = Field(description="Names of the two bodies.")
-    friction: NotNegative | Literal["stick"] = Field(
-        description='Coefficient of Coulomb friction between them, so that they separate; "stick": they do not.'
-    )
-
-
-class Contact(Table):
-    """What bodies do to each other where they meet."""
-
-    default: Literal["stick", "separate"] = Field(
-        "stick",
-        description='"stick": bodies share one velocity field, meet up to two cells before they touch, and do not '
-        'slide. "separate": each elastic body has a velocity field of its own; they meet each other, and walls and '
-        "colliders that separate, where their surfaces are, slide with friction, and part. Liquids, grains and bodies "
-        "that yield stick to all others.",
-    )
-    friction: NotNegative = Field(0.0, description='Coefficient of Coulomb friction between bodies that "separate".')
-    pairs: tuple[ContactPair, ...] = Field((), description="Pairs of bodies that do something else.")
-
-
 class Output(Table):
     """What is stored of each particle, besides its position, body and material."""
 
@@ -427,7 +405,7 @@ class Scene(Table):
             if set(pair.between) == {first.name, second.name}:
                 return None if pair.friction == "stick" else pair.friction
         separate = self.contact.default == "separate" and first.has_surface and second.has_surface
-        return self.contact.friction if separate else None
+        return self.contact.friction_of(first.material, second.material) if separate else None
 
     def separates(self, source: "Body | Emitter") -> bool:
         """Return whether a body has a velocity field of its own: its surface meets others, walls and colliders."""
