@@ -119,7 +119,7 @@ def exchange(
         if n_a @ n_c >= 0.7:
             continue
         mean = unit(n_a - n_c)
-        axes = [normal_along(a, w[0], mean), -normal_along(c, w[1], -mean), mean]
+        axes = [normal_along(a, w[0], -n_c), -normal_along(c, w[1], -n_a), mean]
         if axes[0] @ axes[1] > 0.999:
             axes = [unit(axes[0] + axes[1])]
         u = momenta[1][at] / m[1] - momenta[0][at] / m[0]
@@ -167,11 +167,11 @@ def stop(
         def far(axis: np.ndarray, w: np.ndarray = w, node: np.ndarray = node, r: np.ndarray = node - points) -> tuple:
             return distance_to(surface, w, node, axis, h), distance_from(r, -axis, 12 / surface.distance, h)
 
-        mean = unit(unit(w @ surface.n) - facing)
-        shares = np.exp(16 * (-normals @ mean - 1))
+        n = unit(w @ surface.n)
+        shares = np.exp(16 * (-normals @ n - 1))
         slopes = np.array([w @ surface.slope / w.sum(), np.zeros(len(node))])
         inverse = 1 / surface.modulus, 1 / surface.density
-        axes = [normal_along(surface, w, mean), -unit(shares @ normals), mean]
+        axes = [normal_along(surface, w, -facing), -unit(shares @ normals), unit(n - facing)]
         if (normals @ facing > 0.9).all():
             axes = [-facing]
         elif axes[0] @ axes[1] > 0.999:

@@ -362,6 +362,24 @@ def test_bodies_that_touch_are_left_alone(backend_of: Callable, shift: float) ->
     assert max(row.kinetic + row.elastic for row in rows) < 1e-5 * (LAMBDA + 2 * MU) * H**2
 
 
+def test_cubes_that_touch_anywhere_are_left_alone(backend_of: Callable) -> None:
+    """At a corner over an edge mean normals look along neither face: from rest they reached 0.05 of the wave speed."""
+    low, high = (
+        body("a", [6.08, 6.86, 5.86], [12.83, 12.8, 11.41]),
+        body("b", [4.11, 7.44, 11.41], [9.55, 13.11, 15.97]),
+    )
+    touch = scene_of(
+        domain={"size": [20 * H] * 3, "spacing": H, "gravity": [0.0] * 3},
+        time={"end": 0.005, "frames": 1},
+        bodies=[low, high],
+        contact=SEPARATE,
+        solver={"precision": "f64"},
+    )
+    frame, row = list(build_run(touch, backend_of("f64", 1)).frames())[-1]
+    assert np.abs(frame.velocity).max() < 5e-4 * math.sqrt((LAMBDA + 2 * MU) / DENSITY)
+    assert row.contact_overlap < 0.01
+
+
 @pytest.mark.slow
 def test_single_precision_bears_nodes_of_hardly_any_mass(backend_of: Callable) -> None:
     """The product of the masses of two bodies at a node is 0 there, and what they do to each other finite."""

@@ -1,9 +1,9 @@
 """Contact of bodies with velocity fields of their own: impulses at nodes that two of them, or one and a wall reach.
 
 At a node the surface of each body is a distance along an axis, by the logarithm of a sum of exponentials over the
-points of the surface around. Of three axes, the mean of both normals and the normals of the faces that it meets, that
-of the largest gap separates them. The impulse is that of a spring on the gap, by backward Euler, and Coulomb's
-friction. See docs/theory.md, 2.8.
+points of the surface around. Of three axes, the mean of both normals and the normals of the faces that look at the
+other, that of the largest gap separates them. The impulse is that of a spring on the gap, by backward Euler, and
+Coulomb's friction. See docs/theory.md, 2.8.
 """
 
 import math
@@ -29,8 +29,8 @@ from mpmcli.solver.transfer.splines import PAD, bounded
 BALL = 3.0
 # Sharpness of the soft minimum of distances, per distance of particles.
 SHARP = 12.0
-# Sharpness of the mean normal of the faces that an axis meets. Bodies whose normals have a larger product look the same
-# way, and not at each other.
+# Sharpness of the mean normal of the faces that look at another body. Bodies whose normals have a larger product look
+# the same way, and not at each other.
 FACING, ALIKE = 16.0, 0.7
 # Products of normals from which on one axis is tried only: of the faces of two bodies, and of an obstacle.
 SAME, SMOOTH = 0.999, 0.9
@@ -38,6 +38,8 @@ SAME, SMOOTH = 0.999, 0.9
 BLEND, DEEPEST = 0.02, 0.3
 # Overlaps between which bodies are stopped more and more, whatever the spring does, cells.
 STOPS = (0.1, 0.2)
+# Of the mass of nodes on flat faces that touch, from which on overlaps and gaps of a node are told.
+LIGHT = 0.1
 # From the nearest point of an obstacle to where others are looked for, and back to its surface at the most, cells.
 FAR_ASIDE = 3.0
 # Nodes of a row that are skipped at most.
@@ -212,7 +214,8 @@ class BodyContact:
                 pushed = self.impulse(gap / h, u, n, aside, kappa, reduced, h / dt, friction)
                 for b in ti.static(range(d)):
                     J[b] = pushed[b]
-                if known and pushed.dot(n) > 0.0:
+                # Nodes of hardly any mass, beside edges, show little of a surface.
+                if known and pushed.dot(n) > 0.0 and reduced > LIGHT * mass:
                     for k, reached in ti.static(enumerate((-gap / h, gap / h))):
                         # Most are no record, and atomics are slow.
                         if reached > self.extremes[w, k]:
@@ -289,7 +292,8 @@ class BodyContact:
                 alike = 0.0
                 for side in range(2):
                     stay_rolled(self.points, thread + side)
-                    met = self.normal_along((2 * thread + side) * self.share, counts[side], normal)
+                    towards = ti.select(side == 0, -n_c, n_a)
+                    met = self.normal_along((2 * thread + side) * self.share, counts[side], towards)
                     for b in ti.static(range(d)):
                         axes[side, b] = met[b]
                         alike += axes[0, b] * axes[1, b]
