@@ -17,7 +17,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import lattice_spacing
 from mpmcli.solver.contact.layers import Layers
-from mpmcli.solver.contact.obstacles import FAR, REACH
+from mpmcli.solver.contact.obstacles import FAR, REACH, place_of
 from mpmcli.solver.contact.surfaces import BodySurfaces
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
@@ -42,8 +42,6 @@ STOPS = (0.1, 0.2)
 LIGHT = 0.1
 # From the nearest point of an obstacle to where others are looked for, and back to its surface at the most, cells.
 FAR_ASIDE = 3.0
-# Nodes of a row that are skipped at most.
-FARTHEST = 1e6
 # Exponents beyond which single precision has no number; in place of 0 where it divides, or its logarithm is taken.
 LARGEST, SMALLEST = 80.0, 1e-37
 # The gap of bodies of which one shows no surface, cells: they do not meet.
@@ -132,28 +130,20 @@ class BodyContact:
         for row in range(first, after):
             node = grid.row_start(row)
             index = grid.linear_index(node)
-            # The node along the row up to which no obstacle is near.
-            far = node[last]
             for _ in range(grid.row_length(node)):
-                present = self.surfaces.present[self.surfaces.place_of(grid, w, index)]
+                place = self.surfaces.place_of(grid, w, index)
+                present = self.surfaces.present[place]
                 # Layers in descending order: pairs of them, then each and the obstacles, whose numbers follow theirs.
-                turns, nearest = 1, FARTHEST
-                if ti.static(obstacles.any):
-                    if present > ti.static(int(self.surfaces.shares)) and node[last] >= far:
-                        turns = 2
-                for turn in range(turns):
+                for turn in range(ti.select(self.surfaces.met[place] > 1, 2, 1)):
                     rest = present
                     while rest > 255 or (turn == 1 and rest > ti.static(int(self.surfaces.shares))):
                         c, others, o = ti.cast(rest & 255, int) - 1, rest >> 8, 0
                         while (turn == 0 and others > 0) or (turn == 1 and o < obstacles.count()):
                             a = ti.select(turn == 0, ti.cast(others & 255, int) - 1, c)
                             met = ti.select(turn == 0, c, self.layers + o)
-                            way = self.exchange(grid, obstacles, w, thread, node, index, a, met, dt, gravity_step)
-                            nearest = ti.min(nearest, way * grid.inverse_spacing)
+                            self.exchange(grid, obstacles, w, thread, node, index, a, met, dt, gravity_step)
                             others, o = others >> 8, o + 1
                         rest = rest >> 8
-                if turns == 2:
-                    far = node[last] + ti.cast(ti.max(nearest - REACH, 0.0), int)
                 node[last] += 1
                 index += 1
 
@@ -171,10 +161,7 @@ class BodyContact:
         dt: float,
         gravity_step: ti.template(),
     ):
-        """Let layer a exchange momentum with layer c, or obstacle c - layers, at a node, by its index in layer 0.
-
-        Return how far the node is from the obstacle, m, see `Obstacles.at`.
-        """
+        """Let layer a exchange momentum with layer c, or obstacle c - layers, at a node, by its index in layer 0."""
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
         at_a, at_c = index + a * ti.static(self.node_count), index + c * ti.static(self.node_count)
         m_a, bodies, way, agree = grid.nodes[at_a][d], c < self.layers, FAR, 0.0
@@ -229,7 +216,6 @@ class BodyContact:
                 self.loads.take(w, node, ti.raw_div(c * (c - 1), 2) + a, -J, place_of(node, h))
             elif ti.static(obstacles.any):
                 obstacles.take(c - self.layers, node, place_of(node, h), J)
-        return way
 
     @ti.func
     def impulse(
@@ -464,12 +450,6 @@ class BodyContact:
         for k in ti.static(range(points.n)):
             for lane in range(LANES):
                 points[k, lane] = self.points[first + k * self.room + lane]
-
-
-@ti.func
-def place_of(node: ti.template(), spacing: float):
-    """Return where a node is, from the lower corner, m."""
-    return ti.cast(node - PAD, float) * spacing
 
 
 @ti.func

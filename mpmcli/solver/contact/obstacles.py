@@ -132,3 +132,9 @@ class Obstacles:
             k, i = self.collider_of(o)
             if k >= 0:
                 self.colliders.loads.take(self.colliders.run, node, k, impulse, x - self.colliders.place[i])
+
+
+@ti.func
+def place_of(node: ti.template(), spacing: float):
+    """Return where a node is, from the lower corner, m."""
+    return ti.cast(node - PAD, float) * spacing

@@ -13,7 +13,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Body
 from mpmcli.scene.sampling import BodyParticles, lattice_spacing
 from mpmcli.solver.contact.layers import Layers
-from mpmcli.solver.contact.obstacles import REACH
+from mpmcli.solver.contact.obstacles import REACH, place_of
 from mpmcli.solver.grid.grid import Grid, box_of
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.sort import TileOrder, stay_rolled
@@ -23,8 +23,10 @@ from mpmcli.solver.transfer.splines import PAD
 BAND = 1.5
 # Stretch of the smallest principal axis, inverse, up to which particles are found.
 CRUSHED = 4.0
-# In place of the first particle of a bin: none. In place of the layer of a particle: it shows nothing.
-EMPTY, HIDDEN = -1, -1
+# Nodes of a row that are skipped at most.
+FARTHEST = 1e6
+# In place of the first particle of a bin: none yet, or none ever. In place of a particle's layer: it shows nothing.
+EMPTY, CLOSED, HIDDEN = -1, -2, -1
 # In place of the depth of a particle that shows nothing.
 BELOW_ALL = 1e30
 # Parts of the distance of particles: by how much a point is moved off edges between faces that are equally near, of
@@ -65,11 +67,13 @@ class BodySurfaces:
         low, high: of each layer of each run, the range of the nodes at which stencils began at the last sort.
         used: of each of them, the nodes in use, as `Grid.box`; box: of each run, those where layers meet each other
             or an obstacle.
-        pairs: as box, of two layers alone.
         drift: of each run, cells that particles may have moved since the sort.
         present: of each node of a run in that box the layers that have mass there, increased by 1, a byte each.
-        first: of each node and surfaced group, the first particle that shows something whose stencil begins there, or
-            EMPTY; following: of each particle, the next one.
+        met: of each of these nodes 1 where two bodies with layers of their own are, and 2 more where an obstacle is in
+            reach of one.
+        first: of each node and surfaced group, its bin: the first particle that shows something whose stencil begins
+            there, EMPTY, or CLOSED where nothing meets at a node of that stencil; following: of each particle, the
+            next one.
         end: of each tile, the particle after the last one that may show something.
         shown: of each particle its layer, or HIDDEN; surface: the normal n of its body, the depth d below it, m,
             and dv/dn, 1/s.
@@ -85,9 +89,10 @@ class BodySurfaces:
         self.node_count, count = grid.node_count, runs * layers.count
         self.low, self.high = (ti.Vector.field(d, int, shape=count) for _ in range(2))
         self.used = ti.field(int, shape=(2 * count, d))
-        self.box, self.pairs = (ti.field(int, shape=(2 * runs, d)) for _ in range(2))
+        self.box = ti.field(int, shape=(2 * runs, d))
         self.drift, self.count = ti.field(int, shape=runs), ti.field(int, shape=runs)
         self.present = ti.field(ti.i64, shape=runs * grid.node_count)
+        self.met = ti.field(int, shape=runs * grid.node_count)
         self.first, self.following, self.shown, self.surface, self.end = {}, {}, {}, {}, {}
         for g in self.surfaced:
             room = groups[g].capacity
@@ -99,7 +104,7 @@ class BodySurfaces:
     @staticmethod
     def bytes_needed(nodes: int, tiles: int, particles: Sequence[int], surface: int) -> int:
         """Return the bytes for so many nodes, tiles, and particles per group of which each shows so many bytes."""
-        return nodes * 8 + (nodes + tiles) * 4 * len(particles) + sum(particles) * (8 + surface)
+        return nodes * 12 + (nodes + tiles) * 4 * len(particles) + sum(particles) * (8 + surface)
 
     # Where bodies may meet.
 
@@ -142,7 +147,6 @@ class BodySurfaces:
                 end = ti.min(self.high[a], self.high[c]) + drift + reach
                 if (end - first).min() >= reach:
                     low, high = ti.min(low, first), ti.max(high, end)
-        self.set_box(self.pairs, grid, w, low, high)
         if ti.static(obstacles.any):
             for o in range(obstacles.count()):
                 first_met, last_met = obstacles.range(o)
@@ -154,15 +158,10 @@ class BodySurfaces:
                         distance, _n, _v, _f = obstacles.at(o, middle, radius / obstacles.spacing + REACH)
                         if distance < radius + REACH * obstacles.spacing:
                             low, high = ti.min(low, first), ti.max(high, end)
-        self.set_box(self.box, grid, w, low, high)
-
-    @ti.func
-    def set_box(self, box: ti.template(), grid: ti.template(), w: int, low: ti.template(), high: ti.template()):
-        """Set a box from its first to its last node, as far as nodes are in use."""
-        for a in ti.static(range(self.dimension)):
-            first = ti.max(low[a], grid.box[2 * w, a])
-            end = ti.min(high[a], grid.box[2 * w, a] + grid.box[2 * w + 1, a] - 1)
-            box[2 * w, a], box[2 * w + 1, a] = first, ti.max(end - first + 1, 0)
+        for a in ti.static(range(d)):
+            first_used, count = grid.box[2 * w, a], grid.box[2 * w + 1, a]
+            first, end = ti.max(low[a], first_used), ti.min(high[a], first_used + count - 1)
+            self.box[2 * w, a], self.box[2 * w + 1, a] = first, ti.max(end - first + 1, 0)
 
     @ti.func
     def ball_of(self, first: ti.template(), last: ti.template(), spacing: float):
@@ -185,11 +184,11 @@ class BodySurfaces:
                 stay_rolled(self.orders[0].buffers.real, place + k)
                 self.present[place + k] = 0
                 for g in ti.static(self.surfaced):
-                    self.first[g][place + k] = EMPTY
+                    self.first[g][place + k] = CLOSED
 
     @ti.func
-    def find_rows(self, grid: ti.template(), w: int, first: int, after: int):
-        """Find which layers have mass at rows of nodes."""
+    def find_rows(self, grid: ti.template(), obstacles: ti.template(), w: int, first: int, after: int):
+        """Find which layers have mass at rows of nodes, and whether they meet anything."""
         last = ti.static(self.dimension - 1)
         for layer in range(self.count[w]):
             used, behind = 2 * (w * self.layers + layer), layer * ti.static(self.node_count)
@@ -208,24 +207,48 @@ class BodySurfaces:
                         stay_rolled(self.orders[0].buffers.real, place + k)
                         if grid.nodes[index + behind + k][last + 1] > 0.0:
                             self.present[place + k] = 256 * self.present[place + k] + layer + 1
+        for row in range(first, after):
+            node = grid.row_start(row)
+            # The node up to which no obstacle is near.
+            place, far = self.place_of(grid, w, grid.linear_index(node)), node[last]
+            for k in range(grid.row_length(node)):
+                bodies = self.bodies_at(place + k)
+                met = ti.cast(bodies > 1, int)
+                if ti.static(obstacles.any):
+                    if bodies > 0 and node[last] >= far:
+                        cells = obstacles.nearest(place_of(node, grid.spacing), REACH) * grid.inverse_spacing
+                        met += 2 * ti.cast(cells < REACH, int)
+                        far = node[last] + ti.cast(ti.min(ti.max(cells - REACH, 0.0), FARTHEST), int)
+                self.met[place + k] = met
+                if met > 0:
+                    for q in range(ti.static(grid.scheme.spline.nodes**self.dimension)):
+                        before, inside = self.stencil_before(grid, node, q)
+                        if inside:
+                            for g in ti.static(self.surfaced):
+                                self.first[g][place + k - before] = EMPTY
+                node[last] += 1
 
     @ti.func
-    def meets(self, grid: ti.template(), w: int, base: ti.template()):
-        """Return whether two bodies are at a node of the stencil that begins at a node."""
-        n = ti.static(grid.scheme.spline.nodes)
-        meet = False
-        for q in range(ti.static(n**self.dimension)):
-            node, rest, inside = base, q, True
-            for a in ti.static(range(self.dimension)):
-                after = ti.raw_div(rest, n)
-                node[a] += rest - after * n
-                inside = inside and node[a] < grid.box[0, a] + grid.box[1, a]
+    def opens(self, g: ti.template(), grid: ti.template(), w: int, low: ti.template(), high: ti.template()):
+        """Return whether a bin is open of a node in a box, given its first and its last node."""
+        last = ti.static(self.dimension - 1)
+        first, end, rows, found = low, high, 1, False
+        for a in ti.static(range(self.dimension)):
+            first[a] = ti.max(low[a], grid.box[0, a])
+            end[a] = ti.min(high[a] + 1, grid.box[0, a] + grid.box[1, a])
+            if ti.static(a < last):
+                rows *= ti.max(end[a] - first[a], 0)
+        for row in range(rows):
+            node, rest = first, row
+            for a in ti.static(range(last)):
+                after = ti.raw_div(rest, end[a] - first[a])
+                node[a] += rest - after * (end[a] - first[a])
                 rest = after
-            if inside:
-                place = self.place_of(grid, w, grid.linear_index(node))
-                stay_rolled(self.orders[0].buffers.real, place)
-                meet = meet or self.bodies_at(place) > 1
-        return meet
+            place = self.place_of(grid, w, grid.linear_index(node))
+            for k in range(end[last] - first[last]):
+                stay_rolled(self.orders[0].buffers.real, place + k)
+                found = found or self.first[g][place + k] != CLOSED
+        return found
 
     @ti.func
     def bodies_at(self, place: int):
@@ -286,21 +309,6 @@ class BodySurfaces:
         return tile + w * ti.static(order.bins + 1), place
 
     @ti.func
-    def may_meet(self, grid: ti.template(), obstacles: ti.template(), w: int, place: ti.template()):
-        """Return whether particles of a tile may meet other bodies, and whether they may meet an obstacle."""
-        bodies, beside = True, False
-        first, last = place * grid.tile - self.drift[w], (place + 1) * grid.tile + self.drift[w]
-        for a in ti.static(range(self.dimension)):
-            low, high = self.pairs[2 * w, a], self.pairs[2 * w, a] + self.pairs[2 * w + 1, a]
-            bodies = bodies and first[a] < high and last[a] > low
-        if ti.static(obstacles.any):
-            # With the stencils of its particles.
-            middle, radius = self.ball_of(first, last + ti.static(grid.scheme.spline.nodes), grid.spacing)
-            reach = radius + REACH * grid.spacing
-            beside = obstacles.nearest(middle, reach * grid.inverse_spacing) < reach
-        return bodies, beside
-
-    @ti.func
     def bin_of(self, grid: ti.template(), w: int, base: ti.template()):
         """Return the bin of the stencils that begin at a node, -1 outside the box."""
         place = self.place_of(grid, w, grid.linear_index(base))
@@ -310,26 +318,30 @@ class BodySurfaces:
         return place
 
     @ti.func
-    def show(self, g: ti.template(), grid: ti.template(), obstacles: ti.template(), w: int, q: int):
+    def show(self, g: ti.template(), grid: ti.template(), w: int, q: int):
         """Find what the particles of the g-th group in the q-th tile show."""
         d, group = ti.static((self.dimension, self.groups[g]))
         tile, place = self.tile_at(grid, self.orders[g], w, q)
-        bodies, beside = self.may_meet(grid, obstacles, w, place)
         begin, end = self.orders[g].start[tile], self.orders[g].start[tile + 1]
-        self.end[g][tile] = ti.select(bodies or beside, end, begin)
+        if begin < end:
+            first, drift = place * grid.tile, self.drift[w]
+            if not self.opens(g, grid, w, first - drift, first + drift + ti.static(grid.tile - 1)):
+                end = begin
+        self.end[g][tile] = end
         for p in range(begin, self.end[g][tile]):
             base, _ = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
             shown = HIDDEN
             # What lies deeper at rest is farther from the surface than the band, unless it is crushed.
-            if self.bin_of(grid, w, base) >= 0 and group.carried[p][d] < CRUSHED * BAND * grid.spacing:
-                N = ti.Vector.zero(float, d)
-                for c in ti.static(range(d)):
-                    N[c] = group.carried[p][c]
-                n = group.stored(p).inverse().transpose() @ N
-                size = n.norm()
-                depth = group.carried[p][d] / size
-                if depth < BAND * grid.spacing:
-                    if beside or self.meets(grid, w, base):
+            if group.carried[p][d] < CRUSHED * BAND * grid.spacing:
+                bin_ = self.bin_of(grid, w, base)
+                if bin_ >= 0 and self.first[g][ti.max(bin_, 0)] != CLOSED:
+                    N = ti.Vector.zero(float, d)
+                    for c in ti.static(range(d)):
+                        N[c] = group.carried[p][c]
+                    n = group.stored(p).inverse().transpose() @ N
+                    size = n.norm()
+                    depth = group.carried[p][d] / size
+                    if depth < BAND * grid.spacing:
                         shown = group.layer_of(p)
                         for c in ti.static(range(d)):
                             self.surface[g][p][c] = n[c] / size

@@ -44,19 +44,19 @@ class CpuContact:
     def find_bodies(self, at: ti.template()):
         """Find where two bodies meet."""
         box = self.near_bodies(at)
-        (grid,) = ti.static((at.grid.within(box),))
+        grid, obstacles = ti.static((at.grid.within(box), obstacles_of(at)))
         first, after = self.rows_near_bodies(grid, at)
-        self.device.contact.surfaces.find_rows(grid, at.w, first, after)
+        self.device.contact.surfaces.find_rows(grid, obstacles, at.w, first, after)
 
     @ti.func
     def show_surface(self, at: ti.template()):
         """Find what particles of the g-th group show."""
         box = self.near_bodies(at)
-        grid, obstacles = ti.static((at.grid.within(box), obstacles_of(at)))
+        (grid,) = ti.static((at.grid.within(box),))
         first, after = self.places.even_part(self.device.contact.surfaces.tile_count(grid, at.w), at.region)
         first, after = self.share(first, after, at.part)
         for q in range(first, after):
-            self.device.contact.surfaces.show(at.g, grid, obstacles, at.w, q)
+            self.device.contact.surfaces.show(at.g, grid, at.w, q)
 
     @ti.func
     def link_surfaces(self, at: ti.template()):
