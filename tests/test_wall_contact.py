@@ -8,6 +8,7 @@ import pytest
 from contact_scenes import DENSITY, E, G, H, body, jelly, scene
 
 from mpmcli.check.result_ledger import CONTACT_SUSPECT, energy_change
+from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene
 from mpmcli.solver.contact.surfaces import BELOW_ALL
 from mpmcli.solver.engine.build import build_run
@@ -238,3 +239,42 @@ def test_jelly_rests_on_the_floor(backend_of: Callable, way: str) -> None:
         if len(bodies) == 2:
             assert frame.position[frame.body == 1, 1].min() / H - floor < 1.0
     assert places[1] == pytest.approx(places[0], abs=1e-3 * H)
+
+
+def piled(low: np.ndarray, size: np.ndarray, youngs_modulus: float, end: float) -> Scene:
+    """Light boxes, (n, 2) in cells, with friction, in a trough of 80 cells."""
+    material = jelly(density=300.0, youngs_modulus=youngs_modulus)
+    boxes = [
+        body(f"b{k}", a.tolist(), (a + b).tolist(), material=material)
+        for k, (a, b) in enumerate(zip(low, size, strict=True))
+    ]
+    domain = {"size": [80 * H, 120 * H], "walls": "separate", "friction": 0.4, "gravity": [0.0, -G]}
+    return scene(boxes, 0.4, end=end, frames=50, domain=domain, solver={"precision": "f32"})
+
+
+def middles(frame: Frame) -> np.ndarray:
+    """Return where bodies are, cells."""
+    return np.array([frame.position[frame.body == k].mean(axis=0) for k in range(frame.body.max() + 1)]) / H
+
+
+@pytest.mark.slow
+def test_a_tower_of_five_cubes_stands(backend_of: Callable) -> None:
+    """It bounces, and loses that in seconds; it sags by rho g H^2 / 2 E, and nothing slides or tilts."""
+    low = np.array([[20 + 0.15 * (-1) ** k, 10 * k] for k in range(5)])
+    frames = list(build_run(piled(low, np.full((5, 2), 10), 1e6, 5.0), backend_of("f32")).frames())
+    moved = middles(frames[-1][0]) - middles(frames[0][0])
+    assert np.abs(moved[:, 0]).max() < 0.15
+    assert -1.3 * 300 * G * (50 * H) ** 2 / 2e6 / H < moved[-1, 1] < 0.0
+
+
+@pytest.mark.slow
+def test_thirty_boxes_come_to_rest(backend_of: Callable) -> None:
+    """Energy is never above its start; in the last second nothing moves by a tenth of a box."""
+    rng = np.random.default_rng(0)
+    size = rng.uniform(7, 10, (30, 2))
+    low = np.array([[5 + 15 * (k % 5), 5 + 17.5 * (k // 5)] for k in range(30)]) + rng.uniform(0, 3, (30, 2))
+    frames = list(build_run(piled(low, size, 2.5e5, 6.0), backend_of("f32")).frames())
+    energy = np.array([row.energy for _, row in frames])
+    assert energy.argmax() == 0
+    assert np.abs(middles(frames[-1][0]) - middles(frames[-10][0])).max() < 0.8
+    assert np.sqrt(2 * frames[-1][1].kinetic / frames[0][1].mass) < 0.05
