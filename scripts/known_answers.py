@@ -102,6 +102,13 @@ def stack_2d(result: Result) -> str:
     return f"flight of the ball {percent(error)} off; the blocks end {max(places) - min(places):.2f} m apart"
 
 
+def rafts_2d(result: Result) -> str:
+    """Compare what carries the bodies that float in the last second with their weights."""
+    force = np.mean([np.array(row.collider_force)[:3, 1] for row in result.ledger[-30:]], axis=0)
+    shares = force / [9.81 * collider.moments.mass for collider in result.colliders[:3]]
+    return f"what carries those that float, over their weights: {', '.join(f'{share:.3f}' for share in shares)}"
+
+
 def billiard_2d(result: Result) -> str:
     """Say how far the momentum is off before a ball is at a cushion."""
     low, high = (corner + side * result.header.spacing for corner, side in ((0.0, 1), (result.header.upper, -1)))
@@ -366,4 +373,5 @@ KNOWN_ANSWERS = {
     "hourglass_2d": kept_out,
     "sand_obstacles_2d": kept_out,
     "silo_3d": kept_out,
+    "rafts_2d": rafts_2d,
 }

@@ -29,17 +29,26 @@ MATERIALS = {
     "sand": {"law": "sand", "density": 1600.0, "youngs_modulus": 3e5, "poissons_ratio": 0.3, "friction_angle": 30.0},
     "von_mises": {"law": "von_mises", **SOFT, "yield_stress": 500.0},
 }
+# It falls into the material, and turns.
+RAFT = {
+    "name": "raft",
+    "density": 500.0,
+    "shape": {"box": {"min": [0.3, 0.45], "max": [0.6, 0.6]}},
+    "velocity": [0.0, -5.0],
+    "angular_velocity": 1.0,
+}
 # By the name of each scene: the materials of its bodies, its dimension, and further tables.
 SCENES = {name: ((name,), 2, {}) for name in MATERIALS} | {
     "3D": (("fluid",), 3, {}),
     "several bodies, FLIP": (("fluid", "fluid"), 2, {"solver": {"transfer": "aflip", "flip": 0.9}}),
     "total": (("neo_hookean", "neo_hookean"), 2, {"solver": {"solids": "total"}}),
     "forces": (("fluid", "neo_hookean"), 2, {"forces": [{"acceleration": ["3*sin(20*t) - 5*x", "2*X"]}]}),
+    "rigid": (("fluid",), 2, {"colliders": [RAFT]}),
     "contact": (("neo_hookean", "neo_hookean"), 2, {"contact": {"default": "separate", "friction": 0.3}}),
 }
 NAMES = tuple(SCENES)
 # Scenes that are loaded into another run, too.
-TWICE = ("snow", "several bodies, FLIP", "forces", "contact")
+TWICE = ("snow", "several bodies, FLIP", "forces", "contact", "rigid")
 
 
 def laws_in(name: str) -> set[str]:

@@ -47,6 +47,8 @@ SCENES = (
         "colliders": (("sand",), 2, {"colliders": True}),
         "colliders, 3D": (("neo_hookean",), 3, {"colliders": True}),
         "contact": (("neo_hookean", "fixed_corotated", "fluid", "snow"), 2, {"contact": 0.3, "colliders": True}),
+        "rigid bodies": (("sand",), 2, {"rigid": True}),
+        "rigid bodies, 3D": (("sand",), 3, {"rigid": True}),
         "slip and stick": (("sand",), 2, {"domain": {"walls": {"default": "slip", "y_min": "stick"}}}),
     }
     | dict.fromkeys(DRIVEN)
@@ -84,11 +86,24 @@ def colliders(dimension: int, k: int) -> list[dict]:
     return [{"name": f"collider {n}", **table} for n, table in enumerate(found[: 5 - (k == 2)])]
 
 
+def rigid(dimension: int, k: int) -> list[dict]:
+    """Return rigid bodies that fall into the material and onto each other, beside a post, with numbers of k."""
+    low, high = [0.3, 0.45, 0.4][:dimension], [0.5, 0.45 + 0.1 * k, 0.6][:dimension]
+    speed = {"velocity": [0.0, -3.0 * k, 0.0][:dimension], "angular_velocity": 2.0 * k, "friction": 0.2 * k}
+    found = [
+        {"shape": {"box": {"min": low, "max": high}}, "density": 300.0 * k, **speed},
+        {"shape": {"ball": {"center": [0.6, 0.5, 0.5][:dimension], "radius": 0.05}}, "wall": "slip"},
+        {"shape": {"ball": {"center": [0.42, 0.75, 0.5][:dimension], "radius": 0.08}}, "density": 900.0, **speed},
+    ]
+    return [{"name": f"body {n}", **table} for n, table in enumerate(found)]
+
+
 # In the default suite, with the runs that are repeated alone: the second is smaller than what the batch has room for.
 # All others, and the first runs of these, carry the marker slow. Colliders are rough, as is the wall that moves.
 USUAL = {
     "colliders": (1,),
     "two laws, two bodies of one": (1,),
+    "rigid bodies": (1,),
 }
 Output = list[tuple[Frame, LedgerRow]]
 
@@ -137,7 +152,8 @@ def scene_named(name: str, other: bool = False) -> Scene:
         data["contact"] = {"default": "separate", "friction": more["contact"] + 0.1 * other}
     scene = parse_scene(data, laws=parameter_models(), source=name).scene
     # They stand in the material, where they meet it at once.
-    return with_colliders(scene, colliders(d, 1 + other) if more.get("colliders") else [])
+    made = colliders if more.get("colliders") else rigid if more.get("rigid") else lambda *_: []
+    return with_colliders(scene, made(d, 1 + other))
 
 
 def batch_of(scenes: Sequence[Scene], backend: object) -> Batch:

@@ -18,6 +18,7 @@ from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.expression import evaluate
 from mpmcli.scene.primitives import Box, Polygon
+from mpmcli.scene.surface import form_surface, surface_points
 
 # Cells outside of a surface up to which it acts on nodes: the outermost of them lies between a quarter of a cell inside
 # and three quarters outside, where fluids neither enter nor lose pressure, and what is rough sticks (docs/theory.md,
@@ -26,6 +27,8 @@ REACH = 0.76
 # Codes of what a surface does.
 SLIP, STICK, SEPARATE = range(3)
 WALLS = {"slip": SLIP, "stick": STICK, "separate": SEPARATE}
+# What a surface does to a node: nothing, it takes what is normal to it and perhaps a part of the rest, or all.
+LOOSE, PRESSED, HELD = range(3)
 FORMS = tuple(DISTANCES)
 # Of all other forms, by their distances on a grid.
 GRID = len(FORMS)
@@ -43,6 +46,8 @@ class ColliderKind:
     count: int  # upper bounds: of the colliders, and of the numbers and the samples of their forms
     numbers: int
     samples: int
+    free: tuple[int, ...] = ()  # which of them move freely
+    points: int = 0  # on the surfaces of these
 
     @staticmethod
     def of(scene: Scene) -> "ColliderKind":
@@ -50,23 +55,28 @@ class ColliderKind:
         found, h = scene.colliders, scene.domain.spacing
         return ColliderKind(
             tuple(sorted({form_code(collider) for collider in found})),
-            tuple(k for k, collider in enumerate(found) if collider.motion.moves),
+            tuple(k for k, collider in enumerate(found) if collider.driven),
             len(found),
             sum(len(numbers_of(collider, h)) for collider in found),
             sum(samples_of(collider.form, h)[0].size for collider in found if form_code(collider) == GRID),
+            tuple(k for k, collider in enumerate(found) if collider.free),
+            sum(len(contact_points(collider, h)) for collider in found if collider.free),
         )
 
     def bytes_needed(self, dimension: int, rows: int) -> int:
         """Return the bytes that loads and distances on grids take on the device, with `rows` of nodes (last axis)."""
-        return Loads.bytes_needed(self.count, dimension, rows) + 4 * self.samples
+        sums = 9 if dimension == 2 else 27
+        loads = Loads.bytes_needed(self.count, dimension, rows)
+        points = self.points * (28 + 32 * dimension)
+        return loads + 8 * rows * len(self.free) * sums + points + 4 * self.samples
 
     def joined(self, other: "ColliderKind") -> "ColliderKind | None":
         """Return the kind that has room for both, None where they need other kernels."""
-        if (self.moving, self.count > 0) != (other.moving, other.count > 0):
+        if (self.moving, self.free, self.count > 0) != (other.moving, other.free, other.count > 0):
             return None
         forms = tuple(sorted({*self.forms, *other.forms}))
         rooms = (max(getattr(self, name), getattr(other, name)) for name in ("count", "numbers", "samples"))
-        return ColliderKind(forms, self.moving, *rooms)
+        return ColliderKind(forms, self.moving, *rooms, self.free, max(self.points, other.points))
 
 
 def form_code(collider: Collider) -> int:
@@ -83,6 +93,11 @@ def numbers_of(collider: Collider, h: float) -> list[float]:
     if form_code(collider) == GRID:
         return GridDistance.numbers(collider.form, pivot, h)
     return DISTANCES[type(collider.form)](d).numbers(collider.form, pivot)
+
+
+def contact_points(collider: Collider, h: float) -> np.ndarray:
+    """Return points on the surface of one that moves freely, about its centre, (n, d), one to a cell of h metres."""
+    return surface_points(form_surface(collider.form), h) - np.array(collider.center)
 
 
 def reach_of(collider: Collider, h: float) -> np.ndarray:
@@ -221,24 +236,20 @@ class Colliders:
     def constrain(self, node: ti.template(), velocity: ti.template(), mass: float):
         """Return the velocity, m/s, of a node that has a mass, kg, after the colliders, which take the rest."""
         d = ti.static(self.dimension)
-        result = ti.Vector.zero(float, d)
-        x = ti.Vector.zero(float, d)
+        result, x = ti.Vector.zero(float, d), self.place_of(node)
         for a in ti.static(range(d)):
             result[a] = velocity[a]
-            x[a] = ti.cast(node[a] - self.first, float) * self.spacing
         for k in range(self.count[self.run]):
             i = self.run * self.room + k
             arm = x - self.place[i]
-            near = True
-            for a in ti.static(range(d)):
-                near = near and arm[a] >= self.reach[i][0, a] and arm[a] <= self.reach[i][1, a]
+            near = self.covers(i, x)
             if ti.static(self.layered):
                 near = near and (self.own == 0 or self.wall[i] != SEPARATE)
             if near:
                 for face in range(self.faces_of(i)):
                     phi, normal = self.distance(i, arm, face)
                     if phi <= REACH * self.spacing:
-                        after = self.met(i, arm, normal, result)
+                        after, _grip = self.met(i, arm, normal, result)
                         if ti.static(self.deterministic):
                             row = self.run * self.loads.rows + self.loads.row_of(node)
                             place = (row * ti.static(self.shape[-1]) + node[d - 1]) * self.room + k
@@ -251,18 +262,30 @@ class Colliders:
         return result
 
     @ti.func
+    def place_of(self, node: ti.template()):
+        """Return where a node is, relative to the lower corner, m."""
+        x = ti.Vector.zero(float, self.dimension)
+        for a in ti.static(range(self.dimension)):
+            x[a] = ti.cast(node[a] - self.first, float) * self.spacing
+        return x
+
+    @ti.func
+    def covers(self, i: int, x: ti.template()):
+        """Return whether collider i may act at a place."""
+        arm, near = x - self.place[i], True
+        for a in ti.static(range(self.dimension)):
+            near = near and arm[a] >= self.reach[i][0, a] and arm[a] <= self.reach[i][1, a]
+        return near
+
+    @ti.func
     def held_back(self, x: ti.template(), way: ti.template()):
         """Return the way, m, that a particle at x may go: at most half of that to the surface of a collider."""
         result = way
         for k in range(self.count[self.run]):
             i = self.run * self.room + k
-            arm = x - self.place[i]
-            near = True
-            for a in ti.static(range(self.dimension)):
-                near = near and arm[a] >= self.reach[i][0, a] and arm[a] <= self.reach[i][1, a]
-            if near:
+            if self.covers(i, x):
                 for face in range(self.faces_of(i)):
-                    phi, normal = self.distance(i, arm, face)
+                    phi, normal = self.distance(i, x - self.place[i], face)
                     result += ti.max(-0.5 * ti.max(phi, 0.0) - result.dot(normal), 0.0) * normal
         return result
 
@@ -308,20 +331,21 @@ class Colliders:
 
     @ti.func
     def met(self, i: int, arm: ti.template(), normal: ti.template(), velocity: ti.template()):
-        """Return the velocity of a node that collider i covers."""
+        """Return the velocity of a node that collider i covers, and what the surface does to it."""
         own = self.velocity[i] + self.turning[i] @ arm
         relative = velocity - own
         away = relative.dot(normal)
         along = relative - away * normal
-        kept = 1.0
+        kept, grip = 1.0, LOOSE
         if self.wall[i] == STICK:
-            kept, away = 0.0, 0.0
+            kept, away, grip = 0.0, 0.0, HELD
         elif away < 0.0 or self.wall[i] == SLIP:
             push, size = -away, along.norm()
-            away = 0.0
+            away, grip = 0.0, PRESSED
             if push > 0.0 and self.friction[i] > 0.0:
                 kept = ti.max(1.0 - self.friction[i] * push / size, 0.0) if size > 0.0 else 0.0
-        return own + kept * along + away * normal
+                grip = PRESSED if kept > 0.0 else HELD
+        return own + kept * along + away * normal, grip
 
 
 @ti.data_oriented

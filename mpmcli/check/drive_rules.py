@@ -1,4 +1,4 @@
-"""Rules on what drives a scene: bodies that spin too fast for their stiffness, colliders that leave too little room."""
+"""Rules on what drives a scene: bodies that spin too fast, colliders that leave too little room or cannot move."""
 
 import math
 from collections.abc import Iterator
@@ -12,12 +12,15 @@ from mpmcli.scene.bounds import body_points
 from mpmcli.scene.domain import PERIODIC
 from mpmcli.scene.primitives import grid_points
 from mpmcli.scene.sampling import initial_motion
+from mpmcli.scene.surface import form_surface, surface_points
 
 # Largest strain of a disc that spins, over the square of the speed of its rim over its waves' (Timoshenko and Goodier,
 # Theory of Elasticity, section 32: (3 + nu) / 8 rho v^2 in the middle); strains that matter, and that nothing survives.
 STRAIN, STRAINED, TORN = 3 / 8, 0.05, 1.0
 # Room over the volume of what fills it: matter is pressed below the first, and crushed below the second.
 TIGHT, CRUSHED = 0.95, 0.25
+# Cells across the thinnest part of a rigid body, at least, and by which it may begin inside of something.
+FEWEST_CELLS, BEGINS_INSIDE = 3.0, 0.1
 # Points along the longest axis of the lattice on which room is measured, and instants of the run.
 POINTS, INSTANTS = {2: 96, 3: 32}, 33
 
@@ -27,6 +30,7 @@ def drive_findings(facts: SceneFacts) -> Iterator[Finding]:
     for body in facts.bodies:
         yield from _rotation(facts, body)
     yield from _room(facts)
+    yield from _rigid(facts)
 
 
 def _rotation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
@@ -58,11 +62,31 @@ def _rotation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     yield Finding("error" if strain > TORN else "warning", "rotation", what, fix, strain, body.name)
 
 
+def _rigid(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield rigid bodies that are too small for the grid, and those that begin inside of something."""
+    scene, h = facts.scene, facts.scene.domain.spacing
+    for body in (collider for collider in scene.colliders if collider.free):
+        lower, upper = np.array(body.form.bounds())
+        cells = float((upper - lower).min() / h)
+        if cells < FEWEST_CELLS:
+            what = f'Rigid body "{body.name}" is {cells:.2g} cells thick: what is on its two sides meets through it.'
+            fix = f"Make it {FEWEST_CELLS:g} cells thick, or the spacing {h * cells / FEWEST_CELLS:.2g} m."
+            yield Finding("warning", "thin", what, fix, cells, body.name)
+        points = surface_points(form_surface(body.form), h)
+        sides = np.minimum(points - scene.domain.origin, scene.domain.upper - points).min(axis=1)
+        others = [(f'collider "{one.name}"', one.signed_distance(points)) for one in scene.colliders if one is not body]
+        for name, distance in [("a wall", sides), *others]:
+            depth = -float(distance.min()) / h
+            if depth > BEGINS_INSIDE:
+                what = f'Rigid body "{body.name}" begins {depth:.2g} cells inside of {name}, and is pushed out.'
+                yield Finding("warning", "overlap", what, f"Move it by {depth * h:.2g} m.", depth, body.name)
+
+
 def _room(facts: SceneFacts) -> Iterator[Finding]:
     """Yield moving colliders that leave some bodies less room than they fill."""
     scene = facts.scene
     words = {word for pair in scene.domain.walls.faces(scene.dimension) for word in pair}
-    moving = [collider for collider in scene.colliders if collider.motion.moves]
+    moving = [collider for collider in scene.colliders if collider.driven]
     if not moving or scene.emitters or {PERIODIC, "open"} & words:
         return
     found = min(_rooms(scene), default=(math.inf, 0.0, 0.0, ""))

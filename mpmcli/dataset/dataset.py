@@ -24,6 +24,7 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import Result, open_result
+from mpmcli.output.collider_files import as_they_moved
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.run_record import RECORD
@@ -59,7 +60,7 @@ class Trajectory(ABC):
     @property
     def colliders(self) -> tuple[Collider, ...]:
         """The colliders that are known."""
-        return self.header.colliders
+        return as_they_moved(self.header.colliders, self)
 
     @property
     def frame_count(self) -> int:

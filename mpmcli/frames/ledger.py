@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 # Of each collider, and of each pair of bodies that separate.
 LOADS = ("collider_force", "collider_torque", "contact_force", "contact_torque")
+# Of each collider that moves freely.
+RIGID = ("rigid_pose", "rigid_motion")
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,9 @@ class LedgerRow:
             `Scene.contact_pairs`, on the first by the second, N, and about the origin of the domain, N m: means, too.
         contact_overlap, contact_gap: deepest overlap of surfaces that met, and their largest gap while they acted on
             each other, since the previous frame, in cells; None where no body separates.
+        rigid_pose: of each collider that moves freely its centre, m, and its angle, rad, or its unit quaternion, the
+            real part first; rigid_motion: its velocity, m/s, and its angular velocity, rad/s. Its energies are in
+            those above, its momenta are not.
         emitted, retired: particles that emitters have let in so far, and that left through open faces; emitted_mass,
             retired_mass: theirs, kg. Sums are over those that are there.
         blocked: particles of emitters that found their place occupied so far: they stay out for good, but where they
@@ -65,6 +70,8 @@ class LedgerRow:
     contact_torque: tuple[tuple[float, ...], ...] = ()
     contact_overlap: float | None = None
     contact_gap: float | None = None
+    rigid_pose: tuple[tuple[float, ...], ...] = ()
+    rigid_motion: tuple[tuple[float, ...], ...] = ()
     emitted: int | None = None
     emitted_mass: float | None = None
     retired: int | None = None

@@ -11,12 +11,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import h5py
 import numpy as np
 
 from mpmcli.errors import RunError
+from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import append_checksum, load_checksums, store_checksums, table_checksum
 from mpmcli.output.durable import require_free_space, sealed, write_text
 from mpmcli.output.vtkhdf import FORMAT, LIBVER, open_vtkhdf
@@ -67,6 +68,26 @@ class ColliderGroup:
         pairs = zip(self.colliders, self.surfaces, strict=True)
         moved = np.concatenate([collider.motion.placed(surface.points, time) for collider, surface in pairs])
         return np.pad(moved, ((0, 0), (0, 3 - moved.shape[1])))
+
+
+class Recorded(Protocol):
+    """What has frames at times, s, and a row of the ledger for each."""
+
+    times: np.ndarray
+
+    @property
+    def ledger(self) -> Sequence[LedgerRow]: ...
+
+
+def as_they_moved(colliders: Sequence[Collider | None], run: Recorded) -> tuple[Collider | None, ...]:
+    """Return the colliders of a run, those that move freely with the motion that its ledger has."""
+    found, free = list(colliders), [k for k, collider in enumerate(colliders) if collider is not None and collider.free]
+    ledger = run.ledger if free else ()
+    if ledger and len(ledger[0].rigid_pose) == len(free):
+        poses = np.array([row.rigid_pose for row in ledger])
+        for j, k in enumerate(free):
+            found[k] = found[k].along(np.asarray(run.times, float), poses[:, j])
+    return tuple(found)
 
 
 def write_collider_files(

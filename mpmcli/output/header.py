@@ -294,8 +294,8 @@ class RunHeader:
 
     @cached_property
     def moved(self) -> bool:
-        """Whether a collider moves, which does work; also where it is not known."""
-        return any(collider is None or collider.motion.moves for collider in self.read_colliders({}))
+        """Whether a collider moves as the scene says, which does work; also where it is not known."""
+        return any(collider is None or collider.driven for collider in self.read_colliders({}))
 
     def read_colliders(self, surfaces: Mapping[int, ClosedSurface]) -> tuple[Collider | None, ...]:
         """Read the colliders, None where that fails; `surfaces`, by number, take the place of those in files."""

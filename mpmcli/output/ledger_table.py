@@ -8,16 +8,18 @@ from dataclasses import fields
 import h5py
 import numpy as np
 
-from mpmcli.frames.ledger import LOADS, LedgerRow
+from mpmcli.frames.ledger import LOADS, RIGID, LedgerRow
 
 COLUMNS = tuple(f.name for f in fields(LedgerRow))
+# A row for each collider, pair or body.
+PER_PART = (*LOADS, *RIGID)
 VECTORS = ("linear_momentum", "angular_momentum")
 # Of scenes in which particles come and go, or bodies separate; elsewhere they are None, and not stored.
 OPTIONAL = ("emitted", "emitted_mass", "retired", "retired_mass", "blocked", "contact_overlap", "contact_gap")
 INTEGERS = ("steps", "emitted", "retired", "blocked")
 TEXT = "limit"
 # What is read where a file has no such column.
-MISSING = {**dict.fromkeys(LOADS, ()), **dict.fromkeys(OPTIONAL)}
+MISSING = {**dict.fromkeys(PER_PART, ()), **dict.fromkeys(OPTIONAL)}
 # Columns of each frame in the CSV: its number, time steps since the start, particles.
 FRAME_COLUMNS = ("frame", "step", "particles")
 
@@ -27,7 +29,7 @@ def ledger_columns(rows: Sequence[LedgerRow]) -> dict[str, np.ndarray]:
     columns = {}
     for name in _stored(rows):
         values = [getattr(row, name) for row in rows]
-        if name in LOADS and not any(values):
+        if name in PER_PART and not any(values):
             continue
         if name == TEXT:
             texts = [text.encode("utf-8") for text in values]
@@ -59,7 +61,7 @@ def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:
             values = [text.decode("utf-8") for text in values]
         elif name in VECTORS:
             values = [tuple(value) for value in values]
-        elif name in LOADS:
+        elif name in PER_PART:
             values = [tuple(map(tuple, value)) for value in values]
         lists.append(values)
     return [LedgerRow(*values) for values in zip(*lists, strict=True)]
@@ -75,7 +77,7 @@ def ledger_csv(rows: Sequence[LedgerRow], frames: Sequence[tuple[int, ...]]) -> 
             value = getattr(row, name)
             if name in VECTORS:
                 record |= {f"{name}_{axis}": repr(float(v)) for axis, v in enumerate(value)}
-            elif name in LOADS:
+            elif name in PER_PART:
                 entries = [(k, axis, v) for k, vector in enumerate(value) for axis, v in enumerate(vector)]
                 record |= {f"{name}_{k}_{axis}": repr(float(v)) for k, axis, v in entries}
             else:

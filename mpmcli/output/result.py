@@ -12,7 +12,7 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import checksum, damaged
-from mpmcli.output.collider_files import read_stored_surfaces
+from mpmcli.output.collider_files import as_they_moved, read_stored_surfaces
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import POSITION, STANDARD, FrameIndex
 from mpmcli.output.reading import DamageError, first_line
@@ -71,6 +71,7 @@ class Result(ABC):
         """The colliders of the scene; one whose mesh is neither found nor stored beside the frames is left out."""
         directory = self.path if self.path.is_dir() else self.path.parent
         found = self.header.read_colliders(read_stored_surfaces(directory))
+        found = as_they_moved(found, self)
         return tuple(collider for collider in found if collider is not None)
 
     @property

@@ -9,7 +9,13 @@ import numpy as np
 
 from mpmcli.errors import NoRoomError, RunError
 from mpmcli.output.checksums import SUMS, path_digest, write_sums
-from mpmcli.output.collider_files import MOVING_FRAME, RESTING_PIECE, pvd_text, write_collider_series
+from mpmcli.output.collider_files import (
+    MOVING_FRAME,
+    RESTING_PIECE,
+    as_they_moved,
+    pvd_text,
+    write_collider_series,
+)
 from mpmcli.output.collider_files import SERIES as COLLIDERS
 from mpmcli.output.durable import is_full, require_free_space, sealed, write_text
 from mpmcli.output.layout import POSITION
@@ -63,8 +69,9 @@ def write_series(
                 _write_vtu(temporary, result.stored(k), compress=compress)
         columns = zip(*(table.tolist() for table in (index.frames, index.steps, index.counts)), strict=True)
         write_text(directory / SERIES_LEDGER, ledger_csv(index.ledger, list(columns)))
-        names += write_collider_series(directory, index.header, index.times.tolist(), colliders)
-        listed = [(time, 0, name) for time, name in zip(index.times.tolist(), names, strict=False)]
+        times, moved = index.times.tolist(), as_they_moved(colliders, index)
+        names += write_collider_series(directory, index.header, times, moved)
+        listed = [(time, 0, name) for time, name in zip(times, names, strict=False)]
         write_text(directory / SERIES, pvd_text(listed))
         names += [SERIES, SERIES_LEDGER]
         write_sums(directory, {name: path_digest(directory / name) for name in names})

@@ -11,7 +11,7 @@ from typing import Any
 from mpmcli.errors import InputError, NoRoomError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.collider_files import write_collider_files
+from mpmcli.output.collider_files import as_they_moved, write_collider_files
 from mpmcli.output.durable import Unsealed, is_full, require_free_space, sync_directory, temporary_of
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameIndex, FrameLayout
@@ -212,8 +212,9 @@ class SegmentStore:
         else:
             pack_segments(segments, packed, compress=self._compress, header=self._header, stop=stop)
         if self._colliders:
-            times = read_index_of(packed).times.tolist()
-            write_collider_files(self._directory, self._header, times, self._colliders)
+            index = read_index_of(packed)
+            colliders = as_they_moved(self._colliders, index)
+            write_collider_files(self._directory, self._header, index.times.tolist(), colliders)
         # The result is complete; a segment that somebody holds open may stay beside it.
         with suppress(OSError):
             remove_segments(self._directory)

@@ -46,6 +46,7 @@ APPEARANCES = {
 }
 # Laws without a preset, in the order in which they come.
 OTHERS = ("#0f9d8a", "#c2569b", "#7d8a2e", "#4e6fb8", "#b0563c")
+UNSEEN = {"law", "surface_friction"}  # parameters that say nothing of what a material looks like
 FAR = 1e6  # upper bound of the ratio of two values of a parameter in the distance between materials
 
 
@@ -54,11 +55,11 @@ def appearance_of(law: str, parameters: dict[str, Any], others: int = 0) -> Appe
 
     Parameters are those of the effective scene; `others` is how many laws without a preset came before.
     """
-    names = parameters.keys() - {"law"}
+    names = parameters.keys() - UNSEEN
     known = {
         name: preset.parameters
         for name, preset in PRESETS.items()
-        if name in APPEARANCES and (preset.law == law or preset.parameters.keys() == names)
+        if name in APPEARANCES and (preset.law == law or preset.parameters.keys() - UNSEEN == names)
     }
     if not known:
         color = OTHERS[others % len(OTHERS)]
@@ -71,7 +72,9 @@ def _distance(preset: dict[str, Any], parameters: dict[str, Any]) -> float:
     total = 0.0
     for name, wanted in preset.items():
         given = parameters.get(name)
-        if any(isinstance(value, bool) or not isinstance(value, int | float) for value in (wanted, given)):
+        if name in UNSEEN or any(
+            isinstance(value, bool) or not isinstance(value, int | float) for value in (wanted, given)
+        ):
             continue
         if wanted > 0.0:
             total += min(abs(math.log(max(given, wanted / FAR) / wanted)), math.log(FAR)) ** 2

@@ -3,14 +3,15 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, ValidationInfo, field_validator, model_validator
 
 from mpmcli.scene.domain import Domain
-from mpmcli.scene.entry import Entry, OfTime, TimeVector, tree_of
+from mpmcli.scene.entry import Entry, OfTime, TimeVector, tree_of, varies
 from mpmcli.scene.expression import Expression, Name, Tree, apply, derivative, evaluate
 from mpmcli.scene.expression import Number as Constant
 from mpmcli.scene.primitives import rotation, unit
@@ -19,6 +20,7 @@ from mpmcli.scene.quantity import (
     NAME,
     NotNegative,
     Number,
+    Positive,
     Table,
     Vector,
     direction_as,
@@ -26,6 +28,7 @@ from mpmcli.scene.quantity import (
     list_of_axes,
     scene_dimension,
 )
+from mpmcli.scene.rigid import Moments, Path, moments_of, turned_by
 from mpmcli.scene.shapes import Form, Shape, exactly_one_form
 
 TIME = Name("t")
@@ -185,6 +188,12 @@ class Collider(Table):
     pivot: Vector | None = Field(
         None, description="Point of the axis, m; it moves along. Default: the centre of the shape."
     )
+    density: Positive | None = Field(
+        None,
+        description="Density, kg/m^3, of one that moves freely: velocity and angular_velocity are those at the start. "
+        "Default: it moves as the scene says.",
+    )
+    _path: Path | None = PrivateAttr(None)
 
     @field_validator("axis", mode="before")
     @classmethod
@@ -208,7 +217,20 @@ class Collider(Table):
             raise flaw("must have times that rise from each to the next", "keyframes")
         if self.wall == "stick" and self.friction > 0:
             raise flaw('is for a surface that slips or separates, and wall is "stick"; leave it out', "friction")
+        if self.free:
+            self._require_free()
         return self
+
+    def _require_free(self) -> None:
+        """Refuse what a rigid body that moves freely cannot have."""
+        for key in ("offset", "angle", "keyframes", "pivot"):
+            if getattr(self, key):
+                raise flaw("is for a collider that moves as the scene says, and density lets it move freely", key)
+        if isinstance(self.form, Plane) or self.side == "inside":
+            raise flaw("is for a shape with the material outside of it; leave it out", "density")
+        if varies(*self.velocity, self.angular_velocity):
+            key = "velocity" if varies(*self.velocity) else "angular_velocity"
+            raise flaw("must be a number, that at the start, where density lets it move freely", key)
 
     def _gives(self, key: str) -> bool:
         """Return whether a motion is given; zeros, as defaults are written out, are none."""
@@ -220,8 +242,25 @@ class Collider(Table):
         return self.shape.form
 
     @property
+    def free(self) -> bool:
+        """Whether it is a rigid body that moves freely."""
+        return self.density is not None
+
+    @property
+    def driven(self) -> bool:
+        """Whether it moves as the scene says."""
+        return not self.free and self.motion.moves
+
+    @cached_property
+    def moments(self) -> Moments:
+        """Mass, centre and inertia of one that moves freely."""
+        return moments_of(self.form, self.density)
+
+    @property
     def center(self) -> tuple[float, ...]:
-        """The pivot: as it is given, or the centre of the bounding box, or the point of a plane."""
+        """The pivot: as it is given, or the centre of mass, or of the bounding box, or the point of a plane."""
+        if self.free:
+            return self.moments.center
         if self.pivot is not None:
             return self.pivot
         if isinstance(self.form, Plane):
@@ -236,8 +275,22 @@ class Collider(Table):
         return float(np.linalg.norm(np.abs(np.array(self.form.bounds()) - self.center).max(axis=0)))
 
     @property
-    def motion(self) -> Motion:
-        """How it moves."""
+    def spin(self) -> np.ndarray:
+        """Angular velocity at the start of one that moves freely, (1,) or (3,), rad/s."""
+        axis = unit(self.axis or (0.0, 0.0, 1.0))
+        return self.angular_velocity * (axis[2:] if len(self.velocity) == 2 else axis)
+
+    def along(self, times: np.ndarray, poses: np.ndarray) -> "Collider":
+        """Return it with the motion that a run found: poses (n, k), places with angles or quaternions, at times, s."""
+        d, found = len(self.velocity), self.model_copy()
+        found._path = Path(self.center, times, poses[:, :d], turned_by(poses[:, d:]))
+        return found
+
+    @property
+    def motion(self) -> Motion | Path:
+        """How it moves; of one that moves freely that at the start, or see `along`."""
+        if self.free:
+            return self._path or Path.start(self.center)
         d = len(self.velocity)
         axis = tuple(unit(self.axis or (0.0, 0.0, 1.0)).tolist())
         if self.keyframes:
@@ -256,7 +309,12 @@ class Collider(Table):
         return Motion(self.center, axis, start, angle, velocity, spin)
 
     def fastest(self, domain: Domain, end: float) -> float:
-        """Return a bound on the speed of its points in a domain between time 0 and `end` (s), m/s."""
+        """Return a bound on the speed of its points in a domain between time 0 and `end` (s), m/s.
+
+        Of one that moves freely it is that at the start.
+        """
+        if self.free:
+            return math.hypot(*self.velocity) + abs(self.angular_velocity) * self.radius
         motion = self.motion
         # What lies outside of the domain meets nothing; the pivot goes this far at most.
         gone = float(np.linalg.norm(motion.offset)) + end * motion.fastest(0.0, end)

@@ -23,8 +23,6 @@ from mpmcli.solver.transfer.splines import PAD
 BAND = 1.5
 # Stretch of the smallest principal axis, inverse, up to which particles are found.
 CRUSHED = 4.0
-# Nodes of a row that are skipped at most.
-FARTHEST = 1e6
 # In place of the first particle of a bin: none yet, or none ever. In place of a particle's layer: it shows nothing.
 EMPTY, CLOSED, HIDDEN = -1, -2, -1
 # In place of the depth of a particle that shows nothing.
@@ -218,7 +216,7 @@ class BodySurfaces:
                     if bodies > 0 and node[last] >= far:
                         cells = obstacles.nearest(place_of(node, grid.spacing), REACH) * grid.inverse_spacing
                         met += 2 * ti.cast(cells < REACH, int)
-                        far = node[last] + ti.cast(ti.min(ti.max(cells - REACH, 0.0), FARTHEST), int)
+                        far = node[last] + ti.cast(ti.min(ti.max(cells - REACH, 0.0), 1e6), int)
                 self.met[place + k] = met
                 if met > 0:
                     for q in range(ti.static(grid.scheme.spline.nodes**self.dimension)):

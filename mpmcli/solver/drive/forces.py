@@ -115,7 +115,7 @@ class Drives:
         steady = scene.domain.steady
         gravity = () if steady else tuple(entries.placed(tree_of(entry)) for entry in scene.domain.gravity)
         forces = tuple(ForceTerms.of(scene, own, entries) for own in members)
-        moving = [collider.motion.rates for collider in scene.colliders if collider.motion.moves]
+        moving = [collider.motion.rates for collider in scene.colliders if collider.driven]
         motions = tuple(tuple(entries.placed(tree) if names_in(tree) else None for tree in rates) for rates in moving)
         return Drives(gravity, forces, motions, entries.timed), entries.found
 

@@ -12,6 +12,8 @@ import numpy as np
 
 from mpmcli.boundaries.colliders import ColliderMotion, Colliders
 from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.rigid_bodies import RigidBodies
+from mpmcli.boundaries.rigid_contact import RigidContact
 from mpmcli.boundaries.walls import REACH as WALLS_REACH
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls, faces_on_grid
 from mpmcli.errors import InputError, RunError
@@ -129,11 +131,12 @@ class Batch:
         self._buffers = SortBuffers(groups, runs) if sorts else None
         orders = self._make_orders(groups, grid) if sorts else []
         contact = contact_between(groups, kind.bodies, grid, backend, runs)
-        colliders = motion = None
+        colliders = motion = rigid = None
         if kind.colliders.count:
             colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, on_cpu=on_cpu, deterministic=deterministic)
             colliders.layered, colliders.own = kind.layers.separate, int(not kind.layers.shares)
             motion = ColliderMotion(colliders, runs) if kind.colliders.moving else None
+            rigid = RigidBodies(colliders, runs) if kind.colliders.free else None
         self.device = Device(
             runs,
             kind.particles,
@@ -144,7 +147,7 @@ class Batch:
             walls,
             friction,
             moving,
-            NodeUpdate(grid, images, colliders),
+            NodeUpdate(grid, images, colliders, rigid),
             ParticleUpdate(
                 grid, kind.faces, runs * len(groups), contact, friction, moving, watches_box=sorts and not on_cpu
             ),
@@ -152,6 +155,8 @@ class Batch:
             Gravity(kind.drives.gravity, [0.0] * d, self.values.device),
             colliders,
             motion,
+            rigid,
+            RigidContact(rigid, kind.faces, runs) if rigid else None,
             Emission(kind.inflow, d, runs) if kind.inflow.groups else None,
             BodyContact(groups, orders, grid, kind.layers, runs, backend.threads) if kind.layers.separate else None,
             ti.field(int, shape=(2 * runs, d)) if on_cpu else None,
@@ -171,6 +176,7 @@ class Batch:
         if on_cpu:
             noted = [one.loads.room * one.loads.width for one in (colliders, self.device.contact) if one is not None]
             noted += [len(EXTREMES)] * kind.layers.separate
+            noted += [rigid.count * (rigid.width + rigid.loads)] if rigid else []
             self.notes = np.zeros((runs, MOST_FRAMES, len(NOTES) + len(groups) * sum_entries(d) + sum(noted)))
             self._build_cpu()
         else:

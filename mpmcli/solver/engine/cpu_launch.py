@@ -10,6 +10,7 @@ from collections import Counter
 import numpy as np
 
 from mpmcli.boundaries.loads import Loads
+from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.body_contact import BodyContact
 from mpmcli.solver.contact.obstacles import Obstacles
@@ -284,14 +285,15 @@ class CpuLaunch:
 
     # Frames.
 
-    def takers(self) -> list[tuple[Loads | BodyContact, int]]:
+    def takers(self) -> list[tuple[Loads | RigidBodies | BodyContact, int]]:
         """Return what notes on a frame have behind the sums of each group, and from which column on."""
         device, column = self.device, len(NOTES) + len(self.members) * self.sum_count
         found = []
         if device.colliders is not None:
             found.append((device.colliders.loads, column))
             column += device.colliders.loads.room * device.colliders.loads.width
-        return found + ([] if device.contact is None else [(device.contact, column)])
+        # Those that separate and those that move freely are not in one scene.
+        return found + [(each, column) for each in (device.rigid, device.contact) if each is not None]
 
     @ti.func
     def record(self, w: int, numbers: ti.template(), counts: ti.template(), notes: ti.template()):

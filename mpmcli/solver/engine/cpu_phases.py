@@ -70,6 +70,7 @@ class CpuPhases(CpuContact):
         self.values = ti.field(float, shape=(device.runs, self.rates + 2 * len(device.groups)))
         self.colours = device.orders[0].colours
         self.moves, self.separates = device.motion is not None, device.contact is not None
+        self.rigid = device.rigid is not None
         # What has come in since the sort follows all colours, on one thread.
         self.passes = self.colours + device.comes_and_goes
         self.kinds: tuple[PartKind, ...] = ()
@@ -155,6 +156,8 @@ class CpuPhases(CpuContact):
             start = numbers[w, self.real.time]
             self.device.values.set_motions(w, self.device.motion, start, start + dt)
             self.device.motion.advance(w, dt)
+        if ti.static(self.rigid):
+            self.device.rigid.begin(w, dt, self.gravity_step(w))
         for g in ti.static(range(len(self.members))):
             # A law may have no particle yet.
             self.values[w, self.rates + 2 * g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
@@ -376,19 +379,44 @@ class CpuPhases(CpuContact):
     @ti.func
     def update(self, at: ti.template()):
         """Turn the momentum of nodes into velocity."""
+        ti.atomic_max(self.values[at.w, SPEED], self.updated(at, False))
+
+    @ti.func
+    def updated(self, at: ti.template(), meets: ti.template()):
+        """Update nodes, or let them meet rigid bodies; return the square of the largest velocity."""
+        speed_squared = 0.0
         if ti.static(at.grid.sparse):
             # Whole pencils: what colliders take is added up row by row.
             first, after = self.places.even_part(at.grid.sizes[PENCILS], at.region)
             first, after = self.share(first, after, at.part)
             begin, end = at.grid.pencils[first], at.grid.pencils[after]
-            ti.atomic_max(self.values[at.w, SPEED], update_blocks(at, begin, end, self.gravity_step(at.w)))
+            speed_squared = update_blocks(at, begin, end, self.gravity_step(at.w), meets)
         else:
             first, after = self.places.rows_of(at.grid, at.region)
             first, after = self.share(first, after, at.part)
             for layer in range(self.layer_count(at)):
                 own = self.used_by(at, layer)
                 (inner,) = ti.static((at.in_layer(layer, own),))
-                ti.atomic_max(self.values[at.w, SPEED], update_rows(inner, first, after, self.gravity_step(at.w)))
+                speed_squared = ti.max(speed_squared, update_rows(inner, first, after, self.gravity_step(at.w), meets))
+        return speed_squared
+
+    @ti.func
+    def meet(self, at: ti.template()):
+        """Find the velocities of rigid bodies: add up what nodes would give them, and then solve for it."""
+        if at.turn % 2 == 0:
+            self.updated(at, True)
+        elif at.region == 0 and at.part == 0:
+            at.nodes.rigid.solve(at.w, at.numbers[at.w, self.real.step])
+
+    @ti.func
+    def move_bodies(self, at: ti.template()):
+        """Move rigid bodies, with what the nodes lost to them."""
+        if at.region == 0 and at.part == 0:
+            dt = at.numbers[at.w, self.real.step]
+            at.nodes.rigid.take(at.w)
+            self.device.rigid_contact.resolve(at.w, dt, at.particles.extent, at.nodes.colliders)
+            speed_squared = at.nodes.rigid.move(at.w, dt)
+            ti.atomic_max(self.values[at.w, SPEED], speed_squared)
 
     @ti.func
     def advance(self, at: ti.template()):

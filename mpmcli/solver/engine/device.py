@@ -5,6 +5,8 @@ from copy import copy
 from dataclasses import dataclass
 
 from mpmcli.boundaries.colliders import ColliderMotion, Colliders
+from mpmcli.boundaries.rigid_bodies import RigidBodies
+from mpmcli.boundaries.rigid_contact import RigidContact
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.body_contact import BodyContact
@@ -27,6 +29,7 @@ class Device:
         groups, orders: of each law, with the particles of all runs.
         friction, moving: coefficients and velocities of the walls of each run.
         colliders, motion: those of each run, and how they move; None where there are none.
+        rigid, rigid_contact: those that move freely, and what else than material they meet; None where there are none.
         values, gravity: numbers that expressions read, and gravity where it varies.
         emission: the mouths of emitters, None where there are none.
         contact: of bodies with layers of nodes of their own, None where all share one.
@@ -50,6 +53,8 @@ class Device:
     gravity: Gravity
     colliders: Colliders | None = None
     motion: ColliderMotion | None = None
+    rigid: RigidBodies | None = None
+    rigid_contact: RigidContact | None = None
     emission: Emission | None = None
     contact: BodyContact | None = None
     stencils: ti.Field | None = None
@@ -72,6 +77,7 @@ class Device:
             loads=self.grid.deterministic and self.nodes.collides,
             shifts=self.grid.dimension if self.grid.fine else 0,
             separates=self.contact is not None,
+            rigid=self.rigid is not None,
         )
 
 
@@ -108,10 +114,12 @@ def views(
     walls.first_plane = w * (device.grid.layers * len(walls.separating))
     walls.first_rough = w * (device.grid.layers * len(walls.rough))
     images = _changed(device.nodes.images, walls=walls)
-    colliders = device.colliders
+    colliders, rigid = device.colliders, device.rigid
     if colliders is not None:
         colliders = _changed(colliders, run=w, spacing=h)
-    nodes = _changed(device.nodes, grid=grid, images=images, colliders=colliders)
+    if rigid is not None:
+        rigid = _changed(rigid, run=w, colliders=colliders)
+    nodes = _changed(device.nodes, grid=grid, images=images, colliders=colliders, rigid=rigid)
     particles = _changed(
         device.particles,
         grid=grid,

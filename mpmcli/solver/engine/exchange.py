@@ -41,7 +41,7 @@ def write_constants(batch: Batch, slot: int, scene: Scene, counts: Sequence[int]
     """
     h, device = scene.domain.spacing, batch.device
     walls, colliders = (device.friction, device.moving, device.grid.period), (device.colliders, device.motion)
-    for data in (*walls, *colliders, device.contact):
+    for data in (*walls, *colliders, device.rigid, device.rigid_contact, device.contact):
         if data is not None:
             data.write(scene, slot)
     numbers, row_counts, real, count = batch.numbers[slot], batch.counts[slot], batch.layout.real, batch.layout.count

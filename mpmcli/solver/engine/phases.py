@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from mpmcli.boundaries.rigid_bodies import ROUNDS
 from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.transfer import redistribution as by
@@ -30,7 +31,7 @@ class Phase:
     """
 
     name: str
-    over: Literal["nodes", "planes", "particles", "loads"]
+    over: Literal["nodes", "planes", "particles", "loads", "bodies"]
     group: int = 0
     adds: bool = False
     turns: int = 1
@@ -64,12 +65,14 @@ def step_phases(
     loads: bool = False,
     shifts: int = 0,
     separates: bool = False,
+    rigid: bool = False,
 ) -> tuple[Phase, ...]:
     """Return the phases of a step; neighbours of one name that add nothing to nodes may be carried out at once.
 
     averaged: whether the particles of each law share their change of volume; contact, friction: whether walls let go,
     or rub; deterministic: whether P2G is in fixed point; loads: whether there are colliders, too; shifts: the
-    dimension where particles are shifted, else 0; separates: whether bodies meet by their surfaces.
+    dimension where particles are shifted, else 0; separates: whether bodies meet by their surfaces; rigid: whether
+    colliders move freely. To meet them takes two turns a round: over nodes, and over the bodies.
     """
     groups = range(len(laws))
     return (
@@ -85,7 +88,9 @@ def step_phases(
         *[Phase("exchange", "nodes")] * separates,
         *[Phase("find_contact", "planes")] * contact,
         *[Phase("find_friction", "planes")] * friction,
+        *[Phase("meet", "nodes", turns=2 * ROUNDS)] * rigid,
         Phase("update", "nodes"),
+        *[Phase("move_bodies", "bodies")] * rigid,
         *[Phase("book_loads", "loads")] * loads,
         *(Phase("advance", "particles", g) for g in groups),
     )

@@ -174,6 +174,12 @@ def _fields(batch: Batch) -> dict[str, ti.Field]:
     if device.contact is not None:
         found |= {"layers.low": device.contact.surfaces.low, "layers.high": device.contact.surfaces.high}
         found |= {"contact.taken": device.contact.loads.taken, "contact.extremes": device.contact.extremes}
+    if device.rigid is not None:
+        found |= {
+            f"rigid.{name}": getattr(device.rigid, name)
+            for name in ("pose", "yielding", "momentum", "booked", "support")
+        }
+        found |= {f"rigid.{name}": getattr(device.rigid_contact, name) for name in ("other", "impulse")}
     return found | ({} if device.particles.contact is None else device.particles.contact.fields())
 
 

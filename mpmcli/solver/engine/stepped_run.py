@@ -212,6 +212,8 @@ class SteppedRun:
         """Take the bounds of time 0 from the measurement of the first launch."""
         self.first_step_seconds = self.batch.first_seconds
         control = self._prepare()
+        free = [each.fastest(self.scene.domain, 0.0) for each in self.scene.colliders if each.free]
+        self._state.speed = max([self._state.speed, *free])
         forces = self._state.external_forces
         forces.measure(0.0, 0.0)
         # Once more, with the step that says how far ahead the next measurement is.

@@ -104,7 +104,8 @@ class Moment(NamedTuple):
         index: its number; time: s; step: steps so far; last_step: the last of them, s.
         taken: the steps since the frame before.
         loads: impulses, N s, and angular impulses, N m s, that each "collider", and of each pair in "contact" the first
-            body, took since then, (count, k), and `EXTREMES`; each where there are any.
+            body, took since then, (count, k), and `EXTREMES`; of each that is "rigid" its pose, relative to the lower
+            corner, and its rates, (count, k); each where there are any.
         blocked: particles of emitters that found no room so far.
     """
 
@@ -197,6 +198,16 @@ class FrameBuilder:
             found = np.array([moment.loads[name] for moment in moments])
             if found.ndim == 1:
                 conserved[name] = found
+            elif name == "rigid":
+                found[..., :d] += self._origin
+                rates = 3 if d == 2 else 6
+                pose, motion = found[..., :-rates], found[..., -rates:]
+                conserved |= {"rigid_pose": pose, "rigid_motion": motion}
+                free = [collider.moments for collider in scene.colliders if collider.free]
+                middle = pose[..., :d] - self._origin - 0.5 * last_steps[:, None, None] * motion[..., :d]
+                for j, body in enumerate(free):
+                    conserved["kinetic"] = conserved["kinetic"] + body.kinetic(pose[:, j], motion[:, j])
+                    conserved["potential"] = conserved["potential"] - body.mass * (middle[:, j] * gravity).sum(axis=1)
             else:
                 # Nothing acts before frame 0.
                 spans = durations[:, None, None]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.frames.ledger import LOADS, LedgerRow
+from mpmcli.frames.ledger import LOADS, RIGID, LedgerRow
 from mpmcli.solver.frames.columns import FrameArrays, ParticleConstants
 from mpmcli.solver.particles.sort import ACTIVE
 
@@ -126,7 +126,7 @@ def ledger_rows(sums: dict[str, np.ndarray], times: Sequence[float], taken: Sequ
     columns = {name: values.tolist() for name, values in sums.items()}
     for name in ("linear_momentum", "angular_momentum"):
         columns[name] = list(map(tuple, columns[name]))
-    for name in LOADS:
+    for name in (*LOADS, *RIGID):
         if name in columns:
             columns[name] = [tuple(map(tuple, rows)) for rows in columns[name]]
     return [

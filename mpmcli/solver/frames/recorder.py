@@ -109,6 +109,9 @@ class FrameRecorder:
                 number = kind.layers.pairs if name == "contact" else takers.count[self._slot]
                 found[name] = rest[:, :size].reshape(count, -1, takers.loads.width)[:, :number]
                 rest = rest[:, size:]
+        if device.rigid is not None:
+            size = device.rigid.width + device.rigid.loads
+            found["rigid"] = rest[:, : device.rigid.count * size].reshape(count, -1, size)
         return found if device.contact is None else found | dict(zip(EXTREMES, rest.T, strict=True))
 
     def _sums(self, count: int) -> tuple[list[Sums], bool]:
@@ -122,6 +125,6 @@ class FrameRecorder:
 
 
 def collider_bound(scene: Scene) -> float:
-    """Return the step in which no collider of a scene moves more than half a cell, s."""
-    speeds = [collider.fastest(scene.domain, scene.time.end) for collider in scene.colliders]
+    """Return the step in which no collider of a scene moves more than half a cell, s, those that move freely aside."""
+    speeds = [each.fastest(scene.domain, scene.time.end) for each in scene.colliders if not each.free]
     return collider_limit(scene.domain.spacing, max(speeds, default=0.0))

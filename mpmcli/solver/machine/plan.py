@@ -81,6 +81,8 @@ WORDS = {
     "exchange": "let bodies push each other",
     "find_contact": "find contact",
     "find_friction": "find friction",
+    "meet": "meet rigid bodies",
+    "move_bodies": "move rigid bodies",
     "book_loads": "add up loads",
     "advance": "gather {}",
 }
@@ -172,6 +174,7 @@ def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = Fal
         deterministic=deterministic,
         loads=deterministic and bool(scene.colliders),
         separates=layers.separate,
+        rigid=any(collider.free for collider in scene.colliders),
     )
     forces = [" with forces" * bool(forces_on(scene, members_of(scene, law.name))) for law in members]
     words = WORDS | {"update": "update grid" + " with colliders" * bool(scene.colliders)}
@@ -203,6 +206,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     ]
     averaged = [averages_volume(scene.solver, law) for law in members]
     require_contact_possible(scene, backend)
+    _require_rigid_possible(scene, backend)
     fields_of = Layers.of(scene)
     separate, layers, pairs = fields_of.separate, fields_of.count, fields_of.pairs
     groups = tuple(
@@ -267,6 +271,24 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     counted = (blocks if sparse else all_tiles) * backend.threads
     entries = max(nodes * max(fine, layers), all_tiles, bins, shown, sorted_entries, counted)
     return Plan(groups, nodes, widest + 8, node_bytes, grid_bytes, host_bytes, passes, backend.arch, sparse, entries)
+
+
+def _require_rigid_possible(scene: Scene, backend: Backend) -> None:
+    """Refuse a scene with colliders that move freely, and something that they cannot meet.
+
+    Raises:
+        InputError: says what.
+    """
+    domain = scene.domain
+    reasons = {
+        f"with --arch {backend.arch}": not backend.on_cpu,
+        "in a domain with periodic walls": any(domain.periodic),
+        "beside walls that move": bool(domain.wall_velocity),
+        "beside bodies that separate": Layers.of(scene).separate,
+    }
+    for reason, applies in reasons.items():
+        if applies and any(collider.free for collider in scene.colliders):
+            raise InputError(f"colliders with a density are not available {reason}; leave their density out.")
 
 
 def _separating_axes(scene: Scene) -> list[int]:

@@ -34,7 +34,8 @@ def roomy_cells(cells: Sequence[int]) -> tuple[int, ...]:
 
 def roomy_colliders(kind: ColliderKind) -> ColliderKind:
     count = max(FEWEST_COLLIDERS, power_of_two(kind.count)) if kind.count else 0
-    return replace(kind, count=count, numbers=in_steps(kind.numbers), samples=in_steps(kind.samples))
+    sizes = {name: in_steps(getattr(kind, name)) for name in ("numbers", "samples", "points")}
+    return replace(kind, count=count, **sizes)
 
 
 def _multiple(count: int, step: int) -> int:

@@ -452,15 +452,20 @@ def advance_tiles(at: ti.template(), first: int, after: int, dt: float, gravity_
 
 
 @ti.func
-def update_rows(at: ti.template(), first: int, last: int, gravity_step: ti.template()):
-    """Update the nodes in rows first to last - 1 of the box in use; return the square of the largest velocity."""
+def update_rows(at: ti.template(), first: int, last: int, gravity_step: ti.template(), meets: ti.template()):
+    """Update the nodes in rows first to last - 1 of the box in use; return the square of the largest velocity.
+
+    `meets` is as of `NodeUpdate.update`.
+    """
     d = ti.static(at.grid.dimension)
     speed_squared = 0.0
     for row in range(first, last):
         node = at.grid.row_start(row)
-        index = at.grid.linear_index(node)
-        for k in range(at.grid.row_length(node)):
-            squared = at.nodes.update(node, index + k, gravity_step)
+        index, nodes = at.grid.linear_index(node), at.grid.row_length(node)
+        if ti.static(meets):
+            nodes *= at.nodes.rigid.near(node, d - 1)
+        for k in range(nodes):
+            squared = at.nodes.update(node, index + k, gravity_step, meets)
             # Not `ti.max`, which takes twice as long for its care of NaN, at every node without mass.
             if squared > speed_squared:
                 speed_squared = squared
@@ -469,7 +474,7 @@ def update_rows(at: ti.template(), first: int, last: int, gravity_step: ti.templ
 
 
 @ti.func
-def update_blocks(at: ti.template(), first: int, after: int, gravity_step: ti.template()):
+def update_blocks(at: ti.template(), first: int, after: int, gravity_step: ti.template(), meets: ti.template()):
     """Update the nodes of blocks `first` to `after` - 1 in the box; return the square of the largest velocity."""
     grid, d = ti.static((at.grid, at.grid.dimension))
     speed_squared = 0.0
@@ -482,7 +487,7 @@ def update_blocks(at: ti.template(), first: int, after: int, gravity_step: ti.te
                 node[a] = place[a] * ti.static(grid.tile) + along
                 inside = inside and node[a] >= grid.box[0, a] and node[a] < grid.box[0, a] + grid.box[1, a]
             if inside:
-                squared = at.nodes.update(node, b * ti.static(grid.block) + q, gravity_step)
+                squared = at.nodes.update(node, b * ti.static(grid.block) + q, gravity_step, meets)
                 # As in `update_rows`.
                 if squared > speed_squared:
                     speed_squared = squared

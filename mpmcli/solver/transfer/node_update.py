@@ -4,6 +4,7 @@ from copy import copy
 
 from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.mirror_images import MirrorImages
+from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.boundaries.walls import REACH
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.grid import Grid
@@ -16,12 +17,16 @@ class NodeUpdate:
     Attributes:
         images: mirror images behind walls, which constrain the velocity.
         colliders: what does so after them, None where there are none.
+        rigid: those that move freely, None where there are none.
     """
 
-    def __init__(self, grid: Grid, images: MirrorImages, colliders: Colliders | None = None) -> None:
+    def __init__(
+        self, grid: Grid, images: MirrorImages, colliders: Colliders | None = None, rigid: RigidBodies | None = None
+    ) -> None:
         self.grid, self.dimension, self.images = grid, grid.dimension, images
         self.needs_contact, self.needs_friction = images.needs_contact, images.needs_friction
         self.collides, self.colliders = colliders is not None, colliders
+        self.rigid = rigid
 
     def in_layer(self, grid: Grid, layer: object) -> "NodeUpdate":
         """Return the update of a layer of nodes, by its number, a variable of a kernel."""
@@ -33,8 +38,10 @@ class NodeUpdate:
         return view
 
     @ti.func
-    def update(self, node: ti.template(), index: int, gravity_step: ti.template()):
+    def update(self, node: ti.template(), index: int, gravity_step: ti.template(), meets: ti.template() = False):
         """Update a node and its images; return the square of its velocity, 0 at an image and where there is no mass.
+
+        If it `meets`, nothing changes but the sums of rigid bodies.
 
         Gravity, gravity_step (m/s), acts on the momentum of every image near a wall, and elsewhere on the velocity.
         """
@@ -44,12 +51,14 @@ class NodeUpdate:
         if ti.static(len(self.grid.period.axes) > 0):
             # Not so beyond a periodic face.
             massive = massive or self.images.walls.near(node)
+        if ti.static(meets):
+            massive = massive and self.rigid.near(node, self.dimension) == 1
         if massive:
-            speed_squared = self.update_massive(node, index, gravity_step)
+            speed_squared = self.update_massive(node, index, gravity_step, meets)
         return speed_squared
 
     @ti.func
-    def update_massive(self, node: ti.template(), index: int, gravity_step: ti.template()):
+    def update_massive(self, node: ti.template(), index: int, gravity_step: ti.template(), meets: ti.template()):
         d = ti.static(self.dimension)
         value = self.grid.part(index, 0)
         pull = gravity_step
@@ -87,17 +96,20 @@ class NodeUpdate:
                 constrained = self.images.walls.constrained(velocity, depth, upper, acts, holds)
                 for c in ti.static(range(d)):
                     velocity[c] = constrained[c]
-            if ti.static(self.collides):
-                met = self.colliders.constrain(node, velocity, value[d])
-                for c in ti.static(range(d)):
-                    velocity[c] = met[c]
+            if ti.static(meets):
+                self.rigid.meet(node, velocity, value[d])
+            else:
+                if ti.static(self.collides):
+                    met = self.colliders.constrain(node, velocity, value[d])
+                    for c in ti.static(range(d)):
+                        velocity[c] = met[c]
 
-            # Unfold.
-            self.write(0, node, index, kind, place, velocity)
-            if ti.static(self.grid.scheme.keeps_before):
-                self.update_before(node, index, kind, place)
-            for a in ti.static(range(d)):
-                speed_squared += velocity[a] ** 2
+                # Unfold.
+                self.write(0, node, index, kind, place, velocity)
+                if ti.static(self.grid.scheme.keeps_before):
+                    self.update_before(node, index, kind, place)
+                for a in ti.static(range(d)):
+                    speed_squared += velocity[a] ** 2
         return speed_squared
 
     @ti.func

@@ -1,0 +1,96 @@
+"""Rigid bodies: colliders with a density, whose motion follows from what pushes them."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from mpmcli.scene.shapes import Form
+
+# Cells along the longest side of a form over which its moments are summed, in 2D and 3D.
+CELLS = {2: 512, 3: 96}
+
+
+@dataclass(frozen=True)
+class Moments:
+    """The mass of a rigid body, kg (per metre of depth in 2D), its centre, m, and its inertia about that, kg m^2."""
+
+    mass: float
+    center: tuple[float, ...]
+    inertia: np.ndarray  # (1, 1) in 2D, (3, 3) in 3D
+
+    def kinetic(self, pose: np.ndarray, motion: np.ndarray) -> np.ndarray:
+        """Return the kinetic energy, J, (n,), of poses and rates (n, k) as in `LedgerRow`."""
+        d = len(self.center)
+        velocity, spin = motion[:, :d], motion[:, d:]
+        if d == 3:
+            spin = np.einsum("nba,nb->na", turned_by(pose[:, d:]), spin)
+        return 0.5 * (self.mass * (velocity**2).sum(axis=1) + np.einsum("na,ab,nb->n", spin, self.inertia, spin))
+
+
+def moments_of(form: Form, density: float) -> Moments:
+    """Return the moments of a form, summed over cells, of which those at the surface are filled in part."""
+    lower, upper = (np.array(corner, float) for corner in form.bounds())
+    d = len(lower)
+    counts = np.ceil((upper - lower) / (upper - lower).max() * CELLS[d]).astype(int)
+    size = (upper - lower) / counts
+    axes = [lower[a] + size[a] * (np.arange(counts[a]) + 0.5) for a in range(d)]
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)
+    masses = density * math.prod(size) * np.clip(0.5 - form.signed_distance(x) / size.min(), 0.0, 1.0)
+    mass = float(masses.sum())
+    center = masses @ x / mass
+    second = (masses[:, None] * (x - center)).T @ (x - center) + np.diag(mass * size**2 / 12)
+    inertia = np.array([[np.trace(second)]]) if d == 2 else np.trace(second) * np.eye(3) - second
+    return Moments(mass, tuple(center.tolist()), inertia)
+
+
+def turned_by(rotation: np.ndarray) -> np.ndarray:
+    """Return rotations (n, d, d) from angles (n, 1) or unit quaternions (n, 4), the real part first."""
+    if rotation.shape[1] == 1:
+        c, s = np.cos(rotation[:, 0]), np.sin(rotation[:, 0])
+        return np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
+    w, v = rotation[:, :1, None], rotation[:, 1:]
+    cross = np.zeros((len(v), 3, 3))
+    for a in range(3):
+        cross[:, a - 2, a - 1], cross[:, a - 1, a - 2] = -v[:, a], v[:, a]
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """The motion of a rigid body as far as it is known, in place of a `Motion`: its pose at the times of some frames.
+
+    Between them it is that of the nearest frame.
+    """
+
+    pivot: tuple[float, ...]  # its centre at the start, (d,), m
+    times: np.ndarray  # (n,), s
+    places: np.ndarray  # of the centre, (n, d), m
+    rotations: np.ndarray  # (n, d, d)
+    moves = turns = True
+    angle = 0.0
+
+    @staticmethod
+    def start(pivot: tuple[float, ...]) -> "Path":
+        """Return the path of a body before it moves."""
+        return Path(pivot, np.zeros(1), np.array([pivot]), np.eye(len(pivot))[None])
+
+    @property
+    def offset(self) -> tuple[float, ...]:
+        """At the start."""
+        return (0.0,) * len(self.pivot)
+
+    def pose(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return where the centre is, (d,), m, and the rotation, (d, d), at a time, s."""
+        k = int(np.abs(self.times - time).argmin())
+        return self.places[k], self.rotations[k]
+
+    def placed(self, points: np.ndarray, time: float) -> np.ndarray:
+        """Return where points (n, d) that start at these places are at a time, s."""
+        place, turned = self.pose(time)
+        return place + (points - np.array(self.pivot)) @ turned.T
+
+    def taken_back(self, points: np.ndarray, time: float) -> np.ndarray:
+        """Undo `placed`."""
+        place, turned = self.pose(time)
+        return np.array(self.pivot) + (points - place) @ turned
