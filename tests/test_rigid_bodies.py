@@ -158,6 +158,17 @@ def test_what_the_material_loses_a_rigid_body_gains(backend_of: Callable, dimens
     assert rows[-1].energy <= rows[0].energy
 
 
+def test_a_sparse_grid_does_the_same(backend_of: Callable) -> None:
+    """Its blocks come in another order than rows."""
+    rigid = {"shape": box([0.52, 0.5], [0.7, 0.8]), "angular_velocity": 1.0, "friction": 0.3}
+    found = []
+    for grid in ("dense", "sparse"):
+        asked = scene(2, 0.0, rigid, jelly={"velocity": [2.0, 0.0]}, solver={"grid": grid})
+        found.append(list(build_run(asked, backend_of("f64", 1)).frames())[-1][1].rigid_motion[0])
+    assert abs(found[0][0]) > 0.1
+    assert found[1] == pytest.approx(found[0], rel=1e-11)
+
+
 @pytest.mark.parametrize("tilt", [0.0, pytest.param(10.0, marks=pytest.mark.slow)])
 def test_a_box_floats_as_deep_as_it_is_heavy(backend_of: Callable, tilt: float) -> None:
     """Of half the density of water half of it is in the water: to 0.35 cells; what carries it is its weight.
