@@ -103,6 +103,9 @@ def test_check_sees_what_is_thin_or_begins_inside() -> None:
     said = [(one.rule, one.what.split('"')[1], round(one.value, 2)) for one in found if one.severity == "warning"]
     expected = [("thin", "bar 0", 2.0), ("overlap", "bar 1", 0.4), ("overlap", "bar 2", 1.0), ("overlap", "bar 3", 1.0)]
     assert [one for one in said if one[1].startswith("bar")] == expected
+    # Nothing is beyond an open face.
+    asked = scene(2, -G, sunk, domain={"walls": {"y_min": "open"}})
+    assert not any(one.rule == "overlap" for one in check_scene(LoadedScene(asked, (), "scene.toml")).findings)
 
 
 # Motion.

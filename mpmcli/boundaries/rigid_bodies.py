@@ -310,7 +310,7 @@ class RigidBodies:
 
     @ti.func
     def load_of(self, impulse: ti.template(), arm: ti.template()):
-        """Return what `Colliders.load_of` does, in double precision."""
+        """Return what `Loads.of` does, in double precision."""
         load = ti.Vector.zero(ti.f64, self.loads)
         for a in ti.static(range(self.dimension)):
             load[a] = impulse[a]

@@ -65,6 +65,7 @@ def _rotation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
 def _rigid(facts: SceneFacts) -> Iterator[Finding]:
     """Yield rigid bodies that are too small for the grid, and those that begin inside of something."""
     scene, h = facts.scene, facts.scene.domain.spacing
+    shut = np.array(scene.domain.walls.faces(scene.dimension)) != "open"
     for body in (collider for collider in scene.colliders if collider.free):
         lower, upper = np.array(body.form.bounds())
         cells = float((upper - lower).min() / h)
@@ -73,10 +74,10 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
             fix = f"Make it {FEWEST_CELLS:g} cells thick, or the spacing {h * cells / FEWEST_CELLS:.2g} m."
             yield Finding("warning", "thin", what, fix, cells, body.name)
         points = surface_points(form_surface(body.form), h)
-        sides = np.minimum(points - scene.domain.origin, scene.domain.upper - points).min(axis=1)
+        sides = np.stack([points - scene.domain.origin, scene.domain.upper - points], axis=-1)[:, shut]
         others = [(f'collider "{one.name}"', one.signed_distance(points)) for one in scene.colliders if one is not body]
         for name, distance in [("a wall", sides), *others]:
-            depth = -float(distance.min()) / h
+            depth = -float(distance.min(initial=np.inf)) / h
             if depth > BEGINS_INSIDE:
                 what = f'Rigid body "{body.name}" begins {depth:.2g} cells inside of {name}, and is pushed out.'
                 yield Finding("warning", "overlap", what, f"Move it by {depth * h:.2g} m.", depth, body.name)

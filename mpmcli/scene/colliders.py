@@ -28,7 +28,7 @@ from mpmcli.scene.quantity import (
     list_of_axes,
     scene_dimension,
 )
-from mpmcli.scene.rigid import Moments, Path, moments_of, turned_by
+from mpmcli.scene.rigid import Moments, Path, Posed, moments_of, turned_by
 from mpmcli.scene.shapes import Form, Shape, exactly_one_form
 
 TIME = Name("t")
@@ -37,7 +37,7 @@ PIECES = 8
 
 
 @dataclass(frozen=True)
-class Motion:
+class Motion(Posed):
     """The motion of a rigid thing about a pivot that moves with it.
 
     A point that starts at X is at pivot + offset + R(angle) (X - pivot), R the rotation about a fixed axis.
@@ -75,16 +75,6 @@ class Motion:
         offset, angle = self.at(time)
         d = len(self.pivot)
         return np.array(self.pivot) + offset, rotation(self.axis, angle)[:d, :d]
-
-    def placed(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Return where points (n, d) that start at these places are at a time, s; the start is that without offset."""
-        place, turned = self.pose(time)
-        return place + (points - np.array(self.pivot)) @ turned.T
-
-    def taken_back(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Undo `placed`: where points (n, d) would have to start."""
-        place, turned = self.pose(time)
-        return np.array(self.pivot) + (points - place) @ turned
 
     def fastest(self, reach: float, end: float) -> float:
         """Return a bound on the speed of points within `reach` (m) of the pivot between 0 and `end` (s), m/s."""

@@ -56,8 +56,22 @@ def turned_by(rotation: np.ndarray) -> np.ndarray:
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
+class Posed:
+    """What has a pivot, (d,), m, and at each time a pose: where the pivot is, and a rotation."""
+
+    def placed(self, points: np.ndarray, time: float) -> np.ndarray:
+        """Return where points (n, d) that start at these places are at a time, s; the start is that without offset."""
+        place, turned = self.pose(time)
+        return place + (points - np.array(self.pivot)) @ turned.T
+
+    def taken_back(self, points: np.ndarray, time: float) -> np.ndarray:
+        """Undo `placed`: where points (n, d) would have to start."""
+        place, turned = self.pose(time)
+        return np.array(self.pivot) + (points - place) @ turned
+
+
 @dataclass(frozen=True, eq=False)
-class Path:
+class Path(Posed):
     """The motion of a rigid body as far as it is known, in place of a `Motion`: its pose at the times of some frames.
 
     Between them it is that of the nearest frame.
@@ -84,13 +98,3 @@ class Path:
         """Return where the centre is, (d,), m, and the rotation, (d, d), at a time, s."""
         k = int(np.abs(self.times - time).argmin())
         return self.places[k], self.rotations[k]
-
-    def placed(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Return where points (n, d) that start at these places are at a time, s."""
-        place, turned = self.pose(time)
-        return place + (points - np.array(self.pivot)) @ turned.T
-
-    def taken_back(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Undo `placed`."""
-        place, turned = self.pose(time)
-        return np.array(self.pivot) + (points - place) @ turned
