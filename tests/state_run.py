@@ -37,13 +37,20 @@ RAFT = {
     "velocity": [0.0, -5.0],
     "angular_velocity": 1.0,
 }
+WHEEL = {
+    "name": "wheel",
+    "mass": 30.0,
+    "shape": {"box": {"min": [0.7, 0.3], "max": [0.78, 0.7]}},
+    "restitution": 0.5,
+    "joint": {"type": "hinge", "point": [0.74, 0.6], "motor": "8 * t", "strength": 60.0},
+}
 # By the name of each scene: the materials of its bodies, its dimension, and further tables.
 SCENES = {name: ((name,), 2, {}) for name in MATERIALS} | {
     "3D": (("fluid",), 3, {}),
     "several bodies, FLIP": (("fluid", "fluid"), 2, {"solver": {"transfer": "aflip", "flip": 0.9}}),
     "total": (("neo_hookean", "neo_hookean"), 2, {"solver": {"solids": "total"}}),
     "forces": (("fluid", "neo_hookean"), 2, {"forces": [{"acceleration": ["3*sin(20*t) - 5*x", "2*X"]}]}),
-    "rigid": (("fluid",), 2, {"colliders": [RAFT]}),
+    "rigid": (("fluid",), 2, {"colliders": [RAFT, WHEEL]}),
     "contact": (("neo_hookean", "neo_hookean"), 2, {"contact": {"default": "separate", "friction": 0.3}}),
 }
 NAMES = tuple(SCENES)

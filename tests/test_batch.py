@@ -95,6 +95,10 @@ def rigid(dimension: int, k: int) -> list[dict]:
         {"shape": {"ball": {"center": [0.6, 0.5, 0.5][:dimension], "radius": 0.05}}, "wall": "slip"},
         {"shape": {"ball": {"center": [0.42, 0.75, 0.5][:dimension], "radius": 0.08}}, "density": 900.0, **speed},
     ]
+    # A flap on a hinge, whose motor has other numbers.
+    flap = {"box": {"min": [0.75, 0.3, 0.4][:dimension], "max": [0.8, 0.6, 0.6][:dimension]}}
+    joint = {"type": "hinge", "point": [0.77, 0.3, 0.5][:dimension], "motor": f"{5 * k} * t", "strength": 20.0 * k}
+    found.append({"shape": flap, "density": 500.0, "joint": joint, "restitution": 0.2 * k})
     return [{"name": f"body {n}", **table} for n, table in enumerate(found)]
 
 

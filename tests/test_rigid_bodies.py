@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 from command import run_here
+from scipy.special import ellipk
 from solver_state import scene_of
 
 from mpmcli.check.result_check import check_result
@@ -15,6 +16,7 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.errors import InputError
 from mpmcli.output import open_result
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
+from mpmcli.scene.primitives import unit
 from mpmcli.scene.rigid import turned_by
 from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.machine.backend import Backend
@@ -70,6 +72,25 @@ def test_moments_are_those_of_the_form() -> None:
         ({"velocity": ["t", 0.0]}, "colliders[0].velocity: must be a number, that at the start"),
         ({"side": "inside"}, "colliders[0].density: is for a shape with the material outside of it"),
         ({"shape": {"plane": {"point": [0.0, 0.1], "normal": [0.0, 1.0]}}}, "colliders[0].density: is for a shape"),
+        ({"mass": 3.0}, 'colliders[0].mass: "density" is given as well'),
+        ({"density": None, "mass": 0.0}, "colliders[0].mass: must be greater than 0"),
+        (
+            {"density": None, "fixed": ["x"]},
+            "colliders[0].fixed: is for one that moves freely; give its density or mass",
+        ),
+        ({"fixed": ["x", "y", "rotation"]}, "colliders[0].fixed: holds all of it; leave its density out"),
+        ({"fixed": ["x"], "joint": {"type": "hinge"}}, 'colliders[0].fixed: "joint" is given as well'),
+        ({"fixed": ["x"], "velocity": [1.0, 2.0]}, "colliders[0].velocity: is not zero where joint or fixed holds it"),
+        (
+            {"joint": {"type": "slider", "axis": [1, 1]}, "angular_velocity": 2.0},
+            "colliders[0].angular_velocity: is not",
+        ),
+        ({"joint": {"type": "hinge"}, "velocity": [1.0, 0.0]}, "colliders[0].velocity: follows from angular_velocity"),
+        ({"joint": {"type": "hinge", "axis": [0, 0, 1]}}, "axis: is for 3D scenes and this one is 2D"),
+        ({"joint": {"type": "hinge", "strength": 2.0}}, 'strength: is that of a motor; give "motor" as well'),
+        ({"joint": {"type": "slider"}}, "axis: missing"),
+        ({"joint": {"type": "weld"}}, "colliders[0].joint"),
+        ({"restitution": 1.5}, "colliders[0].restitution: must be"),
     ],
 )
 def test_what_cannot_move_freely_is_one_sentence(given: dict, said: str) -> None:
@@ -214,7 +235,120 @@ def test_a_bystander_leaves_the_material_alone(backend_of: Callable) -> None:
     assert found[0].position.tobytes() == found[1].position.tobytes()
 
 
+# Joints, motors and forces.
+
+
+def moved(asked: Scene, backend: Backend) -> tuple[np.ndarray, np.ndarray]:
+    """Return the poses and the rates, (frames, bodies, k), of the rigid bodies of a scene."""
+    rows = [row for _, row in build_run(asked, backend).frames()]
+    return np.array([row.rigid_pose for row in rows]), np.array([row.rigid_motion for row in rows])
+
+
+CORNER = {"shape": box([0.05, 0.0], [0.2, 0.2])}
+
+
+@pytest.mark.parametrize(("dimension", "release"), [(2, 1.5), (3, 1.0)])
+def test_a_pendulum_keeps_its_period(backend_of: Callable, dimension: int, release: float) -> None:
+    """4 K(sin(a / 2)) sqrt(I / (m g L)), released at an angle a, to the square of the step; the centre on its circle.
+
+    In 3D about an axis that is tilted by 30 degrees, along which gravity has no part.
+    """
+    d, length, point = dimension, 0.3, np.array([0.6, 0.8] + [0.6] * (dimension - 2))
+    axis = unit([0.0, 0.0, 1.0]) if d == 2 else np.array([0.5, 0.0, math.sqrt(0.75)])
+    side = np.array([axis[2], 0.0, -axis[0]])[:d]
+    center = point + length * (math.sin(release) * side - math.cos(release) * np.eye(d)[1])
+    bob = {"ball": {"center": center.tolist(), "radius": 0.1}}
+    hinge = {"type": "hinge", "point": point.tolist()} | ({"axis": axis.tolist()} if d == 3 else {})
+    corner = {"shape": box([0.05] + [0.0] * (d - 1), [0.2] * d)}
+    time, gravity = {"end": 2.5, "frames": 500, "step": 1e-3}, {"gravity": [0.0, -G] + [0.0] * (d - 2)}
+    asked = scene(d, 0.0, {"shape": bob, "joint": hinge}, jelly=corner, time=time, domain=gravity)
+    poses, _ = moved(asked, backend_of("f64", 1))
+    body, arm = asked.colliders[0].moments, poses[:, 0, :d] - point
+    inertia = (axis @ body.inertia @ axis if d == 3 else body.inertia[0, 0]) + body.mass * length**2
+    period = 4 * ellipk(math.sin(release / 2) ** 2) * math.sqrt(inertia / (body.mass * G * length))
+    assert np.linalg.norm(arm, axis=1) == pytest.approx(length, rel=1e-9)
+    swing = arm @ side
+    times = np.linspace(0.0, 2.5, 501)
+    (k,) = np.nonzero((swing[:-1] > 0) & (swing[1:] <= 0))
+    passed = times[k] + (times[k + 1] - times[k]) * swing[k] / (swing[k] - swing[k + 1])
+    assert passed[-1] - passed[0] == pytest.approx((len(passed) - 1) * period, rel=1e-4)
+    assert swing.max() == pytest.approx(length * math.sin(release), rel=1e-4)
+
+
+def test_forces_and_sliders(backend_of: Callable) -> None:
+    """On a slope of 45 degrees half of gravity is left; a force in x alone of 2 t gives t^3 / 3."""
+    block = {"shape": box([0.5, 0.7], [0.7, 0.9]), "joint": {"type": "slider", "axis": [1, -1]}}
+    pushed = {"shape": box([0.9, 0.7], [1.1, 0.9]), "fixed": ["y", "rotation"]}
+    forces = [{"body": "bar 1", "acceleration": ["2 * t", 0.0]}, {"acceleration": [0.0, 1.0]}]
+    asked = scene(2, -G, block, pushed, jelly=CORNER, end=0.2, forces=forces)
+    poses, _ = moved(asked, backend_of("f64", 1))
+    way = 0.25 * (G - 1) * 0.2**2
+    assert poses[-1, 0] - poses[0, 0] == pytest.approx([way, -way, 0.0], rel=1e-6)
+    assert poses[-1, 1] - poses[0, 1] == pytest.approx([0.2**3 / 3, 0.0, 0.0], rel=1e-3)
+
+
+def test_a_motor_gives_its_strength_until_it_has_its_rate(backend_of: Callable) -> None:
+    """Angular velocity M t / I, up to that asked for, and down again; one without limit keeps its rate at once."""
+    wheel = {"shape": {"ball": {"center": [0.8, 0.7], "radius": 0.2}}}
+    wheel["joint"] = {"type": "hinge", "motor": "5 if t < 0.75 else 2", "strength": 20.0}
+    ram = {"shape": box([0.4, 0.3], [0.6, 0.5]), "density": None, "mass": 4.0}
+    ram["joint"] = {"type": "slider", "axis": [-1, 0], "motor": 0.5}
+    times = {"end": 1.0, "frames": 10, "step": 1e-3}
+    asked = scene(2, -G, wheel, ram, jelly=CORNER, time=times, domain={"walls": "separate"})
+    poses, rates = moved(asked, backend_of("f64", 1))
+    inertia, t = asked.colliders[0].moments.inertia[0, 0], np.linspace(0.0, 1.0, 11)
+    assert rates[:8, 0, 2] == pytest.approx(np.minimum(5.0, 20.0 * t[:8] / inertia), rel=1e-9)
+    # Within a step of the instant.
+    assert rates[8:, 0, 2] == pytest.approx(np.maximum(2.0, 5.0 - 20.0 * (t[8:] - 0.75) / inertia), abs=0.02)
+    # Before it meets the jelly.
+    assert rates[1:4, 1, 0] == pytest.approx(-0.5, abs=1e-9)
+    assert np.ptp(poses[:, 1, 1]) == 0
+
+
+def test_a_hinge_takes_no_angular_momentum(backend_of: Callable) -> None:
+    """Of a bar that jelly hits: about the hinge that of both together stays, to rounding."""
+    bar = {"shape": box([0.52, 0.45], [0.62, 0.9]), "joint": {"type": "hinge", "point": [0.57, 0.85]}}
+    asked = scene(2, 0.0, bar, jelly={"velocity": [2.0, 0.0]}, end=0.2)
+    rows = [row for _, row in build_run(asked, backend_of("f64", 1)).frames()]
+    body = asked.colliders[0].moments
+    point, rate = np.array([0.57, 0.85]), np.array([row.rigid_motion[0][2] for row in rows])
+    inertia = body.inertia[0, 0] + body.mass * float(np.sum((np.array(body.center) - point) ** 2))
+    momentum = np.array([row.linear_momentum for row in rows])
+    turning = np.array([row.angular_momentum[0] for row in rows])
+    total = turning - point[0] * momentum[:, 1] + point[1] * momentum[:, 0] + inertia * rate
+    assert abs(rate[-1]) > 1.0
+    assert np.abs(total - total[0]).max() < 1e-11 * np.abs(turning).max()
+
+
 # Walls, colliders and each other.
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.6, 1.0])
+def test_a_ball_bounces(backend_of: Callable, restitution: float) -> None:
+    """From a height H to e^2 H, e^4 H, ... of it, to the first order in the step."""
+    ball = {"shape": {"ball": {"center": [0.7, 0.4], "radius": 0.1}}, "restitution": restitution}
+    asked = scene(2, -G, ball, jelly=CORNER, time={"end": 1.5, "frames": 300, "step": 5e-4})
+    poses, _ = moved(asked, backend_of("f64", 1))
+    height = poses[:, 0, 1] - 0.1
+    assert height.min() > -1e-3
+    peaks = [b for a, b, c in zip(height, height[1:], height[2:], strict=False) if b >= a and b > c]
+    if restitution == 0.0:
+        assert np.abs(height[100:]).max() < 1e-6
+    else:
+        assert np.array(peaks[:2]) / 0.3 == pytest.approx(restitution ** np.array([2.0, 4.0]), abs=5e-3)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_ball_rolls_as_a_ball(backend_of: Callable, dimension: int) -> None:
+    """Down a slope at g sin(a) / (1 + k), k = 1/2 of a disc, 2/5 of a ball, however few points it has."""
+    d, angle, radius = dimension, 0.3, 0.1
+    ball = {"shape": {"ball": {"center": [0.3, radius] + [0.6] * (d - 2), "radius": radius}}, "friction": 0.5}
+    corner = {"shape": box([1.0] + [0.0] * (d - 1), [1.15] * 1 + [0.15] * (d - 1))}
+    gravity = {"gravity": [G * math.sin(angle), -G * math.cos(angle)] + [0.0] * (d - 2), "walls": "separate"}
+    asked = scene(d, 0.0, ball, jelly=corner, end=0.5, domain=gravity)
+    poses, _ = moved(asked, backend_of("f64", 1))
+    assert poses[-1, 0, 0] - 0.3 == pytest.approx(0.125 * G * math.sin(angle) / (1.5 if d == 2 else 1.4), rel=2e-3)
+    assert poses[-1, 0, 1] == pytest.approx(radius, abs=1e-4)
 
 
 @pytest.mark.parametrize("floor", ["wall", "collider", "sticks"])

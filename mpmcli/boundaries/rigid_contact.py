@@ -1,21 +1,27 @@
 """Contact of rigid bodies with walls, colliders and each other: points of their surfaces, against signed distances.
 
-Of each point the nearest thing counts. Impulses at points are found one after another in some sweeps (projected
-Gauss-Seidel), none of which pulls, and with Coulomb's friction. A point that would pass a surface in the step ends on
-it; where one has passed already, a part of that is undone.
+Of each point the nearest thing counts; those of a ball lie where it faces that. Impulses at points are found one after
+another in some sweeps (projected Gauss-Seidel), none of which pulls, and with Coulomb's friction. A point that would
+pass a surface in the step ends on it, or parts from it by its coefficient of restitution; where one has passed already,
+a part of that is undone.
 """
 
 from mpmcli.boundaries.colliders import STICK, contact_points
 from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
+from mpmcli.scene.primitives import Ball
 
 # Cells within which a point may meet something in a step; the part of a depth that a step undoes; most sweeps, and the
 # change of impulses in one, over the largest of them, below which they are enough.
 NEAR, UNDONE, SWEEPS, ENOUGH = 0.6, 0.2, 50, 1e-6
+# How often the point of a ball is looked for that faces something.
+LOOKS = 2
 # Coefficient of friction of what sticks; in place of the number of a collider: a wall, and nothing.
 STUCK = 1e3
 WALL, NOTHING = -1, -2
+# Where a point may pass a surface in this step, and parts from it in the next.
+LATER = -1.0
 
 
 @ti.data_oriented
@@ -28,6 +34,8 @@ class RigidContact:
         self.walls = tuple((a, side) for a in range(d) for side in (0, 1) if faces[a][side] != "open")
         n = runs * self.room
         self.used = ti.field(int, shape=runs)
+        # Of each body the radius if it is a ball, m, else 0.
+        self.ball = ti.field(ti.f64, shape=runs * bodies.count)
         # Of each point: its body, and where it is on it.
         self.body, self.point = ti.field(int, shape=n), ti.Vector.field(d, ti.f64, shape=n)
         # How far it is from the centre of its body in this step.
@@ -36,19 +44,26 @@ class RigidContact:
         self.meets, self.other = ti.field(int, shape=n), ti.field(int, shape=n)
         self.gap, self.friction = ti.field(ti.f64, shape=n), ti.field(ti.f64, shape=n)
         self.normal, self.impulse = (ti.Vector.field(d, ti.f64, shape=n) for _ in range(2))
-        # Of each collider the body that it is, or -1; of each face its coefficient of friction.
+        # By which it parts from what it begins to touch, m/s, or LATER.
+        self.rebound = ti.field(ti.f64, shape=n)
+        # Of each collider the body that it is, or -1, and its coefficient of restitution; of each face its friction.
         self.body_of = ti.field(int, shape=bodies.colliders.room)
         self.body_of.fill(-1)
         for j, k in enumerate(bodies.free):
             self.body_of[k] = j
+        self.restitution = ti.field(float, shape=runs * bodies.colliders.room)
         self.face_friction = ti.field(float, shape=(runs, d, 2))
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the points of a run."""
+        for k, collider in enumerate(scene.colliders):
+            self.restitution[run * self.bodies.colliders.room + k] = collider.restitution
         found = [contact_points(scene.colliders[k], scene.domain.spacing) for k in self.bodies.free]
         self.used[run] = sum(map(len, found))
         q = run * self.room
         for j, points in enumerate(found):
+            form = scene.colliders[self.bodies.free[j]].form
+            self.ball[run * self.bodies.count + j] = form.radius if isinstance(form, Ball) else 0.0
             for point in points.tolist():
                 self.body[q], self.point[q], self.other[q] = j, point, NOTHING
                 self.impulse[q] = [0.0] * self.dimension
@@ -63,7 +78,7 @@ class RigidContact:
         first = run * self.room
         any_meets = False
         for q in range(first, first + self.used[run]):
-            any_meets = self.look(run, q, extent, colliders) or any_meets
+            any_meets = self.look(run, q, dt, extent, colliders) or any_meets
         if any_meets:
             for q in range(first, first + self.used[run]):
                 if self.meets[q] == 1:
@@ -75,10 +90,12 @@ class RigidContact:
                     if self.meets[q] == 1:
                         change = ti.max(change, self.push(run, q, dt, colliders))
                         most = ti.max(most, self.impulse[q].norm())
+                for j in range(self.bodies.count):
+                    self.bodies.turn_motor(run * self.bodies.count + j, dt)
                 sweep += 1
 
     @ti.func
-    def look(self, run: int, q: int, extent: ti.template(), colliders: ti.template()):
+    def look(self, run: int, q: int, dt: ti.f64, extent: ti.template(), colliders: ti.template()):
         """Find what point q may meet; return whether there is anything.
 
         Where that is what it met in the step before, the impulses of that step are where those of this one begin.
@@ -86,13 +103,51 @@ class RigidContact:
         d = ti.static(self.dimension)
         b = run * self.bodies.count + self.body[q]
         own = self.bodies.numbers[self.body[q]]
-        x = self.bodies.turned(b) @ self.point[q]
+        arm, normal = self.bodies.turned(b) @ self.point[q], ti.Vector.zero(ti.f64, d)
+        gap, other, friction = ti.cast(0, ti.f64), NOTHING, 0.0
+        tries = 1
+        if self.ball[b] > 0:
+            tries += LOOKS
+        for k in range(tries):
+            if k > 0 and other != NOTHING:
+                # Of a ball the point that faces what is near.
+                arm = -self.ball[b] * normal
+            gap, other, friction, normal = self.nearest(run, b, own, arm, extent, colliders)
         for a in ti.static(range(d)):
-            self.arm[q][a] = x[a]
+            self.arm[q][a] = arm[a]
+        self.friction[q] = ti.cast(ti.max(friction, self.rub_of(colliders, run * colliders.room + own)), ti.f64)
+        pressed = ti.max(self.impulse[q].dot(normal), 0.0)
+        if self.other[q] != other:
+            pressed = ti.cast(0, ti.f64)
+        after = pressed * normal + self.rubbed(q, self.impulse[q] - self.impulse[q].dot(normal) * normal, pressed)
+        self.meets[q], self.other[q], self.gap[q] = ti.cast(other != NOTHING, int), other, gap
+        for a in ti.static(range(d)):
+            self.normal[q][a], self.impulse[q][a] = normal[a], after[a]
+        self.rebound[q] = 0
+        if other != NOTHING and pressed == 0:
+            bounces = self.restitution[run * colliders.room + own]
+            if other >= 0:
+                bounces = ti.max(bounces, self.restitution[run * colliders.room + other])
+            approach = -self.velocity_of(run, q, colliders).dot(normal)
+            if bounces > 0 and approach > 0:
+                # It parts from where it is at the end of this step or the next, whichever is nearer to the surface.
+                # Half of what gravity does in the step comes before it, half after.
+                pulled = -0.5 * normal.dot(self.bodies.kick[b])
+                if other >= 0:
+                    if self.body_of[other] >= 0:
+                        pulled += 0.5 * normal.dot(self.bodies.kick[run * self.bodies.count + self.body_of[other]])
+                parts = ti.max(ti.cast(bounces, ti.f64) * (approach - pulled) - pulled, 0.0)
+                self.rebound[q] = parts if 2 * gap < approach * dt else LATER
+        return other != NOTHING
+
+    @ti.func
+    def nearest(self, run: int, b: int, own: int, arm: ti.template(), extent: ti.template(), colliders: ti.template()):
+        """Return what is nearest to a point at an arm from the centre of body b: distance, which, friction, normal."""
+        d = ti.static(self.dimension)
+        x, normal = arm, ti.Vector.zero(ti.f64, d)
+        for a in ti.static(range(d)):
             x[a] += self.bodies.pose[b, a]
-        h = ti.cast(colliders.spacing, ti.f64)
-        gap, other, friction = ti.cast(NEAR, ti.f64) * h, NOTHING, 0.0
-        normal = ti.Vector.zero(ti.f64, d)
+        gap, other, friction = ti.cast(NEAR * colliders.spacing, ti.f64), NOTHING, 0.0
         for a, side in ti.static(self.walls):
             away = x[a] if ti.static(side == 0) else ti.cast(extent[a], ti.f64) - x[a]
             if away < gap:
@@ -110,15 +165,7 @@ class RigidContact:
                         gap, other, friction = ti.cast(phi, ti.f64), k, self.rub_of(colliders, i)
                         for c in ti.static(range(d)):
                             normal[c] = ti.cast(found[c], ti.f64)
-        self.friction[q] = ti.cast(ti.max(friction, self.rub_of(colliders, run * colliders.room + own)), ti.f64)
-        pressed = ti.max(self.impulse[q].dot(normal), 0.0)
-        if self.other[q] != other:
-            pressed = ti.cast(0, ti.f64)
-        after = pressed * normal + self.rubbed(q, self.impulse[q] - self.impulse[q].dot(normal) * normal, pressed)
-        self.meets[q], self.other[q], self.gap[q] = ti.cast(other != NOTHING, int), other, gap
-        for a in ti.static(range(d)):
-            self.normal[q][a], self.impulse[q][a] = normal[a], after[a]
-        return other != NOTHING
+        return gap, other, friction, normal
 
     @ti.func
     def rubbed(self, q: int, rub: ti.template(), pressed: ti.f64):
@@ -136,27 +183,27 @@ class RigidContact:
     @ti.func
     def push(self, run: int, q: int, dt: ti.f64, colliders: ti.template()):
         """Change the impulse at point q so that it holds there; return by how much, N s."""
-        b, partner, arm, from_other = self.sides(run, q)
-        velocity = self.bodies.velocity_at(b, arm)
-        if self.other[q] >= 0:
-            i = run * colliders.room + self.other[q]
-            if partner >= 0:
-                velocity -= self.bodies.velocity_at(partner, from_other)
-            else:
-                away = from_other - ti.cast(colliders.place[i], ti.f64)
-                velocity -= ti.cast(colliders.velocity[i], ti.f64) + ti.cast(colliders.turning[i], ti.f64) @ away
+        velocity = self.velocity_of(run, q, colliders)
         normal, before = self.normal[q], self.impulse[q]
         along = velocity.dot(normal)
         wanted = -self.gap[q] / dt
         if self.gap[q] < 0:
             wanted *= ti.cast(UNDONE, ti.f64)
+        if self.rebound[q] > 0:
+            wanted = ti.max(wanted, self.rebound[q])
+        elif self.rebound[q] == LATER:
+            wanted = along
         old = before.dot(normal)
-        pressed = ti.max(old + (wanted - along) / self.yielding(b, partner, normal, arm, from_other), 0.0)
         slide = velocity - along * normal
         speed = slide.norm()
-        rub = before - old * normal
-        if speed > 0 and self.friction[q] > 0:
-            rub -= slide / self.yielding(b, partner, slide / speed, arm, from_other)
+        pressed, rub = ti.cast(0, ti.f64), before - old * normal
+        # In a loop, so that it is compiled once.
+        for k in range(2 if speed > 0 and self.friction[q] > 0 else 1):
+            yielding = self.yielding(run, q, normal if k == 0 else slide / speed)
+            if k == 0:
+                pressed = ti.max(old + (wanted - along) / yielding, 0.0)
+            else:
+                rub -= slide / yielding
         after = pressed * normal + self.rubbed(q, rub, pressed)
         self.give(run, q, after - before)
         for a in ti.static(range(self.dimension)):
@@ -164,36 +211,51 @@ class RigidContact:
         return (after - before).norm()
 
     @ti.func
+    def velocity_of(self, run: int, q: int, colliders: ti.template()):
+        """Return the velocity of point q as seen from what it meets, m/s."""
+        velocity = ti.Vector.zero(ti.f64, self.dimension)
+        for s in range(2):
+            b, arm, sign = self.side(run, q, s)
+            if b >= 0:
+                velocity += sign * self.bodies.velocity_at(b, arm)
+            elif self.other[q] >= 0:
+                i = run * colliders.room + self.other[q]
+                away = arm - ti.cast(colliders.place[i], ti.f64)
+                velocity -= ti.cast(colliders.velocity[i], ti.f64) + ti.cast(colliders.turning[i], ti.f64) @ away
+        return velocity
+
+    @ti.func
     def give(self, run: int, q: int, impulse: ti.template()):
         """Give the body of point q an impulse there, N s, and the body that it meets the opposite one."""
-        b, partner, arm, from_other = self.sides(run, q)
-        self.bodies.hit(b, impulse, arm)
-        if partner >= 0:
-            self.bodies.hit(partner, -impulse, from_other)
+        for s in range(2):
+            b, arm, sign = self.side(run, q, s)
+            if b >= 0:
+                self.bodies.hit(b, sign * impulse, arm)
 
     @ti.func
-    def sides(self, run: int, q: int):
-        """Return the body of point q and the one that it meets, or -1, and the arms of the point from their centres.
+    def side(self, run: int, q: int, s: int):
+        """Return the body of point q, or of what it meets (s = 1), the arm of the point from its centre, and 1 or -1.
 
-        In place of the second one the place of the point where it meets no body.
+        In place of a body that is none -1, and in place of the arm the place of the point.
         """
-        d = ti.static(self.dimension)
-        b, partner = run * self.bodies.count + self.body[q], -1
-        arm = self.arm[q]
-        from_other = arm
-        for a in ti.static(range(d)):
-            from_other[a] += self.bodies.pose[b, a]
-        if self.other[q] >= 0:
-            if self.body_of[self.other[q]] >= 0:
-                partner = run * self.bodies.count + self.body_of[self.other[q]]
-                for a in ti.static(range(d)):
-                    from_other[a] -= self.bodies.pose[partner, a]
-        return b, partner, arm, from_other
+        b, arm, sign = run * self.bodies.count + self.body[q], self.arm[q], 1.0
+        if s == 1:
+            for a in ti.static(range(self.dimension)):
+                arm[a] += self.bodies.pose[b, a]
+            b, sign = -1, -1.0
+            if self.other[q] >= 0:
+                if self.body_of[self.other[q]] >= 0:
+                    b = run * self.bodies.count + self.body_of[self.other[q]]
+                    for a in ti.static(range(self.dimension)):
+                        arm[a] -= self.bodies.pose[b, a]
+        return b, arm, sign
 
     @ti.func
-    def yielding(self, b: int, partner: int, n: ti.template(), arm: ti.template(), from_other: ti.template()):
-        """Return by how much the relative velocity of two bodies along n grows with an impulse along it, 1/kg."""
-        result = self.bodies.yields(b, n, arm)
-        if partner >= 0:
-            result += self.bodies.yields(partner, n, from_other)
+    def yielding(self, run: int, q: int, n: ti.template()):
+        """Return what an impulse of 1 N s along n adds to the velocity of point q, seen from what it meets, m/s."""
+        result = ti.cast(0, ti.f64)
+        for s in range(2):
+            b, arm, _sign = self.side(run, q, s)
+            if b >= 0:
+                result += self.bodies.yields(b, n, arm)
         return result

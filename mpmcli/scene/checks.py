@@ -361,7 +361,7 @@ def _hydrostatic(body: Body, scene: Scene) -> Iterator[tuple[str, str]]:
 
 
 def _pushed(scene: Scene) -> Iterator[Problem]:
-    names = [body.name for body in scene.sources]
+    names = [*(body.name for body in scene.sources), *(one.name for one in scene.colliders if one.free)]
     for table, entries in (("forces", scene.forces), ("impulses", scene.impulses)):
         for k, force in enumerate(entries):
             if force.body is not None and force.body not in names:

@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, PrivateAttr, ValidationInfo, field_validator, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, model_validator
 
 from mpmcli.scene.domain import Domain
 from mpmcli.scene.entry import Entry, OfTime, TimeVector, tree_of, varies
@@ -26,9 +26,8 @@ from mpmcli.scene.quantity import (
     direction_as,
     flaw,
     list_of_axes,
-    scene_dimension,
 )
-from mpmcli.scene.rigid import Moments, Path, Posed, moments_of, turned_by
+from mpmcli.scene.rigid import Fixed, Hinge, Joint, Moments, Path, Posed, SpinAxis, Z, moments_of, turned_by, ways_of
 from mpmcli.scene.shapes import Form, Shape, exactly_one_form
 
 TIME = Name("t")
@@ -172,9 +171,7 @@ class Collider(Table):
     keyframes: tuple[Keyframe, ...] = Field(
         (), description="Offsets and angles at some times, in place of all these; linear between them."
     )
-    axis: tuple[Number, Number, Number] | None = Field(
-        None, description="Direction of the axis that it turns about; 3D only. Default: [0, 0, 1]."
-    )
+    axis: SpinAxis = Field(None, description="Direction of the axis that it turns about; 3D only. Default: [0, 0, 1].")
     pivot: Vector | None = Field(
         None, description="Point of the axis, m; it moves along. Default: the centre of the shape."
     )
@@ -183,16 +180,21 @@ class Collider(Table):
         description="Density, kg/m^3, of one that moves freely: velocity and angular_velocity are those at the start. "
         "Default: it moves as the scene says.",
     )
+    mass: Positive | None = Field(
+        None, description="Mass, kg (2D: per metre of depth), in place of the density. Default: that of the density."
+    )
+    restitution: float = Field(
+        0.0,
+        strict=True,
+        ge=0,
+        le=1,
+        description="Coefficient of restitution, 0 to 1, where rigid bodies meet; of two the larger one counts.",
+    )
+    fixed: tuple[Fixed, ...] = Field(
+        (), description='What a free one does not do: move along "x", "y" or "z", or "rotation". Default: nothing.'
+    )
+    joint: Joint | None = Field(None, description="What holds a free one to the world: a hinge or a slider.")
     _path: Path | None = PrivateAttr(None)
-
-    @field_validator("axis", mode="before")
-    @classmethod
-    def _axis_has_a_direction(cls, axis: Any, info: ValidationInfo) -> Any:
-        if axis is not None and scene_dimension(info) == 2:
-            raise flaw("is for 3D scenes and this one is 2D, where colliders turn in their plane; leave it out")
-        if isinstance(axis, list | tuple) and not any(axis):
-            raise flaw("must have a direction, as [0, 0, 1] has; found zeros")
-        return axis
 
     @model_validator(mode="after")
     def _one_way_to_move(self) -> "Collider":
@@ -209,18 +211,40 @@ class Collider(Table):
             raise flaw('is for a surface that slips or separates, and wall is "stick"; leave it out', "friction")
         if self.free:
             self._require_free()
+        elif self.fixed or self.joint:
+            raise flaw("is for one that moves freely; give its density or mass", "fixed" if self.fixed else "joint")
         return self
 
     def _require_free(self) -> None:
         """Refuse what a rigid body that moves freely cannot have."""
+        given = "mass" if self.density is None else "density"
+        if None not in (self.density, self.mass):
+            raise flaw('"density" is given as well; leave one of them out', "mass")
         for key in ("offset", "angle", "keyframes", "pivot"):
             if getattr(self, key):
-                raise flaw("is for a collider that moves as the scene says, and density lets it move freely", key)
+                raise flaw(f"is for a collider that moves as the scene says, and {given} lets it move freely", key)
         if isinstance(self.form, Plane) or self.side == "inside":
-            raise flaw("is for a shape with the material outside of it; leave it out", "density")
+            raise flaw("is for a shape with the material outside of it; leave it out", given)
         if varies(*self.velocity, self.angular_velocity):
             key = "velocity" if varies(*self.velocity) else "angular_velocity"
-            raise flaw("must be a number, that at the start, where density lets it move freely", key)
+            raise flaw(f"must be a number, that at the start, where {given} lets it move freely", key)
+        self._require_ways(given)
+
+    def _require_ways(self, given: str) -> None:
+        """Refuse a start that a joint or what is fixed does not allow."""
+        d, hinged = len(self.velocity), isinstance(self.joint, Hinge)
+        if self.fixed and (self.joint or not ways_of(d, self.fixed).size):
+            both = '"joint" is given as well; leave one of them out'
+            raise flaw(both if self.joint else f"holds all of it; leave its {given} out", "fixed")
+        if hinged and self._gives("velocity"):
+            raise flaw("follows from angular_velocity where a hinge holds it; leave it out", "velocity")
+        if hinged and self.axis is not None:
+            raise flaw("is that of the hinge; leave it out", "axis")
+        if not hinged:
+            held = self.rates - self.ways @ np.linalg.pinv(self.ways) @ self.rates
+            if np.abs(held).max() > 1e-9:
+                key = "velocity" if np.abs(held[:d]).max() > 1e-9 else "angular_velocity"
+                raise flaw("is not zero where joint or fixed holds it", key)
 
     def _gives(self, key: str) -> bool:
         """Return whether a motion is given; zeros, as defaults are written out, are none."""
@@ -234,7 +258,7 @@ class Collider(Table):
     @property
     def free(self) -> bool:
         """Whether it is a rigid body that moves freely."""
-        return self.density is not None
+        return (self.density, self.mass) != (None, None)
 
     @property
     def driven(self) -> bool:
@@ -244,7 +268,7 @@ class Collider(Table):
     @cached_property
     def moments(self) -> Moments:
         """Mass, centre and inertia of one that moves freely."""
-        return moments_of(self.form, self.density)
+        return moments_of(self.form, self.density, self.mass)
 
     @property
     def center(self) -> tuple[float, ...]:
@@ -267,8 +291,26 @@ class Collider(Table):
     @property
     def spin(self) -> np.ndarray:
         """Angular velocity at the start of one that moves freely, (1,) or (3,), rad/s."""
-        axis = unit(self.axis or (0.0, 0.0, 1.0))
+        axis = unit((self.joint.axis if isinstance(self.joint, Hinge) else self.axis) or Z)
         return self.angular_velocity * (axis[2:] if len(self.velocity) == 2 else axis)
+
+    @property
+    def arm(self) -> np.ndarray:
+        """From the point of the hinge of one that moves freely to its centre at the start, (d,), m."""
+        point = getattr(self.joint, "point", None)
+        return np.zeros(len(self.velocity)) if point is None else np.array(self.center) - point
+
+    @property
+    def ways(self) -> np.ndarray:
+        """Velocities and spins that one that moves freely may start with, (k, n), of each of n ways at a rate of 1."""
+        return self.joint.way(self.arm)[:, None] if self.joint else ways_of(len(self.velocity), self.fixed)
+
+    @property
+    def rates(self) -> np.ndarray:
+        """Velocity and spin at the start of one that moves freely, (k,), m/s and rad/s."""
+        if isinstance(self.joint, Hinge):
+            return self.angular_velocity * self.ways[:, 0]
+        return np.concatenate([self.velocity, self.spin])
 
     def along(self, times: np.ndarray, poses: np.ndarray) -> "Collider":
         """Return it with the motion that a run found: poses (n, k), places with angles or quaternions, at times, s."""
@@ -282,7 +324,7 @@ class Collider(Table):
         if self.free:
             return self._path or Path.start(self.center)
         d = len(self.velocity)
-        axis = tuple(unit(self.axis or (0.0, 0.0, 1.0)).tolist())
+        axis = tuple(unit(self.axis or Z).tolist())
         if self.keyframes:
             times = [key.time for key in self.keyframes]
             offsets = [between_keys(times, [key.offset[a] for key in self.keyframes]) for a in range(d)]
@@ -304,7 +346,7 @@ class Collider(Table):
         Of one that moves freely it is that at the start.
         """
         if self.free:
-            return math.hypot(*self.velocity) + abs(self.angular_velocity) * self.radius
+            return math.hypot(*self.rates[: len(self.velocity)]) + abs(self.angular_velocity) * self.radius
         motion = self.motion
         # What lies outside of the domain meets nothing; the pivot goes this far at most.
         gone = float(np.linalg.norm(motion.offset)) + end * motion.fastest(0.0, end)

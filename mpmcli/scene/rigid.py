@@ -2,9 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
+from mpmcli.scene.entry import OfTime
+from mpmcli.scene.primitives import unit
+from mpmcli.scene.quantity import AXES, Number, Positive, Table, Vector, direction_as, flaw, scene_dimension
 from mpmcli.scene.shapes import Form
 
 # Cells along the longest side of a form over which its moments are summed, in 2D and 3D.
@@ -28,20 +33,92 @@ class Moments:
         return 0.5 * (self.mass * (velocity**2).sum(axis=1) + np.einsum("na,ab,nb->n", spin, self.inertia, spin))
 
 
-def moments_of(form: Form, density: float) -> Moments:
-    """Return the moments of a form, summed over cells, of which those at the surface are filled in part."""
+def moments_of(form: Form, density: float | None, mass: float | None) -> Moments:
+    """Return the moments of a form with a density, kg/m^3, or else a mass, kg.
+
+    They are sums over cells, of which those at the surface are filled in part.
+    """
     lower, upper = (np.array(corner, float) for corner in form.bounds())
     d = len(lower)
     counts = np.ceil((upper - lower) / (upper - lower).max() * CELLS[d]).astype(int)
     size = (upper - lower) / counts
     axes = [lower[a] + size[a] * (np.arange(counts[a]) + 0.5) for a in range(d)]
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)
-    masses = density * math.prod(size) * np.clip(0.5 - form.signed_distance(x) / size.min(), 0.0, 1.0)
+    masses = math.prod(size) * np.clip(0.5 - form.signed_distance(x) / size.min(), 0.0, 1.0)
+    masses *= mass / masses.sum() if density is None else density
     mass = float(masses.sum())
     center = masses @ x / mass
     second = (masses[:, None] * (x - center)).T @ (x - center) + np.diag(mass * size**2 / 12)
     inertia = np.array([[np.trace(second)]]) if d == 2 else np.trace(second) * np.eye(3) - second
     return Moments(mass, tuple(center.tolist()), inertia)
+
+
+def _has_direction(axis: Any, info: ValidationInfo) -> Any:
+    if axis is not None and scene_dimension(info) == 2:
+        raise flaw("is for 3D scenes and this one is 2D, where colliders turn in their plane; leave it out")
+    if isinstance(axis, list | tuple) and not any(axis):
+        raise flaw("must have a direction, as [0, 0, 1] has; found zeros")
+    return axis
+
+
+# Of what turns; None in 2D.
+SpinAxis = Annotated[tuple[Number, Number, Number] | None, BeforeValidator(_has_direction)]
+Z = (0.0, 0.0, 1.0)
+
+
+class _Joint(Table):
+    """What leaves a rigid body one way to move, along which a motor may drive it."""
+
+    motor: OfTime | None = Field(
+        None, description="Rate that a motor keeps, rad/s or m/s: a number, or an expression of t. Default: no motor."
+    )
+    strength: Positive | None = Field(
+        None, description="Largest torque of the motor, N m, or its largest force, N. Default: no limit."
+    )
+
+    @model_validator(mode="after")
+    def _strength_is_that_of_a_motor(self) -> "_Joint":
+        if self.strength is not None and self.motor is None:
+            raise flaw('is that of a motor; give "motor" as well', "strength")
+        return self
+
+
+class Hinge(_Joint):
+    """A hinge, about whose axis a rigid body turns."""
+
+    type: Literal["hinge"]
+    point: Vector | None = Field(None, description="Point of the axis, m. Default: the centre of mass.")
+    axis: SpinAxis = Field(None, description="Direction of the axis; 3D only. Default: [0, 0, 1].")
+
+    def way(self, arm: np.ndarray) -> np.ndarray:
+        """Return velocity and spin, (k,), at a rate of 1, of a body whose centre is at an arm (d,) from the point."""
+        axis = unit(self.axis or Z)
+        around = np.cross(axis, np.pad(arm, (0, 3 - len(arm))))
+        return np.concatenate([around[: len(arm)], axis[2:] if len(arm) == 2 else axis])
+
+
+class Slider(_Joint):
+    """A slider, along which a rigid body moves without turning."""
+
+    type: Literal["slider"]
+    axis: direction_as("[0, 1] has in 2D") = Field(description="Direction to move along, of any length.")
+
+    def way(self, arm: np.ndarray) -> np.ndarray:
+        """Return velocity and spin, (k,), at a rate of 1."""
+        return np.concatenate([unit(self.axis), np.zeros(2 * len(arm) - 3)])
+
+
+Joint = Annotated[Hinge | Slider, Field(discriminator="type")]
+# What of a motion may be fixed.
+Fixed = Literal["x", "y", "z", "rotation"]
+
+
+def ways_of(dimension: int, fixed: tuple[str, ...]) -> np.ndarray:
+    """Return in columns the velocities and spins of a body of which some are fixed, at a rate of 1 each."""
+    turns = 2 * dimension - 3
+    left = [a for a in range(dimension) if AXES[a] not in fixed]
+    left += [] if "rotation" in fixed else range(dimension, dimension + turns)
+    return np.eye(dimension + turns)[:, left]
 
 
 def turned_by(rotation: np.ndarray) -> np.ndarray:

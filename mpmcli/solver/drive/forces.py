@@ -36,14 +36,18 @@ MARGIN = 1.5
 Push = Callable[[int, int, int], tuple[float, float]]
 
 
-def forces_on(scene: Scene, members: Sequence[int]) -> tuple[Force, ...]:
-    names = {scene.sources[i].name for i in members}
+def names_of(scene: Scene, members: Sequence[int]) -> list[str]:
+    """Return the names of some bodies, given by their indices."""
+    return [scene.sources[i].name for i in members]
+
+
+def forces_on(scene: Scene, names: Sequence[str]) -> tuple[Force, ...]:
     return tuple(force for force in scene.pushes if force.body is None or force.body in names)
 
 
-def needs_initial(scene: Scene, members: Sequence[int]) -> bool:
+def needs_initial(scene: Scene, names: Sequence[str]) -> bool:
     """Return whether any force on these bodies depends on the initial position."""
-    trees = [tree_of(entry) for force in forces_on(scene, members) for entry in force.acceleration]
+    trees = [tree_of(entry) for force in forces_on(scene, names) for entry in force.acceleration]
     return any(names_in(tree) & set(INITIAL) for tree in trees)
 
 
@@ -57,7 +61,7 @@ class Term:
 
 @dataclass(frozen=True)
 class ForceTerms:
-    """Forces on particles of one law, as a kernel computes them; runs for which they are equal share kernels.
+    """Forces on particles of one law, or on rigid bodies, as a kernel computes them; where equal, runs share kernels.
 
     Attributes:
         moves, initial: whether any of them depends on the position, and on the initial position.
@@ -71,12 +75,11 @@ class ForceTerms:
     slope: Place | None = None
 
     @staticmethod
-    def of(scene: Scene, members: Sequence[int], entries: Entries) -> "ForceTerms":
-        """Return the forces on some bodies, given by their indices, with the numbers that they add to `entries`."""
-        forces = forces_on(scene, members)
-        if not forces:
+    def of(scene: Scene, names: Sequence[str], entries: Entries) -> "ForceTerms":
+        """Return the forces on some bodies, with the numbers that they add to `entries`."""
+        forces = forces_on(scene, names)
+        if not forces or not names:
             return ForceTerms()
-        names = [scene.sources[i].name for i in members]
         terms, found = [], set()
         for force in forces:
             trees = [tree_of(entry) for entry in force.acceleration]
@@ -100,12 +103,15 @@ class Drives:
     Attributes:
         gravity: along each axis, of the numbers of a run; nothing where it is steady. forces: on each law.
         motions: of each collider that moves, for velocity and spin the place of what depends on time, None of others.
+        rigid: on rigid bodies; motors: (which of them, rate).
         timed: of each number of a run whether it depends on time.
     """
 
     gravity: tuple[Place, ...]
     forces: tuple[ForceTerms, ...]
     motions: tuple[tuple[Place | None, ...], ...]
+    rigid: ForceTerms
+    motors: tuple[tuple[int, Place], ...]
     timed: tuple[bool, ...]
 
     @staticmethod
@@ -114,10 +120,14 @@ class Drives:
         entries = Entries(scene.domain.origin)
         steady = scene.domain.steady
         gravity = () if steady else tuple(entries.placed(tree_of(entry)) for entry in scene.domain.gravity)
-        forces = tuple(ForceTerms.of(scene, own, entries) for own in members)
+        forces = tuple(ForceTerms.of(scene, names_of(scene, own), entries) for own in members)
         moving = [collider.motion.rates for collider in scene.colliders if collider.driven]
         motions = tuple(tuple(entries.placed(tree) if names_in(tree) else None for tree in rates) for rates in moving)
-        return Drives(gravity, forces, motions, entries.timed), entries.found
+        free = [collider for collider in scene.colliders if collider.free]
+        rigid = ForceTerms.of(scene, [collider.name for collider in free], entries)
+        joints = [(j, collider.joint) for j, collider in enumerate(free) if collider.joint]
+        motors = tuple((j, entries.placed(tree_of(one.motor))) for j, one in joints if one.motor is not None)
+        return Drives(gravity, forces, motions, rigid, motors, entries.timed), entries.found
 
 
 @ti.data_oriented
@@ -209,6 +219,13 @@ class Gravity:
         return result
 
 
+def _nodes_of(forces: ForceTerms, values: DeviceValues) -> tuple[tuple[int, tuple[tuple[int, object], ...]], ...]:
+    """Return of each force its body, and each axis along which it acts with the node that evaluates it."""
+    return tuple(
+        (term.place, tuple((axis, node_of(tree, values)) for axis, tree in term.axes)) for term in forces.terms
+    )
+
+
 @ti.data_oriented
 class GroupForce:
     """All forces on one group of particles.
@@ -219,10 +236,7 @@ class GroupForce:
 
     def __init__(self, dimension: int, forces: ForceTerms, values: DeviceValues, room: int) -> None:
         """Build the nodes; `room` is the number of bodies that each run may have in the group."""
-        self.dimension = dimension
-        self.terms = tuple(
-            (term.place, tuple((axis, node_of(tree, values)) for axis, tree in term.axes)) for term in forces.terms
-        )
+        self.dimension, self.terms = dimension, _nodes_of(forces, values)
         self.moves, self.spreads = forces.moves, forces.moves and not forces.initial
         self.reach, self.slope = node_of(forces.reach, values), node_of(forces.slope, values)
         self.room = room
@@ -278,6 +292,35 @@ class GroupForce:
         else:
             a = self.at(group, p, x, X)
         return a, slope
+
+
+@ti.data_oriented
+class RigidDrive:
+    """Forces on rigid bodies, as accelerations of their centres, and the rates that their motors keep."""
+
+    def __init__(self, dimension: int, drives: Drives, values: DeviceValues) -> None:
+        self.dimension, self.terms = dimension, _nodes_of(drives.rigid, values)
+        self.motors = tuple((j, node_of(rate, values)) for j, rate in drives.motors)
+
+    @ti.func
+    def acceleration(self, j: int, x: ti.template(), X: ti.template(), run: int):
+        """Return the acceleration of the j-th body with its centre at x, at the start at X."""
+        result = ti.Vector.zero(float, self.dimension)
+        for place, axes in ti.static(self.terms):
+            if place < 0 or place == j:
+                for axis, node in ti.static(axes):
+                    result[axis] += node.evaluate(x, X, run)
+        return result
+
+    @ti.func
+    def motor(self, j: int, run: int):
+        """Return the rate that the motor of the j-th body keeps."""
+        result = 0.0
+        nowhere = ti.Vector.zero(float, self.dimension)
+        for which, node in ti.static(self.motors):
+            if which == j:
+                result = node.evaluate(nowhere, nowhere, run)
+        return result
 
 
 def build_push(group: ParticleArrays, backend: Backend) -> Push:

@@ -19,7 +19,7 @@ from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls, faces_on_gri
 from mpmcli.errors import InputError, RunError
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.body_contact import EXTREMES, BodyContact
-from mpmcli.solver.drive.forces import DriveValues, Gravity, push_on
+from mpmcli.solver.drive.forces import DriveValues, Gravity, RigidDrive, push_on
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.cpu_launch import CpuLaunch
 from mpmcli.solver.engine.device import Device
@@ -136,7 +136,8 @@ class Batch:
             colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, on_cpu=on_cpu, deterministic=deterministic)
             colliders.layered, colliders.own = kind.layers.separate, int(not kind.layers.shares)
             motion = ColliderMotion(colliders, runs) if kind.colliders.moving else None
-            rigid = RigidBodies(colliders, runs) if kind.colliders.free else None
+            pushes = RigidDrive(d, kind.drives, self.values.device)
+            rigid = RigidBodies(colliders, pushes, runs) if kind.colliders.free else None
         self.device = Device(
             runs,
             kind.particles,

@@ -157,7 +157,7 @@ class CpuPhases(CpuContact):
             self.device.values.set_motions(w, self.device.motion, start, start + dt)
             self.device.motion.advance(w, dt)
         if ti.static(self.rigid):
-            self.device.rigid.begin(w, dt, self.gravity_step(w))
+            self.device.rigid.begin(w, dt, self.values[w, KICK], self.gravity_step(w))
         for g in ti.static(range(len(self.members))):
             # A law may have no particle yet.
             self.values[w, self.rates + 2 * g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
@@ -413,7 +413,7 @@ class CpuPhases(CpuContact):
         """Move rigid bodies, with what the nodes lost to them."""
         if at.region == 0 and at.part == 0:
             dt = at.numbers[at.w, self.real.step]
-            at.nodes.rigid.take(at.w)
+            at.nodes.rigid.take(at.w, dt)
             self.device.rigid_contact.resolve(at.w, dt, at.particles.extent, at.nodes.colliders)
             speed_squared = at.nodes.rigid.move(at.w, dt)
             ti.atomic_max(self.values[at.w, SPEED], speed_squared)

@@ -20,7 +20,7 @@ from mpmcli.scene.sampling import estimate_body, has_expressions
 from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.contact.layers import Layers, require_contact_possible
 from mpmcli.solver.contact.surfaces import BodySurfaces
-from mpmcli.solver.drive.forces import forces_on, needs_initial
+from mpmcli.solver.drive.forces import forces_on, names_of, needs_initial
 from mpmcli.solver.engine.phases import step_phases
 from mpmcli.solver.frames.columns import FrameColumns
 from mpmcli.solver.grid.fixed_point import FixedPoint
@@ -176,7 +176,7 @@ def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = Fal
         separates=layers.separate,
         rigid=any(collider.free for collider in scene.colliders),
     )
-    forces = [" with forces" * bool(forces_on(scene, members_of(scene, law.name))) for law in members]
+    forces = [" with forces" * bool(forces_on(scene, names_of(scene, members_of(scene, law.name)))) for law in members]
     words = WORDS | {"update": "update grid" + " with colliders" * bool(scene.colliders)}
     return tuple(
         words[phase.name].format(members[phase.group].name) + forces[phase.group] * (phase.name == "scatter")
@@ -218,7 +218,8 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 dimension,
                 backend.precision,
                 several=bodies[name] > 1,
-                keeps_initial=scene.solver.solids == "total" or needs_initial(scene, members_of(scene, name)),
+                keeps_initial=scene.solver.solids == "total"
+                or needs_initial(scene, names_of(scene, members_of(scene, name))),
                 averaged=shares,
                 total=scene.solver.solids == "total",
                 slips=slips_in(scene.solver, rough_faces(scene)),
