@@ -109,6 +109,12 @@ def rafts_2d(result: Result) -> str:
     return f"what carries those that float, over their weights: {', '.join(f'{share:.3f}' for share in shares)}"
 
 
+def paddle_wheel_2d(result: Result) -> str:
+    """Compare the mean torque of the water in the second half with that of the brake."""
+    torque = np.mean([row.collider_torque[0] for row in result.ledger[len(result.ledger) // 2 :]])
+    return f"mean torque of the water {torque:.1f} N m, that of the brake 60"
+
+
 def billiard_2d(result: Result) -> str:
     """Say how far the momentum is off before a ball is at a cushion."""
     low, high = (corner + side * result.header.spacing for corner, side in ((0.0, 1), (result.header.upper, -1)))
@@ -374,4 +380,5 @@ KNOWN_ANSWERS = {
     "sand_obstacles_2d": kept_out,
     "silo_3d": kept_out,
     "rafts_2d": rafts_2d,
+    "paddle_wheel_2d": paddle_wheel_2d,
 }

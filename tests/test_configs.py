@@ -44,6 +44,7 @@ def test_these_are_the_scenes():
         "mixed_2d",
         "mixer_2d",
         "mud_slump_2d",
+        "paddle_wheel_2d",
         "rafts_2d",
         "rolling_3d",
         "rubber_bounce_2d",

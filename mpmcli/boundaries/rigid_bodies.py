@@ -1,108 +1,34 @@
 """Colliders that move freely: their velocities are found together with those of the nodes in reach.
 
-Each body has one velocity U, of its centre and its spin, with which its momentum and what the nodes give it agree:
-M U = P + sum A^T J(U), where J are the impulses of `Colliders.met` and A maps U to the velocity at a node. Newton's
-method finds it in rounds, of which each adds up the nodes row by row and then the rows in their order. Whatever it
-finds, the body gets exactly what the nodes lose in the update. Sums, momenta and poses are in double precision.
-
-U = W y, with a column of W for each way in which a body can move: all of them, those that `fixed` leaves, or the one of
-its joint. What holds it takes the rest of the momentum. A motor gives what keeps y, as far as its strength goes.
+Each body has one velocity U with which its momentum and what the nodes give it agree: M U = P + sum A^T J(U), where J
+are the impulses of `Colliders.met` and A maps U to the velocity at a node. Newton's method finds it in rounds, of which
+each adds up the nodes row by row and then the rows in their order. Whatever it finds, the body gets exactly what the
+nodes lose in the update.
 """
 
-import math
-
-import numpy as np
-
 from mpmcli.boundaries.colliders import HELD, LOOSE, REACH, Colliders
+from mpmcli.boundaries.rigid_motion import RigidMotion
 from mpmcli.quick_taichi import ti
-from mpmcli.scene import Scene
-from mpmcli.scene.rigid import Hinge
 
 # Most rounds of a step. A body is settled when a round would change less than this share of its energy with the nodes.
 ROUNDS, SETTLED = 6, 1e-12
-# Angle of a part of a turn in a step, rad, and most parts.
-PART, MOST_PARTS = 1e-3, 100.0
 
 
 @ti.data_oriented
-class RigidBodies:
-    """The colliders of some runs that move freely.
+class RigidBodies(RigidMotion):
+    """Rigid bodies among the nodes of the grid.
 
     Attributes:
-        free: their indices among the colliders of a run; run: whose bodies are meant; pushes: a `RigidDrive`.
-        pose: where their centres are, relative to the lower corner, m, and their angles, rad, or unit quaternions.
-        momentum: and angular momentum about the centre. booked: what they took from the material since the last frame.
-        rate: velocity and angular velocity, as the rounds of a step have found them so far.
-        support: what walls and the like gave each in the last step; the rounds take it for what they give in this one.
-        inertia: about the axes of the shape; mobility: the rate for a momentum, W (W^T M W)^-1 W^T, as it is now.
-        axes: in 3D the principal axes of the shape, a column each, and behind them the moments about them.
-        ways, left: W, and how many columns it has; spins: whether all rotations are among them.
-        start: where the centre was; kick: what gravity and forces add to its velocity in this step, m/s.
-        hinge: where the point of a hinge is, and from it the centre, about the axes of the shape, m; hinged: whether
-            there is one.
-        strength: of a motor, N m or N, 0 without; motor: the rate that it keeps; drive: its impulse in this step.
-        weight, square: of the first way w: w^T M w and w^T w.
         sums: impulses of nodes on each, and the matrix that says how they fall with its velocity, by rows of nodes;
-            total: of all rows.
+            total: of all rows; entries: numbers of each.
     """
 
     def __init__(self, colliders: Colliders, drive: object, runs: int) -> None:
-        self.pushes = drive
-        self.colliders, self.dimension, self.free = colliders, colliders.dimension, colliders.kind.free
-        self.loads, self.turns, self.run = colliders.loads.width, 1 if colliders.dimension == 2 else 3, 0
-        self.count, self.width = len(self.free), self.dimension + (1 if self.dimension == 2 else 4)
-        self.entries = self.loads + self.loads * (self.loads + 1) // 2
+        super().__init__(colliders, drive, runs)
         n = runs * self.count
-        self.numbers = ti.field(int, shape=self.count)
-        self.numbers.from_numpy(np.array(self.free, np.int32))
-        self.pose = ti.field(ti.f64, shape=(n, self.width))
-        self.momentum, self.rate, self.booked, self.support = (
-            ti.field(ti.f64, shape=(n, self.loads)) for _ in range(4)
-        )
-        self.mass, self.weight, self.square, self.strength, self.motor, self.drive = (
-            ti.field(ti.f64, shape=n) for _ in range(6)
-        )
-        self.inertia = ti.Matrix.field(self.turns, self.turns, ti.f64, shape=n)
-        self.mobility, self.ways = (ti.field(ti.f64, shape=(n, self.loads, self.loads)) for _ in range(2))
-        self.left, self.spins, self.hinged = (ti.field(int, shape=n) for _ in range(3))
-        self.hinge = ti.Matrix.field(2, self.dimension, ti.f64, shape=n)
-        self.start, self.kick = (ti.Vector.field(self.dimension, kind, shape=n) for kind in (float, ti.f64))
-        if self.dimension == 3:
-            self.axes = ti.field(ti.f64, shape=(n, 4, 3))
-        self.settled = ti.field(int, shape=n)
+        self.entries = self.loads + self.loads * (self.loads + 1) // 2
         self.sums = ti.field(ti.f64, shape=(n * colliders.loads.rows, self.entries))
         self.total = ti.field(ti.f64, shape=(n, self.entries))
-        # The matrix of an equation for U and its right side; the same for y, with room for several right sides.
-        self.system = ti.field(ti.f64, shape=(n, self.loads, self.loads + 1))
-        self.reduced = ti.field(ti.f64, shape=(n, self.loads, 2 * self.loads))
-
-    def write(self, scene: Scene, run: int = 0) -> None:
-        """Set the bodies of a run, at time 0."""
-        d, origin = self.dimension, np.array(scene.domain.origin)
-        for j, k in enumerate(self.free):
-            collider, b = scene.colliders[k], run * self.count + j
-            moments, ways, joint = collider.moments, collider.ways, collider.joint
-            start = [*(np.array(moments.center) - origin), *([0.0] if d == 2 else [1.0, 0.0, 0.0, 0.0])]
-            inert = np.zeros((self.loads, self.loads))
-            inert[:d, :d], inert[d:, d:] = moments.mass * np.eye(d), moments.inertia
-            mobility = ways @ np.linalg.inv(ways.T @ inert @ ways) @ ways.T
-            found, axes = np.linalg.eigh(moments.inertia)
-            zeros = np.zeros(self.loads)
-            rows = {self.pose: start, self.momentum: inert @ collider.rates, self.booked: zeros, self.support: zeros}
-            rows |= {self.mobility: mobility, self.ways: ways}
-            rows |= {self.axes: np.vstack([axes, found])} if d == 3 else {}
-            for field, values in rows.items():
-                for place, value in np.ndenumerate(np.array(values)):
-                    field[b, *place] = value
-            self.mass[b], self.inertia[b] = moments.mass, moments.inertia.tolist()
-            first = ways[:, 0]
-            self.weight[b], self.square[b] = first @ inert @ first, first @ first
-            self.left[b], self.spins[b] = ways.shape[1], int(np.linalg.matrix_rank(ways[d:]) == self.turns)
-            self.hinged[b] = int(isinstance(joint, Hinge))
-            self.start[b] = start[:d]
-            self.hinge[b] = [(np.array(moments.center) - collider.arm - origin).tolist(), collider.arm.tolist()]
-            driven = joint is not None and joint.motor is not None
-            self.strength[b] = (joint.strength or math.inf) if driven else 0.0
 
     @ti.func
     def sum_up(self, run: int, frame: int, column: int, notes: ti.template()):
@@ -119,31 +45,7 @@ class RigidBodies:
                 notes[run, frame, taken + a] += self.booked[b, a]
                 self.booked[b, a] = ti.cast(0, ti.f64)
 
-    # A step.
-
-    @ti.func
-    def begin(self, run: int, dt: ti.f64, kick: float, pull: ti.template()):
-        """Begin a step of dt seconds: put the bodies in place.
-
-        Gravity changes velocities by pull, m/s, and forces act for kick seconds.
-        """
-        d = ti.static(self.dimension)
-        for j in range(self.count):
-            b = run * self.count + j
-            i = self.collider_of(run, j)
-            turned = self.turned(b)
-            for a in ti.static(range(d)):
-                self.colliders.place[i][a] = ti.cast(self.pose[b, a], float)
-            push = pull + kick * self.pushes.acceleration(j, self.colliders.place[i], self.start[b], run)
-            self.motor[b] = ti.cast(self.pushes.motor(j, run), ti.f64)
-            for a in ti.static(range(d)):
-                self.kick[b][a] = ti.cast(push[a], ti.f64)
-                self.momentum[b, a] += self.mass[b] * self.kick[b][a]
-                for c in ti.static(range(d)):
-                    self.colliders.turned[i][a, c] = ti.cast(turned[a, c], float)
-            self.take_rate(b)
-            self.show_rate(b, i, dt)
-            self.settled[b] = 0
+    # A round.
 
     @ti.func
     def near(self, node: ti.template(), axes: ti.template()):
@@ -264,114 +166,6 @@ class RigidBodies:
             self.settled[b] = 1
 
     @ti.func
-    def set_inertia(self, b: int):
-        """Let the matrix of the system of body b be that of its mass and inertia."""
-        d = ti.static(self.dimension)
-        own = self.inertia[b]
-        if ti.static(d == 3):
-            turned = self.turned(b)
-            own = turned @ own @ turned.transpose()
-        for a in range(self.loads):
-            for c in range(self.loads):
-                self.system[b, a, c] = self.mass[b] if a == c else ti.cast(0, ti.f64)
-        for a, c in ti.static(ti.ndrange(self.turns, self.turns)):
-            self.system[b, d + a, d + c] = own[a, c]
-
-    @ti.func
-    def reduce(self, b: int):
-        """Set the matrix W^T S W of body b, S that of its system."""
-        n, ways = ti.static(self.loads), self.left[b]
-        for m in range(ways):
-            for a in range(n):
-                # S W, behind the matrix.
-                moved = ti.cast(0, ti.f64)
-                for c in range(n):
-                    moved += self.system[b, a, c] * self.ways[b, c, m]
-                self.reduced[b, a, n + m] = moved
-        for k in range(ways):
-            for m in range(ways):
-                entry = ti.cast(0, ti.f64)
-                for a in range(n):
-                    entry += self.ways[b, a, k] * self.reduced[b, a, n + m]
-                self.reduced[b, k, m] = entry
-
-    @ti.func
-    def eliminate(self, b: int, sides: int):
-        """Solve the reduced system of body b, which is symmetric and positive, for some right sides, in their place."""
-        n = self.left[b]
-        for k in range(n):
-            first = 1.0 / self.reduced[b, k, k]
-            for c in range(k, n + sides):
-                self.reduced[b, k, c] = self.reduced[b, k, c] * first
-            for a in range(n):
-                factor = self.reduced[b, a, k]
-                if a != k:
-                    for c in range(k, n + sides):
-                        self.reduced[b, a, c] = self.reduced[b, a, c] - factor * self.reduced[b, k, c]
-
-    @ti.func
-    def set_mobility(self, b: int):
-        """Set the mobility of body b as it is now."""
-        n, ways = ti.static(self.loads), self.left[b]
-        self.set_inertia(b)
-        self.reduce(b)
-        self.weight[b] = self.reduced[b, 0, 0]
-        for k in range(ways):
-            for a in range(n):
-                self.reduced[b, k, ways + a] = self.ways[b, a, k]
-        self.eliminate(b, n)
-        for a in range(n):
-            for c in range(n):
-                entry = ti.cast(0, ti.f64)
-                for k in range(ways):
-                    entry += self.ways[b, a, k] * self.reduced[b, k, ways + c]
-                self.mobility[b, a, c] = entry
-
-    # Of a body that a joint holds.
-
-    @ti.func
-    def rate_of(self, b: int):
-        """Return the rate of body b along its first way, the one of a joint, times the square of the length of that."""
-        result = ti.cast(0, ti.f64)
-        for a in range(self.loads):
-            result += self.ways[b, a, 0] * self.rate[b, a]
-        return result
-
-    @ti.func
-    def turn_motor(self, b: int, dt: ti.f64):
-        """Let the motor of body b give in all, in a step of dt seconds, what keeps its rate, or what it can."""
-        if self.strength[b] > 0:
-            square = self.square[b]
-            given = self.clamped(b, dt, self.drive[b] + (self.motor[b] - self.rate_of(b) / square) * self.weight[b])
-            for a in range(self.loads):
-                self.momentum[b, a] += self.ways[b, a, 0] * (given - self.drive[b]) / square
-            self.drive[b] = given
-            self.take_rate(b)
-
-    @ti.func
-    def clamped(self, b: int, dt: ti.f64, impulse: ti.f64):
-        """Return what the motor of body b can give of an impulse in dt seconds."""
-        return ti.max(ti.min(impulse, self.strength[b] * dt), -self.strength[b] * dt)
-
-    @ti.func
-    def follow(self, b: int):
-        """Put the centre of body b where the hinge leaves it, and let it move on about that."""
-        d = ti.static(self.dimension)
-        rate = self.rate_of(b) / self.square[b]
-        arm, spin = ti.Vector.zero(ti.f64, d), ti.Vector.zero(ti.f64, self.turns)
-        for a in ti.static(range(d)):
-            arm[a] = self.hinge[b][1, a]
-        arm = self.turned(b) @ arm
-        for a in ti.static(range(self.turns)):
-            spin[a] = self.ways[b, ti.static(d + a), 0]
-        along = self.crossed(spin) @ arm
-        for a in ti.static(range(d)):
-            self.pose[b, a] = self.hinge[b][0, a] + arm[a]
-            self.ways[b, a, 0] = along[a]
-        for a in range(self.loads):
-            self.rate[b, a] = rate * self.ways[b, a, 0]
-
-    @ti.func
     def take(self, run: int, dt: ti.f64):
         """Give the bodies what the nodes lost."""
         for j in range(self.count):
@@ -391,195 +185,6 @@ class RigidBodies:
             self.take_rate(b)
             self.drive[b] = 0
             self.turn_motor(b, dt)
-
-    @ti.func
-    def move(self, run: int, dt: ti.f64):
-        """End a step: move the bodies; return the square of their largest speed."""
-        d = ti.static(self.dimension)
-        fastest = 0.0
-        for j in range(self.count):
-            b = run * self.count + j
-            i = self.collider_of(run, j)
-            speed, spin = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-            for a in ti.static(range(d)):
-                self.pose[b, a] += dt * self.rate[b, a]
-                speed += self.rate[b, a] ** 2
-            for a in ti.static(range(d, self.loads)):
-                spin += self.rate[b, a] ** 2
-            self.turn(b, dt)
-            if self.hinged[b] == 1:
-                self.follow(b)
-            self.set_mobility(b)
-            if self.left[b] < self.loads:
-                # What holds it takes the momentum in other directions.
-                if self.hinged[b] == 0:
-                    self.take_rate(b)
-                for a in range(self.loads):
-                    self.momentum[b, a] = 0
-                    for c in range(self.loads):
-                        self.momentum[b, a] += self.system[b, a, c] * self.rate[b, c]
-            reached = ti.sqrt(speed) + ti.sqrt(spin) * ti.cast(self.colliders.reach[i][1, 0], ti.f64)
-            fastest = ti.max(fastest, ti.cast(reached * reached, float))
-        return fastest
-
-    @ti.func
-    def turn(self, b: int, dt: ti.f64):
-        """Turn body b about its centre in dt seconds: its angular momentum stays, or its spin where that is held.
-
-        A free one in 3D in parts, of each turns about the principal axes one after another (Dullweber, Leimkuhler and
-        McLachlan 1997): the energy swings by the square of an angle PART, and does not drift.
-        """
-        if ti.static(self.dimension == 2):
-            self.pose[b, 2] += dt * self.rate[b, 2]
-        else:
-            q, square = ti.Vector([self.pose[b, 3 + a] for a in range(4)]), ti.cast(0, ti.f64)
-            momentum = ti.Vector([self.momentum[b, 3 + a] for a in range(3)])
-            for a in ti.static(range(3)):
-                square += self.rate[b, 3 + a] ** 2
-            parts = ti.cast(ti.min(ti.sqrt(square) * dt / PART, MOST_PARTS), int) + 1
-            if self.spins[b] == 0:
-                parts = 0
-                half = 0.5 * dt * ti.sqrt(square)
-                scale = 0.5 * dt * self.sinc(half)
-                spin = ti.Vector([scale * self.rate[b, 3 + a] for a in range(3)])
-                q = self.product_of(ti.Vector([ti.cos(half), spin[0], spin[1], spin[2]]), q)
-            for _ in range(parts):
-                for k in range(5):
-                    c = 2 - ti.abs(2 - k)
-                    axis = ti.Vector([self.axes[b, a, c] for a in range(3)])
-                    half = 0.5 * dt / parts * momentum.dot(self.carried(q, axis)) / self.axes[b, 3, c]
-                    if c < 2:
-                        half *= 0.5
-                    s = ti.sin(half)
-                    q = self.product_of(q, ti.Vector([ti.cos(half), s * axis[0], s * axis[1], s * axis[2]]))
-            q = q.normalized()
-            for a in ti.static(range(4)):
-                self.pose[b, 3 + a] = q[a]
-
-    @ti.func
-    def carried(self, q: ti.template(), v: ti.template()):
-        """Return a vector turned by a unit quaternion."""
-        u = ti.Vector([q[1], q[2], q[3]])
-        side = 2.0 * u.cross(v)
-        return v + q[0] * side + u.cross(side)
-
-    @ti.func
-    def product_of(self, p: ti.template(), q: ti.template()):
-        """Return the product of two quaternions."""
-        v, u = ti.Vector([p[1], p[2], p[3]]), ti.Vector([q[1], q[2], q[3]])
-        w = p[0] * u + q[0] * v + v.cross(u)
-        return ti.Vector([p[0] * q[0] - v.dot(u), w[0], w[1], w[2]])
-
-    # Of a body.
-
-    @ti.func
-    def load_of(self, impulse: ti.template(), arm: ti.template()):
-        """Return what `Loads.of` does, in double precision."""
-        load = ti.Vector.zero(ti.f64, self.loads)
-        for a in ti.static(range(self.dimension)):
-            load[a] = impulse[a]
-        if ti.static(self.dimension == 2):
-            load[2] = arm[0] * impulse[1] - arm[1] * impulse[0]
-        else:
-            turning = arm.cross(impulse)
-            for a in ti.static(range(3)):
-                load[3 + a] = turning[a]
-        return load
-
-    @ti.func
-    def velocity_at(self, b: int, arm: ti.template()):
-        """Return the velocity of body b at an arm from its centre."""
-        spin, result = ti.Vector.zero(ti.f64, self.turns), ti.Vector.zero(ti.f64, self.dimension)
-        for a in ti.static(range(self.turns)):
-            spin[a] = self.rate[b, ti.static(self.dimension + a)]
-        turning = self.crossed(spin) @ arm
-        for a in ti.static(range(self.dimension)):
-            result[a] = self.rate[b, a] + turning[a]
-        return result
-
-    @ti.func
-    def hit(self, b: int, impulse: ti.template(), arm: ti.template()):
-        """Give body b an impulse at an arm from its centre."""
-        load = self.load_of(impulse, arm)
-        for a in ti.static(range(self.loads)):
-            self.momentum[b, a] = self.momentum[b, a] + load[a]
-            self.support[b, a] = self.support[b, a] + load[a]
-        self.take_rate(b)
-
-    @ti.func
-    def yields(self, b: int, n: ti.template(), arm: ti.template()):
-        """Return by how much the velocity of body b along n grows with an impulse along it at an arm, 1/kg."""
-        load, result = self.load_of(n, arm), ti.cast(0, ti.f64)
-        for a in ti.static(range(self.loads)):
-            for c in ti.static(range(self.loads)):
-                result += load[a] * self.mobility[b, a, c] * load[c]
-        return result
-
-    @ti.func
-    def collider_of(self, run: int, j: int):
-        """Return the index of the j-th body among the colliders of all runs."""
-        return run * self.colliders.room + self.numbers[j]
-
-    @ti.func
-    def turned(self, b: int):
-        """Return the rotation of body b, (d, d)."""
-        d = ti.static(self.dimension)
-        result = ti.Matrix.zero(ti.f64, d, d)
-        if ti.static(d == 2):
-            c, s = ti.cos(self.pose[b, 2]), ti.sin(self.pose[b, 2])
-            result[0, 0], result[0, 1], result[1, 0], result[1, 1] = c, -s, s, c
-        else:
-            cross = self.crossed(ti.Vector([self.pose[b, 4 + a] for a in range(3)]))
-            square = cross @ cross
-            for a in ti.static(range(3)):
-                for c in ti.static(range(3)):
-                    own = 1.0 if ti.static(a == c) else 0.0
-                    result[a, c] = own + 2.0 * (self.pose[b, 3] * cross[a, c] + square[a, c])
-        return result
-
-    @ti.func
-    def crossed(self, v: ti.template()):
-        """Return the matrix (d, d) that maps an arm to the velocity there for a spin, of 1 or 3 numbers."""
-        d = ti.static(self.dimension)
-        result = ti.Matrix.zero(ti.f64, d, d)
-        if ti.static(d == 2):
-            result[0, 1], result[1, 0] = -v[0], v[0]
-        else:
-            for a in ti.static(range(3)):
-                b, c = ti.static((a + 1) % 3), ti.static((a + 2) % 3)
-                result[b, c], result[c, b] = -v[a], v[a]
-        return result
-
-    @ti.func
-    def take_rate(self, b: int):
-        """Let body b have the velocity that follows from its momentum."""
-        for a in range(self.loads):
-            rate = ti.cast(0, ti.f64)
-            for c in range(self.loads):
-                rate += self.mobility[b, a, c] * self.momentum[b, c]
-            self.rate[b, a] = rate
-
-    @ti.func
-    def sinc(self, x: ti.f64):
-        """Return sin(x) / x."""
-        return ti.sin(x) / x if x > 0 else ti.cast(1, ti.f64)
-
-    @ti.func
-    def show_rate(self, b: int, i: int, dt: ti.f64):
-        """Let nodes meet body b, which is collider i, with its rate: the chords of a step of dt seconds."""
-        d = ti.static(self.dimension)
-        spin, square = ti.Vector.zero(ti.f64, self.turns), ti.cast(0, ti.f64)
-        for a in ti.static(range(self.turns)):
-            spin[a] = self.rate[b, d + a]
-            square += spin[a] ** 2
-        angle = dt * ti.sqrt(square)
-        half = self.sinc(0.5 * angle)
-        cross = self.crossed(spin)
-        turning = self.sinc(angle) * cross + (0.5 * dt * half * half) * (cross @ cross)
-        for a in ti.static(range(d)):
-            self.colliders.velocity[i][a] = ti.cast(self.rate[b, a], float)
-            for c in ti.static(range(d)):
-                self.colliders.turning[i][a, c] = ti.cast(turning[a, c], float)
 
     # Rows of nodes in reach.
 
