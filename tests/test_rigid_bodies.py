@@ -1,5 +1,6 @@
 """Colliders with a density: they fall, spin, share momentum with the material, float, slide and stand."""
 
+import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -406,4 +407,13 @@ def test_a_result_has_the_body_where_it_was(tmp_path: Path) -> None:
     assert done.status == 0
     with np.load(tmp_path / "out" / "000000.npz") as file:
         assert file["wall_position"].mean(axis=1) == pytest.approx(places[:, :2], abs=2e-3)
+        assert file["rigid_pose"][:, 0] == pytest.approx(places)
+        assert file["rigid_motion"][-1, 0] == pytest.approx([0.1, -G * 0.1, 3.0], abs=G * 0.005)
+    # The types of LagrangeBench and of "Learning to simulate" for rigid bodies.
+    for form, number in (("lagrangebench", 3), ("gns", 0)):
+        done = run_here("export", tmp_path / "run", "--to", form, "-o", tmp_path / form, "--walls", "colliders")
+        assert done.status == 0
+        types = json.loads((tmp_path / form / "metadata.json").read_text())["particle_types"]
+        assert types["rigid_body"] == number
+        assert number not in [types[name] for name in types if name != "rigid_body"]
     assert check_result(tmp_path / "run").verdict == "stable"

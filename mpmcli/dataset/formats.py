@@ -20,8 +20,9 @@ from mpmcli.dataset.metadata import (
     require_alike,
 )
 from mpmcli.dataset.shard import LABELS, MOVING, SPLITS, group_name
-from mpmcli.dataset.thinned import ThinnedTrajectory
+from mpmcli.dataset.thinned import KINDS, ThinnedTrajectory
 from mpmcli.errors import InputError
+from mpmcli.frames.ledger import RIGID
 from mpmcli.output.durable import ask_for
 from mpmcli.output.layout import POSITION
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
@@ -49,7 +50,7 @@ class Format(ABC):
 
 
 class LearnerFormat(Format):
-    """A file for each split; laws have particle types from `usual`, then `free`; walls have `wall` or `moving_wall`."""
+    """A file for each split; laws have particle types from `usual`, then `free`; `KINDS` are the types of walls."""
 
     name: ClassVar[str]
     suffix: ClassVar[str]
@@ -57,6 +58,7 @@ class LearnerFormat(Format):
     free: ClassVar[Sequence[int]]
     wall: ClassVar[int]
     moving_wall: ClassVar[int]
+    rigid_body: ClassVar[int]
     parameters: Sequence[str] = ()
 
     @abstractmethod
@@ -102,25 +104,24 @@ class LearnerFormat(Format):
     def types(self) -> dict[str, int]:
         """The particle type of each law; an InputError says that there are more laws than types."""
         laws = sorted({law.name for each in self.trajectories for law in each.source.header.laws})
-        types = {name: self.usual[name] for name in laws if name in self.usual}
+        taken = self._wall_types().values()
+        types = {name: self.usual[name] for name in laws if self.usual.get(name, -1) not in {-1, *taken}}
         others = [name for name in laws if name not in types]
-        left = [number for number in self.free if number not in types.values()]
+        left = [number for number in self.free if number not in {*types.values(), *taken}]
         if others[len(left) :]:
             law = others[len(left)]
             raise InputError(f"{self.name} has no particle type left for {law}, the law of some of the particles.")
         return types | dict(zip(others, left, strict=False))
 
     def _wall_types(self) -> dict[str, int]:
-        moving = {bool(moves) for each in self.trajectories for moves in np.unique(each.walls.moving)}
-        if self.wall == self.moving_wall:
-            return {"wall": self.wall} if moving else {}
-        known = {"wall": (False, self.wall), "moving_wall": (True, self.moving_wall)}
-        return {name: number for name, (moves, number) in known.items() if moves in moving}
+        found = {KINDS[k] for each in self.trajectories for k in np.unique(each.walls.kinds)}
+        known = {name: getattr(self, name) for name in KINDS if name in found}
+        return {"wall" if number == self.wall else name: number for name, number in known.items()}
 
     def particle_types(self, trajectory: ThinnedTrajectory) -> np.ndarray:
         """Return the type of each particle, and then of each on walls, (N + W,) int64."""
         laws = np.array([self.types[law.name] for law in trajectory.source.header.laws], np.int64)
-        walls = np.where(trajectory.walls.moving, self.moving_wall, self.wall).astype(np.int64)
+        walls = np.array([getattr(self, name) for name in KINDS], np.int64)[trajectory.walls.kinds]
         return np.concatenate([laws[trajectory.label("material")], walls])
 
 
@@ -140,7 +141,7 @@ class LagrangeBench(LearnerFormat):
     # Its own types are 0 fluid, 1 solid wall, 2 moving wall, 3 rigid body, -1 padding, out of 9.
     usual: ClassVar = {"fluid": 0, "sand": 4, "viscoplastic": 5, "snow": 6, "von_mises": 7, "fixed_corotated": 8}
     free = (8, 7, 6, 5, 4)
-    wall, moving_wall = 1, 2
+    wall, moving_wall, rigid_body = 1, 2, 3
 
     def check(self) -> None:
         super().check()
@@ -222,10 +223,11 @@ class Gns(LearnerFormat):
 
     name, suffix = "GNS", ".npz"
     # As in the data of DeepMind's "Learning to simulate": 5 water, 6 sand, 7 goop; 3 stands for particles whose motion
-    # is given, here those on walls.
+    # is given, here those on walls, and 0 for rigid bodies.
     usual: ClassVar = dict(fluid=5, sand=6, viscoplastic=7, fixed_corotated=0, neo_hookean=1, snow=2, von_mises=4)
     free = (8, 4, 2, 1, 0, 7)
     wall = moving_wall = 3
+    rigid_body = 0
 
     def check(self) -> None:
         for each in self.trajectories:
@@ -327,6 +329,7 @@ class Npz(Format):
 
     @staticmethod
     def _arrays(trajectory: ThinnedTrajectory) -> Iterable[tuple[str, np.ndarray]]:
+        rows = trajectory.ledger()
         for name in (*MOVING, *trajectory.source.field_names):
             yield name, trajectory.read(name)
         for name in LABELS:
@@ -338,6 +341,9 @@ class Npz(Format):
             dtype = trajectory.layout.arrays["Points"].dtype
             yield "wall_position", trajectory.walls.positions(trajectory.times).astype(dtype)
             yield "wall_collider", trajectory.walls.numbers
+        if rows[0].rigid_pose:
+            for name in RIGID:
+                yield name, np.array([getattr(row, name) for row in rows])
 
 
 class Vtkhdf(Format):

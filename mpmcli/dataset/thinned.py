@@ -13,11 +13,14 @@ from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
 from mpmcli.scene.colliders import Collider, Motion
 from mpmcli.scene.primitives import Box
+from mpmcli.scene.rigid import Path
 from mpmcli.scene.surface import collider_surface, form_surface, surface_points
 
 # Of colliders, or of the domain as well.
 Walls = Literal["none", "colliders", "all"]
 WALLS: tuple[Walls, ...] = ("none", "colliders", "all")
+# What a particle on a wall is part of: what rests, what moves as the scene says, or what moves freely.
+KINDS = ("wall", "moving_wall", "rigid_body")
 # The number in place of that of a collider, of the walls of the domain.
 DOMAIN = -1
 # Distance in spacings to which a point is on a surface.
@@ -37,9 +40,9 @@ class WallParticles:
     spacing: float
 
     @cached_property
-    def _parts(self) -> list[tuple[int, np.ndarray, Motion | None]]:
+    def _parts(self) -> list[tuple[int, np.ndarray, Motion | Path | None]]:
         """Number, points (n, d) and motion of each wall; None for one that rests, whose points lie where they are."""
-        found: list[tuple[int, np.ndarray, Motion | None]] = []
+        found: list[tuple[int, np.ndarray, Motion | Path | None]] = []
         header = self.header
         if self.walls == "none" or header.origin is None:
             return found
@@ -83,9 +86,10 @@ class WallParticles:
         return np.repeat(np.array([number for number, _, _ in self._parts], np.int32), self._sizes)
 
     @property
-    def moving(self) -> np.ndarray:
-        """Whether each particle moves, (W,) bool."""
-        return np.repeat(np.array([motion is not None for _, _, motion in self._parts], bool), self._sizes)
+    def kinds(self) -> np.ndarray:
+        """What each particle is part of, an index into KINDS, (W,) int."""
+        kinds = [0 if motion is None else 2 if isinstance(motion, Path) else 1 for _, _, motion in self._parts]
+        return np.repeat(np.array(kinds, int), self._sizes)
 
     def positions(self, times: Sequence[float]) -> np.ndarray:
         """Return where they are at some times, s: (T, W, d) float64, m."""
