@@ -30,6 +30,7 @@ def test_these_are_the_sweeps():
         "sand_boxes_2d",
         "sand_obstacles_2d",
         "thrown_blocks_2d",
+        "thrown_stones_2d",
         "water_drop_2d",
     ]
     used = {load_sweep(path, laws=LAWS).base.name for path in SWEEPS}
