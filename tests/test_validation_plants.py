@@ -246,6 +246,27 @@ PLANTS = (
         "lost *= 1.0",
         ("snow_oedometer",),
     ),
+    Plant(
+        "rigid bodies get no torque",
+        "boundaries/rigid_bodies.py",
+        "self.momentum[b, a] = self.momentum[b, a] + self.colliders.loads.taken[row][a]",
+        "self.momentum[b, a] = self.momentum[b, a] + (1.0 if a < 2 else 0.0) * self.colliders.loads.taken[row][a]",
+        ("floating_box",),
+    ),
+    Plant(
+        "a torque with the wrong sign",
+        "boundaries/loads.py",
+        "load[2] = arm[0] * impulse[1] - arm[1] * impulse[0]",
+        "load[2] = arm[1] * impulse[0] - arm[0] * impulse[1]",
+        ("floating_box",),
+    ),
+    Plant(
+        "rigid bodies meet nodes as fast as they were",
+        "boundaries/rigid_bodies.py",
+        "self.rate[b, a] += self.ways[b, a, k] * found",
+        "self.rate[b, a] += 0.0 * self.ways[b, a, k] * found",
+        ("floating_box",),
+    ),
 )
 
 
