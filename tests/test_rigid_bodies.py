@@ -125,9 +125,24 @@ def test_check_sees_what_is_thin_or_begins_inside() -> None:
     said = [(one.rule, one.what.split('"')[1], round(one.value, 2)) for one in found if one.severity == "warning"]
     expected = [("thin", "bar 0", 2.0), ("overlap", "bar 1", 0.4), ("overlap", "bar 2", 1.0), ("overlap", "bar 3", 1.0)]
     assert [one for one in said if one[1].startswith("bar")] == expected
+    huge = check_scene(LoadedScene(scene(2, -G, {"shape": box([-0.3, 0.7], [1.5, 0.9])}), (), "scene.toml")).findings
+    (what,) = (one.what for one in huge if one.rule == "too-large" and one.severity == "error")
+    assert "1.5 times as long as the domain" in what
     # Nothing is beyond an open face.
     asked = scene(2, -G, sunk, domain={"walls": {"y_min": "open"}})
     assert not any(one.rule == "overlap" for one in check_scene(LoadedScene(asked, (), "scene.toml")).findings)
+
+
+def test_check_says_what_a_stiff_body_costs() -> None:
+    """A bar a hundred times as stiff as the jelly, and three times as dense: steps sqrt(100 / 3) times as short."""
+    bar = {"name": "bar", "material": JELLY | {"density": 3000.0, "youngs_modulus": 1e7}}
+    bar["shape"] = box([0.7, 0.4], [0.9, 0.6])
+    jelly = {"name": "jelly", "material": JELLY, "shape": box([0.3, 0.4], [0.5, 0.65])}
+    for others, times in (([bar], math.sqrt(100 / 3)), ([], None), ([bar | {"material": JELLY}], None)):
+        domain, time = {"size": [1.2, 1.2], "spacing": H, "gravity": [0.0, -G]}, {"end": 0.1, "frames": 2}
+        other = scene_of(domain=domain, time=time, bodies=[jelly, *others])
+        found = [one for one in check_scene(LoadedScene(other, (), "scene.toml")).findings if one.rule == "stiff"]
+        assert [one.value for one in found] == ([] if times is None else [pytest.approx(times, rel=0.2)])
 
 
 # Motion.

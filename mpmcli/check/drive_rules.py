@@ -73,6 +73,11 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
             what = f'Rigid body "{body.name}" is {cells:.2g} cells thick: what is on its two sides meets through it.'
             fix = f"Make it {FEWEST_CELLS:g} cells thick, or the spacing {h * cells / FEWEST_CELLS:.2g} m."
             yield Finding("warning", "thin", what, fix, cells, body.name)
+        long = np.where(shut.all(axis=1), (upper - lower) / scene.domain.size, 0.0)
+        if long.max() > 1:
+            what = f'Rigid body "{body.name}" is {long.max():.3g} times as long as the domain between its walls.'
+            yield Finding("error", "too-large", what, "Make it smaller, or the domain larger.", long.max(), body.name)
+            continue
         points = surface_points(form_surface(body.form), h)
         sides = np.stack([points - scene.domain.origin, scene.domain.upper - points], axis=-1)[:, shut]
         others = [(f'collider "{one.name}"', one.signed_distance(points)) for one in scene.colliders if one is not body]

@@ -17,6 +17,8 @@ from mpmcli.stability.transfer_factors import impact_loss, loss_per_step, step_i
 # Ratio to the stable step below which a step is reported: four times the cost and loss of energy (tests/hard_cases,
 # H19).
 SMALL_STEP = 0.25
+# Factor on the step without a body from which on that is said.
+MUCH_STIFFER = 4.0
 # Consequence of a step above each limit.
 LONE = "above it a lone particle, and with it the run, is unstable"
 CONSEQUENCE = {
@@ -40,7 +42,8 @@ STRESS_NOISE = 0.01
 
 
 def step_findings(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield the findings on time.step."""
+    """Yield the findings on time.step, and on a body that is much stiffer than all others."""
+    yield from _stiff(facts)
     step, safety = facts.scene.time.step, facts.scene.time.safety
     if step == "auto":
         return
@@ -74,6 +77,20 @@ def step_findings(facts: SceneFacts) -> Iterator[Finding]:
         )
         fix = f'Set time.step to {facts.step:.4g} s, or to "auto".'
         yield Finding("warning", "small-step", what, fix, step / facts.step)
+
+
+def _stiff(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield a solid that alone sets the step: as a rigid body it would set none."""
+    binding = facts.binding
+    body = next((one for one in facts.scene.bodies if one.name == binding.body), None)
+    if body is None or not body.material.solid or body.shape.points or len(facts.scene.sources) < 2:
+        return
+    times = min(limit.value for limit in facts.limits if limit.body != binding.body) / binding.value
+    if times < MUCH_STIFFER:
+        return
+    what = f'Body "{body.name}" alone sets the step: without it steps would be {times:.2g} times as long.'
+    fix = f"If it need not deform, make it a collider with density = {body.material.density:g}: a rigid body."
+    yield Finding("note", "stiff", what, fix, times, body.name)
 
 
 def loss_findings(facts: SceneFacts) -> Iterator[Finding]:
