@@ -80,6 +80,7 @@ def test_moments_are_those_of_the_form() -> None:
             "colliders[0].fixed: is for one that moves freely; give its density or mass",
         ),
         ({"fixed": ["x", "y", "rotation"]}, "colliders[0].fixed: holds all of it; leave its density out"),
+        ({"fixed": ["z"]}, 'colliders[0].fixed: must be some of "x", "y" and "rotation" in 2D'),
         ({"fixed": ["x"], "joint": {"type": "hinge"}}, 'colliders[0].fixed: "joint" is given as well'),
         ({"fixed": ["x"], "velocity": [1.0, 2.0]}, "colliders[0].velocity: is not zero where joint or fixed holds it"),
         (

@@ -236,6 +236,8 @@ class Collider(Table):
         if self.fixed and (self.joint or not ways_of(d, self.fixed).size):
             both = '"joint" is given as well; leave one of them out'
             raise flaw(both if self.joint else f"holds all of it; leave its {given} out", "fixed")
+        if d == 2 and "z" in self.fixed:
+            raise flaw('must be some of "x", "y" and "rotation" in 2D', "fixed")
         if hinged and self._gives("velocity"):
             raise flaw("follows from angular_velocity where a hinge holds it; leave it out", "velocity")
         if hinged and self.axis is not None:

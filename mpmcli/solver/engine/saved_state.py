@@ -177,7 +177,7 @@ def _fields(batch: Batch) -> dict[str, ti.Field]:
     if device.rigid is not None:
         found |= {
             f"rigid.{name}": getattr(device.rigid, name)
-            for name in ("pose", "mobility", "ways", "momentum", "booked", "support")
+            for name in ("pose", "mobility", "ways", "weight", "momentum", "booked", "support")
         }
         found |= {f"rigid.{name}": getattr(device.rigid_contact, name) for name in ("other", "impulse")}
     return found | ({} if device.particles.contact is None else device.particles.contact.fields())
