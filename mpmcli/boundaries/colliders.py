@@ -67,7 +67,7 @@ class ColliderKind:
         """Return the bytes that loads and distances on grids take on the device, with `rows` of nodes (last axis)."""
         sums = 9 if dimension == 2 else 27
         loads = Loads.bytes_needed(self.count, dimension, rows)
-        points = self.points * (28 + 32 * dimension)
+        points = self.points * (36 + 32 * dimension)
         return loads + 8 * rows * len(self.free) * sums + points + 4 * self.samples
 
     def joined(self, other: "ColliderKind") -> "ColliderKind | None":

@@ -23,8 +23,8 @@ class RigidBodies(RigidMotion):
             total: of all rows; entries: numbers of each.
     """
 
-    def __init__(self, colliders: Colliders, drive: object, runs: int) -> None:
-        super().__init__(colliders, drive, runs)
+    def __init__(self, colliders: Colliders, pushes: object, runs: int) -> None:
+        super().__init__(colliders, pushes, runs)
         n = runs * self.count
         self.entries = self.loads + self.loads * (self.loads + 1) // 2
         self.sums = ti.field(ti.f64, shape=(n * colliders.loads.rows, self.entries))
@@ -148,7 +148,7 @@ class RigidBodies(RigidMotion):
         # A motor's body has one way, and its system is a number.
         resisted, lacked = self.reduced[b, 0, 0], self.reduced[b, 0, ways]
         if self.strength[b] > 0:
-            wanted = resisted * (self.motor[b] - self.rate_of(b) / self.square[b]) - lacked
+            wanted = resisted * (self.motor[b] - self.rate_of(b)) - lacked
             self.reduced[b, 0, 1] += self.clamped(b, dt, wanted)
         right = self.reduced[b, 0, ways] - lacked
         self.eliminate(b, 1)

@@ -39,8 +39,8 @@ class RigidMotion:
         system: the matrix of an equation for U and its right side; reduced: the same for y, with room for several.
     """
 
-    def __init__(self, colliders: Colliders, drive: object, runs: int) -> None:
-        self.pushes = drive
+    def __init__(self, colliders: Colliders, pushes: object, runs: int) -> None:
+        self.pushes = pushes
         self.colliders, self.dimension, self.free = colliders, colliders.dimension, colliders.kind.free
         self.loads, self.turns, self.run = colliders.loads.width, 1 if colliders.dimension == 2 else 3, 0
         self.count, self.width = len(self.free), self.dimension + (1 if self.dimension == 2 else 4)
@@ -203,10 +203,9 @@ class RigidMotion:
     def turn_motor(self, b: int, dt: ti.f64):
         """Let the motor of body b give in all, in a step of dt seconds, what keeps its rate, or what it can."""
         if self.strength[b] > 0:
-            square = self.square[b]
-            given = self.clamped(b, dt, self.drive[b] + (self.motor[b] - self.rate_of(b) / square) * self.weight[b])
+            given = self.clamped(b, dt, self.drive[b] + (self.motor[b] - self.rate_of(b)) * self.weight[b])
             for a in range(self.loads):
-                self.momentum[b, a] += self.ways[b, a, 0] * (given - self.drive[b]) / square
+                self.momentum[b, a] += self.ways[b, a, 0] * (given - self.drive[b]) / self.square[b]
             self.drive[b] = given
             self.take_rate(b)
 
@@ -217,17 +216,17 @@ class RigidMotion:
 
     @ti.func
     def rate_of(self, b: int):
-        """Return the rate of body b along its first way, the one of a joint, times the square of the length of that."""
+        """Return the rate of body b along its first way, the one of a joint."""
         result = ti.cast(0, ti.f64)
         for a in range(self.loads):
             result += self.ways[b, a, 0] * self.rate[b, a]
-        return result
+        return result / self.square[b]
 
     @ti.func
     def follow(self, b: int):
         """Put the centre of body b where the hinge leaves it, and let it move on about that."""
         d = ti.static(self.dimension)
-        rate = self.rate_of(b) / self.square[b]
+        rate = self.rate_of(b)
         arm, spin = ti.Vector.zero(ti.f64, d), ti.Vector.zero(ti.f64, self.turns)
         for a in ti.static(range(d)):
             arm[a] = self.hinge[b][1, a]

@@ -246,7 +246,7 @@ class Collider(Table):
             held = self.rates - self.ways @ np.linalg.pinv(self.ways) @ self.rates
             if np.abs(held).max() > 1e-9:
                 key = "velocity" if np.abs(held[:d]).max() > 1e-9 else "angular_velocity"
-                raise flaw("is not zero where joint or fixed holds it", key)
+                raise flaw("must be 0 along what joint or fixed holds", key)
 
     def _gives(self, key: str) -> bool:
         """Return whether a motion is given; zeros, as defaults are written out, are none."""
@@ -345,10 +345,14 @@ class Collider(Table):
     def fastest(self, domain: Domain, end: float) -> float:
         """Return a bound on the speed of its points in a domain between time 0 and `end` (s), m/s.
 
-        Of one that moves freely it is that at the start.
+        Of one that moves freely it is that at the start, and at the largest rate of its motor.
         """
         if self.free:
-            return math.hypot(*self.rates[: len(self.velocity)]) + abs(self.angular_velocity) * self.radius
+            motions = [self.rates]
+            if self.joint and self.joint.motor is not None:
+                motions.append(largest_of(tree_of(self.joint.motor), 0.0, end) * self.ways[:, 0])
+            d = len(self.velocity)
+            return max(float(np.linalg.norm(u[:d]) + np.linalg.norm(u[d:]) * self.radius) for u in motions)
         motion = self.motion
         # What lies outside of the domain meets nothing; the pivot goes this far at most.
         gone = float(np.linalg.norm(motion.offset)) + end * motion.fastest(0.0, end)

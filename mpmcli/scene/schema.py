@@ -139,7 +139,7 @@ class Impulse(Table):
     """A push on what is within a radius of a place, as a hand gives it."""
 
     name: str | None = Field(None, pattern=NAME, description="Name of the impulse, for --set.")
-    body: str | None = Field(None, description="Name of the body that it acts on. Default: all of them.")
+    body: str | None = Field(None, description="Name of the body or rigid body that it acts on. Default: all of them.")
     start: NotNegative = Field(description="When it begins, s.")
     end: Positive | None = Field(
         None, description="When it ends, s. Default: a thousandth of the interval between frames after it begins."
@@ -341,7 +341,7 @@ class Force(Table):
     """An acceleration that acts on one body, or on all of them."""
 
     name: str | None = Field(None, pattern=NAME, description="Name of the force, for --set.")
-    body: str | None = Field(None, description="Name of the body that it acts on. Default: all of them.")
+    body: str | None = Field(None, description="Name of the body or rigid body that it acts on. Default: all of them.")
     acceleration: PlaceVector = Field(
         description="m/s^2, one entry per axis: numbers, or expressions of the time t (s), the position x, y, z "
         "and the initial position X, Y, Z of a particle (m)."

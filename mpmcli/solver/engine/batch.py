@@ -136,8 +136,8 @@ class Batch:
             colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, on_cpu=on_cpu, deterministic=deterministic)
             colliders.layered, colliders.own = kind.layers.separate, int(not kind.layers.shares)
             motion = ColliderMotion(colliders, runs) if kind.colliders.moving else None
-            pushes = RigidDrive(d, kind.drives, self.values.device)
-            rigid = RigidBodies(colliders, pushes, runs) if kind.colliders.free else None
+            if kind.colliders.free:
+                rigid = RigidBodies(colliders, RigidDrive(d, kind.drives, self.values.device), runs)
         self.device = Device(
             runs,
             kind.particles,
