@@ -110,9 +110,21 @@ def rafts_2d(result: Result) -> str:
 
 
 def paddle_wheel_2d(result: Result) -> str:
-    """Compare the mean torque of the water in the second half with that of the brake."""
-    torque = np.mean([row.collider_torque[0] for row in result.ledger[len(result.ledger) // 2 :]])
-    return f"mean torque of the water {torque:.1f} N m, that of the brake 60"
+    """Compare the mean torque of the water in the second half, less what speeds the wheel up, with the brake's."""
+    first, *rows = result.ledger[len(result.ledger) // 2 :]
+    (inertia,) = result.colliders[0].moments.inertia.ravel()
+    gained = inertia * (rows[-1].rigid_motion[0][2] - first.rigid_motion[0][2]) / (rows[-1].time - first.time)
+    torque = np.mean([row.collider_torque[0] for row in rows])
+    return f"mean torque of the water {torque - gained:.1f} N m, that of the brake 60 N m"
+
+
+def crater_3d(result: Result) -> str:
+    """Compare how deep the ball lies in the end with what balls dropped into grains do."""
+    rows, ball, bed = result.ledger, result.colliders[0], 0.14
+    heights = [row.rigid_pose[0][2] - 0.05 - bed for row in (rows[0], rows[-1])]
+    fallen = 2.5**2 / (2 * 9.81) + heights[0] - heights[1]
+    asked = 0.14 / math.tan(math.radians(35)) * math.sqrt(ball.density / 1600) * 0.1 ** (2 / 3) * fallen ** (1 / 3)
+    return f"ball {-heights[1]:.4f} m deep; balls dropped into grains (Uehara et al. 2003) {asked:.4f}"
 
 
 def billiard_2d(result: Result) -> str:
@@ -381,4 +393,5 @@ KNOWN_ANSWERS = {
     "silo_3d": kept_out,
     "rafts_2d": rafts_2d,
     "paddle_wheel_2d": paddle_wheel_2d,
+    "crater_3d": crater_3d,
 }

@@ -114,5 +114,4 @@ def test_a_box_of_no_thickness_is_checked(backend_of: Callable, flushes: bool) -
         ti.sync()
         assert float("1e-308") * float("1.0") == 0.0
     checked = check_scene(parsed(scene_of([0.0, -9.8], 1e-308)))
-    assert checked.forecast.dissipation == float("inf")
     assert any(finding.rule == "resolution" or "thick" in finding.what for finding in checked.findings)

@@ -12,8 +12,9 @@ from test_batch import Output, batch_of, outputs_of, same
 from test_deterministic import on_gpu_path
 
 from mpmcli.check.result_check import check_result
+from mpmcli.check.scene_check import check_scene
 from mpmcli.output import open_result
-from mpmcli.scene import Scene, sample_bodies, scene_to_toml
+from mpmcli.scene import LoadedScene, Scene, sample_bodies, scene_to_toml
 from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.machine.backend import Backend
 
@@ -143,6 +144,18 @@ def test_the_jet_leaves_as_if_nothing_were_there(
     assert frame.position[there, 0].max() < 1.0 + 4 * SPACING
     assert row.mass == pytest.approx(jet[0][1].mass + row.emitted_mass - row.retired_mass, rel=1e-9)
     assert row.linear_momentum[0] == pytest.approx(SPEED * (row.emitted_mass - row.retired_mass), rel=1e-5)
+
+
+def test_a_jet_needs_no_body(backend_of: Callable[..., Backend], jet: Output) -> None:
+    """Emitters alone are a scene, and the jet does not know of the pool that it never meets: the same, to the byte."""
+    scene = jet_scene(bodies=[])
+    alone = outputs_of(batch_of([scene], backend_of("f32", 1)), [scene])[0]
+    pool = len(jet[0][0].position) - len(alone[0][0].position)
+    for (frame, _), (mine, _) in zip(jet, alone, strict=True):
+        assert np.array_equal(frame.position[pool:], mine.position)
+        assert np.array_equal(frame.velocity[pool:], mine.velocity)
+    check = check_scene(LoadedScene(scene, (), "jet.toml"))
+    assert check.passes() and check.forecast.steps > 0
 
 
 def test_runs_have_the_bytes_that_they_have_alone(backend_of: Callable[..., Backend]) -> None:

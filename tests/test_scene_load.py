@@ -87,10 +87,10 @@ def test_missing_tables_and_no_bodies():
     assert refusal("") == [
         "scene.toml: domain: missing key: The box that the scene lives in, and its grid",
         "scene.toml: time: missing key: How long, how many frames, which steps",
-        "scene.toml: bodies: missing key: The bodies, at least one",
     ]
     head = GOOD[: GOOD.index("[[bodies]]")]
-    assert refusal("bodies = []\n" + head) == ["scene.toml:1: bodies: needs at least 1 entry; found 0"]
+    none = "bodies: needs at least one entry, or emitters that bring the material"
+    assert refusal("bodies = []\n" + head) == [f"scene.toml:1: {none}"] and refusal(head) == [f"scene.toml: {none}"]
 
 
 def test_a_sliver_without_particles_is_refused():

@@ -137,7 +137,7 @@ class SceneFacts:
     @property
     def first_contact(self) -> float:
         """Time of the first contact of any body, s; until then no material is stiffer than at rest."""
-        return min(facts.arrival.time for facts in self.bodies)
+        return min((facts.arrival.time for facts in self.bodies), default=0.0)
 
 
 def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> list[Arrival]:
@@ -147,6 +147,8 @@ def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> li
     expression, or bodies start deformed (`pressed`), all arrive at time 0 at the speed `fastest`, m/s.
     """
     domain = scene.domain
+    if not scene.bodies:
+        return []
     if pressed or scene.pushes or not domain.steady or any(moves_unevenly(body) for body in scene.bodies):
         return [Arrival(0.0, fastest)] * len(scene.bodies)
     reach = CONTACT * domain.spacing

@@ -65,8 +65,6 @@ class Forecast:
     host_bytes: int
     file_bytes: int
     vtk_bytes: int
-    # Share of energy per second lost by a wave twice as long as the thinnest body, 1/s.
-    dissipation: float
 
     def as_dict(self) -> dict:
         """Return the forecast as a dictionary for JSON."""
@@ -91,8 +89,6 @@ def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
             + min(frames, 1 + computing / HOLD) * SEAL_SECONDS
             + DISK_PASSES * file_bytes / DISK_BYTES_PER_SECOND
         )
-    thinnest = min(facts.bodies, key=lambda body: body.thickness)
-    step = damped_step(facts, thinnest, facts.taken(facts.step_at_start))
     return Forecast(
         steps=steps,
         steps_range=(steps_at(facts, facts.step_at_start), steps_at(facts, facts.step)),
@@ -104,7 +100,6 @@ def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
         host_bytes=plan.host_bytes,
         file_bytes=file_bytes,
         vtk_bytes=series_bytes(scene, plan.particles),
-        dissipation=wave_loss(thinnest.thickness, scene.domain.spacing, step, scene.solver),
     )
 
 

@@ -96,6 +96,8 @@ def _friction(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
 
 
 def _density(facts: SceneFacts) -> Iterator[Finding]:
+    if not facts.bodies:
+        return
     light = min(facts.bodies, key=lambda body: body.body.material.density)
     heavy = max(facts.bodies, key=lambda body: body.body.material.density)
     ratio = heavy.body.material.density / light.body.material.density

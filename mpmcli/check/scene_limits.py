@@ -92,7 +92,8 @@ def reachable(scene: Scene, starts: Sequence[Start]) -> SceneBounds:
 
 def _release_speed(scene: Scene, starts: Sequence[Start]) -> float:
     """Return the largest speed that the energy stored at the start gives to a particle, m/s."""
-    return math.sqrt(max(2 * s.energy / b.material.density for s, b in zip(starts, scene.bodies, strict=True)))
+    squares = (2 * s.energy / b.material.density for s, b in zip(starts, scene.bodies, strict=True))
+    return math.sqrt(max(squares, default=0.0))
 
 
 def joined(start: StateBound, reached: StateBound) -> StateBound:
@@ -169,8 +170,8 @@ def _motion_limits(scene: Scene, bounds: SceneBounds, release: float) -> list[Sc
         falls = f"fall, initial speeds and the energy stored at the start make {reached:.4g} m/s, jets up to"
         falls += f" {SPRAY:g} times that"
     rates = {body.name: _initial_rate(body, scene.dimension) for body in scene.bodies}
-    quickest = max(rates, key=lambda name: rates[name])
-    rate, impact = rates[quickest], IMPACT_GRADIENT * reached / h
+    quickest = max(rates, key=lambda name: rates[name], default="")
+    rate, impact = rates.get(quickest, 0.0), IMPACT_GRADIENT * reached / h
     limits = [
         _motion_limit(
             speed_limit(h, initial, bounds.gravity),

@@ -383,7 +383,7 @@ class Scene(Table):
     )
     domain: Domain = Field(description="The box that the scene lives in, and its grid.")
     time: Time = Field(description="How long, how many frames, which steps.")
-    bodies: tuple[Body, ...] = Field(min_length=1, description="The bodies, at least one.")
+    bodies: tuple[Body, ...] = Field((), description="The bodies; none where emitters bring all material.")
     emitters: tuple[Emitter, ...] = Field((), description="Where material flows in. Default: none.")
     forces: tuple[Force, ...] = Field((), description="Accelerations beside gravity; what acts on a particle adds up.")
     colliders: tuple[Collider, ...] = Field((), description="Rigid things that the material meets, at rest or moving.")
@@ -393,6 +393,12 @@ class Scene(Table):
     contact: Contact = Field(Contact(), description="What bodies do to each other. Default: they stick.")
     output: Output = Field(Output(), description="What is stored.")
     solver: SolverSettings = Field(SolverSettings(), description="How it is computed.")
+
+    @model_validator(mode="after")
+    def _has_material(self) -> "Scene":
+        if not self.sources:
+            raise flaw("needs at least one entry, or emitters that bring the material", "bodies")
+        return self
 
     @property
     def dimension(self) -> int:
@@ -459,7 +465,7 @@ def scene_model(laws: tuple[type[MaterialParameters], ...]) -> type[Scene]:
         "Scene",
         __base__=Scene,
         __doc__=Scene.__doc__,
-        bodies=(tuple[body, ...], Field(min_length=1, description=texts["bodies"])),
+        bodies=(tuple[body, ...], Field((), description=texts["bodies"])),
         emitters=(tuple[emitter, ...], Field((), description=texts["emitters"])),
         output=(output, Field(output(), description=texts["output"])),
     )
