@@ -16,7 +16,9 @@ from PIL import Image
 from mpmcli.output import Result, open_result
 from mpmcli.output.segments import SEGMENTS
 from mpmcli.render.picture_file import settings_digest, write_picture
+from mpmcli.render.render_scene import APPEARANCES
 from mpmcli.render.request import Request, plan_render
+from mpmcli.render.settings import THEMES
 
 pytestmark = pytest.mark.usefixtures("drawing")
 
@@ -63,6 +65,71 @@ def test_a_picture_of_the_last_frame_lies_beside_the_result(run: Path) -> None:
     assert said["pictures"] == [str(run / "render" / "dots_000005.png")] and said["made"] == 1
     with Image.open(said["pictures"][0]) as picture:
         assert picture.size == (320, 180)
+
+
+SCENE_WITH_ALL = """\
+[domain]
+size = [1.0, 0.6]
+spacing = 0.02
+[time]
+end = 1.0
+frames = 2
+[[bodies]]
+name = "block"
+material = "jelly"
+shape = { box = { min = [0.1, 0.1], max = [0.3, 0.3] } }
+velocity = [1.0, 0.0]
+[[emitters]]
+name = "jet"
+material = "water"
+shape = { box = { min = [0.6, 0.4], max = [0.8, 0.5] } }
+velocity = [0.0, -2.0]
+[[colliders]]
+name = "post"
+shape = { box = { min = [0.8, 0.0], max = [0.9, 0.2] } }
+"""
+
+
+def test_a_scene_is_drawn_as_it_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bodies, the first layer of each emitter, colliders, and arrows as long as the speeds; nothing else is left."""
+    monkeypatch.chdir(tmp_path)
+    Path("start.toml").write_text(SCENE_WITH_ALL, encoding="utf-8")
+    said = json.loads(run_here("render", "start.toml", "--workers", 1, "--json").stdout)
+    assert said["pictures"] == ["start.png"] and sorted(tmp_path.iterdir()) == [
+        tmp_path / "start.png",
+        tmp_path / "start.toml",
+    ]
+    with Image.open("start.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+
+    def near(color: str, within: int = 60) -> np.ndarray:
+        wanted = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
+        return np.abs(pixels - wanted).max(axis=2) < within
+
+    # The legend is in the right part of the picture.
+    inside = np.arange(pixels.shape[1]) < 1100
+    walls = near(THEMES["light"].wall)
+    rows, columns = (np.flatnonzero(walls.sum(axis=axis) > 300) for axis in (1, 0))
+    top, bottom, left, right = rows.min(), rows.max(), columns.min(), columns.max()
+
+    def place(row: float, column: float) -> tuple[float, float]:
+        return (column - left) / (right - left), 0.6 * (bottom - row) / (bottom - top)
+
+    jelly, water = (np.argwhere(near(APPEARANCES[name].ink) & inside) for name in ("jelly", "water"))
+    assert place(*jelly.mean(axis=0)) == pytest.approx((0.2, 0.2), abs=0.01)
+    assert place(*water.mean(axis=0)) == pytest.approx((0.7, 0.45), abs=0.01)
+    assert np.ptp(water[:, 1]) / (right - left) == pytest.approx(0.2, abs=0.02)
+    post = np.argwhere(near(THEMES["light"].solid) & inside & (np.arange(pixels.shape[0]) > top)[:, None])
+    assert place(*np.median(post, axis=0)) == pytest.approx((0.85, 0.1), abs=0.02)
+    # The jet's arrow begins at its mouth and goes down by 0.15 m; the block's is half as long.
+    dark = near(THEMES["light"].text, 20)
+    column = round(left + 0.7 * (right - left))
+    arrow = np.flatnonzero(dark[top + 10 : bottom - 10, column]) + top + 10
+    # Its speed stands below.
+    arrow = np.split(arrow, np.flatnonzero(np.diff(arrow) > 3) + 1)[0]
+    assert place(arrow.max(), column)[1] == pytest.approx(0.3, abs=0.02)
+    assert json.loads(run_here("render", "start.toml", "--json").stdout)["made"] == 0
+    assert "--frame is for results" in refused("start.toml", "--frame", "first", "-o", "other.png")
 
 
 def test_stdout_gets_the_paths_that_were_asked_for(run: Path, tmp_path: Path) -> None:

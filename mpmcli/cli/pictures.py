@@ -1,6 +1,8 @@
 """`mpmcli render` and `mpmcli plot`."""
 
 import logging
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +69,9 @@ WIDEST = 3
 def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool, **asked: Any) -> int:
     """Draw frames of a RESULT without a screen: pictures, a film (--movie) or a montage.
 
+    RESULT may be a scene (.toml): its start is drawn, with the velocities of bodies, emitters and colliders, into
+    <name of the scene>.png.
+
     RESULT may be a dataset: its montage shows evenly spaced trajectories at one frame, the middle one or --frame, and
     goes to montage.png in the dataset.
 
@@ -77,15 +82,30 @@ def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool
     from mpmcli.cli.progress import ProgressBar
     from mpmcli.dataset.dataset import is_dataset
     from mpmcli.dataset.montage import plan_montage
+    from mpmcli.materials.registry import parameter_models
     from mpmcli.output import open_result
     from mpmcli.plain_text import counted
     from mpmcli.render.request import Request, plan_render
+    from mpmcli.render.scene_start import result_of_start
+    from mpmcli.scene import load_scene
 
     # Without a home directory it warns about its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     request = Request(**asked)
-    plan = plan_montage(result, request) if is_dataset(result) else plan_render(open_result(result), request)
-    with ProgressBar(plan.due, "frames", quiet=quiet) as bar, interrupts_wait():
+    with ExitStack() as stack:
+        if result.suffix == ".toml":
+            of_results = {"--frame": request.frames, "--movie": request.movie, "--montage": request.montage}
+            for option in (option for option, value in of_results.items() if value):
+                raise InputError(f"{option} is for results, and of {result} the start is drawn; leave it out.")
+            scene = load_scene(result, laws=parameter_models()).scene
+            start, arrows = stack.enter_context(result_of_start(scene))
+            color = request.color or ("material" if request.mode == "dots" else None)
+            output = request.output or Path(f"{result.stem}.png")
+            plan = plan_render(start, replace(request, output=output, color=color, arrows=arrows))
+        else:
+            plan = plan_montage(result, request) if is_dataset(result) else plan_render(open_result(result), request)
+        bar = stack.enter_context(ProgressBar(plan.due, "frames", quiet=quiet))
+        stack.enter_context(interrupts_wait())
         done = plan.carry_out(workers, watch=bar.show, stop=interrupt_came)
     for warning in done.warnings:
         print_note(f"warning: {warning}")

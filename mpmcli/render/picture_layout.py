@@ -27,6 +27,7 @@ LEAST = 16  # least pixels along each side of the viewport
 BAR_WIDTH, TICK = 18, 6
 SWATCH = 16
 LEGEND_SHARE = 0.3  # largest fraction of the width for legends; longer names are shortened
+ARROW = 0.15  # length of the largest velocity, as a part of the domain
 SCALE_SHARE = 0.18  # largest length of a scale bar, as a fraction of the width
 TICKS = 6
 NO_NUMBER = "no number"
@@ -49,6 +50,7 @@ class PictureLayout:
     grid: tuple[int, int] = (1, 1)  # columns and rows of pictures of the scene
     walls: bool = True  # whether the walls of the domain are drawn around each of them
     scale_bar: bool = True  # whether there is room for one below
+    arrows: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()  # places, m, and velocities there, m/s
 
     @property
     def viewport_size(self) -> tuple[int, int]:
@@ -84,6 +86,8 @@ class PictureLayout:
                 self._caption(draw, captions[k] if captions else time, x, y - self._label // 2)
             if self.walls:
                 self._walls(draw, view, (x, y))
+            if self.arrows:
+                self._draw_arrows(draw, view, (x, y))
         if self.scale_bar:
             self._draw_scale_bar(draw, view)
         self._heading(draw, times[0] if self.grid == (1, 1) else None)
@@ -176,6 +180,25 @@ class PictureLayout:
         (x0, y0), (x1, y1) = edges.min(axis=0).tolist(), edges.max(axis=0).tolist()
         w = self._px(2)
         draw.rectangle((x0 - w, y0 - w, x1 + w - 1, y1 + w - 1), outline=self.theme.wall, width=w)
+
+    def _draw_arrows(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
+        """Draw velocities, the fastest as long as a part of the domain, each with its speed in m/s."""
+        flat = [0.0] * (3 - self.scene.dimension)
+        starts, velocities = (np.array([(*one[k], *flat) for one in self.arrows]) for k in (0, 1))
+        speeds = np.linalg.norm(velocities, axis=1)
+        longest = ARROW * float(np.ptp([self.scene.lower, self.scene.upper], axis=0).max())
+        ends = starts + velocities * (longest / speeds.max())
+        (tails, tips), width = (view.pixels(points)[:, :2] + place for points in (starts, ends)), self._px(3)
+        for tail, tip, speed in zip(tails, tips, speeds.tolist(), strict=True):
+            length = float(np.linalg.norm(tip - tail))
+            along = (tip - tail) / max(length, 1.0)
+            head = min(self._px(12), length)
+            wings = [tip - head * along + sign * 0.45 * head * np.array([-along[1], along[0]]) for sign in (1, -1)]
+            draw.line([*map(tuple, (tail, tip - 0.8 * head * along))], self.theme.text, width)
+            draw.polygon([*map(tuple, (tip, *wings))], self.theme.text)
+            beside, anchor = tip + self._px(SMALL) * along, "lm" if along[0] >= 0 else "rm"
+            halo = {"stroke_width": self._px(2), "stroke_fill": self.theme.ground}
+            draw.text(tuple(beside), f"{speed:.3g} m/s", self.theme.text, self._small, anchor=anchor, **halo)
 
     def _draw_scale_bar(self, draw: "ImageDraw", view: View) -> None:
         length = round_length(SCALE_SHARE * self.size[0] / view.pixels_per_metre)

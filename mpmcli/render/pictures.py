@@ -106,7 +106,7 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
     # A scale bar has no meaning in perspective.
     parallel = view_of(scene, camera, (width, width)).parallel
     size, times = (width, height or width), expected_times(result)
-    layout = PictureLayout(size, scene, theme, times, colors, settings.grid, walls, parallel)
+    layout = PictureLayout(size, scene, theme, times, colors, settings.grid, walls, parallel, settings.arrows)
     if height is None:
         aspect = min(max(aspect_of(scene, camera), FLATTEST), 1.0 / FLATTEST)
         for _ in range(FITTING_ROUNDS):
@@ -207,8 +207,10 @@ def picture_digest(result: Result, settings: Settings, ks: Sequence[int]) -> str
     times = expected_times(result)
     labels = [time_text(float(result.times[k]), times) for k in ks]
     frames = [[int(result.numbers[k]), int(result.particle_counts[k]), repr(result.ledger[k])] for k in ks]
+    # Pictures of earlier versions have no arrows, and stay right.
+    asked = {name: value for name, value in asdict(settings).items() if name != "arrows" or value}
     return settings_digest(
-        {**asdict(settings), "scene": result.header.stored.get("scene", ""), "frames": frames, "labels": labels}
+        {**asked, "scene": result.header.stored.get("scene", ""), "frames": frames, "labels": labels}
     )
 
 

@@ -52,6 +52,7 @@ class Request:
     save_surface: Path | None = None
     colliders: Colliders = "solid"
     overwrite: bool = False
+    arrows: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
 
     @property
     def rate(self) -> float:
@@ -200,6 +201,7 @@ def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()
         cmap=request.cmap,
         grid=grid,
         colliders=request.colliders,
+        arrows=request.arrows,
     )
     setup = replace(set_up(result, settings), captions=captions)
     if (request.clim or request.cmap) and not isinstance(setup.colors, Coloring):

@@ -34,6 +34,7 @@ class Settings:
     cmap: str | None = None  # colour map of matplotlib, None for the one that suits the values
     grid: tuple[int, int] = (1, 1)  # columns and rows of a montage, (1, 1) for a picture of one frame
     colliders: Colliders = "solid"  # "clear": in 3D only their far sides are drawn, as those of containers are
+    arrows: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()  # places, m, and velocities, m/s, to be shown
 
 
 @dataclass(frozen=True)
