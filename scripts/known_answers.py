@@ -120,7 +120,7 @@ def paddle_wheel_2d(result: Result) -> str:
 
 def crater_3d(result: Result) -> str:
     """Compare how deep the ball lies in the end with what balls dropped into grains do."""
-    rows, ball, bed = result.ledger, result.colliders[0], 0.14
+    rows, ball, bed = result.ledger, result.colliders[0], 0.12
     heights = [row.rigid_pose[0][2] - 0.05 - bed for row in (rows[0], rows[-1])]
     fallen = 2.5**2 / (2 * 9.81) + heights[0] - heights[1]
     asked = 0.14 / math.tan(math.radians(35)) * math.sqrt(ball.density / 1600) * 0.1 ** (2 / 3) * fallen ** (1 / 3)
