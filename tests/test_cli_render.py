@@ -309,8 +309,10 @@ def test_surfaces_are_drawn_and_saved_for_other_tools(run: Path, tmp_path: Path)
     out, meshes = tmp_path / "out", tmp_path / "meshes"
     said = rendered(run, "--mode", "surface", "-o", out, "--frame", "0:2", "--save-surface", meshes, "--workers", 1)
     assert said["made"] == 2
-    names = {f"surface_{name}_{k:06d}.{kind}" for name in ("water", "jelly") for k in (0, 1) for kind in ("vtp", "obj")}
-    assert {path.name for path in meshes.iterdir()} == names | {"surface_water.vtp.series", "surface_jelly.vtp.series"}
+    # The jelly is none of the presets, and goes by the name of its body.
+    kinds = [(name, k, kind) for name in ("water", "body_1") for k in (0, 1) for kind in ("vtp", "obj")]
+    names = {f"surface_{name}_{k:06d}.{kind}" for name, k, kind in kinds}
+    assert {path.name for path in meshes.iterdir()} == names | {"surface_water.vtp.series", "surface_body_1.vtp.series"}
     # The block of water has 12 by 8 particles, each of which stands for its square; its corners are rounded.
     water = pv.read(meshes / "surface_water_000001.vtp")
     assert water.area == pytest.approx(12 * 8 * 0.025**2, rel=0.08)

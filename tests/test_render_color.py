@@ -98,7 +98,7 @@ def test_colours_are_those_of_the_map_and_nan_has_its_own(result: Result, scene:
 
 def test_materials_and_bodies_have_colours_of_their_own(result: Result, scene: RenderScene) -> None:
     f = result.frame(0, ())
-    for name, kinds in (("material", ("water", "jelly")), ("body", ("body 0", "body 1"))):
+    for name, kinds in (("material", ("water", "body 1")), ("body", ("body 0", "body 1"))):
         colors = color_by(name, result, scene, LIGHT)
         assert isinstance(colors, Categories) and colors.names == kinds
         rgb = colors.particle_rgb(f)

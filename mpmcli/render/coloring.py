@@ -117,7 +117,7 @@ def color_by(
 
 def material_colors(scene: RenderScene, inks: Sequence[str]) -> Categories:
     """Return colours by material, "#rrggbb" of each."""
-    names = tuple(appearance.name for appearance in scene.appearances)
+    names = tuple(appearance.title for appearance in scene.appearances)
     return Categories("material", names, tuple(inks), scene.material_of)
 
 

@@ -189,7 +189,7 @@ def _ordered(triangles: np.ndarray, count: int) -> np.ndarray:
 def surface_paths(scene: RenderScene, directory: Path, index: int) -> list[Path]:
     """Return the files that `save_surface` writes for a frame whose every material has particles."""
     return [
-        directory / f"surface_{slug(appearance.name)}_{index:06d}.{kind}"
+        directory / f"surface_{slug(appearance.title)}_{index:06d}.{kind}"
         for appearance in scene.appearances
         for kind in ("vtp", "obj")
     ]
@@ -226,7 +226,7 @@ def save_surface(scene: RenderScene, frame: Frame, directory: Path) -> list[Path
 
 def write_series(scene: RenderScene, directory: Path, frames: Sequence[tuple[int, float]]) -> list[Path]:
     """Write `surface_<material>.vtp.series`, the times, s, of frames by number, for every material; return paths."""
-    names = [slug(appearance.name) for appearance in scene.appearances]
+    names = [slug(appearance.title) for appearance in scene.appearances]
     paths = [directory / f"surface_{name}.vtp.series" for name in names]
     for path, name in zip(paths, names, strict=True):
         files = [{"name": f"surface_{name}_{index:06d}.vtp", "time": time} for index, time in sorted(frames)]

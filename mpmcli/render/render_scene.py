@@ -30,6 +30,12 @@ class Appearance:
     ink: str  # of dots and legends: distinguishable from every other on a light and on a dark background
     finish: Finish
     liquid: bool = False  # flows as one body, so that dots hide what it is
+    label: str = ""  # in legends, in place of the name
+
+    @property
+    def title(self) -> str:
+        """What legends and names of files call it."""
+        return self.label or self.name
 
 
 APPEARANCES = {
@@ -47,6 +53,7 @@ APPEARANCES = {
 # Laws without a preset, in the order in which they come.
 OTHERS = ("#0f9d8a", "#c2569b", "#7d8a2e", "#4e6fb8", "#b0563c")
 UNSEEN = {"law", "surface_friction"}  # parameters that say nothing of what a material looks like
+ALIKE = 1e-12  # distance of materials below which they are the same
 FAR = 1e6  # upper bound of the ratio of two values of a parameter in the distance between materials
 
 
@@ -148,8 +155,10 @@ def _materials(
             firsts.append(body)
     names = [appearance.name for appearance in appearances]
     for k, (name, body) in enumerate(zip(names, firsts, strict=True)):
-        if names.count(name) > 1:
-            appearances[k] = replace(appearances[k], name=f"{name} ({body})")
+        # A viscous water may look most like honey, and is none.
+        exact = name in PRESETS and _distance(PRESETS[name].parameters, dict(kinds[k])) < ALIKE
+        if not exact or names.count(name) > 1:
+            appearances[k] = replace(appearances[k], label=f"{name} ({body})" if exact else body)
     return tuple(appearances), tuple(kinds.index(table) for table in tables)
 
 
