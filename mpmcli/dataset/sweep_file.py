@@ -7,19 +7,21 @@ from os import PathLike
 from pathlib import Path as File
 from typing import Any
 
+import tomli_w
 from pydantic import ValidationError
 
 from mpmcli.dataset.draw import PlacementError, draw, template_extent
 from mpmcli.dataset.sweep import ROUND_OFF, Placement, Sweep, SweepTable, is_number
 from mpmcli.errors import InputError
 from mpmcli.scene import parse_scene
+from mpmcli.scene.base import read_scene
 from mpmcli.scene.geometry_file import absence
-from mpmcli.scene.load import read_toml, report, scene_problems
+from mpmcli.scene.load import report, scene_problems
 from mpmcli.scene.material import Laws
 from mpmcli.scene.problem import Path, Problem, listed, nearest, path_text, problems_of, quoted, written
 from mpmcli.scene.quantity import AXES, NUMBER_WORDS, dimension_of
 from mpmcli.scene.shapes import COMBINED
-from mpmcli.scene.toml_file import key_parts, set_value
+from mpmcli.scene.toml_file import key_parts, read_toml, set_value
 
 MOST_BODIES = 1000
 # The key of a placement by the list that its template is in.
@@ -36,7 +38,7 @@ def load_sweep(path: str | PathLike[str], *, laws: Laws, count: int | None = Non
     text, data = read_toml(path, "sweep")
     read = data if count is None else {**data, "count": count}
     base = _base_file(File(path), text, data)
-    base_text, base_data = read_toml(base)
+    base_text, base_data = read_scene(base)
     place = read.get("place")
     tables = {**read, "place": [place]} if isinstance(place, dict) else read
     try:
@@ -45,6 +47,7 @@ def load_sweep(path: str | PathLike[str], *, laws: Laws, count: int | None = Non
         problems = [_as_written(p, read) for p in problems_of(error, tables, SweepTable)]
         raise InputError(report(problems, str(path), text)) from None
     parse_scene(base_data, laws=laws, source=str(base), text=base_text, directory=base.parent)
+    base_text = base_text or tomli_w.dumps(base_data)
     same = {name: getattr(table, name) for name in ("count", "seed", "method", "accept", "vary", "split")}
     sweep = Sweep(File(path), text, data, base, base_text, base_data, placements=table.place, **same)
     problems = list(_misplaced(sweep))

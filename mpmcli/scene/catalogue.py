@@ -39,6 +39,12 @@ def json_schema(laws: Laws) -> dict[str, Any]:
     definitions["Body"]["properties"]["material"] = {"description": material["description"], "oneOf": forms}
     definitions["Domain"]["oneOf"] = [{"required": ["spacing"]}, {"required": ["cells"]}]
     schema["$defs"] = dict(sorted(definitions.items()))
+    # Not in the model of a scene: they are gone once it is read.
+    text = {"type": "string"}
+    base = {**text, "description": "Path of a scene that this one begins with; tables here are merged into its tables."}
+    remove = {"type": "array", "items": text, "description": "Names of what the base has and this scene has not."}
+    schema["properties"] |= {"base": base, "remove": remove}
+    schema["anyOf"] = [{"required": ["base"]}, {"required": schema.pop("required")}]
     return {"$schema": GenerateJsonSchema.schema_dialect, **schema}
 
 

@@ -1,7 +1,5 @@
 """From a TOML file to a complete scene, or to one error that names everything wrong with it."""
 
-import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -12,6 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from mpmcli.errors import InputError
+from mpmcli.scene.base import read_scene
 from mpmcli.scene.bounds import reaching, scene_bounds
 from mpmcli.scene.checks import problems_in
 from mpmcli.scene.entry import definitions
@@ -32,7 +31,7 @@ from mpmcli.scene.problem import (
 from mpmcli.scene.quantity import dimension_of
 from mpmcli.scene.sampling import points_per_cell
 from mpmcli.scene.schema import Scene, scene_model
-from mpmcli.scene.toml_file import apply_overrides, copied, key_lines, line_of, too_deep
+from mpmcli.scene.toml_file import apply_overrides, copied, key_lines, line_of
 
 
 def repaired(
@@ -71,18 +70,6 @@ def _as_written(problems: list[Problem], *renames: Renames) -> list[Problem]:
     return problems
 
 
-_POSITION = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
-# Messages of tomllib that a plainer sentence replaces.
-_SYNTAX = {
-    "Cannot overwrite a value": "this key is given twice",
-    "Invalid value": "this is no TOML value; text needs quotes, numbers and lists none",
-    "Expected '=' after a key in a key/value pair": "expected key = value",
-    "Invalid initial character for a key part": "expected a key; a table in { } stands on one line",
-    "Unclosed array": "a list is not closed with ]",
-    "Invalid statement": "expected key = value or a [table]",
-}
-
-
 @dataclass(frozen=True)
 class LoadedScene:
     """A complete scene and what was chosen on the way to it.
@@ -109,7 +96,7 @@ def load_scene(path: str | PathLike[str], overrides: Sequence[str] = (), *, laws
     Raises:
         InputError: one line per fault: `FILE:LINE: KEY PATH: what is wrong and what would be right`.
     """
-    text, data = read_toml(path)
+    text, data = read_scene(path)
     directory = File(path).parent
     return parse_scene(data, laws=laws, source=str(path), text=text, overrides=overrides, directory=directory)
 
@@ -215,52 +202,3 @@ def report(
         place = override[0] if override else source if line is None else f"{source}:{line}"
         rows.append(": ".join(filter(None, [place, path_text(problem.path), problem.sentence])))
     return "\n".join(rows)
-
-
-def read_toml(path: str | PathLike[str], kind: str = "scene") -> tuple[str, dict[str, Any]]:
-    """Return the text of a TOML file, and what it holds.
-
-    Args:
-        path: the file.
-        kind: what the file describes, one word, for errors.
-
-    Raises:
-        InputError: the file cannot be read, or is not valid TOML.
-    """
-    file = File(path)
-    try:
-        # utf-8-sig: some editors begin a file with a byte order mark.
-        text = file.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file; give the path of a {kind} in TOML") from None
-    except IsADirectoryError:
-        inside = file / f"{kind}.toml"
-        hint = f"did you mean {inside}?" if inside.is_file() else f"give the path of a {kind} in TOML"
-        raise InputError(f"{file}: this is a directory; {hint}") from None
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{file}: this is no text in UTF-8 (byte {error.start} is {error.object[error.start]:#04x}); "
-            f"give a {kind} in TOML"
-        ) from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{file}: the file cannot be read: {reason}") from None
-    return text, _parse(text, str(path))
-
-
-def _parse(text: str, source: str) -> dict[str, Any]:
-    try:
-        found = tomllib.loads(text)
-        if not too_deep(found):
-            return found
-    except tomllib.TOMLDecodeError as error:
-        said = str(error)
-        place = source
-        if position := _POSITION.search(said):
-            said = said[: position.start()]
-            line, column = position.groups() if position[1] else (max(1, len(text.splitlines())), None)
-            place += f":{line}" + (f":{column}" if column else "")
-        raise InputError(f"{place}: not valid TOML: {_SYNTAX.get(said, said[:1].lower() + said[1:])}") from None
-    except (ValueError, RecursionError):
-        pass
-    raise InputError(f"{source}: not valid TOML: a number is too long or lists are too deep")

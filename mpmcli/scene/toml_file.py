@@ -4,6 +4,8 @@ import re
 import tomllib
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
+from os import PathLike
+from pathlib import Path as File
 from typing import Any
 
 import tomli_w
@@ -36,6 +38,67 @@ def too_deep(tree: Any) -> bool:
         if not level:
             return False
     return True
+
+
+_POSITION = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
+# Messages of tomllib that a plainer sentence replaces.
+_SYNTAX = {
+    "Cannot overwrite a value": "this key is given twice",
+    "Invalid value": "this is no TOML value; text needs quotes, numbers and lists none",
+    "Expected '=' after a key in a key/value pair": "expected key = value",
+    "Invalid initial character for a key part": "expected a key; a table in { } stands on one line",
+    "Unclosed array": "a list is not closed with ]",
+    "Invalid statement": "expected key = value or a [table]",
+}
+
+
+def read_toml(path: str | PathLike[str], kind: str = "scene") -> tuple[str, dict[str, Any]]:
+    """Return the text of a TOML file, and what it holds.
+
+    Args:
+        path: the file.
+        kind: what the file describes, one word, for errors.
+
+    Raises:
+        InputError: the file cannot be read, or is not valid TOML.
+    """
+    file = File(path)
+    try:
+        # utf-8-sig: some editors begin a file with a byte order mark.
+        text = file.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{file}: there is no such file; give the path of a {kind} in TOML") from None
+    except IsADirectoryError:
+        inside = file / f"{kind}.toml"
+        hint = f"did you mean {inside}?" if inside.is_file() else f"give the path of a {kind} in TOML"
+        raise InputError(f"{file}: this is a directory; {hint}") from None
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{file}: this is no text in UTF-8 (byte {error.start} is {error.object[error.start]:#04x}); "
+            f"give a {kind} in TOML"
+        ) from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{file}: the file cannot be read: {reason}") from None
+    return text, _parse(text, str(path))
+
+
+def _parse(text: str, source: str) -> dict[str, Any]:
+    try:
+        found = tomllib.loads(text)
+        if not too_deep(found):
+            return found
+    except tomllib.TOMLDecodeError as error:
+        said = str(error)
+        place = source
+        if position := _POSITION.search(said):
+            said = said[: position.start()]
+            line, column = position.groups() if position[1] else (max(1, len(text.splitlines())), None)
+            place += f":{line}" + (f":{column}" if column else "")
+        raise InputError(f"{place}: not valid TOML: {_SYNTAX.get(said, said[:1].lower() + said[1:])}") from None
+    except (ValueError, RecursionError):
+        pass
+    raise InputError(f"{source}: not valid TOML: a number is too long or lists are too deep")
 
 
 _BLANK = re.compile(r"[ \t]*")
