@@ -1,15 +1,16 @@
-"""`mpmcli materials` and `mpmcli schema`."""
+"""`mpmcli new`, `mpmcli materials` and `mpmcli schema`."""
 
 import inspect
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from shutil import copyfile
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from mpmcli.cli.options import json_option, plugin_option
-from mpmcli.cli.streams import print_json, print_text
+from mpmcli.cli.options import json_option, output_option, plugin_option
+from mpmcli.cli.streams import print_json, print_note, print_text
 from mpmcli.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,6 +18,43 @@ if TYPE_CHECKING:
 
 # Width of the text, in columns, if stdout is not a terminal.
 WIDTH = 140
+
+
+@click.command("new")
+@click.argument("name", required=False)
+@output_option("The file to write; <NAME>.toml here by default.", "FILE.toml")
+@json_option
+def new_command(name: str | None, output: Path | None, as_json: bool) -> None:
+    """List the example scenes, or copy the one called NAME, to be changed.
+
+    `mpmcli simulate NAME` runs one as it is.
+    """
+    from mpmcli.scene.examples import caption, examples, files_of, title
+    from mpmcli.scene.problem import hint_at
+
+    known = examples()
+    if name is None:
+        if as_json:
+            print_json({key: {"title": title(path), "shows": caption(path)} for key, path in known.items()})
+        else:
+            width = max(map(len, known))
+            print_text("\n".join(f"{key:<{width}}  {title(path)}" for key, path in known.items()))
+        return
+    if name not in known:
+        raise InputError(f'there is no example "{name}"; {hint_at(name, list(known), "mpmcli new lists them")}')
+    source, target = known[name], output or Path(f"{name}.toml")
+    copies = {target: source} | {target.parent / file: source.parent / file for file in files_of(source)}
+    for path in copies:
+        if path.exists():
+            raise InputError(f"{path} is there already; give another place with -o.")
+    for path, original in copies.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        copyfile(original, path)
+    if as_json:
+        print_json({"path": str(target), "files": [str(path) for path in copies], "shows": caption(source)})
+    else:
+        print_note(f"{title(source)}: {caption(source)}\nTo run it: mpmcli simulate {target}")
+        print_text(str(target))
 
 
 @click.command("materials")

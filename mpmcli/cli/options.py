@@ -8,6 +8,21 @@ from pathlib import Path
 import click
 
 PATH = click.Path(path_type=Path)
+
+
+class SceneOrResult(click.Path):
+    """A path, or the name of an example scene where nothing of that name is there."""
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        path = super().convert(value, param, ctx)
+        if path.suffix or path.parent != Path() or path.exists():
+            return path
+        from mpmcli.scene.examples import examples
+
+        return examples().get(path.name, path)
+
+
+SCENE = SceneOrResult(path_type=Path)
 COUNT = click.IntRange(min=1)
 
 SECONDS = {"d": 86400, "h": 3600, "m": 60, "min": 60, "s": 1}

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from mpmcli.cli.interrupt import interrupt_came, interrupts_wait
-from mpmcli.cli.options import COUNT, PATH, choice_option, json_option, output_option, quiet_option
+from mpmcli.cli.options import COUNT, PATH, SCENE, choice_option, json_option, output_option, quiet_option
 from mpmcli.cli.streams import print_json, print_note, print_text
 from mpmcli.errors import InputError
 from mpmcli.render.settings import COLLIDERS, MODES, THEMES, parse_size
@@ -24,7 +24,7 @@ WIDEST = 3
 
 
 @click.command("render")
-@click.argument("result", type=PATH)
+@click.argument("result", type=SCENE)
 @output_option("A .png for one picture, or a directory; by default the directory render beside the result.", "OUT")
 @choice_option("--mode", MODES, "dots", "How particles are drawn.")
 @click.option(

@@ -18,6 +18,7 @@ from mpmcli.errors import MpmcliError
 # Name of each command, the module that holds it as NAME_command, and its line in the help, which so loads no module.
 COMMANDS = {
     "simulate": ("simulate", "Run a scene and store its particles."),
+    "new": ("materials", "List the example scenes, or copy one."),
     "check": ("inspection", "Say which step is safe and why, or whether a result stayed stable."),
     "warm": ("simulate", "Compile the kernels of scenes ahead."),
     "sweep": ("dataset", "Compute a dataset of many varied runs."),
