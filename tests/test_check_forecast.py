@@ -167,9 +167,9 @@ def test_the_command_probes_and_writes_nothing(tmp_path: Path, monkeypatch: pyte
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "drop.toml"
     path.write_text(SCENE)
-    outcome = run_here("check", path, "--threads", "2", "--json")
+    outcome = run_here("check", path, "--probe", "--threads", "2", "--json")
     forecast = json.loads(outcome.stdout)["forecast"]
-    assert outcome.status == 0
+    assert outcome.status == 0 and forecast["measured"]
     assert forecast["seconds"] > forecast["steps"] * forecast["step_seconds"] + forecast["compile_seconds"] > 0
     assert list(tmp_path.iterdir()) == [path]
 
@@ -177,7 +177,7 @@ def test_the_command_probes_and_writes_nothing(tmp_path: Path, monkeypatch: pyte
         raise UnstableRunError(Diagnosis(1, 0.1, 7, "drop", (0.5, 0.5), "went to pieces", "wave", 0.1, "look at it"))
 
     monkeypatch.setattr(Run, "advance", broken)
-    outcome = run_here("check", path, "--threads", "2")
+    outcome = run_here("check", path, "--probe", "--threads", "2")
     assert outcome.status == 1
     assert "error: The run became unstable within 0 steps of the probe: the run became unstable" in outcome.stdout
     assert "not ok: 1 error" in outcome.stdout

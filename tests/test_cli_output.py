@@ -52,8 +52,9 @@ def test_json_is_all_there_is_on_stdout(results):
     lines = outcome.stderr.splitlines()
     assert lines[0] == summary["notes"][0]
     assert lines[1].startswith("256 particles on ")
+    assert "steps of about" in lines[2] and "by a table of measured kinds" in lines[2]
     # A slow machine has time for lines of progress.
-    assert all("/5 frames: t = " in line for line in lines[2:])
+    assert all("/5 frames: t = " in line for line in lines[3:])
 
 
 def test_quiet_says_nothing(results):

@@ -56,7 +56,7 @@ def with_manifest(directory: Path) -> Path:
 
 def put(name: str, directory: Path) -> tuple[Path, list[tuple[str, ...]]]:
     """Put a file of the corpus where a command finds it; return what is given to the commands, and these."""
-    checks = [("check", "{}", "--no-probe"), ("info", "{}")]
+    checks = [("check", "{}"), ("info", "{}")]
     if name in ("mesh.obj", "points.npy"):
         shape, _, _ = name.partition(".")
         more = "" if shape == "mesh" else 'spacing = 0.1, velocity = ["vx", "vy", "vz"]'

@@ -263,7 +263,7 @@ def test_a_law_is_one_file_of_the_package(tmp_path: Path) -> None:
     (law,) = said("materials", "log_fluid", "--json")["laws"]
     assert [knob["name"] for knob in law["knobs"]] == ["swiftness"]
     assert "LogFluidParameters" in said("schema")["$defs"]
-    assert said("check", "scene.toml", "--no-probe", "--json")["ok"]
+    assert said("check", "scene.toml", "--json")["ok"]
     summary = said("simulate", "scene.toml", "-o", "result", "--json")
     assert (summary["status"], summary["frames"]) == ("finished", 5)
     assert said("check", "result", "--json")["verdict"] == "stable"

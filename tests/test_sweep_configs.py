@@ -58,7 +58,7 @@ def test_a_base_scene_says_what_it_is_and_passes_the_check(path):
     said = int(re.search(r"# How long it takes: ([\d,]+) particles", header)[1].replace(",", ""))
     particles = estimate_particles(load_scene(path, laws=LAWS).scene)
     assert said == pytest.approx(particles, rel=0.05)
-    outcome = run_here("check", path, "--no-probe")
+    outcome = run_here("check", path)
     assert (outcome.status, outcome.stderr) == (0, "")
 
 

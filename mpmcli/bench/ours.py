@@ -93,10 +93,10 @@ class Ours:
     def __init__(self, data: dict, particles: list[BodyParticles] | None, threads: int, arch: str = "cpu") -> None:
         """Put the scene on the device, with these particles, one entry per body, in place of its own sampling."""
         from mpmcli.solver.engine.batch import Batch
-        from mpmcli.solver.engine.build import useful_threads
         from mpmcli.solver.engine.compiled_kind import CompiledKind
         from mpmcli.solver.engine.run import Run
         from mpmcli.solver.machine.backend import choose_backend, start
+        from mpmcli.solver.machine.costs import useful_threads
 
         scene = parse_scene(data, laws=parameter_models(), source=data["title"]).scene
         backend = choose_backend(arch, threads, scene.solver.precision, compile_cache=False)

@@ -19,6 +19,7 @@ from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene, scene_to_toml
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.frames.builder import POSITION_ERROR
+from mpmcli.solver.machine.costs import WORTH, cheapest, cost_of
 from mpmcli.solver.machine.plan import Plan, require_room
 from mpmcli.solver.transfer.kept_motion import OWN_STEP, own_limit
 from mpmcli.stability.transfer_factors import loss_per_step
@@ -34,6 +35,8 @@ VTU_BYTES = 1300
 # Seconds to flush a group of frames to disk and to take a frame into one, and bytes per second of a disk, measured on
 # four scenes.
 SEAL_SECONDS = 0.03
+# Seconds until a run begins to compile.
+START_SECONDS = 1.0
 FRAME_SECONDS = 0.0005
 DISK_BYTES_PER_SECOND = 4e8
 # A frame is written once as a segment, read, written into the packed file, and compared: four passes.
@@ -55,10 +58,12 @@ class Forecast:
     steps_range: tuple[int, int]
     # Those stored, including the first.
     frames: int
-    # Wall time of the run, part of it for the compilation of kernels, and that of a step; None without a probe.
+    # Wall time of the run, part of it for the compilation of kernels, and that of a step: by a probe if `measured`,
+    # else by the table of costs, which has none for GPUs.
     seconds: float | None
     compile_seconds: float | None
     step_seconds: float | None
+    measured: bool
     # All fields on the device; a frame and what it is made of, or the initial state; the packed file without
     # compression; the series of --format vtk.
     device_bytes: int
@@ -71,18 +76,29 @@ class Forecast:
         return {**vars(self), "steps_range": list(self.steps_range)}
 
 
-def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
-    """Return the forecast of a run; times are None without a probe."""
+def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None, threads: int) -> Forecast:
+    """Return the forecast of a run on some threads; times are those of the probe, if there is one."""
     scene = facts.scene
     steps = expected_steps(facts)
     file_bytes = packed_bytes(scene, plan.particles)
     frames = scene.time.frames + 1
+    start, compiling, step, frame = START_SECONDS, None, None, 0.0
+    if probe is not None:
+        start, compiling, step, frame = (
+            probe.start_seconds,
+            probe.compile_seconds,
+            probe.step_seconds,
+            probe.frame_seconds,
+        )
+    elif plan.arch == "cpu":
+        cost = cost_of(scene, cheapest(scene, steps, threads))
+        compiling, step = cost.compile, cost.step / threads**WORTH
     seconds = None
-    if probe is not None and probe.step_seconds is not None:
-        computing = steps * probe.step_seconds + frames * probe.frame_seconds
+    if compiling is not None and step is not None:
+        computing = steps * step + frames * frame
         seconds = (
-            probe.start_seconds
-            + probe.compile_seconds
+            start
+            + compiling
             + computing
             + frames * FRAME_SECONDS
             # Frames are sealed in groups, once in HOLD seconds.
@@ -94,8 +110,9 @@ def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None) -> Forecast:
         steps_range=(steps_at(facts, facts.step_at_start), steps_at(facts, facts.step)),
         frames=frames,
         seconds=seconds,
-        compile_seconds=None if probe is None else probe.compile_seconds,
-        step_seconds=None if probe is None else probe.step_seconds,
+        compile_seconds=compiling,
+        step_seconds=step,
+        measured=probe is not None,
         device_bytes=plan.device_bytes,
         host_bytes=plan.host_bytes,
         file_bytes=file_bytes,
@@ -120,6 +137,11 @@ def expected_steps(facts: SceneFacts) -> int:
     whole = math.floor(free * frames)
     mixed = (free * frames - whole) * before + (1 - free * frames + whole) * after if whole < frames else 0.0
     return round(whole * before + mixed + max(0, frames - whole - 1) * after)
+
+
+def step_seconds(scene: Scene) -> float:
+    """Return what a step of one of many runs takes on one thread, s, by the table of costs."""
+    return cost_of(scene, "most").step
 
 
 def damped_step(facts: SceneFacts, body: BodyFacts, step: float, shorter: float = 1.0) -> float:

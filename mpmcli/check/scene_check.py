@@ -17,6 +17,7 @@ from mpmcli.errors import InputError
 from mpmcli.plain_text import counted, size_text, text_table
 from mpmcli.scene import LoadedScene
 from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.machine.costs import useful_threads
 from mpmcli.solver.machine.plan import Plan, make_plan
 
 # A scene of more steps is rejected; the counts of a forecast are exact below 2^53.
@@ -56,6 +57,17 @@ class SceneCheck:
         ]
         return "\n\n".join(part for part in parts if part)
 
+    def outlook(self) -> str:
+        """Return one line for a run that begins: steps and what sets them, frames, disk, time."""
+        forecast, limit, step = self.forecast, self.facts.binding, self.facts.taken(self.facts.step_expected)
+        cause = f"by the {limit.name} limit" + (f' of "{limit.body}"' if limit.body else "")
+        if step < self.facts.step_expected:
+            cause = "as the scene asks"
+        return (
+            f"{forecast.steps:,} steps of about {step:.3g} s, {cause}; {counted(forecast.frames, 'frame')}, "
+            f"{size_text(forecast.file_bytes)}{_took_text(forecast)}"
+        )
+
     def as_dict(self) -> dict:
         """Return the check as a dictionary for JSON; `ok` is whether it passes."""
         facts, (always, at_start) = self.facts, (self.facts.binding, self.facts.binding_at_start)
@@ -77,11 +89,17 @@ class SceneCheck:
 
 
 def check_scene(
-    loaded: LoadedScene, *, plan: Plan | None = None, probe: Probe | None = None, directory: Path = Path()
+    loaded: LoadedScene,
+    *,
+    plan: Plan | None = None,
+    probe: Probe | None = None,
+    directory: Path = Path(),
+    threads: int | None = None,
 ) -> SceneCheck:
     """Check a scene, without Taichi; the plan is by default for all cores, the probe measures the cost of a step.
 
-    `directory` is where results would go. InputError: no step is stable, or more than MOST_STEPS are needed.
+    `directory` is where results would go, `threads` those of the run: None for as many as the scene has use for.
+    InputError: no step is stable, or more than MOST_STEPS are needed.
     """
     scene = loaded.scene
     facts = SceneFacts(scene)
@@ -93,7 +111,8 @@ def check_scene(
         )
     if plan is None:
         plan = make_plan(scene, Backend("cpu", available_cores(), scene.solver.precision, compile_cache=True))
-    forecast = forecast_of(facts, plan, probe)
+    threads = threads or useful_threads(plan.particles, available_cores())
+    forecast = forecast_of(facts, plan, probe, threads)
     rules = (step_findings, shape_findings, material_findings, drive_findings, loss_findings, rounding_findings)
     findings = [finding for rule in rules for finding in rule(facts)]
     findings += output_findings(facts, plan, forecast, directory)
@@ -160,15 +179,21 @@ def _plan_text(plan: Plan) -> str:
 def _forecast_text(forecast: Forecast) -> str:
     low, high = sorted(forecast.steps_range)
     steps = f"{forecast.steps:,} steps" + (f" ({low:,} to {high:,})" if low != high else "")
-    took = ""
-    if forecast.seconds is not None:
-        took = f", {_time_text(forecast.seconds)} here, {forecast.compile_seconds:.2g} s of it compilation"
     return (
-        f"{steps}, {forecast.frames:,} frames{took}\n"
+        f"{steps}, {forecast.frames:,} frames{_took_text(forecast)}\n"
         f"{size_text(forecast.device_bytes)} on the device, {size_text(forecast.host_bytes)} for frames beside it, "
         f"{size_text(forecast.file_bytes)} on the disk before "
         f"compression ({size_text(forecast.vtk_bytes)} more with --format vtk)"
     )
+
+
+def _took_text(forecast: Forecast) -> str:
+    if forecast.seconds is None:
+        return ""
+    compiling = f"{forecast.compile_seconds:.2g} s of it to compile"
+    if not forecast.measured:
+        compiling += ", unless a run of this kind did; by a table of measured kinds"
+    return f", {_time_text(forecast.seconds)} ({compiling})"
 
 
 def _time_text(seconds: float) -> str:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from mpmcli.cli.options import COUNT, PATH, json_option, plugin_option, set_option
+from mpmcli.cli.options import COUNT, SCENE, json_option, plugin_option, set_option
 from mpmcli.cli.streams import print_answer, print_json, print_text
 from mpmcli.errors import InputError
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 @click.command("check")
-@click.argument("path", type=PATH)
+@click.argument("path", type=SCENE)
 @set_option
 @plugin_option
-@click.option("--no-probe", is_flag=True, help="Skip the run of two seconds that measures the time of a step.")
+@click.option("--probe", is_flag=True, help="Measure the time of a step by a run of two seconds, and of compilation.")
 @click.option("--strict", is_flag=True, help="Treat warnings as errors.")
 @click.option("--threads", type=COUNT, help="CPU threads; as many as simulate takes by default.")
 @json_option
@@ -32,7 +32,7 @@ def check_command(path: Path, strict: bool, as_json: bool, **of_scene: object) -
     if path.suffix == ".toml":
         check = _check_scene(path, **of_scene)
     else:
-        options = {"overrides": "--set", "plugins": "--plugin", "no_probe": "--no-probe", "threads": "--threads"}
+        options = {"overrides": "--set", "plugins": "--plugin", "probe": "--probe", "threads": "--threads"}
         given = [option for name, option in options.items() if of_scene[name]]
         if given:
             raise InputError(f"{given[0]} is for scenes, and {path} is none; leave it out.")
@@ -47,9 +47,8 @@ def check_command(path: Path, strict: bool, as_json: bool, **of_scene: object) -
 
 
 def _check_scene(
-    path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], no_probe: bool, threads: int | None
+    path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], probe: bool, threads: int | None
 ) -> "SceneCheck":
-    from mpmcli.check.probe import probe_scene
     from mpmcli.check.scene_check import check_scene
     from mpmcli.cores import available_cores
     from mpmcli.materials.registry import load_plugins
@@ -59,16 +58,18 @@ def _check_scene(
 
     loaded = load_scene(path, overrides, laws=load_plugins(plugins))
     backend = Backend("cpu", threads or available_cores(), loaded.scene.solver.precision, compile_cache=True)
-    check = check_scene(loaded, plan=make_plan(loaded.scene, backend))
+    check = check_scene(loaded, plan=make_plan(loaded.scene, backend), threads=threads)
     # A scene that does not fit into memory is not run.
-    if not no_probe and not any(finding.rule == "memory" for finding in check.findings):
-        probe, plan = probe_scene(loaded, check.forecast.steps, threads=threads)
-        check = check_scene(loaded, plan=plan, probe=probe)
+    if probe and not any(finding.rule == "memory" for finding in check.findings):
+        from mpmcli.check.probe import probe_scene
+
+        found, plan = probe_scene(loaded, check.forecast.steps, threads=threads)
+        check = check_scene(loaded, plan=plan, probe=found, threads=threads)
     return check
 
 
 @click.command("info")
-@click.argument("path", type=PATH)
+@click.argument("path", type=SCENE)
 @set_option
 @plugin_option
 @click.option("--verify", is_flag=True, help="Read all of a result, a dataset or an export, and compare its checksums.")

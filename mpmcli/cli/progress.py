@@ -102,13 +102,16 @@ class SimulateProgress(ProgressBar):
             f"{plan.device_bytes / 1e6:.3g} MB on the device "
             f"({plan.bytes_per_particle} B per particle, {plan.bytes_per_node} B per node)"
         )
+        if summary.outlook:
+            self.say(summary.outlook)
 
     def advance(self, row: "LedgerRow", summary: "RunSummary") -> None:
         """Show one more stored frame."""
         if summary.frames < 2:
             return  # the kernels compile in the first step
         taken = summary.timings["solve_s"] + summary.timings["output_s"]
-        left = taken * (self._total - summary.frames) / (summary.frames - 1)
+        steps_left = (self._end - summary.time) / row.step_max
+        left = taken / (summary.steps - summary.steps_before) * steps_left
         self.show(
             summary.frames,
             f"t = {row.time:.4g} of {self._end:.4g} s, {summary.rate / 1e6:.1f} M particle-steps/s",

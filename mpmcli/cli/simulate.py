@@ -1,5 +1,6 @@
 """`mpmcli simulate` and `mpmcli warm`."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -8,14 +9,14 @@ import click
 
 from mpmcli.cli import options
 from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
-from mpmcli.cli.options import COUNT, PATH, json_option, quiet_option
-from mpmcli.cli.streams import print_answer, print_json, print_text
+from mpmcli.cli.options import COUNT, SCENE, json_option, quiet_option
+from mpmcli.cli.streams import print_answer, print_json, print_note, print_text
 from mpmcli.cli.supervisor import announce
 from mpmcli.errors import InputError
 
 
 @click.command("simulate")
-@click.argument("scene", type=PATH)
+@click.argument("scene", type=SCENE)
 @options.output_option("Where the result goes; results/<name of the scene> by default.", name="directory")
 @options.set_option
 @options.plugin_option
@@ -50,7 +51,10 @@ from mpmcli.errors import InputError
 @quiet_option
 @json_option
 def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: bool, **run: Any) -> int:
-    """Run SCENE, a TOML file, and store its particles for ParaView, h5py and learners."""
+    """Run SCENE and store its particles for ParaView, h5py and learners.
+
+    SCENE is a TOML file, or the name of an example, which `mpmcli new` lists.
+    """
     from mpmcli.cli.progress import SimulateProgress
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
@@ -71,12 +75,15 @@ def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: b
     with progress, interrupts_wait():
         summary = simulate(loaded, settings, progress.start, progress.advance, interrupt_came)
     progress.close(summary)
+    if summary.status in ("interrupted", "stopped") and summary.frames:
+        again = [word for word in sys.argv[1:] if word not in ("--overwrite", "--resume")]
+        print_note(f"To go on: {shlex.join(['mpmcli', *again, '--resume'])}")
     print_answer(summary, as_json, quiet=quiet)
     return {"finished": 0, "interrupted": interrupted_code()}.get(summary.status, 1)
 
 
 @click.command("warm")
-@click.argument("scenes", type=PATH, nargs=-1, required=True)
+@click.argument("scenes", type=SCENE, nargs=-1, required=True)
 @options.arch_option("Where they will be computed")
 @click.option("--threads", type=COUNT, help="CPU threads; by default as many as `mpmcli simulate` takes.")
 @click.option("--jobs", type=COUNT, help="Processes at once; one for each core by default.")

@@ -14,10 +14,10 @@ import numpy as np
 
 from mpmcli import __version__
 from mpmcli.check.facts import SceneFacts
-from mpmcli.check.forecast import expected_steps, layout_of
+from mpmcli.check.forecast import expected_steps, layout_of, step_seconds
 from mpmcli.cores import available_cores
 from mpmcli.dataset.card import write_card
-from mpmcli.dataset.compute import LOOK_AHEAD, Task, Workers, joined_workers, local_workers, scene_fault
+from mpmcli.dataset.compute import Task, Workers, joined_workers, local_workers, scene_fault
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.folder import MANIFEST, SHARD_BYTES, VERDICTS, Folder, Manifest, Row, require_empty
 from mpmcli.dataset.shard import BASE, LABELS, SWEEP
@@ -30,7 +30,6 @@ from mpmcli.output.lock import LOCK, refuse_locked, take_lock
 from mpmcli.plain_text import counted, duration_text, size_text, text_table
 from mpmcli.scene import Scene, estimate_particles
 from mpmcli.simulation.engine import Arch
-from mpmcli.simulation.runner import Runner
 
 # Trajectories whose sizes give the size of all.
 SAMPLE = 16
@@ -40,8 +39,6 @@ HEADER_BYTES, FRAME_BYTES = 11_000, 200
 TASK, GPU_TASK, ROUNDS = 8, 128, 8
 # Why a trajectory has failed that no worker survived.
 LOST = "every worker that computed it was killed, perhaps for want of memory."
-# Seconds of the run that measures the time of a particle-step.
-PROBE_SECONDS = 1.0
 # Rows of the table of a rehearsal, and faults below it.
 MOST_ROWS, MOST_FAULTS = 20, 10
 
@@ -325,7 +322,10 @@ def _tasks(sweep: Sweep, settings: SweepSettings, numbers: Sequence[int], worker
 
 @dataclass(frozen=True)
 class Rehearsed:
-    """One trajectory: values by key, expected counts, bytes without compression, and why it cannot be computed."""
+    """One trajectory: values by key, counts, bytes without compression, seconds, and why it cannot be computed.
+
+    Seconds are those of a thread by the table of costs, 0 where the trajectory cannot be computed.
+    """
 
     number: int
     split: str
@@ -333,15 +333,15 @@ class Rehearsed:
     particles: int
     steps: int
     bytes: int
+    seconds: float
     fault: str
 
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """Trajectories of a part, and the particle-steps per second of one of the `workers`, 0 where none is computed."""
+    """Trajectories of a part, and the workers that share them."""
 
     trajectories: tuple[Rehearsed, ...]
-    rate: float
     workers: int
 
     @property
@@ -356,14 +356,13 @@ class Rehearsal:
 
     @property
     def seconds(self) -> float | None:
-        """Expected wall time, None where it is not known."""
-        work = sum(one.particles * one.steps for one in self.trajectories)
-        return work / self.rate / self.workers if self.rate else None
+        """Expected wall time, None where none can be computed."""
+        return sum(one.seconds for one in self.trajectories) / self.workers or None
 
     def as_dict(self) -> dict:
         """Return it as JSON can hold it."""
         whole = {"ok": self.passes, "trajectories": [vars(one) for one in self.trajectories], "bytes": self.bytes}
-        return {**whole, "seconds": self.seconds, "workers": self.workers, "particle_steps_per_s": self.rate}
+        return {**whole, "seconds": self.seconds, "workers": self.workers}
 
     def text(self) -> str:
         """Return it as text: the first draws, what cannot be computed, and the forecast."""
@@ -388,51 +387,27 @@ class Rehearsal:
 
 
 def rehearse(sweep: Sweep, settings: SweepSettings, stop: Callable[[], bool] = lambda: False) -> Rehearsal:
-    """Draw and check the trajectories of a part, and time the first sound one; InputError: none can be drawn."""
+    """Draw and check the trajectories of a part, and forecast their cost; InputError: none can be drawn."""
     laws = load_plugins(settings.plugins)
     per_shard = _per_shard(_bytes_of_trajectories(sweep, settings))
     folder = Folder(settings.directory, sweep.count, per_shard, settings.part)
-    found, sound, first = [], None, []
+    found = []
     for number in folder.all_numbers():
         if stop():
             raise KeyboardInterrupt
-        values, fault, counts = {}, "", (0, 0, 0)
+        values, fault, counts = {}, "", (0, 0, 0, 0.0)
         try:
             drawn = draw(sweep, number)
             values = drawn.values
             loaded = drawn.scene(laws)
             fault, particles = scene_fault(loaded), estimate_particles(loaded.scene)
             steps = expected_steps(SceneFacts(loaded.scene))
-            counts = particles, steps, trajectory_bytes(loaded.scene, particles)
-            if not fault:
-                sound = sound or loaded.scene
-                first += [loaded.scene] if number < LOOK_AHEAD else []
+            seconds = 0.0 if fault else steps * step_seconds(loaded.scene)
+            counts = particles, steps, trajectory_bytes(loaded.scene, particles), seconds
         except InputError as error:
             fault = str(error)
         found.append(Rehearsed(number, sweep.split_of(number), values, *counts, fault))
-    rate = 0.0 if sound is None else _rate(sound, first, settings)
-    return Rehearsal(tuple(found), rate, settings.workers or available_cores())
-
-
-def _rate(scene: Scene, first: Sequence[Scene], settings: SweepSettings) -> float:
-    """Return particle-steps per second of a worker, compiled with room for the `first` scenes, as a sweep's are."""
-    runner = Runner(settings.arch, settings.threads)
-    with suppress(InputError):
-        runner.expect(first)
-    interval = scene.time.end / scene.time.frames
-    # The first run compiles the kernels.
-    frames, seconds, steps = 1, 0.0, 0
-    runner.run(_cut(scene, interval, frames))
-    while seconds < PROBE_SECONDS and frames <= scene.time.frames:
-        began = time.perf_counter()
-        recording = runner.run(_cut(scene, interval, frames))
-        seconds, steps = time.perf_counter() - began, recording.steps
-        frames *= 2
-    return recording.particles * steps / seconds
-
-
-def _cut(scene: Scene, interval: float, frames: int) -> Scene:
-    return scene.model_copy(update={"time": scene.time.model_copy(update={"end": frames * interval, "frames": frames})})
+    return Rehearsal(tuple(found), settings.workers or available_cores())
 
 
 def _short(value: Any) -> str:

@@ -63,7 +63,8 @@ def simulate(
     earlier = find_resumption(loaded, settings.directory) if settings.resume else None
     backend = backend_for(scene, settings.arch, settings.threads, compile_cache=settings.compile_cache)
     plan = make_plan(scene, backend)
-    findings = check_scene(loaded, plan=plan, directory=settings.directory).findings
+    check = check_scene(loaded, plan=plan, directory=settings.directory, threads=backend.threads)
+    findings = check.findings
     if not (settings.force or passes(findings)):
         raise InputError(_refusal(loaded.source, findings))
     complete = earlier is not None and earlier.complete
@@ -82,7 +83,7 @@ def simulate(
             if earlier is None:
                 taken.clear()
         notes = (*loaded.notes, *(finding.line for finding in findings if finding.severity != "note"))
-        begun = _Begun(loaded, settings, plan, backend, earlier, notes, began, taken)
+        begun = _Begun(loaded, settings, plan, backend, earlier, notes, began, taken, check.outlook())
         if run is None:
             return _complete(begun, on_start, stop)
         return _store_run(begun, run, on_start, on_frame, stop)
@@ -97,6 +98,7 @@ class _Begun(NamedTuple):
     notes: tuple[str, ...]
     began: float
     taken: TakenDirectory
+    outlook: str
 
 
 def _build(scene: Scene, settings: RunSettings, plan: Plan, backend: Backend) -> Run:
@@ -119,7 +121,7 @@ def _store_run(
     on_frame: Callable[[LedgerRow, RunSummary], None],
     stop: Callable[[], bool | str],
 ) -> RunSummary:
-    loaded, settings, plan, backend, earlier, notes, began, taken = begun
+    loaded, settings, plan, backend, earlier, notes, began, taken, outlook = begun
     scene = loaded.scene
     forced = settings.force and scene.time.step != "auto"
     text = scene_to_toml(scene)
@@ -130,6 +132,7 @@ def _store_run(
         go_on(run, earlier, backend, forced=forced)
         take_over(settings.directory, earlier)
     summary = new_summary(loaded, settings, plan, backend, earlier, notes)
+    summary.outlook = "" if earlier is not None else outlook
     on_start(summary)
     record = new_record(loaded, settings, summary, earlier)
     record.write()
@@ -177,7 +180,7 @@ def _store_run(
 
 def _complete(begun: _Begun, on_start: Callable[[RunSummary], None], stop: Callable[[], bool | str]) -> RunSummary:
     """Pack the frames of a run that had stored all of them; nothing is done where they are packed."""
-    loaded, settings, plan, backend, earlier, notes, began, _ = begun
+    loaded, settings, plan, backend, earlier, notes, began, *_ = begun
     summary = new_summary(loaded, settings, plan, backend, earlier, notes)
     on_start(summary)
     clock = Stopwatch(summary.timings, began)
@@ -232,7 +235,7 @@ def _compute(
         with clock.adding("output_s"):
             clock.book(run.first_step_seconds, "compile_s")
             clock.book(run.frame_seconds + checkpoints.seconds, "output_s")
-            summary.steps = run.step_count
+            summary.steps, summary.time = run.step_count, run.time
             summary.timings["watch_s"] = run.measure_seconds
             record.timings = summary.timings
             for row in sealed:

@@ -15,10 +15,10 @@ class RunSummary:
         directory: where the result is; path: the file to open, None where no frame was written.
         status: "finished", "unstable", "interrupted" by a signal, "stopped" at a limit or for want of room, "failed".
         message: why it ended early, "" where it did not.
-        frames, steps, particles: counts; frames_expected: of the whole run; steps_before:
+        time: simulated so far, s. frames, steps, particles: counts; frames_expected: of the whole run; steps_before:
             those of earlier processes, where the run was resumed.
         backend: "arch", "threads" and "precision"; plan: memory and passes.
-        notes: what was chosen for the user, and warnings of the check.
+        notes: what was chosen for the user, and warnings of the check; outlook: its forecast, a line.
         timings: seconds by name: start_s (load and allocate), compile_s (first step, compilation
             included), solve_s (all further steps), watch_s (of these, measuring the state for the limits), output_s
             (frames and packing), wall_s.
@@ -34,6 +34,8 @@ class RunSummary:
     status: str = "running"
     message: str = ""
     path: Path | None = None
+    outlook: str = ""
+    time: float = 0.0
     frames: int = 0
     steps: int = 0
     steps_before: int = 0

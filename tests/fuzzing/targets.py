@@ -37,7 +37,7 @@ class Target:
 
 
 def _check(rng: Random) -> tuple[Words, ...]:
-    return (("info", "scene.toml"),) if rng.random() < 0.1 else (("check", "scene.toml", "--no-probe"),)
+    return (("info", "scene.toml"),) if rng.random() < 0.1 else (("check", "scene.toml"),)
 
 
 def _toml(data: dict, otherwise: bytes) -> bytes:

@@ -9,14 +9,10 @@ from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.run import Run
 from mpmcli.solver.machine.backend import Arch, Backend, choose_backend
+from mpmcli.solver.machine.costs import cheapest, useful_threads
 
-# Particles that are worth a thread.
-WORTH_A_THREAD = 2_500
 # On a GPU, where runs advance at once.
 FEW_ON_GPU = 100_000
-# Particle-steps below which the time to optimise kernels exceeds what faster steps save, about a tenth: of one law. The
-# time grows faster than the number of laws, which share one kernel.
-LITTLE_WORK = 8e8
 
 
 def backend_for(
@@ -39,15 +35,8 @@ def backend_for(
     backend = choose_backend(arch, threads, scene.solver.precision, compile_cache=compile_cache)
     if not backend.on_cpu:
         return backend
-    particles = estimate_particles(scene)
-    little = LITTLE_WORK * len({body.material.law for body in scene.sources}) ** 2
-    optimisation = "few" if particles * expected_steps() < little else "most"
-    return replace(backend, threads=threads or useful_threads(particles, backend.threads), optimisation=optimisation)
-
-
-def useful_threads(particles: int, threads: int) -> int:
-    """Return how many of these threads a run of so many particles has use for."""
-    return min(threads, max(1, particles // WORTH_A_THREAD))
+    threads = threads or useful_threads(estimate_particles(scene), backend.threads)
+    return replace(backend, threads=threads, optimisation=cheapest(scene, expected_steps(), threads))
 
 
 def suits_batch(particles: int, backend: Backend) -> bool:
