@@ -139,9 +139,9 @@ def expected_steps(facts: SceneFacts) -> int:
     return round(whole * before + mixed + max(0, frames - whole - 1) * after)
 
 
-def step_seconds(scene: Scene) -> float:
-    """Return what a step of one of many runs takes on one thread, s, by the table of costs."""
-    return cost_of(scene, "most").step
+def seconds_of_one(scene: Scene, steps: int) -> float:
+    """Return what one of many runs takes on one thread, s, by the table of costs."""
+    return steps * cost_of(scene, "most").step + scene.time.frames * FRAME_SECONDS
 
 
 def damped_step(facts: SceneFacts, body: BodyFacts, step: float, shorter: float = 1.0) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mpmcli import __version__
 from mpmcli.check.facts import SceneFacts
-from mpmcli.check.forecast import expected_steps, layout_of, step_seconds
+from mpmcli.check.forecast import expected_steps, layout_of, seconds_of_one
 from mpmcli.cores import available_cores
 from mpmcli.dataset.card import write_card
 from mpmcli.dataset.compute import Task, Workers, joined_workers, local_workers, scene_fault
@@ -402,7 +402,7 @@ def rehearse(sweep: Sweep, settings: SweepSettings, stop: Callable[[], bool] = l
             loaded = drawn.scene(laws)
             fault, particles = scene_fault(loaded), estimate_particles(loaded.scene)
             steps = expected_steps(SceneFacts(loaded.scene))
-            seconds = 0.0 if fault else steps * step_seconds(loaded.scene)
+            seconds = 0.0 if fault else seconds_of_one(loaded.scene, steps)
             counts = particles, steps, trajectory_bytes(loaded.scene, particles), seconds
         except InputError as error:
             fault = str(error)
