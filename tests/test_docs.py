@@ -17,7 +17,7 @@ from command import ROOT
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.output.ledger_table import COLUMNS
-from mpmcli.scene import parse_scene, scene_to_toml
+from mpmcli.scene import load_scene, parse_scene, scene_to_toml
 from mpmcli.scene.expression import FUNCTIONS
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -240,7 +240,7 @@ def test_the_table_of_keys_is_complete():
 def test_the_expressions_of_the_page_belong_to_the_first_scene():
     """Put into the first scene, the fragment makes another that loads, and says what it said."""
     scene = tomllib.loads(blocks("toml", "README.md")[0])
-    fragment = tomllib.loads(blocks("toml", "docs/scenes.md")[0])
+    fragment = tomllib.loads(next(block for block in blocks("toml", "docs/scenes.md") if "sin(2 * t)" in block))
     scene["domain"] |= fragment["domain"]
     scene["bodies"][0] |= fragment["bodies"][0]
     loaded = parse_scene({**scene, "forces": fragment["forces"]}, laws=parameter_models()).scene
@@ -250,6 +250,13 @@ def test_the_expressions_of_the_page_belong_to_the_first_scene():
     page = PAGES["docs/scenes.md"]
     told = page[page.index("## Forces and initial") : page.index("## Example scenes")]
     assert set(FUNCTIONS) <= set(re.findall(r"\w+", told))
+
+
+def test_the_scene_of_the_page_with_a_base_loads(tmp_path):
+    (tmp_path / "drop.toml").write_text(blocks("toml", "README.md")[0], encoding="utf-8")
+    (tmp_path / "other.toml").write_text(blocks("toml", "docs/scenes.md")[0], encoding="utf-8")
+    scene = load_scene(tmp_path / "other.toml", laws=parameter_models()).scene
+    assert [(body.name, body.material.density) for body in scene.bodies] == [("pool", 1020.0)] and scene.time.end == 2.0
 
 
 def script(name: str):

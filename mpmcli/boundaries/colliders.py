@@ -18,6 +18,7 @@ from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.expression import evaluate
 from mpmcli.scene.primitives import Box, Polygon
+from mpmcli.scene.quantity import AXES
 from mpmcli.scene.surface import form_surface, surface_points
 
 # Cells outside of a surface up to which it acts on nodes: the outermost of them lies between a quarter of a cell inside
@@ -25,8 +26,10 @@ from mpmcli.scene.surface import form_surface, surface_points
 # 3.8). A little more, so that no node is at that distance by rounding.
 REACH = 0.76
 # Codes of what a surface does.
-SLIP, STICK, SEPARATE = range(3)
-WALLS = {"slip": SLIP, "stick": STICK, "separate": SEPARATE}
+SLIP, STICK, SEPARATE, HOLD = range(4)
+WALLS = {"slip": SLIP, "stick": STICK, "separate": SEPARATE, "hold": HOLD}
+# Cells outside of a shape that holds, up to which it holds nodes, so that what is held ends half a cell off at most.
+HELD_OUTSIDE = 0.499
 # What a surface does to a node: nothing, it takes what is normal to it and perhaps a part of the rest, or all.
 LOOSE, PRESSED, HELD = range(3)
 FORMS = tuple(DISTANCES)
@@ -156,6 +159,8 @@ class Colliders:
         self.form, self.wall = ti.field(int, shape=n), ti.field(int, shape=n)
         self.begin, self.side = ti.field(int, shape=n), ti.field(int, shape=n)
         self.friction = ti.field(float, shape=n)
+        # Along which axes it lets go of what it holds, 1 or 0.
+        self.lets = ti.Vector.field(d, int, shape=n)
         # Where the pivot is, relative to the lower corner, m, how it is turned, and the nodes that it may act on.
         self.place = ti.Vector.field(d, float, shape=n)
         self.turned = ti.Matrix.field(d, d, float, shape=n)
@@ -184,6 +189,9 @@ class Colliders:
             self.form[i], self.wall[i], self.begin[i] = form_code(collider), WALLS[collider.wall], used
             self.side[i] = -1 if collider.side == "inside" else 1
             self.friction[i] = collider.friction
+            self.lets[i] = [
+                int(collider.axes is not None and axis not in collider.axes) for axis in AXES[: self.dimension]
+            ]
             used += len(numbers)
             place, turned = collider.motion.pose(0.0)
             self.place[i] = (place - origin).tolist()
@@ -248,7 +256,7 @@ class Colliders:
             if near:
                 for face in range(self.faces_of(i)):
                     phi, normal = self.distance(i, arm, face)
-                    if phi <= REACH * self.spacing:
+                    if phi <= self.reach_of_surface(i):
                         after, _grip = self.met(i, arm, normal, result)
                         if ti.static(self.deterministic):
                             row = self.run * self.loads.rows + self.loads.row_of(node)
@@ -260,6 +268,11 @@ class Colliders:
                         for a in ti.static(range(d)):
                             result[a] = after[a]
         return result
+
+    @ti.func
+    def reach_of_surface(self, i: int):
+        """Return how far outside of its surface collider i acts on nodes, m."""
+        return ti.select(self.wall[i] == HOLD, HELD_OUTSIDE, REACH) * self.spacing
 
     @ti.func
     def place_of(self, node: ti.template()):
@@ -283,7 +296,7 @@ class Colliders:
         result = way
         for k in range(self.count[self.run]):
             i = self.run * self.room + k
-            if self.covers(i, x):
+            if self.covers(i, x) and self.wall[i] != HOLD:
                 for face in range(self.faces_of(i)):
                     phi, normal = self.distance(i, x - self.place[i], face)
                     result += ti.max(-0.5 * ti.max(phi, 0.0) - result.dot(normal), 0.0) * normal
@@ -337,7 +350,7 @@ class Colliders:
         away = relative.dot(normal)
         along = relative - away * normal
         kept, grip = 1.0, LOOSE
-        if self.wall[i] == STICK:
+        if self.wall[i] == STICK or self.wall[i] == HOLD:
             kept, away, grip = 0.0, 0.0, HELD
         elif away < 0.0 or self.wall[i] == SLIP:
             push, size = -away, along.norm()
@@ -345,7 +358,11 @@ class Colliders:
             if push > 0.0 and self.friction[i] > 0.0:
                 kept = ti.max(1.0 - self.friction[i] * push / size, 0.0) if size > 0.0 else 0.0
                 grip = PRESSED if kept > 0.0 else HELD
-        return own + kept * along + away * normal, grip
+        after = own + kept * along + away * normal
+        for a in ti.static(range(self.dimension)):
+            if self.lets[i][a] == 1:
+                after[a] = velocity[a]
+        return after, grip
 
 
 @ti.data_oriented

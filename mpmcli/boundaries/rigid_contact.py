@@ -6,7 +6,7 @@ pass a surface in the step ends on it, or parts from it by its coefficient of re
 a part of that is undone.
 """
 
-from mpmcli.boundaries.colliders import STICK, contact_points
+from mpmcli.boundaries.colliders import HOLD, STICK, contact_points
 from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
@@ -157,7 +157,7 @@ class RigidContact:
                 normal[a] = 1.0 if ti.static(side == 0) else -1.0
         for k in range(colliders.count[run]):
             i = run * colliders.room + k
-            if k != own:
+            if k != own and colliders.wall[i] != HOLD:
                 place = ti.cast(x, float)
                 if colliders.covers(i, place):
                     phi, found = colliders.distance(i, place - colliders.place[i], 0)

@@ -80,7 +80,11 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
             continue
         points = surface_points(form_surface(body.form), h)
         sides = np.stack([points - scene.domain.origin, scene.domain.upper - points], axis=-1)[:, shut]
-        others = [(f'collider "{one.name}"', one.signed_distance(points)) for one in scene.colliders if one is not body]
+        others = [
+            (f'collider "{one.name}"', one.signed_distance(points))
+            for one in scene.colliders
+            if one is not body and not one.holds
+        ]
         for name, distance in [("a wall", sides), *others]:
             depth = -float(distance.min(initial=np.inf)) / h
             if depth > BEGINS_INSIDE:
@@ -92,7 +96,7 @@ def _room(facts: SceneFacts) -> Iterator[Finding]:
     """Yield moving colliders that leave some bodies less room than they fill."""
     scene = facts.scene
     words = {word for pair in scene.domain.walls.faces(scene.dimension) for word in pair}
-    moving = [collider for collider in scene.colliders if collider.driven]
+    moving = [collider for collider in scene.colliders if collider.driven and not collider.holds]
     if not moving or scene.emitters or {PERIODIC, "open"} & words:
         return
     found = min(_rooms(scene), default=(math.inf, 0.0, 0.0, ""))
@@ -124,7 +128,7 @@ def _rooms(scene: Scene) -> Iterator[tuple[float, float, float, str]]:
     def parts(time: float) -> np.ndarray:
         """Return the number of the part in which each point lies, from 1 on; 0 of what is in a collider."""
         free = np.ones(len(lattice), bool)
-        for collider in scene.colliders:
+        for collider in (collider for collider in scene.colliders if not collider.holds):
             free &= collider.signed_distance(lattice, time) > 0
         return label(free.reshape(counts))[0].ravel()
 

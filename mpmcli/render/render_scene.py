@@ -125,6 +125,7 @@ def render_scene_of(result: Result) -> RenderScene:
     if d == 3 and gravity is not None and gravity.any():
         axis = int(np.argmax(np.abs(gravity)))
         up = np.where(np.arange(3) == axis, -np.sign(gravity[axis]), 0.0)
+    shown = [k for k, collider in enumerate(result.colliders) if not collider.holds]
     return RenderScene(
         title=one_line(header.title),
         dimension=d,
@@ -136,8 +137,9 @@ def render_scene_of(result: Result) -> RenderScene:
         material_of=material_of,
         distances=tuple(header.spacing / body.particles_per_cell ** (1 / d) for body in bodies),
         densities=tuple(body.density or 1000.0 for body in bodies),
-        colliders=result.colliders,
-        collider_frames=result.collider_frames,
+        # What holds a part is no thing to be seen.
+        colliders=tuple(result.colliders[k] for k in shown),
+        collider_frames=result.collider_frames and tuple(result.collider_frames[k] for k in shown),
     )
 
 

@@ -79,7 +79,7 @@ def _in_the_way(emitter: Emitter, places: np.ndarray, scene: Scene) -> Iterator[
     found += [
         (f'collider "{collider.name}"', collider.signed_distance(places) < -_SLACK * h)
         for collider in scene.colliders
-        if not collider.motion.moves
+        if not collider.motion.moves and not collider.holds
     ]
     for what, inside in found:
         if inside.any():
@@ -205,7 +205,7 @@ def _in_colliders(scene: Scene) -> Iterator[Problem]:
         places = particle_places(body, i, h)
         for k, collider in enumerate(scene.colliders if len(places) else ()):
             distance = collider.signed_distance(places)
-            if distance.min() < -_SLACK * h:
+            if distance.min() < -_SLACK * h and not collider.holds:
                 where = place_text(places[distance.argmin()])
                 said = (
                     f'body "{body.name}" overlaps collider "{collider.name}" at the start, for example at {where}; '
@@ -367,6 +367,21 @@ def _pushed(scene: Scene) -> Iterator[Problem]:
             if force.body is not None and force.body not in names:
                 hint = hint_at(force.body, names, f"the bodies are {listed(names, 'and')}")
                 yield Problem((table, k, "body"), f'no body has the name "{force.body}"; {hint}')
+    for k, force in enumerate(scene.forces):
+        found = [(i, body) for i, body in enumerate(scene.bodies) if force.body in (None, body.name)]
+        solid = any(one.free and one.name == force.body for one in scene.colliders)
+        if force.force is not None and force.body in names and not found and not solid:
+            yield Problem(
+                ("forces", k, "force"), f'"{force.body}" flows in, and has no mass at the start; give acceleration'
+            )
+        if force.region is not None and solid:
+            yield Problem(
+                ("forces", k, "region"), f'"{force.body}" is rigid, and a force acts on all of it; leave it out'
+            )
+        elif force.region is not None and found:
+            h = scene.domain.spacing
+            if not any(force.region.form.contains(particle_places(body, i, h)).any() for i, body in found):
+                yield Problem(("forces", k, "region"), "no particle starts there; move it or make it larger")
 
 
 def _paired(scene: Scene) -> Iterator[Problem]:

@@ -105,7 +105,7 @@ def has_jump(tree: Tree, slope: Tree, end: float) -> bool:
 
 Normal = direction_as("[0, 1] has in 2D")
 # What a surface does, as walls of the domain.
-SurfaceWord = Literal["slip", "stick", "separate"]
+SurfaceWord = Literal["slip", "stick", "separate", "hold"]
 ZERO = Constant(0.0)
 
 
@@ -154,8 +154,13 @@ class Collider(Table):
     side: Literal["outside", "inside"] = Field(
         "outside", description="Where the material is: outside of the shape, or inside, as in a container."
     )
-    wall: SurfaceWord = Field("separate", description="What its surface does: slip, stick or separate.")
+    wall: SurfaceWord = Field(
+        "separate", description="What its surface does: slip, stick or separate; hold: what lies inside moves with it."
+    )
     friction: NotNegative = Field(0.0, description="Coefficient of friction, unless it sticks.")
+    axes: tuple[Literal["x", "y", "z"], ...] | None = Field(
+        None, description='With wall = "hold": the axes along which it holds. Default: all of them.'
+    )
     velocity: TimeVector = Field(
         None,
         validate_default=True,
@@ -207,13 +212,25 @@ class Collider(Table):
         times = [key.time for key in self.keyframes]
         if any(b <= a for a, b in pairwise(times)):
             raise flaw("must have times that rise from each to the next", "keyframes")
-        if self.wall == "stick" and self.friction > 0:
-            raise flaw('is for a surface that slips or separates, and wall is "stick"; leave it out', "friction")
+        if self.wall in ("stick", "hold") and self.friction > 0:
+            raise flaw(f'is for a surface that slips or separates, and wall is "{self.wall}"; leave it out', "friction")
+        self._require_holding()
         if self.free:
             self._require_free()
         elif self.fixed or self.joint:
             raise flaw("is for one that moves freely; give its density or mass", "fixed" if self.fixed else "joint")
         return self
+
+    def _require_holding(self) -> None:
+        """Refuse what only one that holds has, and what one that holds cannot have."""
+        if self.axes is not None and not self.holds:
+            raise flaw(f'is for wall = "hold", and wall is "{self.wall}"; leave it out', "axes")
+        if self.axes is not None and (not self.axes or (len(self.velocity) == 2 and "z" in self.axes)):
+            raise flaw(
+                f"must be some of {'x, y' if len(self.velocity) == 2 else 'x, y, z'}; found {list(self.axes)}", "axes"
+            )
+        if self.holds and (self.free or self.side == "inside"):
+            raise flaw('is "hold", which is for the inside of a shape that moves as the scene says', "wall")
 
     def _require_free(self) -> None:
         """Refuse what a rigid body that moves freely cannot have."""
@@ -261,6 +278,11 @@ class Collider(Table):
     def free(self) -> bool:
         """Whether it is a rigid body that moves freely."""
         return (self.density, self.mass) != (None, None)
+
+    @property
+    def holds(self) -> bool:
+        """Whether what lies inside moves with it, as a part that is pinned; it is no obstacle then."""
+        return self.wall == "hold"
 
     @property
     def driven(self) -> bool:

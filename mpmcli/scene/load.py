@@ -29,7 +29,7 @@ from mpmcli.scene.problem import (
     value_at,
 )
 from mpmcli.scene.quantity import dimension_of
-from mpmcli.scene.sampling import points_per_cell
+from mpmcli.scene.sampling import particle_places, points_per_cell
 from mpmcli.scene.schema import Scene, scene_model
 from mpmcli.scene.toml_file import apply_overrides, copied, key_lines, line_of
 
@@ -168,6 +168,7 @@ def _validate(
 
 def _resolve(scene: Scene, knobs: dict[tuple[str, int], list[str]], source: str) -> LoadedScene:
     """Set the "auto" parameters of every material from the speeds and pressures that can reach its body."""
+    scene = _with_accelerations(scene)
     whole = scene_bounds(scene)
     resolved, notes = {}, []
     for table in ("bodies", "emitters"):
@@ -183,6 +184,23 @@ def _resolve(scene: Scene, knobs: dict[tuple[str, int], list[str]], source: str)
             notes += [f"{body.name}: {sentence}" for sentence in (*knobs.get((table, i), []), *sentences)]
         resolved[table] = tuple(found)
     return LoadedScene(scene.model_copy(update=resolved), tuple(notes), source)
+
+
+def _with_accelerations(scene: Scene) -> Scene:
+    """Turn forces, and what acts in a region, into accelerations that depend on where a particle starts."""
+    forces = []
+    for force in scene.forces:
+        if force.force is None and force.region is None:
+            forces.append(force)
+            continue
+        mass = next((one.moments.mass for one in scene.colliders if one.free and one.name == force.body), 0.0)
+        for index, body in enumerate(scene.bodies):
+            if force.force is not None and body.name == force.body:
+                mass = body.material.density * body.shape.form.volume
+                if force.region is not None:
+                    mass *= float(force.region.form.contains(particle_places(body, index, scene.domain.spacing)).mean())
+        forces.append(force.spread(mass))
+    return scene.model_copy(update={"forces": tuple(forces)})
 
 
 def report(

@@ -16,16 +16,14 @@ from pydantic import (
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.contact import Contact
 from mpmcli.scene.domain import Domain
-from mpmcli.scene.entry import Constants, Entry, PlaceVector, StartDeformation, StartMatrix, StartVector
-from mpmcli.scene.expression import POSITION
-from mpmcli.scene.expression_reader import parse
+from mpmcli.scene.entry import Constants, StartDeformation, StartMatrix, StartVector
+from mpmcli.scene.forces import Force, Impulse
 from mpmcli.scene.material import MaterialParameters
 from mpmcli.scene.quantity import (
     NAME,
     Flag,
     Integer,
     NotNegative,
-    Number,
     Positive,
     Table,
     Vector,
@@ -124,59 +122,6 @@ class Emitter(Table):
         if self.end is not None and self.end <= self.start:
             raise flaw(f"must be after start, {self.start:g} s; found {self.end:g}", "end")
         return self
-
-
-# What is left of a push at a distance r, in radii; nothing beyond 1. A Gaussian has a third as its standard deviation.
-# The pushes of an impulse are forces, whose means are exact.
-FALLOFF = {"none": "1", "linear": "(1 - sqrt({r2}))", "gaussian": "exp(-4.5 * {r2})"}
-# Length of an impulse at a time, as a part of the interval between frames.
-INSTANT = 1e-3
-# Radii around the centre in which a radial push falls to zero.
-CORE = 1e-3
-
-
-class Impulse(Table):
-    """A push on what is within a radius of a place, as a hand gives it."""
-
-    name: str | None = Field(None, pattern=NAME, description="Name of the impulse, for --set.")
-    body: str | None = Field(None, description="Name of the body or rigid body that it acts on. Default: all of them.")
-    start: NotNegative = Field(description="When it begins, s.")
-    end: Positive | None = Field(
-        None, description="When it ends, s. Default: a thousandth of the interval between frames after it begins."
-    )
-    center: Vector = Field(description="Where it is strongest, m.")
-    radius: Positive = Field(description="Distance from the centre beyond which nothing is pushed, m.")
-    strength: Number = Field(
-        description="Change of velocity at the centre in all, m/s; a negative one pulls, or pushes backwards."
-    )
-    direction: Vector | None = Field(None, description="Of the push, of any length. Default: away from the centre.")
-    falloff: Literal["none", "linear", "gaussian"] = Field(
-        "linear",
-        description="How the push falls with the distance: not at all, linearly to the radius, or as a Gaussian.",
-    )
-
-    @model_validator(mode="after")
-    def _lasts_and_points(self) -> "Impulse":
-        if self.end is not None and self.end <= self.start:
-            raise flaw(f"must be after start, {self.start:g} s; found {self.end:g}", "end")
-        if self.direction is not None and not any(self.direction):
-            raise flaw("must not be zero; leave it out for a push away from the centre", "direction")
-        return self
-
-    def acceleration(self, interval: float) -> tuple[Entry, ...]:
-        """Return the acceleration, m/s^2, expressions of t and the position; `interval` is that between frames, s."""
-        end = self.start + INSTANT * interval if self.end is None else self.end
-        axes = POSITION[: len(self.center)]
-        away = [f"({x} - ({c!r}))" for x, c in zip(axes, self.center, strict=True)]
-        r2 = "(" + " + ".join(f"({a} / {self.radius!r})**2" for a in away) + ")"
-        push = f"({self.strength / (end - self.start)!r} if t >= {self.start!r} and t < {end!r} else 0)"
-        near = f"({FALLOFF[self.falloff].format(r2=r2)} if {r2} < 1 else 0)"
-        if self.direction is None:
-            pointing = [f"({a} / {self.radius!r} / max(sqrt({r2}), {CORE}))" for a in away]
-        else:
-            length = sum(n**2 for n in self.direction) ** 0.5
-            pointing = [repr(n / length) for n in self.direction]
-        return tuple(0.0 if one == "0.0" else parse(f"{push} * {near} * ({one})", ("t", *axes), {}) for one in pointing)
 
 
 # Poisson's ratio above which bodies lock without `f_bar`: a beam of four cells is 5 % too stiff at 0.45, 13 % at 0.49.
@@ -335,17 +280,6 @@ class Body(Table):
     def has_surface(self) -> bool:
         """Whether particles can carry its surface: it stays elastic, and its shape is known."""
         return self.material.elastic and self.shape.points is None
-
-
-class Force(Table):
-    """An acceleration that acts on one body, or on all of them."""
-
-    name: str | None = Field(None, pattern=NAME, description="Name of the force, for --set.")
-    body: str | None = Field(None, description="Name of the body or rigid body that it acts on. Default: all of them.")
-    acceleration: PlaceVector = Field(
-        description="m/s^2, one entry per axis: numbers, or expressions of the time t (s), the position x, y, z "
-        "and the initial position X, Y, Z of a particle (m)."
-    )
 
 
 def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:

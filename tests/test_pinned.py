@@ -1,0 +1,153 @@
+"""Pinned parts (colliders that hold) and loads (forces in newtons): against Newton's laws and bent beams."""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from good_scene import refusal
+from solver_state import scene_of
+
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import Scene, parse_scene
+from mpmcli.solver.engine.build import build_run
+from mpmcli.validation.cases.cantilever import BELOW, LENGTH, THICKNESS, SmallBend
+
+JELLY = {"law": "fixed_corotated", "density": 1000.0, "youngs_modulus": 2e4, "poissons_ratio": 0.2}
+H = 0.05
+
+
+def block(**tables: object) -> Scene:
+    """Return a block of 8 x 6 cells of jelly in free space."""
+    shape = {"box": {"min": [0.4, 0.4], "max": [0.8, 0.7]}}
+    return scene_of(
+        domain={"size": [2.0, 1.2], "spacing": H} | tables.pop("domain", {}),
+        time={"end": 0.2, "frames": 4},
+        bodies=[{"name": "block", "material": JELLY, "shape": shape}],
+        solver={"precision": "f64"},
+        **tables,
+    )
+
+
+def held(**more: object) -> dict:
+    """Return what holds the left end of the block, three cells wide."""
+    return {"name": "clamp", "wall": "hold", "shape": {"box": {"min": [0.3, 0.3], "max": [0.55, 0.8]}}, **more}
+
+
+def run(scene: Scene, backend_of: Callable) -> tuple[Frame, list[LedgerRow]]:
+    """Return the last frame, and the ledger."""
+    frames = list(build_run(scene, backend_of("f64", 1)).frames())
+    return frames[-1][0], [row for _, row in frames]
+
+
+@pytest.mark.parametrize(
+    "region", [None, {"box": {"min": [0.6, 0.0], "max": [1.0, 1.0]}}, {"ball": {"center": [0.6, 0.55], "radius": 0.1}}]
+)
+def test_a_force_accelerates_a_body_by_its_size_over_the_mass(backend_of: Callable, region: dict | None) -> None:
+    """Momentum is force times time, to rounding, wherever it acts; velocities are those half a step before a frame."""
+    force = {"body": "block", "force": [60.0, -20.0]} | ({"region": region} if region else {})
+    _, rows = run(block(forces=[force]), backend_of)
+    lag = 0.5 * rows[-1].step_min
+    assert rows[-1].step_min == pytest.approx(rows[-1].step_max)
+    assert rows[-1].linear_momentum == pytest.approx([60.0 * (0.2 - lag), -20.0 * (0.2 - lag)], rel=1e-9)
+
+
+def test_a_force_on_a_rigid_body_is_one(backend_of: Callable) -> None:
+    ball = {"name": "ball", "density": 500.0, "shape": {"ball": {"center": [1.5, 0.5], "radius": 0.15}}}
+    scene = block(colliders=[ball], forces=[{"body": "ball", "force": [30.0, 0.0]}])
+    _, rows = run(scene, backend_of)
+    lag = 0.5 * rows[-1].step_min
+    gained = 30.0 * (0.2 - lag) / (500.0 * np.pi * 0.15**2)
+    assert rows[-1].rigid_motion[0][0] == pytest.approx(gained, rel=1e-5)
+
+
+def test_what_holds_takes_what_the_body_lacks(backend_of: Callable) -> None:
+    """The momentum that gravity gave is in the body or in the clamp, which the ledger tells; its inside stays."""
+    gravity = {"gravity": [0.0, -9.81]}
+    frame, rows = run(block(domain=gravity, colliders=[held()]), backend_of)
+    took = sum(np.array(b.collider_force[0]) * (b.time - a.time) for a, b in pairwise(rows))
+    lag = 0.5 * rows[-1].step_min
+    weight = rows[0].mass * 9.81
+    there = np.array(rows[-1].linear_momentum) - np.array(rows[0].linear_momentum)
+    # What the clamp takes is counted to the end of the last step.
+    assert there + took == pytest.approx([0.0, -weight * (0.2 - lag)], abs=0.01 * weight * 0.2)
+    # Some of the block sinks; two cells inside of the clamp nothing does.
+    start, _ = run(block(colliders=[held()]), backend_of)
+    moved = frame.position - start.position
+    assert np.abs(moved[start.position[:, 0] < 0.55 - 2 * H]).max() < 1e-12 and moved[:, 1].min() < -0.01
+
+
+def test_it_moves_along_a_path_and_lets_go_of_axes(backend_of: Callable) -> None:
+    """A part moves with its clamp, and one that holds y alone slides along x as if free."""
+    frame, _ = run(block(colliders=[held(offset=["0.2 * t", "0.0"])]), backend_of)
+    start, _ = run(block(colliders=[held()]), backend_of)
+    moved = frame.position - start.position
+    inside = start.position[:, 0] < 0.55 - 2 * H
+    assert moved[inside] == pytest.approx(np.tile([0.04, 0.0], (inside.sum(), 1)), abs=1e-12)
+    whole = held(axes=["y"]) | {"shape": {"box": {"min": [0.0, 0.0], "max": [2.0, 1.2]}}}
+    frame, rows = run(block(domain={"gravity": [1.0, -9.81]}, colliders=[whole]), backend_of)
+    moved = frame.position - start.position
+    assert moved == pytest.approx(np.tile([0.5 * 0.2**2, 0.0], (len(moved), 1)), rel=1e-6, abs=1e-12)
+    assert rows[-1].collider_force[0][1] == pytest.approx(-9.81 * rows[0].mass, rel=1e-6)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3, 0.6])
+def test_a_beam_bends_as_one_that_a_wall_holds(backend_of: Callable, shift: float) -> None:
+    """To first order: what holds ends half a cell off at most, and the cube of the length counts."""
+    case, n = SmallBend(), 4
+    tables = case.tables(n)
+    domain = tables["domain"]
+    domain["origin"], domain["size"][0] = [-1.0 - shift * domain["spacing"], -BELOW], domain["size"][0] + 1.0
+    del domain["walls"]
+    tables["bodies"][0]["shape"] = {"box": {"min": [-0.75, 0.0], "max": [LENGTH, THICKNESS]}}
+    clamp = {"min": [-0.9, -0.5], "max": [0.0, THICKNESS + 0.5]}
+    tables["colliders"] = [{"name": "clamp", "wall": "hold", "shape": {"box": clamp}}]
+    tables["solver"] = {"precision": "f64"}
+    scene = parse_scene(tables, laws=parameter_models()).scene
+    error = case.measure(n, scene, list(build_run(scene, backend_of("f64", 1)).frames()))["tip error"]
+    off = (1 + min(shift, 1 - shift) / n / LENGTH) ** 3 - 1
+    assert error < 0.045 + off
+
+
+HOLD = """\
+[domain]
+size = [2.0, 1.0]
+spacing = 0.05
+[time]
+end = 0.2
+frames = 4
+[[bodies]]
+name = "block"
+material = "jelly"
+shape = { box = { min = [0.2, 0.3], max = [0.6, 0.6] } }
+[[colliders]]
+name = "clamp"
+wall = "hold"
+shape = { box = { min = [0.1, 0.2], max = [0.3, 0.7] } }
+[[forces]]
+body = "block"
+force = [1.0, 0.0]
+"""
+
+
+@pytest.mark.parametrize(
+    ("good", "bad", "said"),
+    [
+        ('wall = "hold"', 'wall = "stick"\naxes = ["x"]', 'axes: is for wall = "hold", and wall is "stick"'),
+        ('wall = "hold"', 'wall = "hold"\naxes = []', "axes: must be some of x, y; found []"),
+        ('wall = "hold"', 'wall = "hold"\naxes = ["z"]', "axes: must be some of x, y; found ['z']"),
+        ('wall = "hold"', 'wall = "hold"\nfriction = 0.3', 'friction: is for a surface that slips or separates'),
+        ('wall = "hold"', 'wall = "hold"\ndensity = 10.0', 'wall: is "hold", which is for the inside'),
+        ('body = "block"\n', "", "body: missing key: the body that the force is spread over"),
+        ("force = [1.0, 0.0]", "", "acceleration: missing key: m/s^2, one entry per axis; or give force, N"),
+        ("force = [1.0, 0.0]", "force = [1.0, 0.0]\nregion = { ball = { center = [1.5, 0.5], radius = 0.1 } }",
+         "region: no particle starts there; move it or make it larger"),
+        ("force = [1.0, 0.0]", "force = [1.0, 0.0]\nregion = {}", "region: must be one of box and ball"),
+    ],
+)  # fmt: skip
+def test_each_bad_one_has_its_sentence(tmp_path, monkeypatch, good: str, bad: str, said: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    (line,) = refusal(HOLD.replace(good, bad))
+    assert said in line
