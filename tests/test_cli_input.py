@@ -2,12 +2,16 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
 from command import ROOT, SCENE, Outcome, run_here
+
+from mpmcli.cli.program import program
 
 
 @pytest.fixture
@@ -204,3 +208,20 @@ def test_a_directory_that_is_gone_has_a_sentence(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(["bash", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr == "error: the working directory no longer exists: go to another one.\n"
+
+
+def commands() -> list[tuple[str, click.Command]]:
+    """Return every command with its words."""
+    context = click.Context(program)
+    found = [(name, program.get_command(context, name)) for name in program.list_commands(context)]
+    groups = [(name, one) for name, one in found if isinstance(one, click.Group)]
+    inner = [(f"{name} {key}", one) for name, group in groups for key, one in group.commands.items()]
+    return [(name, one) for name, one in found if not isinstance(one, click.Group)] + inner
+
+
+@pytest.mark.parametrize(("name", "command"), commands(), ids=lambda value: value if isinstance(value, str) else "")
+def test_the_help_of_each_command_has_an_example_that_it_takes(name: str, command: click.Command) -> None:
+    example = command.epilog
+    assert example.startswith(f"Example: mpmcli {name}")
+    words = shlex.split(example.partition(">")[0])[2 + len(name.split()) :]
+    command.make_context(name, words)

@@ -369,6 +369,24 @@ def test_bad_input_has_one_sentence(truth: Path, tmp_path: Path, monkeypatch: py
     assert run_here("dataset", "status", tmp_path).status == 2
 
 
+def test_keys_of_the_base_are_set_and_a_dataset_is_replaced(tmp_path: Path) -> None:
+    """As if the base said so; what is no dataset stays."""
+    sweep = write_sweep(tmp_path, 2)
+    words = ("--set", "time.frames=2", "--quiet", "--workers", "1")
+    assert run_here("sweep", sweep, "-o", tmp_path / "d", *words).status == 0
+    assert [each.frame_count for each in open_dataset(tmp_path / "d")] == [3, 3]
+    refused = run_here("sweep", sweep, "-o", tmp_path / "d", *words)
+    assert refused.status == 2 and "holds a dataset" in refused.stderr
+    both = run_here("sweep", sweep, "-o", tmp_path / "d", "--overwrite", "--resume")
+    assert both.status == 2 and "give one of them" in both.stderr
+    assert run_here("sweep", sweep, "-o", tmp_path / "d", "--overwrite", "--quiet", "--workers", "1").status == 0
+    assert [each.frame_count for each in open_dataset(tmp_path / "d")] == [5, 5]
+    other = run_here("sweep", sweep, "-o", tmp_path, "--overwrite")
+    assert other.status == 2 and "holds no dataset" in other.stderr and sweep.exists()
+    bad = run_here("sweep", sweep, "-o", tmp_path / "e", "--set", "time.frmes=2")
+    assert bad.status == 2 and 'did you mean "frames"' in bad.stderr and not (tmp_path / "e").exists()
+
+
 def test_a_rehearsal_tells_draws_disk_and_time(truth: Path, tmp_path: Path) -> None:
     """Its bytes are those of the dataset, within what headers take, and its draws those that come."""
     outcome = run_here("sweep", write_sweep(tmp_path), "--dry-run", "--json", "-o", tmp_path / "d")

@@ -10,7 +10,7 @@ from mpmcli.cli.streams import print_json, print_text
 from mpmcli.errors import InputError
 
 
-@click.command("bench")
+@click.command("bench", epilog="Example: mpmcli bench --case 2d-64 --threads 1")
 @click.option("--dataset", is_flag=True, help="Measure instead how many trajectories an hour a sweep makes.")
 @click.option("--profile", is_flag=True, help="Measure instead what sort, P2G, grid and G2P take, for each law.")
 @click.option("--case", "names", multiple=True, metavar="NAME", help="Only this case, e.g. 3d-128. May be repeated.")

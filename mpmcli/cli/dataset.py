@@ -11,12 +11,13 @@ from mpmcli.cli import options
 from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
 from mpmcli.cli.options import COUNT, PATH, json_option, quiet_option
 from mpmcli.cli.streams import print_answer, print_json, print_note, print_text
+from mpmcli.errors import InputError
 
 # Time in which the workers of a sweep end, and this process, s.
 RESERVE = 5.0
 
 
-@click.command("sweep")
+@click.command("sweep", epilog="Example: mpmcli sweep drops.toml --count 8 -o datasets/drops")
 @click.argument("sweep", type=PATH)
 @options.output_option("Where the dataset goes; datasets/<name of the sweep> by default.", "DATASET", "directory")
 @click.option("--count", type=COUNT, help="Number of trajectories, in place of that of the file.")
@@ -30,6 +31,8 @@ RESERVE = 5.0
     default="1/1",
     help="Compute the i-th of n parts; mpmcli dataset merge joins them.",
 )
+@options.set_option
+@click.option("--overwrite", is_flag=True, help="Replace the dataset in the directory.")
 @click.option("--resume", is_flag=True, help="Go on with the dataset in the directory.")
 @click.option("--dry-run", is_flag=True, help="List the draws, check each scene, and forecast time and disk space.")
 @options.arch_option("Where each worker computes")
@@ -40,28 +43,41 @@ RESERVE = 5.0
 @quiet_option
 @json_option
 def sweep_command(
-    sweep: Path, count: int | None, dry_run: bool, max_time: float | None, quiet: bool, as_json: bool, **given: Any
+    sweep: Path,
+    count: int | None,
+    overrides: tuple[str, ...],
+    overwrite: bool,
+    dry_run: bool,
+    max_time: float | None,
+    quiet: bool,
+    as_json: bool,
+    **given: Any,
 ) -> int:
     """Compute the trajectories of SWEEP, a TOML file, and store them as a dataset for learners.
 
     An interrupted or killed sweep goes on with --resume. Trajectories that are not stable are computed again with
-    half the step, up to twice, and then left out; the exit code is 1 if there are any.
+    half the step, up to twice, and then left out; the exit code is 1 if there are any. --set replaces keys of the base
+    scene, for all trajectories.
     """
     from mpmcli.cli.progress import ProgressBar
     from mpmcli.dataset.report import status_of
     from mpmcli.dataset.sweep_file import load_sweep
-    from mpmcli.dataset.sweep_run import SweepSettings, SweepState, discard_beginning, rehearse, run_sweep
+    from mpmcli.dataset.sweep_run import SweepSettings, SweepState, discard, discard_beginning, rehearse, run_sweep
     from mpmcli.materials.registry import load_plugins
     from mpmcli.plain_text import duration_text
 
     end = math.inf if max_time is None else time.monotonic() + max_time - RESERVE
-    loaded = load_sweep(sweep, laws=load_plugins(given["plugins"]), count=count)
+    loaded = load_sweep(sweep, laws=load_plugins(given["plugins"]), count=count, overrides=overrides)
     directory = given["directory"] = given["directory"] or Path("datasets") / sweep.stem
     settings = SweepSettings(**given)
+    if overwrite and settings.resume:
+        raise InputError("--resume keeps an earlier dataset, and --overwrite removes it: give one of them.")
     if dry_run:
         rehearsal = rehearse(loaded, settings)
         print_answer(rehearsal, as_json)
         return 0 if rehearsal.passes else 1
+    if overwrite:
+        discard(directory)
     made = [path for path in (directory, *directory.parents) if not path.exists()][::-1]
     with ProgressBar(loaded.count, "trajectories", quiet=quiet) as bar, interrupts_wait():
 
@@ -97,7 +113,7 @@ def dataset_command() -> None:
     """Look after datasets that `mpmcli sweep` has made."""
 
 
-@dataset_command.command("status")
+@dataset_command.command("status", epilog="Example: mpmcli dataset status datasets/drops")
 @click.argument("dataset", type=PATH)
 @json_option
 def status(dataset: Path, as_json: bool) -> None:
@@ -107,7 +123,7 @@ def status(dataset: Path, as_json: bool) -> None:
     print_answer(status_of(dataset), as_json)
 
 
-@dataset_command.command("verify")
+@dataset_command.command("verify", epilog="Example: mpmcli dataset verify datasets/drops")
 @click.argument("dataset", type=PATH)
 @quiet_option
 @json_option
@@ -130,7 +146,7 @@ def verify(dataset: Path, quiet: bool, as_json: bool) -> int:
     return 1 if verification.faults else 0
 
 
-@dataset_command.command("card")
+@dataset_command.command("card", epilog="Example: mpmcli dataset card datasets/drops")
 @click.argument("dataset", type=PATH)
 def card(dataset: Path) -> None:
     """Write README.md of DATASET again, with the picture montage.png if `mpmcli render` has drawn it."""
@@ -141,7 +157,7 @@ def card(dataset: Path) -> None:
     print_text(str(write_card(dataset)))
 
 
-@dataset_command.command("merge")
+@dataset_command.command("merge", epilog="Example: mpmcli dataset merge parts/1 parts/2 -o datasets/drops")
 @click.argument("parts", type=PATH, nargs=-1, required=True)
 @click.option("-o", "--output", type=PATH, metavar="DATASET", required=True)
 @json_option
@@ -152,7 +168,7 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
     print_answer(merge(parts, output), as_json)
 
 
-@click.command("export")
+@click.command("export", epilog="Example: mpmcli export datasets/drops --to gns -o exports/drops")
 @click.argument("dataset", type=PATH)
 @click.option(
     "--to",

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mpmcli.output.verify import Verification
 
 
-@click.command("check")
+@click.command("check", epilog="Example: mpmcli check drop.toml --set domain.spacing=0.01")
 @click.argument("path", type=SCENE)
 @set_option
 @plugin_option
@@ -68,7 +68,7 @@ def _check_scene(
     return check
 
 
-@click.command("info")
+@click.command("info", epilog="Example: mpmcli info results/drop --verify")
 @click.argument("path", type=SCENE)
 @set_option
 @plugin_option
@@ -190,7 +190,7 @@ def _plain(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-@click.command("doctor")
+@click.command("doctor", epilog="Example: mpmcli doctor")
 @json_option
 def doctor_command(as_json: bool) -> int:
     """Say whether everything that mpmcli needs works on this machine.

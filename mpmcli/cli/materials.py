@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 WIDTH = 140
 
 
-@click.command("new")
+@click.command("new", epilog="Example: mpmcli new dam_break_2d -o dam.toml")
 @click.argument("name", required=False)
 @output_option("The file to write; <NAME>.toml here by default.", "FILE.toml")
 @json_option
@@ -57,7 +57,7 @@ def new_command(name: str | None, output: Path | None, as_json: bool) -> None:
         print_text(str(target))
 
 
-@click.command("materials")
+@click.command("materials", epilog="Example: mpmcli materials sand")
 @click.argument("name", required=False)
 @plugin_option
 @json_option
@@ -95,7 +95,7 @@ def materials_command(name: str | None, plugins: tuple[Path, ...], as_json: bool
         _print(facts, in_full=name is not None)
 
 
-@click.command("schema")
+@click.command("schema", epilog="Example: mpmcli schema > scene.schema.json")
 @plugin_option
 def schema_command(plugins: tuple[Path, ...]) -> None:
     """Print the JSON Schema of scenes on stdout.

@@ -23,7 +23,7 @@ SIZE_MIN, SIZE_MAX = 300, 8_000
 WIDEST = 3
 
 
-@click.command("render")
+@click.command("render", epilog="Example: mpmcli render results/drop --mode surface --movie drop.mp4")
 @click.argument("result", type=SCENE)
 @output_option("A .png for one picture, or a directory; by default the directory render beside the result.", "OUT")
 @choice_option("--mode", MODES, "dots", "How particles are drawn.")
@@ -119,7 +119,7 @@ def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool
     return 0
 
 
-@click.command("plot")
+@click.command("plot", epilog="Example: mpmcli plot results/drop -o ledger.png")
 @click.argument("result", type=PATH)
 @output_option(f"The picture; {LEDGER} in the directory of the result by default.", "OUT.png")
 @choice_option("--theme", ["light", "dark"], "light", "Colours.")

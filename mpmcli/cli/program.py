@@ -81,13 +81,10 @@ def program(context: click.Context, debug: bool) -> None:
         context.exit(2)
 
 
-@click.command("completion")
+@click.command("completion", epilog="Example: mpmcli completion bash >> ~/.bashrc")
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion_command(shell: str) -> None:
-    """Print the script that completes mpmcli in SHELL.
-
-    For bash: `mpmcli completion bash >> ~/.bashrc`.
-    """
+    """Print the script that completes mpmcli in SHELL."""
     from click.shell_completion import get_completion_class
 
     script = get_completion_class(shell)

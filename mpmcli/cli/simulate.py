@@ -15,7 +15,7 @@ from mpmcli.cli.supervisor import announce
 from mpmcli.errors import InputError
 
 
-@click.command("simulate")
+@click.command("simulate", epilog="Example: mpmcli simulate drop.toml -o results/drop --set time.end=2")
 @click.argument("scene", type=SCENE)
 @options.output_option("Where the result goes; results/<name of the scene> by default.", name="directory")
 @options.set_option
@@ -82,7 +82,7 @@ def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: b
     return {"finished": 0, "interrupted": interrupted_code()}.get(summary.status, 1)
 
 
-@click.command("warm")
+@click.command("warm", epilog="Example: mpmcli warm drop.toml dam_break_2d")
 @click.argument("scenes", type=SCENE, nargs=-1, required=True)
 @options.arch_option("Where they will be computed")
 @click.option("--threads", type=COUNT, help="CPU threads; by default as many as `mpmcli simulate` takes.")

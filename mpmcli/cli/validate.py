@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mpmcli.validation.study import Journal
 
 
-@click.command("validate")
+@click.command("validate", epilog="Example: mpmcli validate couette --levels coarse")
 @click.argument("names", nargs=-1, metavar="[CASE]...")
 @choice_option(
     "--levels level",

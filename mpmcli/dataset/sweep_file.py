@@ -2,7 +2,7 @@
 
 import copy
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from os import PathLike
 from pathlib import Path as File
 from typing import Any
@@ -21,24 +21,28 @@ from mpmcli.scene.material import Laws
 from mpmcli.scene.problem import Path, Problem, listed, nearest, path_text, problems_of, quoted, written
 from mpmcli.scene.quantity import AXES, NUMBER_WORDS, dimension_of
 from mpmcli.scene.shapes import COMBINED
-from mpmcli.scene.toml_file import key_parts, read_toml, set_value
+from mpmcli.scene.toml_file import apply_overrides, key_parts, read_toml, set_value
 
 MOST_BODIES = 1000
 # The key of a placement by the list that its template is in.
 KINDS = {"bodies": "body", "colliders": "collider"}
 
 
-def load_sweep(path: str | PathLike[str], *, laws: Laws, count: int | None = None) -> Sweep:
+def load_sweep(
+    path: str | PathLike[str], *, laws: Laws, count: int | None = None, overrides: Sequence[str] = ()
+) -> Sweep:
     """Read a sweep and its base scene from TOML files, and try the scenes that they make.
 
     The base is sought beside the sweep, then in the working directory. Trajectory 0 must be valid, also with each
-    distribution at its ends, one key at a time. `count` replaces that of the file. InputError has one line per fault:
-    `FILE:LINE: KEY: what is wrong and what would be right`.
+    distribution at its ends, one key at a time. `count` replaces that of the file, `overrides` keys of the base scene
+    (`apply_overrides`). InputError has one line per fault: `FILE:LINE: KEY: what is wrong and what would be right`.
     """
     text, data = read_toml(path, "sweep")
     read = data if count is None else {**data, "count": count}
     base = _base_file(File(path), text, data)
     base_text, base_data = read_scene(base)
+    if overrides:
+        base_text, (base_data, _) = "", apply_overrides(base_data, overrides)
     place = read.get("place")
     tables = {**read, "place": [place]} if isinstance(place, dict) else read
     try:

@@ -180,6 +180,15 @@ def open_folder(
     return folder, manifest
 
 
+def discard(directory: Path) -> None:
+    """Remove a dataset, if there is one; InputError: something else is there, or another process writes it."""
+    if directory.is_dir() and any(directory.iterdir()):
+        if not (directory / MANIFEST).exists():
+            raise InputError(f"{directory} holds no dataset, and --overwrite replaces nothing else.")
+        refuse_locked(directory)
+        shutil.rmtree(directory)
+
+
 def discard_beginning(directory: Path, made: Sequence[Path]) -> None:
     """Remove a dataset in which no trajectory has been done, and the directories `made` for it, outermost first."""
     if not (directory / MANIFEST).exists() or Manifest(directory).rows():

@@ -132,7 +132,7 @@ def _store_run(
         go_on(run, earlier, backend, forced=forced)
         take_over(settings.directory, earlier)
     summary = new_summary(loaded, settings, plan, backend, earlier, notes)
-    summary.outlook = "" if earlier is not None else outlook
+    summary.outlook, summary.particles = "" if earlier is not None else outlook, run.particle_count
     on_start(summary)
     record = new_record(loaded, settings, summary, earlier)
     record.write()

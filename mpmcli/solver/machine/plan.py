@@ -16,7 +16,7 @@ from mpmcli.materials.law import Law
 from mpmcli.materials.registry import laws
 from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene
-from mpmcli.scene.sampling import estimate_body, has_expressions
+from mpmcli.scene.sampling import count_body, has_expressions
 from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.contact.layers import Layers, require_contact_possible
 from mpmcli.solver.contact.surfaces import BodySurfaces
@@ -197,8 +197,8 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     width = node_width(dimension, on_cpu=backend.on_cpu)
     bodies = Counter(body.material.law for body in scene.sources)
     counts = Counter[str]()
-    for body in scene.bodies:
-        counts[body.material.law] += estimate_body(body, scene.domain.spacing)
+    for index, body in enumerate(scene.bodies):
+        counts[body.material.law] += count_body(body, index, scene.domain.spacing)
     for emitter in scene.emitters:
         counts[emitter.material.law] += sheets_of(emitter, scene).particles
     members = [
