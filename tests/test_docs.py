@@ -36,6 +36,7 @@ SHORTER = {
     "mpmcli sweep drops.toml --count 4 -o results/drops": (
         "mpmcli sweep drops.toml --count 4 --workers 1 -o results/drops"
     ),
+    "mpmcli sweep splashes.toml --count 6": "mpmcli sweep splashes.toml --count 3 --workers 1",
     "mpmcli render results/drop --mode surface --size 640x480 --movie results/drop.mp4": (
         "mpmcli render results/drop --mode surface --size 320x240 --movie results/drop.mp4"
     ),
@@ -112,6 +113,10 @@ def checkout(tmp_path_factory) -> Path:
             shutil.copy(source, directory / name)
     for name, page in {"drop.toml": "README.md", "drops.toml": "docs/datasets.md"}.items():
         (directory / name).write_text(blocks("toml", page)[0], encoding="utf-8")
+    for name, text in re.findall(
+        r"Save this as `(\S+)`:\n\n```\w+\n(.*?)^```$", PAGES["docs/tutorial.md"], re.M | re.S
+    ):
+        (directory / name).write_text(text, encoding="utf-8")
     programs = directory / ".venv" / "bin"
     programs.mkdir(parents=True)
     for name, arguments in {"python": "", "mpmcli": "-m mpmcli"}.items():
@@ -176,6 +181,7 @@ def test_the_commands_make_what_the_readme_says(commands, checkout):
     assert "results/dam_break_2d/particles.vtkhdf" in commands["scripts/demo"].stdout
     assert open_result(checkout / "results" / "series" / "particles.pvd").frame_count == 5
     assert open_result(checkout / "results" / "faster").times[-1] == 0.4
+    assert commands["python load.py"].stdout.splitlines()[0].startswith("1 (51, ")
     summary = json.loads((checkout / "series.json").read_text(encoding="utf-8"))
     assert summary["status"] == "finished" and summary["backend"]["precision"] == "f64"
     assert json.loads((checkout / "scene.schema.json").read_text(encoding="utf-8"))["title"] == "Scene"
