@@ -113,7 +113,7 @@ def test_walls_that_cannot_be_had_are_refused(tmp_path: Path) -> None:
     outcome = run_here("export", path, "--to", "npz", "-o", tmp_path / "out", "--walls", "colliders")
     assert outcome.status == 2 and 'the collider "post" of trajectory 0 cannot be read' in outcome.stderr
     outcome = run_here("export", path, "--to", "vtkhdf", "-o", tmp_path / "out", "--walls", "colliders")
-    assert outcome.status == 2 and "--walls is for learners and numpy" in outcome.stderr
+    assert outcome.status == 2 and "--walls is for training code and NumPy" in outcome.stderr
     assert not (tmp_path / "out").exists()
 
 

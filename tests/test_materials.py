@@ -262,7 +262,7 @@ def test_the_stiffest_state_is_no_softer_than_rest(name: str) -> None:
 
 @BOTH
 @EVERY
-def test_nothing_makes_a_law_say_nan(probes: Probes, name: str, dimension: int) -> None:
+def test_laws_stay_finite(probes: Probes, name: str, dimension: int) -> None:
     """Crushed to 1 %, torn, sheared by 10, flat, inverted: a finite answer each, where there is volume left (H6)."""
     probe = probes(dimension, name)
     d = dimension

@@ -301,7 +301,7 @@ def check_wild(probe: LawProbe) -> None:
 
 @BOTH
 @pytest.mark.parametrize("kind", ["dry", "damp", "uncorrected"])
-def test_nothing_makes_sand_say_nan(probes: Probes, kind: str, dimension: int) -> None:
+def test_sand_stays_finite(probes: Probes, kind: str, dimension: int) -> None:
     """H17: crushed to 1 %, torn, flat, inverted, or nothing at all."""
     check_wild(probes(dimension, kind))
 

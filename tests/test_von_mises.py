@@ -221,7 +221,7 @@ def check_wild(probe: LawProbe) -> None:
 
 @BOTH
 @pytest.mark.parametrize("kind", ["hardening", "perfect"])
-def test_nothing_makes_metal_say_nan(probes: Probes, kind: str, dimension: int) -> None:
+def test_metal_stays_finite(probes: Probes, kind: str, dimension: int) -> None:
     check_wild(probes(dimension, kind))
 
 

@@ -53,7 +53,7 @@ def sweep_command(
     as_json: bool,
     **given: Any,
 ) -> int:
-    """Compute the trajectories of SWEEP, a TOML file, and store them as a dataset for learners.
+    """Compute the trajectories of SWEEP, a TOML file, and store them as a dataset.
 
     An interrupted or killed sweep goes on with --resume. Trajectories that are not stable are computed again with
     half the step, up to twice, and then left out; the exit code is 1 if there are any. --set replaces keys of the base
@@ -175,7 +175,7 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
     "form",
     type=click.Choice(["lagrangebench", "gns", "npz", "vtkhdf"]),
     required=True,
-    help="For the learners LagrangeBench or GNS, for numpy, or for ParaView and every command that reads results.",
+    help="The training code of LagrangeBench or GNS, NumPy, or ParaView and all commands that read results.",
 )
 @click.option("-o", "--output", "directory", type=PATH, required=True, metavar="DIR", help="Where it goes.")
 @click.option("--trajectory", type=click.IntRange(min=0), metavar="N", help="Only the trajectory with this number.")
@@ -202,9 +202,9 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
 @quiet_option
 @json_option
 def export_command(dataset: Path, quiet: bool, as_json: bool, **given: Any) -> None:
-    """Write DATASET, a directory of trajectories or the result of one run, in the format of a learner or a viewer.
+    """Write DATASET, a directory of trajectories or the result of one run, for training code or a viewer.
 
-    Beside the data lies metadata.json with bounds, spacings, and the statistics of displacements that learners
+    Beside the data lies metadata.json with bounds, spacings, and the statistics of displacements that training code
     normalise with. The directory appears when it is complete.
     """
     from mpmcli.cli.progress import ProgressBar

@@ -26,7 +26,7 @@ COMMANDS = {
     "info": ("inspection", "Say what a result or a scene holds, and whether it has changed."),
     "render": ("pictures", "Draw frames of a result: pictures, films, montages."),
     "plot": ("pictures", "Draw a result's ledger: energies, momentum, steps, volumes, reach."),
-    "export": ("dataset", "Write a dataset or a result for learners, numpy or ParaView."),
+    "export": ("dataset", "Write a dataset or a result for training code, NumPy or ParaView."),
     "materials": ("materials", "List laws, presets, their parameters and knobs."),
     "schema": ("materials", "Print the JSON Schema of scenes, for editors."),
     "validate": ("validate", "Measure speed against error on problems with known answers."),

@@ -51,7 +51,7 @@ from mpmcli.errors import InputError
 @quiet_option
 @json_option
 def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: bool, **run: Any) -> int:
-    """Run SCENE and store its particles for ParaView, h5py and learners.
+    """Run SCENE and store its particles for ParaView, h5py and training code.
 
     SCENE is a TOML file, or the name of an example, which `mpmcli new` lists.
     """

@@ -1,4 +1,4 @@
-"""Datasets: many trajectories in one directory, opened for reading, and exported for learners."""
+"""Datasets: many trajectories in one directory, opened for reading, and exported for training code."""
 
 from mpmcli.dataset.dataset import Dataset, Trajectory
 from mpmcli.dataset.dataset import open_dataset as open

@@ -1,4 +1,4 @@
-"""Export of a dataset to what learners, numpy and ParaView read: a directory that appears as a whole or not."""
+"""Export of a dataset for training code, NumPy and ParaView: a directory that appears complete, or not at all."""
 
 import itertools
 import json

@@ -1,4 +1,4 @@
-"""The formats of an export: LagrangeBench and GNS for learners, npz for numpy, vtkhdf for ParaView."""
+"""The formats of an export: LagrangeBench and GNS for training code, npz for NumPy, vtkhdf for ParaView."""
 
 import math
 import zipfile
@@ -49,7 +49,7 @@ class Format(ABC):
         """Write the files, and call `tick` after each trajectory."""
 
 
-class LearnerFormat(Format):
+class TrainingFormat(Format):
     """A file for each split; laws have particle types from `usual`, then `free`; `KINDS` are the types of walls."""
 
     name: ClassVar[str]
@@ -125,7 +125,7 @@ class LearnerFormat(Format):
         return np.concatenate([laws[trajectory.label("material")], walls])
 
 
-class LagrangeBench(LearnerFormat):
+class LagrangeBench(TrainingFormat):
     """train.h5, valid.h5 and test.h5, as the class H5Dataset of LagrangeBench reads them.
 
     Source: github.com/tumaer/lagrangebench, lagrangebench/data/data.py, utils.py (NodeType) and
@@ -213,7 +213,7 @@ class LagrangeBench(LearnerFormat):
         return np.clip(placed, 0.0, extent * (1 - 2.0**-20)).astype(np.float32)
 
 
-class Gns(LearnerFormat):
+class Gns(TrainingFormat):
     """train.npz, valid.npz and test.npz, as the particle data loader of GNS reads them.
 
     Source: github.com/geoelements/gns, gns/data_loader.py, gns/train.py and docs/gns_data.md. Each entry is an object
@@ -351,7 +351,7 @@ class Vtkhdf(Format):
 
     def check(self) -> None:
         if any(each.walls.walls != "none" for each in self.trajectories):
-            raise InputError("--walls is for learners and numpy: mpmcli render draws the colliders of a vtkhdf itself.")
+            raise InputError("--walls is for training code and NumPy; of a vtkhdf mpmcli render draws the colliders.")
 
     def size(self) -> int:
         return sum(file_size(each.layout, [each.particle_count] * each.frame_count) for each in self.trajectories)

@@ -1,4 +1,4 @@
-"""What metadata.json says of an export, whatever its format; with the statistics of motion for learners."""
+"""The contents of metadata.json in all formats of an export, with the statistics of motion for training code."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -112,7 +112,7 @@ def learning_facts(trajectories: Sequence[ThinnedTrajectory]) -> tuple[dict[str,
 
 
 def require_alike(trajectories: Sequence[ThinnedTrajectory], form: str) -> None:
-    """Refuse with an InputError trajectories of which a learner's loader cannot, or should not, make one set."""
+    """Refuse with an InputError trajectories that training code cannot, or should not, load as one set."""
     first, remedy = trajectories[0], "--to npz takes trajectories that differ."
     dt = time_between(first)
     if first.frame_count < LEAST_FRAMES:

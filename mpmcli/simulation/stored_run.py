@@ -1,4 +1,4 @@
-"""What a run writes, and what is told of it: summary, record, scene and store, at its start and at its end."""
+"""Opens and closes the record, the summary, the scene and the store of a run."""
 
 from pathlib import Path
 from typing import Any
