@@ -145,3 +145,29 @@ def test_a_body_on_a_collider_has_no_edge_there_and_is_not_seen_behind_a_thin_on
             assert above[2] > above[0] + 60, "no gap, but water"
             below = at(picture, view, x, top - 3 / view.pixels_per_metre)
             assert near(below, np.array(rgb_bytes(LIGHT.ground)))
+
+
+@pytest.mark.parametrize("mode", ["dots", "surface", "fluid"])
+def test_a_hollow_collider_is_cut_open(tmp_path: Path, mode: str) -> None:
+    """The jelly in a tube is seen from the front by default."""
+    outer, inner = ({"min": [a, a, -0.1], "max": [1 - a, 1 - a, 1.1]} for a in (0.2, 0.3))
+    tube = {"name": "tube", "shape": {"box": outer, "subtract": [{"box": inner}]}}
+    inside = lattice((0.35, 0.35, 0.3), (0.65, 0.65, 0.7), H / 2)
+    result = write(tmp_path / "run", header((1.0, 1.0, 1.0), H, [JELLY], [tube]), [frame(0, inside)])
+    (open_, view), (shut, _) = (drawn(result, mode, colliders=word) for word in ("auto", "solid"))
+    assert green(open_, view, 0.5) > 20 > 0 > green(shut, view, 0.5)
+    # What holds little is no vessel, and stays whole.
+    outside = np.concatenate([lattice((0.0, 0.0, 0.0), (0.15, 1.0, 0.5), H / 2), inside[:5]])
+    other = write(tmp_path / "other", header((1.0, 1.0, 1.0), H, [JELLY], [tube]), [frame(0, outside)])
+    assert set_up(other, Settings(mode=mode, color=None, size=(64, 64))).settings.colliders == "solid"
+
+
+def test_no_edge_of_the_domain_crosses_what_is_inside(tmp_path: Path) -> None:
+    """A cube of jelly that fills it, seen from over a corner, has the colour of jelly in the middle of its outline."""
+    full = lattice((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), H)
+    result = write(tmp_path / "run", header((1.0, 1.0, 1.0), 2 * H, [JELLY]), [frame(0, full)])
+    picture, view = drawn(result, "dots", camera="iso")
+    corner = max(np.ndindex(2, 2, 2), key=lambda pick: float(np.array(pick) @ view.axes[2]))
+    column, row, _ = np.rint(view.pixels(np.array([corner], float))[0]).astype(int)
+    window = picture[row + 4 : row + 60, column - 1 : column + 2].reshape(-1, 3)
+    assert (window[:, 1] - np.maximum(window[:, 0], window[:, 2]) > 5).all()

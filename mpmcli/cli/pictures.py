@@ -51,7 +51,10 @@ WIDEST = 3
 )
 @choice_option("--theme", list(THEMES), "light", "Colours around the particles.")
 @choice_option(
-    "--colliders", COLLIDERS, "solid", "How colliders are drawn; clear: in 3D their far sides only, which hide nothing."
+    "--colliders",
+    COLLIDERS,
+    "auto",
+    "How colliders are drawn; clear: in 3D their far sides only, which hide nothing; auto: hollow ones are cut open.",
 )
 @click.option("--movie", type=PATH, metavar="FILE", help="Make a film: .mp4 or .gif.")
 @click.option("--fps", type=float, help="Frames of the film per second, 30 by default.")

@@ -162,11 +162,19 @@ def collider_meshes(scene: RenderScene) -> tuple[ColliderMesh, ...]:
     lower, upper = np.array(scene.lower), np.array(scene.upper)
     side = float(np.max(upper - lower))
     surfaces = [collider_surface(collider, lower, upper) for collider in scene.colliders]
+    for number in scene.hollow:
+        surfaces[number] = _cut_open(surfaces[number], scene.towards)
     return tuple(
         ColliderMesh(collider, number, without_doubles(surface), side)
         for number, (collider, surface) in enumerate(zip(scene.colliders, surfaces, strict=True))
         if len(surface.cells)
     )
+
+
+def _cut_open(surface: Surface, towards: tuple[float, ...]) -> Surface:
+    """Return what of a closed surface lies behind the plane through its middle that faces a direction, closed there."""
+    middle = 0.5 * (surface.points.min(axis=0) + surface.points.max(axis=0))
+    return surface_of(poly_data(surface).clip_closed_surface(-np.array(towards), origin=middle).triangulate())
 
 
 class ColliderActors:

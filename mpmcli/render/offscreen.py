@@ -30,10 +30,15 @@ class OffscreenRenderer:
         view.place(self.plotter)
 
     def add_box(self, lower: tuple[float, ...], upper: tuple[float, ...], color: str, width: float = 1.5) -> None:
-        """Draw the edges of the domain."""
+        """Draw the edges of the domain, but for the three in front, which would cross all that is inside."""
         import pyvista as pv
 
-        box = pv.Box(bounds=np.stack([lower, upper], axis=1).ravel().tolist()).extract_all_edges()
+        picks = np.array([[i >> axis & 1 for axis in range(3)] for i in range(8)])
+        corners = np.where(picks == 1, np.array(upper), np.array(lower))
+        front = int((corners @ self.view.axes[2]).argmax())
+        edges = [(i, i | 1 << axis) for i in range(8) for axis in range(3) if not i >> axis & 1]
+        lines = [[2, *edge] for edge in edges if front not in edge]
+        box = pv.PolyData(corners, lines=np.array(lines).ravel())
         self.plotter.add_mesh(box, color=color, line_width=width * self.samples, lighting=False, reset_camera=False)
 
     def add_dots(self, cloud: "pv.PolyData", *, lit: bool = True) -> "pv.Actor":

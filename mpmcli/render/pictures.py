@@ -22,9 +22,11 @@ from mpmcli.render.render_scene import RenderScene, render_scene_of
 from mpmcli.render.settings import THEMES, Settings, Theme, require_possible
 from mpmcli.render.view import View, aspect_of, slice_of, view_of
 from mpmcli.render.window import choose_window
+from mpmcli.scene.colliders import Plane
 
 # Least ratio of height to width, and inverse of the largest, of pictures whose height follows from the scene.
 FLATTEST = 0.2
+HIDDEN = 0.05  # share of the particles within the box of a collider, from which on it is cut open
 FITTING_ROUNDS = 4  # iterations in which the sizes of the texts and of the picture settle
 FOREIGN = "{path} is there already, and mpmcli render did not make it: give another place with -o, or --overwrite."
 
@@ -86,6 +88,9 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
     scene, theme = render_scene_of(result), THEMES[settings.theme]
     colliders = () if settings.colliders == "none" else scene.colliders
     scene = replace(scene, colliders=colliders, clear=settings.colliders == "clear")
+    hollow = _hollow(scene, result) if settings.colliders == "auto" else ()
+    if settings.colliders == "auto" and not hollow:
+        settings = replace(settings, colliders="solid")
     if settings.mode == "dots" and settings.color is None:
         settings = replace(settings, color="material" if len(scene.appearances) > 1 else "speed")
     camera = settings.camera
@@ -113,7 +118,24 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
             layout = replace(layout, size=(width, layout.height_for(aspect)))
         settings = replace(settings, size=layout.size)
         require_possible(*layout.size, f"{width}xauto")
-    return RenderSetup(result, settings, scene, colors, layout, view_of(scene, camera, layout.viewport_size))
+    view = view_of(scene, camera, layout.viewport_size)
+    if hollow:
+        # Half of them, in front of a plane along the upward axis.
+        towards = view.axes[2] * (np.array(scene.up) == 0.0)
+        scene = replace(scene, hollow=hollow, towards=tuple(towards.tolist()))
+    return RenderSetup(result, settings, scene, colors, layout, view)
+
+
+def _hollow(scene: RenderScene, result: Result) -> tuple[int, ...]:
+    """Return the colliders of a 3D scene that would hide what is inside: much starts within the box of each."""
+    found = []
+    for number, collider in enumerate(scene.colliders if scene.dimension == 3 else ()):
+        if collider.side == "outside" and not collider.free and not isinstance(collider.form, Plane):
+            lower, upper = collider.form.bounds()
+            places = collider.motion.taken_back(result.present_frame(0, ()).position, 0.0)
+            inside = ((places > lower) & (places < upper)).all(axis=1)
+            found += [number] if inside.mean() > HIDDEN else []
+    return tuple(found)
 
 
 def expected_times(result: Result) -> tuple[float, ...]:

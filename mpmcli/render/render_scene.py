@@ -104,6 +104,8 @@ class RenderScene:
     densities: tuple[float, ...]  # (b,) at rest, kg/m^3
     colliders: tuple[Collider, ...] = ()  # that are drawn
     collider_frames: tuple[int, ...] | None = None  # the frame that each collider is in; None where all are in all
+    hollow: tuple[int, ...] = ()  # numbers of the colliders in 3D that are cut open, so that what is inside is seen
+    towards: tuple[float, ...] = (0.0, 0.0, 0.0)  # the direction (3,) from which they are cut
     clear: bool = False  # colliders in 3D show only their far sides, as containers do, so that they hide nothing
 
     def shows(self, number: int, frame: Frame) -> bool:

@@ -50,7 +50,7 @@ class Request:
     fps: float | None = None
     montage: str | None = None
     save_surface: Path | None = None
-    colliders: Colliders = "solid"
+    colliders: Colliders = "auto"
     overwrite: bool = False
     arrows: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
 

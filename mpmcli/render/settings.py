@@ -9,8 +9,8 @@ from mpmcli.errors import InputError
 
 Mode = Literal["dots", "surface", "fluid", "density"]
 MODES: tuple[Mode, ...] = ("dots", "surface", "fluid", "density")
-Colliders = Literal["solid", "clear", "none"]
-COLLIDERS: tuple[Colliders, ...] = ("solid", "clear", "none")
+Colliders = Literal["auto", "solid", "clear", "none"]
+COLLIDERS: tuple[Colliders, ...] = ("auto", "solid", "clear", "none")
 ThemeName = Literal["light", "dark"]
 # Pixels along a side, and in all: more would not fit into the memory of a renderer.
 SIDE_MIN, SIDE_MAX = 64, 16_384
@@ -33,7 +33,8 @@ class Settings:
     limits: tuple[float, float] | None = None  # of the colours, None where they have none
     cmap: str | None = None  # colour map of matplotlib, None for the one that suits the values
     grid: tuple[int, int] = (1, 1)  # columns and rows of a montage, (1, 1) for a picture of one frame
-    colliders: Colliders = "solid"  # "clear": in 3D only their far sides are drawn, as those of containers are
+    # "clear": in 3D only their far sides are drawn, as those of containers are; "auto": hollow ones are cut open.
+    colliders: Colliders = "auto"
     arrows: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()  # places, m, and velocities, m/s, to be shown
 
 
