@@ -204,8 +204,8 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
 def export_command(dataset: Path, quiet: bool, as_json: bool, **given: Any) -> None:
     """Write DATASET, a directory of trajectories or the result of one run, for training code or a viewer.
 
-    Beside the data lies metadata.json with bounds, spacings, and the statistics of displacements that training code
-    normalise with. The directory appears when it is complete.
+    metadata.json beside the data holds bounds, spacings, and the statistics of displacements with which training code
+    normalises. The directory appears when it is complete.
     """
     from mpmcli.cli.progress import ProgressBar
     from mpmcli.dataset.dataset import open_dataset
