@@ -104,6 +104,8 @@ class SimulateProgress(ProgressBar):
         )
         if summary.outlook:
             self.say(summary.outlook)
+        if self.drawn and summary.compiling:
+            self.show(0, f"compiling, up to about {summary.compiling:.0f} s")
 
     def advance(self, row: "LedgerRow", summary: "RunSummary") -> None:
         """Show one more stored frame."""

@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from mpmcli.check.finding import Finding, passes
-from mpmcli.check.scene_check import check_scene
+from mpmcli.check.scene_check import SceneCheck, check_scene
 from mpmcli.errors import InputError, MpmcliError, NoRoomError, RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
@@ -83,7 +83,7 @@ def simulate(
             if earlier is None:
                 taken.clear()
         notes = (*loaded.notes, *(finding.line for finding in findings if finding.severity != "note"))
-        begun = _Begun(loaded, settings, plan, backend, earlier, notes, began, taken, check.outlook())
+        begun = _Begun(loaded, settings, plan, backend, earlier, notes, began, taken, check)
         if run is None:
             return _complete(begun, on_start, stop)
         return _store_run(begun, run, on_start, on_frame, stop)
@@ -98,7 +98,7 @@ class _Begun(NamedTuple):
     notes: tuple[str, ...]
     began: float
     taken: TakenDirectory
-    outlook: str
+    check: SceneCheck
 
 
 def _build(scene: Scene, settings: RunSettings, plan: Plan, backend: Backend) -> Run:
@@ -121,7 +121,7 @@ def _store_run(
     on_frame: Callable[[LedgerRow, RunSummary], None],
     stop: Callable[[], bool | str],
 ) -> RunSummary:
-    loaded, settings, plan, backend, earlier, notes, began, taken, outlook = begun
+    loaded, settings, plan, backend, earlier, notes, began, taken, check = begun
     scene = loaded.scene
     forced = settings.force and scene.time.step != "auto"
     text = scene_to_toml(scene)
@@ -132,7 +132,9 @@ def _store_run(
         go_on(run, earlier, backend, forced=forced)
         take_over(settings.directory, earlier)
     summary = new_summary(loaded, settings, plan, backend, earlier, notes)
-    summary.outlook, summary.particles = "" if earlier is not None else outlook, run.particle_count
+    summary.particles = run.particle_count
+    if earlier is None:
+        summary.outlook, summary.compiling = check.outlook(), check.forecast.compile_seconds
     on_start(summary)
     record = new_record(loaded, settings, summary, earlier)
     record.write()

@@ -18,7 +18,8 @@ class RunSummary:
         time: simulated so far, s. frames, steps, particles: counts; frames_expected: of the whole run; steps_before:
             those of earlier processes, where the run was resumed.
         backend: "arch", "threads" and "precision"; plan: memory and passes.
-        notes: what was chosen for the user, and warnings of the check; outlook: its forecast, a line.
+        notes: what was chosen for the user, and warnings of the check.
+        outlook: the forecast of the check, a line; compiling: seconds of it to compile, None where not known.
         timings: seconds by name: start_s (load and allocate), compile_s (first step, compilation
             included), solve_s (all further steps), watch_s (of these, measuring the state for the limits), output_s
             (frames and packing), wall_s.
@@ -35,6 +36,7 @@ class RunSummary:
     message: str = ""
     path: Path | None = None
     outlook: str = ""
+    compiling: float | None = None
     time: float = 0.0
     frames: int = 0
     steps: int = 0
