@@ -118,7 +118,7 @@ class FakeRun:
     fault: BaseException | None = None
 
     def __init__(self, *_: object, **__: object) -> None:
-        self.particle_count, self.step_count = 1, 0
+        self.particle_count, self.step_count, self.time = 1, 0, 0.0
         self.first_step_seconds = self.frame_seconds = self.measure_seconds = 0.0
         self.laws = ("fluid",)
 
@@ -126,7 +126,7 @@ class FakeRun:
         for k in range(3):
             if k == 2 and self.fault is not None:
                 raise self.fault
-            self.step_count = 10 * k
+            self.step_count, self.time = 10 * k, float(k)
             position = np.full((1, 2), 0.5 + k, np.float32)
             body = np.zeros(1, np.int32)
             frame = Frame(k, float(k), 10 * k, position, 0 * position, body, body)

@@ -82,7 +82,7 @@ def test_a_container_has_its_material_inside() -> None:
     ("collider", "said"),
     [
         ({"wall": "sticky"}, "colliders[0].wall"),
-        ({"wall": "open"}, 'colliders[0].wall: must be "slip", "stick" or "separate"'),
+        ({"wall": "open"}, 'colliders[0].wall: must be "slip", "stick", "separate" or "hold"'),
         ({"wall": "stick", "friction": 0.2}, "colliders[0].friction: is for a surface that slips or separates"),
         ({"friction": -1}, "colliders[0].friction: must be at least 0"),
         ({"velocity": [1.0, 0.0], "offset": ["t", 0.0]}, 'colliders[0].offset: "velocity" is given as well'),

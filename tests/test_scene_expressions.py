@@ -71,7 +71,7 @@ REFUSED = {
     "forces.stir.body=bal": 'forces[0].body: no body has the name "bal"; did you mean "ball"?',
     "forces.stir.acceleration=[0, 'z']": 'forces[0].acceleration[1]: has no "z" in a 2D scene; ',
     "forces.stir.acceleration=[1]": "forces[0].acceleration: needs two numbers in this 2D scene ",
-    "forces=[{body='ball'}]": "forces[0].acceleration: missing key: m/s^2, one entry per axis: ",
+    "forces=[{body='ball'}]": "forces[0].acceleration: missing key: m/s^2, one entry per axis; or give force, N",
     "forces.stir.accelration=[0, 1]": 'forces[0].accelration: unknown key; did you mean "acceleration"?',
     "domain.gravity=['x', 0]": 'domain.gravity[0]: has an unknown name "x"; the name here is t',
     "domain.gravity=[true, 0]": "domain.gravity[0]: must be a number or an expression in quotes; found true",
