@@ -93,6 +93,22 @@ def test_it_moves_along_a_path_and_lets_go_of_axes(backend_of: Callable) -> None
     assert rows[-1].collider_force[0][1] == pytest.approx(-9.81 * rows[0].mass, rel=1e-6)
 
 
+@pytest.mark.gpu
+def test_a_gpu_holds_as_the_cpu_does(backend_of: Callable) -> None:
+    scene = block(domain={"gravity": [0.0, -9.81]}, colliders=[held(offset=["0.2 * t", "0.0"], axes=["y"])])
+    found = []
+    for arch in ("vulkan", "cpu"):
+        steps = build_run(scene, backend_of("f32", 1, arch))
+        for _ in range(100):
+            steps.step(5e-4)
+        frame, row = steps.frame()
+        found.append((frame.position, np.array(row.collider_force[0])))
+    (position, force), (expected, expected_force) = found
+    assert np.abs(position - expected).max() < 100 * np.finfo(np.float32).eps
+    assert force == pytest.approx(expected_force, rel=1e-3, abs=1e-3 * np.abs(expected_force).max())
+    assert np.abs(expected_force[0]) < 1e-3 * np.abs(expected_force[1])
+
+
 @pytest.mark.parametrize("shift", [0.0, 0.3, 0.6])
 def test_a_beam_bends_as_one_that_a_wall_holds(backend_of: Callable, shift: float) -> None:
     """To first order: what holds ends half a cell off at most, and the cube of the length counts."""
