@@ -32,6 +32,7 @@ def test_it_copies_one_with_its_files(tmp_path: Path, monkeypatch: pytest.Monkey
     assert json.loads(run_here("info", "mine/silo.toml", "--json").stdout)["colliders"] == ["silo: mesh"]
     for words, said in (
         (("silo_3d", "-o", "mine/silo.toml"), "silo.toml is there already"),
+        (("silo_3d", "-o", "mine/silo.toml/inside.toml"), "inside.toml could not be written"),
         (("silo",), 'there is no example "silo"; did you mean "silo_3d"?'),
     ):
         refused = run_here("new", *words)

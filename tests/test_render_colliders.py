@@ -156,10 +156,14 @@ def test_a_hollow_collider_is_cut_open(tmp_path: Path, mode: str) -> None:
     result = write(tmp_path / "run", header((1.0, 1.0, 1.0), H, [JELLY], [tube]), [frame(0, inside)])
     (open_, view), (shut, _) = (drawn(result, mode, colliders=word) for word in ("auto", "solid"))
     assert green(open_, view, 0.5) > 20 > 0 > green(shut, view, 0.5)
+    above, _ = drawn(result, mode, camera="top")
+    assert above.std() > 1
     # What holds little is no vessel, and stays whole.
     outside = np.concatenate([lattice((0.0, 0.0, 0.0), (0.15, 1.0, 0.5), H / 2), inside[:5]])
     other = write(tmp_path / "other", header((1.0, 1.0, 1.0), H, [JELLY], [tube]), [frame(0, outside)])
     assert set_up(other, Settings(mode=mode, color=None, size=(64, 64))).settings.colliders == "solid"
+    empty = write(tmp_path / "none", header((1.0, 1.0, 1.0), H, [JELLY], [tube]), [frame(0, inside[:0])])
+    assert set_up(empty, Settings(mode=mode, color="material", size=(64, 64))).settings.colliders == "solid"
 
 
 def test_no_edge_of_the_domain_crosses_what_is_inside(tmp_path: Path) -> None:

@@ -94,6 +94,7 @@ def test_files_are_found_where_the_base_is(scene, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
+        ('remove = ["drop"]\n', "base: missing key: the scene whose names `remove` leaves out"),
         ("base = 3\n", "base: must be the path of a scene in quotes; found 3"),
         ('base = "nowhere.toml"\n', "there is no such file"),
         ('base = "scene.toml"\n', "base: scene.toml has this scene as its base in turn"),

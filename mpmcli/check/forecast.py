@@ -19,7 +19,7 @@ from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene, scene_to_toml
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.frames.builder import POSITION_ERROR
-from mpmcli.solver.machine.costs import WORTH, cheapest, cost_of
+from mpmcli.solver.machine.costs import cheapest, cost_of
 from mpmcli.solver.machine.plan import Plan, require_room
 from mpmcli.solver.transfer.kept_motion import OWN_STEP, own_limit
 from mpmcli.stability.transfer_factors import loss_per_step
@@ -92,7 +92,7 @@ def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None, threads: int
         )
     elif plan.arch == "cpu":
         cost = cost_of(scene, cheapest(scene, steps, threads))
-        compiling, step = cost.compile, cost.step / threads**WORTH
+        compiling, step = cost.compile, cost.step_on(threads)
     seconds = None
     if compiling is not None and step is not None:
         computing = steps * step + frames * frame

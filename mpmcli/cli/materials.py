@@ -48,8 +48,11 @@ def new_command(name: str | None, output: Path | None, as_json: bool) -> None:
         if path.exists():
             raise InputError(f"{path} is there already; give another place with -o.")
     for path, original in copies.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        copyfile(original, path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            copyfile(original, path)
+        except OSError as error:
+            raise InputError(f"{path} could not be written ({error.strerror}); give another place with -o.") from error
     if as_json:
         print_json({"path": str(target), "files": [str(path) for path in copies], "shows": caption(source)})
     else:

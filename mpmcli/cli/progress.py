@@ -109,11 +109,12 @@ class SimulateProgress(ProgressBar):
 
     def advance(self, row: "LedgerRow", summary: "RunSummary") -> None:
         """Show one more stored frame."""
-        if summary.frames < 2:
-            return  # the kernels compile in the first step
+        done = summary.steps - summary.steps_before
+        if summary.frames < 2 or done < 1:
+            return  # the kernels compile in the first step, or a frame was left from before
         taken = summary.timings["solve_s"] + summary.timings["output_s"]
         steps_left = (self._end - summary.time) / row.step_max
-        left = taken / (summary.steps - summary.steps_before) * steps_left
+        left = taken / done * steps_left
         self.show(
             summary.frames,
             f"t = {row.time:.4g} of {self._end:.4g} s, {summary.rate / 1e6:.1f} M particle-steps/s",

@@ -172,9 +172,15 @@ def collider_meshes(scene: RenderScene) -> tuple[ColliderMesh, ...]:
 
 
 def _cut_open(surface: Surface, towards: tuple[float, ...]) -> Surface:
-    """Return what of a closed surface lies behind the plane through its middle that faces a direction, closed there."""
+    """Return what of a closed surface lies behind the plane through its middle that faces a direction, closed there.
+
+    An open one, as the domain cuts it off, stays as it is.
+    """
+    data = poly_data(surface)
+    if not len(surface.cells) or data.n_open_edges:
+        return surface
     middle = 0.5 * (surface.points.min(axis=0) + surface.points.max(axis=0))
-    return surface_of(poly_data(surface).clip_closed_surface(-np.array(towards), origin=middle).triangulate())
+    return surface_of(data.clip_closed_surface(-np.array(towards), origin=middle).triangulate())
 
 
 class ColliderActors:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.render_scene import RenderScene
-from mpmcli.render.settings import Theme, rgb_bytes
+from mpmcli.render.settings import Arrow, Theme, rgb_bytes
 from mpmcli.render.view import View
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class PictureLayout:
     grid: tuple[int, int] = (1, 1)  # columns and rows of pictures of the scene
     walls: bool = True  # whether the walls of the domain are drawn around each of them
     scale_bar: bool = True  # whether there is room for one below
-    arrows: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()  # places, m, and velocities there, m/s
+    arrows: tuple[Arrow, ...] = ()
 
     @property
     def viewport_size(self) -> tuple[int, int]:

@@ -26,6 +26,7 @@ from mpmcli.scene.colliders import Plane
 
 # Least ratio of height to width, and inverse of the largest, of pictures whose height follows from the scene.
 FLATTEST = 0.2
+LEVEL = 1e-6  # length of a direction along the ground, of which less is none
 HIDDEN = 0.05  # share of the particles within the box of a collider, from which on it is cut open
 FITTING_ROUNDS = 4  # iterations in which the sizes of the texts and of the picture settle
 FOREIGN = "{path} is there already, and mpmcli render did not make it: give another place with -o, or --overwrite."
@@ -119,9 +120,9 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
         settings = replace(settings, size=layout.size)
         require_possible(*layout.size, f"{width}xauto")
     view = view_of(scene, camera, layout.viewport_size)
-    if hollow:
-        # Half of them, in front of a plane along the upward axis.
-        towards = view.axes[2] * (np.array(scene.up) == 0.0)
+    # Half of them is left out, in front of a plane along the upward axis; seen from above they are open anyway.
+    towards = view.axes[2] * (np.array(scene.up) == 0.0)
+    if hollow and np.linalg.norm(towards) > LEVEL:
         scene = replace(scene, hollow=hollow, towards=tuple(towards.tolist()))
     return RenderSetup(result, settings, scene, colors, layout, view)
 
@@ -134,7 +135,7 @@ def _hollow(scene: RenderScene, result: Result) -> tuple[int, ...]:
             lower, upper = collider.form.bounds()
             places = collider.motion.taken_back(result.present_frame(0, ()).position, 0.0)
             inside = ((places > lower) & (places < upper)).all(axis=1)
-            found += [number] if inside.mean() > HIDDEN else []
+            found += [number] if inside.sum() > HIDDEN * len(inside) else []
     return tuple(found)
 
 

@@ -24,7 +24,7 @@ from mpmcli.render.pictures import (
     set_up,
 )
 from mpmcli.render.reconstruction import save_surfaces, surface_paths
-from mpmcli.render.settings import Colliders, Mode, Settings, parse_grid, parse_limits, parse_size
+from mpmcli.render.settings import Arrow, Colliders, Mode, Settings, parse_grid, parse_limits, parse_size
 from mpmcli.render.view import CAMERAS
 
 DIRECTORY = "render"  # directory of pictures in that of the result
@@ -52,7 +52,7 @@ class Request:
     save_surface: Path | None = None
     colliders: Colliders = "auto"
     overwrite: bool = False
-    arrows: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()
+    arrows: tuple[Arrow, ...] = ()
 
     @property
     def rate(self) -> float:

@@ -13,13 +13,12 @@ from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader
 from mpmcli.output.result import Result, open_result
 from mpmcli.output.store import SegmentStore
+from mpmcli.render.settings import Arrow
 from mpmcli.scene import Scene, sample_bodies, scene_to_toml
 from mpmcli.scene.expression import evaluate
 from mpmcli.scene.schema import Emitter
 from mpmcli.scene.sheets import sheets_of
 
-# A place, m, and a velocity there, m/s; each (d,).
-Arrow = tuple[tuple[float, ...], tuple[float, ...]]
 NOTHING_YET = dict.fromkeys(("kinetic", "elastic", "potential", "mass", "speed_max", "courant_max"), 0.0)
 
 

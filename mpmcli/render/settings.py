@@ -11,6 +11,8 @@ Mode = Literal["dots", "surface", "fluid", "density"]
 MODES: tuple[Mode, ...] = ("dots", "surface", "fluid", "density")
 Colliders = Literal["auto", "solid", "clear", "none"]
 COLLIDERS: tuple[Colliders, ...] = ("auto", "solid", "clear", "none")
+# A place, m, and a velocity there, m/s; each (d,).
+Arrow = tuple[tuple[float, ...], tuple[float, ...]]
 ThemeName = Literal["light", "dark"]
 # Pixels along a side, and in all: more would not fit into the memory of a renderer.
 SIDE_MIN, SIDE_MAX = 64, 16_384
@@ -35,7 +37,7 @@ class Settings:
     grid: tuple[int, int] = (1, 1)  # columns and rows of a montage, (1, 1) for a picture of one frame
     # "clear": in 3D only their far sides are drawn, as those of containers are; "auto": hollow ones are cut open.
     colliders: Colliders = "auto"
-    arrows: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...] = ()  # places, m, and velocities, m/s, to be shown
+    arrows: tuple[Arrow, ...] = ()
 
 
 @dataclass(frozen=True)

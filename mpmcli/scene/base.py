@@ -20,6 +20,8 @@ def read_scene(path: str | PathLike[str], seen: Sequence[Path] = ()) -> tuple[st
     name, remove = data.pop("base", None), data.pop("remove", [])
     if name is None and not remove:
         return text, data
+    if name is None:
+        raise InputError(f"{path}: base: missing key: the scene whose names `remove` leaves out")
     if not isinstance(name, str):
         raise InputError(f"{path}: base: must be the path of a scene in quotes; found {name!r}")
     if not isinstance(remove, list) or not all(isinstance(one, str) for one in remove):

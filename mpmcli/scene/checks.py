@@ -8,6 +8,7 @@ from typing import get_args
 
 import numpy as np
 
+from mpmcli.scene.bounds import body_places
 from mpmcli.scene.colliders import Collider, Plane, has_jump, slope_of
 from mpmcli.scene.entry import entries_in
 from mpmcli.scene.expression import Expression
@@ -380,7 +381,7 @@ def _pushed(scene: Scene) -> Iterator[Problem]:
             )
         elif force.region is not None and found:
             h = scene.domain.spacing
-            if not any(force.region.form.contains(particle_places(body, i, h)).any() for i, body in found):
+            if not any(force.region.form.contains(body_places(body, i, h)).any() for i, body in found):
                 yield Problem(("forces", k, "region"), "no particle starts there; move it or make it larger")
 
 

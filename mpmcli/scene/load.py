@@ -11,7 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 from mpmcli.errors import InputError
 from mpmcli.scene.base import read_scene
-from mpmcli.scene.bounds import reaching, scene_bounds
+from mpmcli.scene.bounds import body_places, reaching, scene_bounds
 from mpmcli.scene.checks import problems_in
 from mpmcli.scene.entry import definitions
 from mpmcli.scene.expand import expand_materials
@@ -29,7 +29,7 @@ from mpmcli.scene.problem import (
     value_at,
 )
 from mpmcli.scene.quantity import dimension_of
-from mpmcli.scene.sampling import particle_places, points_per_cell
+from mpmcli.scene.sampling import points_per_cell
 from mpmcli.scene.schema import Scene, scene_model
 from mpmcli.scene.toml_file import apply_overrides, copied, key_lines, line_of
 
@@ -198,7 +198,7 @@ def _with_accelerations(scene: Scene) -> Scene:
             if force.force is not None and body.name == force.body:
                 mass = body.material.density * body.shape.form.volume
                 if force.region is not None:
-                    mass *= float(force.region.form.contains(particle_places(body, index, scene.domain.spacing)).mean())
+                    mass *= float(force.region.form.contains(body_places(body, index, scene.domain.spacing)).mean())
         forces.append(force.spread(mass))
     return scene.model_copy(update={"forces": tuple(forces)})
 

@@ -29,9 +29,13 @@ class Cost:
     compile: float
     step: float
 
+    def step_on(self, threads: int) -> float:
+        """Return the seconds of a step on some threads."""
+        return self.step / threads**WORTH
+
     def seconds(self, steps: int, threads: int) -> float:
         """Return what so many steps take, compilation included."""
-        return self.compile + steps * self.step / threads**WORTH
+        return self.compile + steps * self.step_on(threads)
 
 
 @cache
