@@ -106,11 +106,11 @@ def test_a_scene_is_drawn_as_it_starts(tmp_path: Path, monkeypatch: pytest.Monke
         wanted = [int(color[k : k + 2], 16) for k in (1, 3, 5)]
         return np.abs(pixels - wanted).max(axis=2) < within
 
-    # The legend is in the right part of the picture.
-    inside = np.arange(pixels.shape[1]) < 1100
     walls = near(THEMES["light"].wall)
     rows, columns = (np.flatnonzero(walls.sum(axis=axis) > 300) for axis in (1, 0))
     top, bottom, left, right = rows.min(), rows.max(), columns.min(), columns.max()
+    # The legend is to the right of the walls.
+    inside = np.arange(pixels.shape[1]) < right
 
     def place(row: float, column: float) -> tuple[float, float]:
         return (column - left) / (right - left), 0.6 * (bottom - row) / (bottom - top)

@@ -108,6 +108,33 @@ def test_titles_and_names_may_hold_what_no_font_has(tmp_path: Path) -> None:
     assert composed(canvas_of(result, by="body")).shape == (500, 800, 3)
 
 
+def test_a_size_that_follows_from_the_scene_leaves_no_empty_space(tmp_path: Path) -> None:
+    for k, extent in enumerate(((2.0, 1.0), (1.0, 1.0), (1.0, 1.6), (0.2, 3.0), (6.0, 1.0))):
+        run = write(tmp_path / str(k), header(extent, 0.1, [WATER]), [frame(0, np.ones((1, 2)))])
+        setup = set_up(run, Settings("dots", "speed", None))
+        width, height = setup.layout.size
+        assert 640 <= width <= 1280 and height <= 720 and (width == 1280 or width == 640 or height > 700)
+        assert width % 2 == height % 2 == 0
+        if width > 640:
+            empty = setup.layout.viewport_size - np.array(extent) * setup.view.pixels_per_metre
+            assert empty.max() < 0.1 * max(setup.layout.viewport_size)
+
+
+def test_lengths_stand_beside_the_edges_of_a_box_in_perspective(tmp_path: Path) -> None:
+    run = write(tmp_path / "run", header((1.0, 2.0, 0.5), 0.1, [WATER]), [frame(0, np.ones((1, 3)))])
+    setup = set_up(run, Settings("dots", "body", (960, 540)))
+    width, height = setup.layout.viewport_size
+    blank = np.full((height, width, 3), rgb_bytes(LIGHT.ground), np.uint8)
+    texts: list[tuple[float, float, str]] = []
+    layout = setup.layout
+    object.__setattr__(layout, "_write", lambda draw, x, y, text, *_: texts.append((x, y, text)))
+    layout.compose([blank], setup.view, [0.0])
+    edges = {"1 m": (0.5, 0, 0), "2 m": (1.0, 1.0, 0), "50 cm": (0, 0, 0.25)}
+    for x, y, text in texts[:3]:
+        column, row, _ = setup.view.pixels(np.array([edges[text]], float))[0]
+        assert abs(x - column) < 60 and abs(y - layout._place(0)[1] - row) < 40
+
+
 def test_walls_of_a_slice_are_where_its_domain_ends(tmp_path: Path) -> None:
     run = write(tmp_path / "run", header((1.0, 2.0, 0.5), 0.1, [WATER]), [frame(0, np.ones((1, 3)))])
     setup = set_up(run, Settings("density", None, (640, 360), camera="side"))

@@ -8,6 +8,7 @@ import pytest
 
 from mpmcli.frames.frame import Frame
 from mpmcli.render.fluid import FluidPainter
+from mpmcli.render.liquid_surface import Liquid, surface_of, window_of
 from mpmcli.render.render_scene import APPEARANCES, RenderScene
 from mpmcli.render.settings import THEMES
 from mpmcli.render.view import View, view_of
@@ -155,6 +156,24 @@ def test_walls_hold_the_liquid(painter: FluidPainter, empty: np.ndarray):
     bottom = int(np.ceil(FRONT.pixels(np.array([[0.0, 0.0, 0.0]]))[0, 1]))
     assert not changed(picture, empty)[bottom + 2 :].any()
     assert changed(picture, empty)[bottom - 4, 40:-40].all()
+
+
+@pytest.mark.parametrize("camera", ["front", "iso"])
+def test_liquid_is_flat_where_it_lies_at_a_wall(camera: str):
+    """A pool ends in the faces of the domain, up to the edge between its surface and the wall."""
+    view = view_of(SUBJECT, camera, (640, 360))
+    position = box((0.0, 0.0, 0.0), (1.6, 0.8, 0.3))
+    pixels = view.pixels(position)
+    scale, volume = view.scale_at(pixels[:, 2]), np.full(len(position), DISTANCE**3)
+    liquids = [Liquid(APPEARANCES["water"], DISTANCE, position, pixels, scale, volume)]
+    window = window_of(liquids, view)
+    surface = surface_of(liquids, window, view, SUBJECT)
+    # Places on the front face, y = 0, from a particle's distance below the surface down.
+    for x, z in ((0.2, 0.02), (0.8, 0.15), (1.4, 0.27)):
+        column, row, depth = view.pixels(np.array([[x, 0.0, z]]))[0]
+        here = int(row) - window.top, int(column) - window.left
+        np.testing.assert_allclose(surface.normal[here] @ view.axes, [0, -1, 0], atol=0.05)
+        assert surface.depth[here] == pytest.approx(depth, abs=0.3 * DISTANCE)
 
 
 def test_liquid_that_has_left_the_domain_is_drawn(painter: FluidPainter, empty: np.ndarray):

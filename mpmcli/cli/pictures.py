@@ -41,7 +41,7 @@ WIDEST = 3
 )
 @click.option("--clim", metavar="LOW,HIGH", help="Limits of the colours; those of the whole result by default.")
 @click.option("--cmap", metavar="NAME", help="A colour map of matplotlib.")
-@click.option("--size", metavar="WxH", help="Pixels; 1280x720 by default.")
+@click.option("--size", metavar="WxH", help="Pixels; by default those within 1280x720 that the scene needs.")
 @click.option(
     "--camera",
     default="iso",

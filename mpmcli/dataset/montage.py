@@ -58,7 +58,7 @@ class TrajectoryCells(Result):
         if any(header.dimension != first.dimension or header.origin is None for header in headers):
             raise InputError(f"{dataset.path} has trajectories of 2 and 3 dimensions, or without a domain.")
         self._first_bodies = np.cumsum([0, *(len(header.bodies) for header in headers)])
-        self.captions = tuple(_caption(each) for each in self._trajectories)
+        self.captions = _captions(self._trajectories)
         pairs = list(zip(self._trajectories, self._chosen, strict=True))
         times = np.array([each.times[k] for each, k in pairs])
         index = FrameIndex(
@@ -152,14 +152,27 @@ def _position(frame: str | None, trajectory: Trajectory) -> int:
     return number % count
 
 
-def _caption(trajectory: Trajectory) -> str:
-    """Return the number of a trajectory, and its drawn values but for those of placed bodies."""
-    values = []
-    for key, value in trajectory.draws.items():
-        if isinstance(value, list | dict):
-            continue
-        parts = key.split(".")
-        name = ".".join(parts[-2:] if parts[-1].isdecimal() else parts[-1:])
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        values.append(f"{name.replace('_', ' ')} {number_text(value) if number else value}")
-    return f"{trajectory.number}: {', '.join(values)}" if values else str(trajectory.number)
+def _captions(trajectories: Sequence[Trajectory]) -> tuple[str, ...]:
+    """Return the number of each trajectory and those drawn values in which the trajectories differ."""
+    draws = [{key: value for key, value in each.draws.items() if _is_short(value)} for each in trajectories]
+    keys = list(dict.fromkeys(key for values in draws for key in values))
+    varying = [key for key in keys if any(values.get(key) != draws[0].get(key) for values in draws)]
+    captions = []
+    for each, values in zip(trajectories, draws, strict=True):
+        texts = [f"{_name(key)} {_text(values[key])}" for key in varying if key in values]
+        captions.append(f"{each.number}: {', '.join(texts)}" if texts else str(each.number))
+    return tuple(captions)
+
+
+def _is_short(value: Any) -> bool:
+    """Return whether a drawn value fits a caption; placed bodies are lists."""
+    return not isinstance(value, list | dict)
+
+
+def _name(key: str) -> str:
+    parts = key.split(".")
+    return ".".join(parts[-2:] if parts[-1].isdecimal() else parts[-1:]).replace("_", " ")
+
+
+def _text(value: Any) -> str:
+    return number_text(value) if isinstance(value, int | float) and not isinstance(value, bool) else str(value)

@@ -1,5 +1,6 @@
 """Draws the ledger of a run: energies, momenta, steps and what bounds them, volumes, speeds, and where matter is."""
 
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+LABEL_WIDTH = 22  # characters in a line of a label beside the axis of values
 MARKED = 8  # fewer points than this are marked, since a single one makes no line
 FEW_DECADES = 2.5  # fewer decades than this have numbers at 2 and 5 times their powers, too
 NAME_MAX = 16  # characters of a name in a legend
@@ -74,9 +76,9 @@ class Panel:
         self.axes, self._times, self._theme = axes, times, theme
 
     def title(self, title: str, label: str) -> None:
-        """Name what is shown, and its unit."""
+        """Set the title and the label of the values, which ends with their unit."""
         self.axes.set_title(title)
-        self.axes.set_ylabel(label)
+        self.axes.set_ylabel(textwrap.fill(label, LABEL_WIDTH))
 
     def line(
         self, values: np.ndarray, name: str, color: int | None, width: float = 1.4, times: np.ndarray | None = None

@@ -197,8 +197,8 @@ class Optics:
 
 # Depths, milk, body, deepening, gloss, sharpness, reflection, bend, glow.
 FINISHES: dict[Finish, Optics] = {
-    "water": Optics(6.0, 0.4, 0.6, 0.12, 1.6, 260.0, 1.0, 0.06),
-    "syrup": Optics(32.0, 1.0, 0.88, 0.2, 1.0, 160.0, 0.9, 0.06),
+    "water": Optics(6.0, 0.4, 0.6, 0.12, 0.7, 260.0, 1.0, 0.03),
+    "syrup": Optics(32.0, 1.0, 0.88, 0.2, 0.7, 160.0, 0.9, 0.03),
     "matte": Optics(200.0, 400.0, 0.9, 0.0, 0.10, 18.0, 0.15, 0.0),
 }
 LAVA = Optics(200.0, 400.0, 0.35, 0.0, 0.15, 30.0, 0.2, 0.0, 1.0)

@@ -86,7 +86,7 @@ color = mix(inside, mirrored, shine);
 // The film that the eye sees where the surface bends into the glass.
 float bent_ = atWall ? smoothstep(0.05, 0.6, 1.0 - dot(normalize(worldNormal), n)) : 0.0;
 color += bent_ * 0.35 * softLight(vec3(upwards));
-color += free_ * lamp * lampColor * 1.2 * pow(max(dot(n, normalize(lampTo + v)), 0.0), 200.0);
+color += free_ * lamp * lampColor * 0.6 * pow(max(dot(n, normalize(lampTo + v)), 0.0), 200.0);
 color += free_ * 0.10 * sky * softLight(n) * pow(1.0 - facing, 2.0);
 //// syrup
 vec3 clear = base / max(max(base.r, base.g), max(base.b, 1e-3));

@@ -24,7 +24,7 @@ CARRIED = (LIGHT, TINT, ROUGH, OUTWARDS)
 VARYINGS = "centroid {0} vec4 carriedLight;\ncentroid {0} vec3 carriedTint, carriedRough, worldPoint, worldNormal;\n"
 BEHIND = "behindTexture"  # name of the picture behind clear things
 # How far what lies behind a clear finish is shifted, as a share of its thickness.
-BENT = {"translucent": "0.16", "water": "0.22", "syrup": "0.2"}
+BENT = {"translucent": "0.08", "water": "0.08", "syrup": "0.08"}
 
 
 def lights_of(scene: RenderScene, view: View, theme: Theme) -> dict[str, np.ndarray]:

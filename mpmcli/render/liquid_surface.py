@@ -112,20 +112,24 @@ def surface_of(liquids: Sequence[Liquid], window: Window, view: View, scene: Ren
     inside = all(((x >= low - more) & (x <= high + more)).all() for x, more in slack)
     whole = [_mirrored(liquid, view, scene) if inside else liquid for liquid in liquids]
     depth, owner, core = _nearest([_moved(liquid, window) for liquid in whole], window)
+    size = min(max(liquid.size for liquid in liquids), WIDEST)
+    soft = max(OUTLINE * size, 0.4)
+    at_wall = np.zeros(window.shape, bool)
     if inside:
-        entry, exit_ = _passage(window, view, scene)
+        entry, exit_, facing = _passage(window, view, scene)
         beyond = depth > exit_
         depth[beyond] = NOTHING
         core &= ~beyond
+        # The walls hold the liquid, whose spheres stand out of the domain there.
+        at_wall = (blurred(((depth < entry) & (entry < NOTHING)).astype(np.float32), soft) > 0.5) & (depth < NOTHING)
     known = depth < NOTHING
+    free = known & ~at_wall
     distance = max(liquid.distance for liquid in liquids)
     scale = view.scale_at(np.where(known, depth, view.distance))
+    depth[at_wall] = NOTHING
     depth = smoothed(depth, np.minimum(SMOOTHING * distance * scale, WIDEST), RADIUS * distance)
     if inside:
-        # The walls hold the liquid: its spheres do not stand out of the domain.
-        depth = np.where(known & (entry < NOTHING), np.maximum(depth, entry), depth)
-    size = min(max(liquid.size for liquid in liquids), WIDEST)
-    soft = max(OUTLINE * size, 0.4)
+        depth = np.where(at_wall, entry, np.where(free & (entry < NOTHING), np.maximum(depth, entry), depth))
     cover = blurred(known.astype(np.float32), soft)
     # A straight edge, blurred, falls by 1 / (sqrt(2 pi) soft) to the pixel: this makes it one pixel wide again.
     alpha = np.clip((cover - 0.5) * np.float32(2.5 * soft) + 0.5, 0, 1)
@@ -139,7 +143,10 @@ def surface_of(liquids: Sequence[Liquid], window: Window, view: View, scene: Ren
     across, up = view.plane(*window.middles)
     ahead = 1.0 if view.parallel else depth
     points = np.stack(np.broadcast_arrays(across * ahead, up * ahead, -depth), axis=-1).astype(np.float32)
-    normal = _softened(normals(points, known), known, max(SOFTNESS * size, 0.5))
+    normal = normals(points, free)
+    if at_wall.any():
+        normal[at_wall] = facing[at_wall]
+    normal = _softened(normal, known, max(SOFTNESS * size, 0.5))
     return Surface(window, alpha, depth, owner, normal, _hollow(normal, alpha > 0, size))
 
 
@@ -198,14 +205,19 @@ def _mirrored(liquid: Liquid, view: View, scene: RenderScene) -> Liquid:
     return replace(liquid, position=position[front], pixels=pixels, scale=view.scale_at(pixels[:, 2]))
 
 
-def _passage(window: Window, view: View, scene: RenderScene) -> tuple[np.ndarray, np.ndarray]:
-    """Return where the rays of pixels enter the domain and where they leave it, m; `NOTHING` twice where they miss."""
+def _passage(window: Window, view: View, scene: RenderScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where the rays of pixels enter the domain and where they leave it, m; `NOTHING` twice where they miss.
+
+    The last array (h, w, 3) holds the normals of the faces through which they enter, in camera axes.
+    """
     start, direction = view.rays(*window.middles)
     ends = np.array([scene.lower, scene.upper])[:, None, None] - start
     ends /= np.where(np.abs(direction) < 1e-12, 1e-12, direction)
     first, last = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
     hit = first <= last
-    return tuple(np.where(hit, distance, NOTHING).astype(np.float32) for distance in (first, last))
+    entered = ends.min(axis=0).argmax(axis=-1)
+    outwards = -np.sign(np.take_along_axis(direction, entered[..., None], -1)) * view.axes.T[entered]
+    return *(np.where(hit, distance, NOTHING).astype(np.float32) for distance in (first, last)), outwards
 
 
 def _softened(normal: np.ndarray, known: np.ndarray, deviation: float) -> np.ndarray:

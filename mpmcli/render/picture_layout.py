@@ -11,7 +11,7 @@ import numpy as np
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.settings import Arrow, Theme, rgb_bytes
-from mpmcli.render.view import View
+from mpmcli.render.view import View, corners_of
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
@@ -49,7 +49,7 @@ class PictureLayout:
     colors: Coloring | Categories | None  # explained by a colour bar or a legend; None without either
     grid: tuple[int, int] = (1, 1)  # columns and rows of pictures of the scene
     walls: bool = True  # whether the walls of the domain are drawn around each of them
-    scale_bar: bool = True  # whether there is room for one below
+    scale_bar: bool = True  # in a parallel view; in perspective the edges of the box have their lengths
     arrows: tuple[Arrow, ...] = ()
 
     @property
@@ -90,6 +90,8 @@ class PictureLayout:
                 self._draw_arrows(draw, view, (x, y))
         if self.scale_bar:
             self._draw_scale_bar(draw, view)
+        elif self.grid == (1, 1):
+            self._draw_lengths(draw, view)
         self._heading(draw, times[0] if self.grid == (1, 1) else None)
         if isinstance(self.colors, Coloring):
             self._color_bar(draw, self.colors, missing)
@@ -203,13 +205,35 @@ class PictureLayout:
     def _draw_scale_bar(self, draw: "ImageDraw", view: View) -> None:
         length = round_length(SCALE_SHARE * self.size[0] / view.pixels_per_metre)
         pixels = round(length * view.pixels_per_metre)
-        pad, w = self._px(PAD), self._px(2)
+        left = self._place(0)[0] + round(view.pixels(np.array([self.scene.lower, self.scene.upper]))[:, 0].min())
+        pad, w = max(self._px(PAD), left), self._px(2)
         y = self.size[1] - self._bottom // 2
         tip = self._px(5)
         draw.rectangle((pad, y - w // 2, pad + pixels - 1, y - w // 2 + w - 1), fill=self.theme.text)
         for x in (pad, pad + pixels - w):
             draw.rectangle((x, y - tip, x + w - 1, y + tip), fill=self.theme.text)
         self._write(draw, pad + pixels + self._px(8), y, length_text(length))
+
+    def _draw_lengths(self, draw: "ImageDraw", view: View) -> None:
+        """Write the length of the domain along each axis beside its lowest edge in the picture, or its leftmost one."""
+        corners = corners_of(self.scene)
+        places = view.pixels(corners) + np.array([*self._place(0), 0])
+        if (places[:, 2] < view.near).any():
+            # The camera is inside of the domain.
+            return
+        middle = places[:, :2].mean(axis=0)
+        for axis in range(3):
+            lower = np.flatnonzero(corners[:, axis] == self.scene.lower[axis])
+            halves = 0.5 * (places[lower] + places[lower + (1 << axis)])[:, :2]
+            upright = abs(self.scene.up[axis]) == 1.0
+            x, y = halves[halves[:, 0].argmin() if upright else halves[:, 1].argmax()]
+            outwards = np.array([x, y]) - middle
+            x, y = (x, y) + self._px(12) * outwards / np.linalg.norm(outwards)
+            text = length_text(self.scene.upper[axis] - self.scene.lower[axis])
+            wide = self._small.getlength(text)
+            left = x - wide if x < middle[0] else x
+            left = min(max(left, self._px(PAD) / 2), self._scene_box[2] - wide)
+            self._write(draw, left, y, text, self.theme.faint, "lm" if upright else "lt")
 
     def _legend(self, draw: "ImageDraw", colors: Categories) -> None:
         pad, swatch, step = self._px(PAD), self._px(SWATCH), self._px(SWATCH + 10)

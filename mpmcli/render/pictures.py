@@ -26,6 +26,7 @@ from mpmcli.scene.colliders import Plane
 
 # Least ratio of height to width, and inverse of the largest, of pictures whose height follows from the scene.
 FLATTEST = 0.2
+LARGEST, NARROWEST = (1280, 720), 640  # pixels of pictures whose size follows from the scene
 LEVEL = 1e-6  # length of a direction along the ground, of which less is none
 HIDDEN = 0.05  # share of the particles within the box of a collider, from which on it is cut open
 FITTING_ROUNDS = 4  # iterations in which the sizes of the texts and of the picture settle
@@ -106,7 +107,7 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
         colors = color_by(settings.color, result, scene, theme, settings.limits, settings.cmap)
     if isinstance(colors, Coloring):
         settings = replace(settings, limits=colors.limits)
-    width, height = settings.size
+    width, height = settings.size or (LARGEST[0], None)
     # In other 3D pictures the walls are the edges of a box, part of the scene.
     walls = scene.dimension == 2 or settings.mode == "density"
     # A scale bar has no meaning in perspective.
@@ -117,6 +118,8 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
         aspect = min(max(aspect_of(scene, camera), FLATTEST), 1.0 / FLATTEST)
         for _ in range(FITTING_ROUNDS):
             layout = replace(layout, size=(width, layout.height_for(aspect)))
+        if settings.size is None:
+            layout = replace(layout, size=_within(layout, aspect))
         settings = replace(settings, size=layout.size)
         require_possible(*layout.size, f"{width}xauto")
     view = view_of(scene, camera, layout.viewport_size)
@@ -125,6 +128,15 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
     if hollow and np.linalg.norm(towards) > LEVEL:
         scene = replace(scene, hollow=hollow, towards=tuple(towards.tolist()))
     return RenderSetup(result, settings, scene, colors, layout, view)
+
+
+def _within(layout: PictureLayout, aspect: float) -> tuple[int, int]:
+    """Return the largest size within `LARGEST` without empty space, even as films need it, `NARROWEST` at least."""
+    (width, height), highest = layout.size, LARGEST[1]
+    while height > highest and width > NARROWEST:
+        width -= 16
+        height = replace(layout, size=(width, min(height, highest))).height_for(aspect)
+    return width, min(height, highest) // 2 * 2
 
 
 def _hollow(scene: RenderScene, result: Result) -> tuple[int, ...]:

@@ -29,7 +29,7 @@ from mpmcli.render.view import CAMERAS
 
 DIRECTORY = "render"  # directory of pictures in that of the result
 USUAL_FPS = 30.0
-USUAL_SIZE, USUAL_MONTAGE_SIZE = "1280x720", "1280xauto"
+USUAL_MONTAGE_SIZE = "1280xauto"
 COLORED = ("dots", "surface")  # modes in which particles have the colours of a value
 
 
@@ -194,7 +194,7 @@ def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()
     settings = Settings(
         mode=request.mode,
         color=request.color or None,
-        size=parse_size(request.size or (USUAL_MONTAGE_SIZE if request.montage else USUAL_SIZE)),
+        size=parse_size(request.size or USUAL_MONTAGE_SIZE) if request.size or request.montage else None,
         camera=request.camera,
         theme=request.theme,
         limits=parse_limits(request.clim) if request.clim else None,

@@ -29,7 +29,8 @@ class Settings:
 
     mode: Mode
     color: str | None  # as `--color-by`; None for the usual one of dots, and for materials as they look
-    size: tuple[int, int | None]  # of the whole picture, pixels; None for a height that follows from the scene
+    # Of the whole picture, pixels; None for a size, or a height, that follows from the scene.
+    size: tuple[int, int | None] | None
     camera: str = "iso"
     theme: str = "light"
     limits: tuple[float, float] | None = None  # of the colours, None where they have none

@@ -142,7 +142,7 @@ def slice_of(scene: RenderScene, camera: str) -> Slice:
 def aspect_of(scene: RenderScene, camera: str) -> float:
     """Return the height of the domain over its width, as a camera sees it, with the margin around it."""
     view = view_of(scene, camera, (SQUARE, SQUARE))
-    width, height = np.ptp(view.pixels(_corners(scene))[:, :2], axis=0) + 2 * MARGIN * SQUARE
+    width, height = np.ptp(view.pixels(corners_of(scene))[:, :2], axis=0) + 2 * MARGIN * SQUARE
     return float(height / width)
 
 
@@ -153,14 +153,15 @@ def _axes(back: np.ndarray, up: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(back, right), back])
 
 
-def _corners(scene: RenderScene) -> np.ndarray:
+def corners_of(scene: RenderScene) -> np.ndarray:
+    """Return the corners (8, 3) of the domain, m; bit k of their number is set at the upper end of axis k."""
     picks = np.array([[i >> axis & 1 for axis in range(3)] for i in range(8)])
     return np.where(picks == 1, np.array(scene.upper), np.array(scene.lower))
 
 
 def _framed(scene: RenderScene, back: np.ndarray, up: np.ndarray, size: tuple[int, int], *, parallel: bool) -> View:
     """Return the nearest view from a direction in which the whole domain is seen, its projection in the middle."""
-    corners, axes = _corners(scene), _axes(back, up)
+    corners, axes = corners_of(scene), _axes(back, up)
     focus = corners.mean(axis=0)
     room = 1.0 - 2.0 * MARGIN
     aspect = size[0] / size[1]
@@ -209,9 +210,9 @@ def _view(
 ) -> View:
     """Return the view from a position to a focus with a direction upwards, the `vectors`."""
     position, focus, up = vectors
-    depths = (position - _corners(scene)) @ _axes(position - focus, up)[2]
+    depths = (position - corners_of(scene)) @ _axes(position - focus, up)[2]
     # A margin for shadows and for particles that have left the domain.
-    spare = 0.1 * float(np.ptp(_corners(scene), axis=0).max())
+    spare = 0.1 * float(np.ptp(corners_of(scene), axis=0).max())
     near, far = float(depths.min()) - spare, float(depths.max()) + spare
     near = max(near, 1e-3 * float(np.linalg.norm(position - focus)))
     plain = [tuple(map(float, vector)) for vector in vectors]
