@@ -27,6 +27,7 @@ def loaded(
     solver: dict[str, Any] | None = None,
     output: dict[str, Any] | None = None,
     contact: dict[str, Any] | None = None,
+    colliders: list[dict[str, Any]] | None = None,
     **body: Any,
 ) -> LoadedScene:
     """Return a scene: by default a block of 16 x 16 cells of fluid on the floor of 64 x 64 cells, h = 1/64 m."""
@@ -37,6 +38,7 @@ def loaded(
         solver=solver or {},
         output=output or {},
         contact=contact or {},
+        colliders=colliders or [],
         bodies=bodies or [block],
     )
     return LoadedScene(scene, (), "scene.toml")

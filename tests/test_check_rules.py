@@ -19,6 +19,7 @@ from mpmcli.scene import LoadedScene
 
 H = 1 / 64
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e7}
+GRAINS = SAND | {"friction_angle": 30.0}
 REST_LIMIT = H / math.sqrt(2 * 1e3)
 WALL_3D = {"size": [1.0, 1.0, 1.0], "cells": [32, 32, 32], "gravity": [0.0, 0.0, -10.0]}
 
@@ -347,3 +348,53 @@ def test_gravity_that_is_no_number_at_some_time(gravity: str, fine: bool) -> Non
         return
     with pytest.raises(InputError, match=r"domain\.gravity\[1\]: must be finite from time 0 to time\.end"):
         check(domain={"gravity": [0.0, gravity]})
+
+
+@pytest.mark.parametrize(
+    ("material", "walls", "fires"),
+    [
+        (GRAINS, {"walls": "separate"}, True),
+        (GRAINS, {"walls": "slip"}, True),
+        (GRAINS, {"walls": {"y_min": "stick"}}, False),
+        (GRAINS, {"friction": {"y_min": 0.3}}, False),
+        (GRAINS, {"friction": {"x_min": 0.3}}, True),
+        (GRAINS, {"gravity": [0.0, 0.0]}, False),
+        ("mud", {}, True),
+        (FLUID | {"viscosity": 0.1}, {}, True),
+        (FLUID | {"viscosity": 0.09}, {}, False),
+        (SOLID, {}, False),
+    ],
+)
+def test_what_slides_on_the_floor_is_said(material: object, walls: dict, fires: bool) -> None:
+    """Grains, mud and viscous liquids on a floor without friction; walls at the sides do not count."""
+    domain = {"gravity": [0.0, -10.0]} | walls
+    assert len(found("slippery", domain=domain, material=material)) == fires
+
+
+@pytest.mark.parametrize(
+    ("body", "fires"),
+    [
+        ({}, True),
+        ({"initial_pressure": "hydrostatic"}, False),
+        ({"velocity": [0.1, 0.0]}, False),
+        ({"material": SOLID}, False),
+        ({"shape": box([0.0, 0.0], [0.9, 0.5])}, False),
+        ({"shape": box([0.0, 0.1], [1.0, 0.5])}, False),
+    ],
+)
+def test_a_pool_without_pressure_is_said(body: dict, fires: bool) -> None:
+    """Fluid from wall to wall on the floor; the pressure at the floor is density times g times depth."""
+    pool = block("pool", [0.0, 0.0], [1.0, 0.5]) | body
+    findings = found("no-pressure", [pool], domain={"gravity": [0.0, -10.0]})
+    assert [finding.value for finding in findings] == [pytest.approx(1000 * 10 * 0.5)] * fires
+
+
+@pytest.mark.parametrize(("cells", "fires"), [(0.0, True), (0.9, True), (1.0, False)])
+def test_a_rigid_body_that_liquid_cannot_lift_is_said(cells: float, fires: bool) -> None:
+    """Less than a cell above the floor of a pool, which has nodes only of both or of neither there."""
+    shape = box([0.25, cells * H], [0.5, 0.25 + cells * H])
+    pool = block("pool", [0.0, 0.0], [1.0, 0.5]) | {"shape": box([0.0, 0.0], [1.0, 0.5]) | {"subtract": [shape]}}
+    raft = {"name": "raft", "shape": shape, "density": 500.0}
+    assert len(found("no-liquid-between", [pool], colliders=[raft])) == fires
+    dry = block("drop", [0.75, 0.5], [0.9, 0.75])
+    assert found("no-liquid-between", [dry], colliders=[raft]) == []

@@ -152,7 +152,7 @@ def test_how_thick_and_how_far_apart() -> None:
             "shape.subtract[0]: needs exactly one of box, ball, capsule, cylinder, mesh, polygon; ",
         ),
         ({**RING, "add": [box([0, 0], [0, 1])]}, "shape.add[0].box.max: must be above min along x"),
-        ({**RING, "add": [{**RING, "box": {}}]}, "shape.add[0].box.min: missing key: Lower corner, m"),
+        ({**RING, "add": [{**RING, "box": {}}]}, "shape.add[0].box.min: missing key: lower corner, m"),
         ({**RING, "substract": []}, 'shape.substract: unknown key; did you mean "subtract"?'),
         (
             {"subtract": [box([0, 0], [1, 1])]},

@@ -28,7 +28,7 @@ REPLACED = [
     ),
     ("end = 1.5", "end = 1.5\nspacing = 3", "8: time.spacing: unknown key here; it belongs to [domain]"),
     ("[time]", "[tme]", '6: tme: unknown key; did you mean "time"?'),
-    ("end = 1.5\n", "", "6: time.end: missing key: Simulated time, s; the scene starts at 0"),
+    ("end = 1.5\n", "", "6: time.end: missing key: simulated time, s; the scene starts at 0"),
     ("end = 1.5", 'end = "1.5"', '7: time.end: must be a number; found "1.5"'),
     ("end = 1.5", "end = true", "7: time.end: must be a number; found true"),
     ("end = 1.5", "end = inf", "7: time.end: must be a finite number; found inf"),

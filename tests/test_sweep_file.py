@@ -372,4 +372,4 @@ def test_a_file_that_cannot_be_read():
         load_sweep("none.toml", laws=LAWS)
     assert str(refused.value) == "none.toml: there is no such file; give the path of a sweep in TOML"
     assert refusal("count = = 3")[0].startswith("sweep.toml:1:9: not valid TOML: ")
-    assert refusal(BARE.replace("count = 1000\n", "")) == ["sweep.toml: count: missing key: Number of trajectories"]
+    assert refusal(BARE.replace("count = 1000\n", "")) == ["sweep.toml: count: missing key: number of trajectories"]

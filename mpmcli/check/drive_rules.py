@@ -21,6 +21,8 @@ STRAIN, STRAINED, TORN = 3 / 8, 0.05, 1.0
 TIGHT, CRUSHED = 0.95, 0.25
 # Cells across the thinnest part of a rigid body, at least, and by which it may begin inside of something.
 FEWEST_CELLS, BEGINS_INSIDE = 3.0, 0.1
+# Cells between a rigid body and what stands below it, from which on liquid gets there.
+UNDER = 1.0
 # Points along the longest axis of the lattice on which room is measured, and instants of the run.
 POINTS, INSTANTS = {2: 96, 3: 32}, 33
 
@@ -90,6 +92,19 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
             if depth > BEGINS_INSIDE:
                 what = f'Rigid body "{body.name}" begins {depth:.2g} cells inside of {name}, and is pushed out.'
                 yield Finding("warning", "overlap", what, f"Move it by {depth * h:.2g} m.", depth, body.name)
+            elif depth > -UNDER * (1 - 1e-6) and _wet(facts, lower, upper):
+                what = (
+                    f'Rigid body "{body.name}" begins {abs(min(depth, 0)):.2g} cells from {name}: no liquid gets '
+                    "between them, so that it is pressed there and does not float up."
+                )
+                fix = f"Set it {UNDER * h:.3g} m away if it should."
+                yield Finding("note", "no-liquid-between", what, fix, -depth, body.name)
+
+
+def _wet(facts: SceneFacts, lower: np.ndarray, upper: np.ndarray) -> bool:
+    """Return whether any liquid begins around a box."""
+    liquids = [body.body.shape.form.bounds() for body in facts.bodies if body.law.deformation == "J"]
+    return any((lower <= high).all() and (low <= upper).all() for low, high in liquids)
 
 
 def _room(facts: SceneFacts) -> Iterator[Finding]:

@@ -1,10 +1,16 @@
-"""Rules on materials: impact speed, softness, locking, density ratio, friction angle."""
+"""Rules on materials: impact speed, softness, locking, density ratio, friction angle, rest on the floor."""
 
 import math
 from collections.abc import Iterator
 
+import numpy as np
+
 from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
+from mpmcli.check.geometry import touched_walls
+from mpmcli.plain_text import number_text
+from mpmcli.scene.primitives import Box
+from mpmcli.scene.quantity import AXES
 
 # Poisson's ratio above which displacement fields of four particles per cell lock (tests/hard_cases, H10).
 LOCKING = 0.49
@@ -17,6 +23,8 @@ FAST, SUPERSONIC = 1 / 3, 1.0
 SOFT = 0.3
 # Degrees by which the friction angle in triaxial extension may exceed the given one.
 STEEP = 10.0
+# Viscosity from which on a fluid is viscous, Pa s: between oil and honey.
+VISCOUS = 0.1
 
 
 def material_findings(facts: SceneFacts) -> Iterator[Finding]:
@@ -25,6 +33,7 @@ def material_findings(facts: SceneFacts) -> Iterator[Finding]:
         for rule in (_impact, _soft, _locking, _friction):
             yield from rule(facts, body)
     yield from _density(facts)
+    yield from _floor(facts)
 
 
 def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
@@ -45,7 +54,7 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     stiffness = body.law.first_set(body.body.material, body.law.stiffness_parameters)
     name, value = stiffness or ("its stiffness", body.stiffness)
     needed = value * (ratio / FAST) ** 2
-    fix = f"Raise {name} from {value:.3g} to {needed:.2g} Pa or more, or slow the scene down."
+    fix = f"Raise {name} from {number_text(value)} to {number_text(needed)} Pa or more, or slow the scene down."
     yield Finding("warning", "impact-speed", what, fix, ratio, body.name)
 
 
@@ -56,11 +65,11 @@ def _soft(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     weight = body.body.material.density * facts.bounds.gravity * body.height
     if weight > SOFT * modulus:
         what = (
-            f'Body "{body.name}" is so soft that its own weight, {weight:.3g} Pa at its foot, is '
-            f"{weight / modulus:.2g} of its modulus of {modulus:.3g} Pa: it collapses."
+            f'Body "{body.name}" is so soft that its own weight, {number_text(weight)} Pa at its foot, is '
+            f"{weight / modulus:.2g} of its modulus of {number_text(modulus)} Pa: it collapses."
         )
         lower = f"make the body lower than {body.height * SOFT * modulus / weight:.2g} m."
-        fix = f"Raise the modulus above {weight / SOFT:.2g} Pa, or {lower}"
+        fix = f"Raise the modulus above {number_text(weight / SOFT)} Pa, or {lower}"
         yield Finding("warning", "soft", what, fix, weight / modulus, body.name)
 
 
@@ -88,7 +97,7 @@ def _friction(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     compression = math.degrees(math.asin(3 * s / (root + s)))
     extension = math.degrees(math.asin(min(1.0, 3 * s / (root - s))))
     what = (
-        f'The friction angle of body "{body.name}", {angle:g} degrees in plane strain, acts as {compression:.1f} '
+        f'The friction angle of body "{body.name}", {angle:.3g} degrees in plane strain, acts as {compression:.1f} '
         f"degrees in triaxial compression and as {extension:.1f} degrees in extension."
     )
     fix = "Give the angle of plane strain; where compression from all sides decides, as in a cone's middle, give more."
@@ -108,3 +117,42 @@ def _density(facts: SceneFacts) -> Iterator[Finding]:
         )
         fix = f"Keep the ratio of densities under {DENSITY_RATIO:g}, or leave the light body out."
         yield Finding("warning", "density-ratio", what, fix, ratio, light.name)
+
+
+def _floor(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield materials that slide on a floor without friction, and liquids that begin without the pressure of rest."""
+    scene = facts.scene
+    gravity = np.nan_to_num(scene.domain.gravity_at(0.0))
+    axis = int(np.abs(gravity).argmax())
+    side = int(gravity[axis] > 0)
+    face, word = f"{AXES[axis]}_{('min', 'max')[side]}", scene.domain.walls.faces(scene.dimension)[axis][side]
+    if not gravity.any() or word not in ("slip", "separate"):
+        return
+    gripping = [body.name for body in facts.bodies if _grips(body)]
+    if gripping and scene.domain.frictions[axis][side] == 0:
+        what = f'Body "{gripping[0]}" slides on the wall {face}, which has no friction.'
+        fix = f'Set domain.walls = {{ {face} = "stick" }}, or domain.friction = {{ {face} = 0.5 }}, if it should not.'
+        yield Finding("note", "slippery", what, fix, 0.0, gripping[0])
+    for body in facts.bodies:
+        form, source = body.body.shape.form, body.body
+        if body.law.deformation != "J" or source.initial_pressure or not isinstance(form, Box):
+            continue
+        touched = touched_walls(scene, form)
+        level = all(all(faces) for a, faces in enumerate(touched) if a != axis)
+        if level and touched[axis][side] and source.deformation is None and not np.any(source.velocity):
+            pressure = source.material.density * float(np.abs(gravity[axis])) * body.height
+            what = (
+                f'Body "{body.name}" fills the domain from wall to wall and begins without pressure: it sinks and '
+                f"bounces for seconds, and its pressure varies by up to {number_text(pressure)} Pa."
+            )
+            fix = 'Set initial_pressure = "hydrostatic" to begin at rest.'
+            yield Finding("note", "no-pressure", what, fix, pressure, body.name)
+
+
+def _grips(body: BodyFacts) -> bool:
+    """Return whether a body would hold to a floor: grains, mud and the like, and viscous liquids."""
+    material = body.body.material
+    if hasattr(material, "friction_angle") or hasattr(material, "consistency"):
+        return True
+    viscosity = getattr(material, "viscosity", 0.0)
+    return body.law.deformation == "J" and isinstance(viscosity, int | float) and viscosity >= VISCOUS

@@ -161,7 +161,7 @@ def _volume_error(numbers: Sequence[int], errors: np.ndarray, findings: FrameFin
     if abs(lasting) > VOLUME_ERROR:
         what = f"From frame {first} to the end liquids and grains fill {100 * abs(lasting):.3g} % "
         what += f"{'more' if lasting > 0 else 'less'} than the volume of their particles"
-        fix = "Leave volume_correction = true in a fluid, or refine the domain."
+        fix = "Refine the domain. Of the materials, fluids with volume_correction and sand correct their volume."
         findings.add("note", "volume-error", first, what, fix, value=lasting)
     return lasting
 

@@ -32,8 +32,8 @@ NEIGHBOUR = 1.2
 FEW, MOST_CELLS = 4, 3e7
 # Particles in a cell over those meant, and share of empty cells inside, from which on it is said.
 CROWDED, GAPS = 3.0, 0.05
-# Mean J of a viscous liquid from which on it is said.
-OPENED = 1.2
+# Mean J of a liquid of that viscosity, Pa s, or more from which on it is said.
+OPENED, VISCOUS = 1.2, 0.1
 # Cells to each side of one that is inside, how full they are on average then, and the fewest that tell a share.
 WINDOW, INSIDE, ENOUGH = 2, 0.85, 64
 
@@ -326,7 +326,7 @@ class CrowdCheck(FrameCheck):
         J = volume_ratio(self._header, frame)
         for label, body in enumerate(self._header.bodies if J is not None else ()):
             own = J[frame.body == label]
-            if body.material.get("viscosity", 0) > 0 and len(own) and own.mean() > OPENED:
+            if body.material.get("viscosity", 0) >= VISCOUS and len(own) and own.mean() > OPENED:
                 mean, name = float(own.mean()), body.name
                 what = f'In frame {frame.index} the viscous liquid of "{name}" has a mean J of {mean:.3g}'
                 fix = "Refine the domain across it, or pour it thicker."

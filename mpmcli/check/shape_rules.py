@@ -55,7 +55,7 @@ def _gaps(facts: SceneFacts) -> Iterator[Finding]:
     for i, j, distance in close_pairs(facts.scene, reach * h):
         cells = distance / h
         first, second = bodies[i], bodies[j]
-        if cells <= TOUCHING or cells >= reach or facts.scene.friction_between(first, second) is not None:
+        if cells <= TOUCHING or cells >= reach * (1 - 1e-6) or facts.scene.friction_between(first, second) is not None:
             continue
         # Bodies with equal velocity would come to rest in contact; those that pass each other are dragged along.
         passing = not np.array_equal(first.velocity, second.velocity)

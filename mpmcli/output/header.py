@@ -172,6 +172,7 @@ class RunHeader:
         shifts: whether particles of liquids and grains are shifted.
         sticking: per axis, whether a face normal to it sticks or has friction.
         periodic: (d,), whether the domain repeats along each axis.
+        faces: the words of the walls, the lower and the upper one of each axis; none where they are not known.
         bodies: in the order of their labels in the frames.
         contacts: see `Scene.contact_pairs`.
         laws: in the order of the labels in the frames.
@@ -198,6 +199,7 @@ class RunHeader:
     shifts: bool
     sticking: tuple[bool, ...] | None
     periodic: np.ndarray
+    faces: tuple[tuple[str, str], ...]
     bodies: tuple[BodyHeader, ...]
     contacts: tuple[tuple[str, str], ...]
     laws: tuple[LawHeader, ...]
@@ -270,6 +272,7 @@ class RunHeader:
             shifts=solver.redistribute == "auto",
             sticking=sticking or None,
             periodic=periodic,
+            faces=faces,
             bodies=_bodies(facts),
             contacts=facts.contacts,
             laws=tuple(

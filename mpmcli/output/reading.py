@@ -35,6 +35,8 @@ def open_hdf5(path: Path, wanted: str) -> h5py.File:
             return h5py.File(path, "r")
     except OSError as error:
         reason = "is not an HDF5 file, or a damaged one" if path.exists() else "does not exist"
+        if path.suffix == ".toml" and path.exists():
+            reason = "is a scene, not a result of `mpmcli simulate`"
         raise InputError(f"{path} {reason}; give {wanted}.") from error
 
 

@@ -176,12 +176,25 @@ class PictureLayout:
             self._write(draw, x + min(self._px(PAD), free), y, text)
 
     def _walls(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
-        """Draw the walls just outside of the domain, so that nothing inside is hidden."""
+        """Draw the walls just outside of the domain, so that nothing inside is hidden.
+
+        Open faces of a 2D domain are left out, and periodic ones are dashed.
+        """
         corners = view.pixels(np.array([self.scene.lower, self.scene.upper]))
         edges = np.rint(corners[:, :2] + place).astype(int)
         (x0, y0), (x1, y1) = edges.min(axis=0).tolist(), edges.max(axis=0).tolist()
-        w = self._px(2)
-        draw.rectangle((x0 - w, y0 - w, x1 + w - 1, y1 + w - 1), outline=self.theme.wall, width=w)
+        w, dash = self._px(2), self._px(12)
+        faces = self.scene.faces if self.scene.dimension == 2 and self.scene.faces else (("", ""), ("", ""))
+        left, right = (x0 - w, y0 - w, x0 - 1, y1 + w - 1), (x1, y0 - w, x1 + w - 1, y1 + w - 1)
+        below, above = (x0 - w, y1, x1 + w - 1, y1 + w - 1), (x0 - w, y0 - w, x1 + w - 1, y0 - 1)
+        for line, word in zip((left, right, below, above), sum(faces, ()), strict=True):
+            if word != "open":
+                draw.rectangle(line, fill=self.theme.wall)
+            along = int(line in (left, right))
+            for start in range(line[along] + dash, line[along + 2], 2 * dash) if word == "periodic" else ():
+                gap = list(line)
+                gap[along], gap[along + 2] = start, min(start + dash, line[along + 2]) - 1
+                draw.rectangle(gap, fill=self.theme.ground)
 
     def _draw_arrows(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
         """Draw velocities, the fastest as long as a part of the domain, each with its speed in m/s."""

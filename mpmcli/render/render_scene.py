@@ -13,6 +13,7 @@ from mpmcli.output.header import BodyHeader
 from mpmcli.output.result import Result
 from mpmcli.plain_text import one_line
 from mpmcli.render.particle_grid import drawable
+from mpmcli.render.settings import lighter
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.presets import PRESETS
 from mpmcli.scene.schema import usual_particles_per_cell
@@ -106,6 +107,7 @@ class RenderScene:
     collider_frames: tuple[int, ...] | None = None  # the frame that each collider is in; None where all are in all
     hollow: tuple[int, ...] = ()  # numbers of the colliders in 3D that are cut open, so that what is inside is seen
     towards: tuple[float, ...] = (0.0, 0.0, 0.0)  # the direction (3,) from which they are cut
+    faces: tuple[tuple[str, str], ...] = ()  # words of the walls of each axis; none where they are not known
     clear: bool = False  # colliders in 3D show only their far sides, as containers do, so that they hide nothing
 
     def shows(self, number: int, frame: Frame) -> bool:
@@ -139,6 +141,7 @@ def render_scene_of(result: Result) -> RenderScene:
         material_of=material_of,
         distances=tuple(header.spacing / body.particles_per_cell ** (1 / d) for body in bodies),
         densities=tuple(body.density or 1000.0 for body in bodies),
+        faces=header.faces,
         # What holds a part is no thing to be seen.
         colliders=tuple(result.colliders[k] for k in shown),
         collider_frames=result.collider_frames and tuple(result.collider_frames[k] for k in shown),
@@ -154,7 +157,7 @@ def _materials(
     for body, table in zip(bodies, tables, strict=True):
         if table not in kinds:
             others = sum(appearance.ink in OTHERS for appearance in appearances)
-            appearances.append(appearance_of(table.get("law", "material"), table, others))
+            appearances.append(_unlike(appearance_of(table.get("law", "material"), table, others), appearances))
             kinds.append(table)
             firsts.append(body)
     names = [appearance.name for appearance in appearances]
@@ -164,6 +167,12 @@ def _materials(
         if not exact or names.count(name) > 1:
             appearances[k] = replace(appearances[k], label=f"{name} ({body})" if exact else body)
     return tuple(appearances), tuple(kinds.index(table) for table in tables)
+
+
+def _unlike(appearance: Appearance, others: Sequence[Appearance]) -> Appearance:
+    """Return an appearance, lighter than those of the same name before it."""
+    share = 1 - 0.7 ** sum(other.name == appearance.name for other in others)
+    return replace(appearance, color=lighter(appearance.color, share), ink=lighter(appearance.ink, share))
 
 
 @dataclass(frozen=True)

@@ -73,6 +73,11 @@ def rgb(color: str) -> tuple[float, ...]:
     return tuple(part / 255.0 for part in rgb_bytes(color))
 
 
+def lighter(color: str, share: float) -> str:
+    """Return a colour "#rrggbb" mixed with this share of white."""
+    return "#" + bytes(round(part + share * (255 - part)) for part in rgb_bytes(color)).hex()
+
+
 def parse_size(text: str) -> tuple[int, int | None]:
     """Read "1280x720", or "1280xauto" for a height that follows from the scene: None; InputError for anything else."""
     match = re.fullmatch(r"(\d{1,9})[xX](\d{1,9}|auto)", text.strip())

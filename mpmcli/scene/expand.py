@@ -94,8 +94,8 @@ class _Material:
         if word in known:
             return True
         if word not in others:
-            hint = f'did you mean "{guess}"? ' if (guess := nearest(word, known)) else ""
-            sentence = f"unknown {kind} {written(word)}; {hint}The {kind}s are {listed(quoted(known), 'and')}"
+            hint = f'did you mean "{guess}"? The' if (guess := nearest(word, known)) else "the"
+            sentence = f"unknown {kind} {written(word)}; {hint} {kind}s are {listed(quoted(known), 'and')}"
         elif kind == "law":
             sentence = f'"{word}" is a preset: write preset = "{word}"'
         else:

@@ -177,7 +177,10 @@ def _missing_key(loc: Path, model: type[BaseModel]) -> str:
         if field and field.description:
             knobs = [name for name, (parameter, _) in knobs_of(table).items() if parameter == loc[-1]]
             instead = "".join(f"; or its knob {name}, 0 to 1" for name in knobs)
-            return f"missing key: {field.description.rstrip('.')}{instead}"
+            description = field.description.rstrip(".")
+            # Young's and Poisson's keep their capitals.
+            first = description[:1] if "'s" in description.split(maxsplit=1)[0] else description[:1].lower()
+            return f"missing key: {first}{description[1:]}{instead}"
     return "missing key"
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import tomli_w
 
 from mpmcli.errors import InputError
+from mpmcli.scene.examples import examples
 from mpmcli.scene.problem import Path, hint_at, listed, nearest_entry, path_text, written
 from mpmcli.scene.schema import Scene
 
@@ -67,7 +68,9 @@ def read_toml(path: str | PathLike[str], kind: str = "scene") -> tuple[str, dict
         # utf-8-sig: some editors begin a file with a byte order mark.
         text = file.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise InputError(f"{file}: there is no such file; give the path of a {kind} in TOML") from None
+        known = list(examples()) if kind == "scene" and not file.suffix else []
+        hint = hint_at(file.name, known, f"give the path of a {kind} in TOML")
+        raise InputError(f"{file}: there is no such file; {hint}") from None
     except IsADirectoryError:
         inside = file / f"{kind}.toml"
         hint = f"did you mean {inside}?" if inside.is_file() else f"give the path of a {kind} in TOML"

@@ -84,7 +84,7 @@ class RunSummary:
             first, last = self.first, self.last
             lines.append(
                 f"energy: {first.energy:.5g} -> {last.energy:.5g} J (kinetic {last.kinetic:.4g}, elastic "
-                f"{last.elastic:.4g}, potential {last.potential:.4g})"
+                f"{last.elastic:.4g}, potential {last.potential + 0.0:.4g})"
             )
             lines.append(f"volume ratio J at the end: {last.volume_ratio_min:.4g} to {last.volume_ratio_max:.4g}")
         if self.last is not None and self.last.blocked:
