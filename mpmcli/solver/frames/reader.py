@@ -91,7 +91,7 @@ def show_range(
         # Half a step back, where the velocities are, and now: a loop, so that the law is compiled once.
         for k in range(turns):
             for lane in range(LANES):
-                C, inner = matrix_of(affine, d, lane), vector_of(internal, 0, inners, lane)
+                C, inner = matrix_of(affine, 0, d, lane), vector_of(internal, 0, inners, lane)
                 stored, constants = stored_of(group, deformation, lane), constants_of(rows, lane)
                 if ti.static(group.averaged):
                     stored *= stretch_to(missing[lane], d)

@@ -334,10 +334,24 @@ class ParticleArrays:
         return values
 
     @ti.func
+    def deformation(self, p: int):
+        """Return J - 1, or F - I as a d x d matrix, of particle p."""
+        if ti.static(self.law.deformation == "F"):
+            H = ti.Matrix.zero(float, self.dimension, self.dimension)
+            for i, j in ti.static(ti.ndrange(self.dimension, self.dimension)):
+                H[i, j] = self.displacement_gradient[p][i, j]
+            return H
+        else:
+            return self.J_minus_1[p]
+
+    @ti.func
     def store(self, p: int, deformation: ti.template(), inner: ti.template()):
-        """Replace what particle p stores of its deformation, and its internal variables."""
-        # Adds the difference, so that a deformation that the law did not change keeps every digit.
-        change = deformation - self.stored(p)
+        """Replace J or F of particle p, and its internal variables; what is unchanged of them keeps every digit."""
+        self.change(p, deformation - self.stored(p), inner)
+
+    @ti.func
+    def change(self, p: int, change: ti.template(), inner: ti.template()):
+        """Add a change to J or F of particle p, and replace its internal variables."""
         if ti.static(self.law.deformation == "F"):
             for i, j in ti.static(ti.ndrange(self.dimension, self.dimension)):
                 self.displacement_gradient[p][i, j] += change[i, j]
@@ -379,17 +393,6 @@ class ParticleArrays:
     @ti.func
     def on_grid(self, p: int):
         return self.place_on_grid[p]
-
-    @ti.func
-    def motion_on_grid(self, p: int):
-        """Return the velocity of particle p, and its gradient with respect to places on the grid."""
-        v, C = self.motion(p)
-        if ti.static(self.total):
-            # Entry by entry: Taichi loses matrices that are assigned as a whole here.
-            at_rest = C @ self.stored(p)
-            for i, j in ti.static(ti.ndrange(self.dimension, self.dimension)):
-                C[i, j] = at_rest[i, j]
-        return v, C
 
     @ti.func
     def row(self, p: int):

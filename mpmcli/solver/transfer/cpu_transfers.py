@@ -6,12 +6,12 @@ to the blocks as a whole: so are the sums of a node those of tiles, in their ord
 """
 
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.particles.arrays import CONSTANTS, MASS, VOLUME
-from mpmcli.solver.particles.state_bounds import NOTHING, deformation_rate, volume_growth, volume_ratio
-from mpmcli.solver.solids.reference_grid import friction_of_walls, pulled_back, push_of_walls
+from mpmcli.solver.particles.arrays import CONSTANTS, VOLUME
+from mpmcli.solver.particles.state_bounds import NOTHING, volume_ratio
 from mpmcli.solver.transfer.lanes import (
     LANES,
     constants_of,
+    deformation_of,
     internal_entries,
     load_deformation,
     load_entry,
@@ -23,6 +23,9 @@ from mpmcli.solver.transfer.lanes import (
     node_rows_of,
     node_values_of,
     repeat_first,
+    set_deformation,
+    set_matrix,
+    set_vector,
     store_lanes,
     stored_entries,
     stored_of,
@@ -30,25 +33,11 @@ from mpmcli.solver.transfer.lanes import (
     weights_of,
     zero_lanes,
 )
-from mpmcli.solver.transfer.particle_update import (
-    SMALLEST_J,
-    add_kept,
-    centred,
-    deformed_gradient,
-    momentum,
-    scatter_volume,
-    turned,
-)
+from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, hand_over, loads_on, take_back
+from mpmcli.solver.transfer.particle_update import SMALLEST_J, scatter_volume
 from mpmcli.solver.transfer.splines import bounded
 from mpmcli.solver.transfer.stencils import add_linear, gather_linear
-from mpmcli.solver.transfer.volume_average import (
-    average_range,
-    even,
-    log_volume,
-    missing_growth,
-    missing_to_mean,
-    stretch_to,
-)
+from mpmcli.solver.transfer.volume_average import average_range, missing_growth
 
 
 @ti.func
@@ -60,22 +49,20 @@ def scatter_range(
     d = ti.static(group.dimension)
     width = ti.static(grid.width)
     nodes = ti.static(grid.scheme.spline.nodes)
-    keeps_F = ti.static(group.law.deformation == "F")
     inners = ti.static(internal_entries(group))
-    x, v, affine = zero_lanes(d), zero_lanes(d), zero_lanes(ti.static(d * d))
+    # Places on the grid, and where particles are, if that is not the same.
+    places, heres = zero_lanes(d), zero_lanes(ti.static(d if group.total else 1))
+    speeds, affine = zero_lanes(d), zero_lanes(ti.static(d * d))
+    deformation, internal = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
+    rows, ratios = zero_lanes(ti.static(group.table.n)), ti.Vector.zero(float, LANES)
+    shares, missing = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES)
+    pushes = zero_lanes(ti.static(d + d * d if group.pushed else 1))
     touches = zero_lanes(ti.static(d if particles.touches else 1))
     frictions = zero_lanes(ti.static(d if group.slips else 1))
-    # Where particles are, if that is not where they are on the grid.
-    here = zero_lanes(ti.static(d if group.total else 1))
-    deformation, internal = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
-    rows = zero_lanes(ti.static(group.table.n))
-    pushes = zero_lanes(ti.static(d + d * d if group.pushed else 1))
-    ratios = ti.Vector.zero(float, LANES)
-    missing = ti.Vector.zero(float, LANES)
-    first_node, weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(nodes * d))
-    middles, slopes = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
-    keeps = ti.static(grid.scheme.keeps_before)
-    shares, behind = ti.Vector.zero(float, LANES), ti.Vector.zero(int, LANES)
+    loaded = ti.static(group.averaged or particles.touches or group.slips or group.pushed or grid.scheme.keeps_before)
+    first_node, behind = ti.Vector.zero(int, LANES), ti.Vector.zero(int, LANES)
+    weights = zero_lanes(ti.static(nodes * d))
+    middles, changes = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
     if ti.static(not group.several):
         load_rows(group, first, 1, rows)
     begin = first
@@ -85,94 +72,52 @@ def scatter_range(
         if ti.static(group.several):
             load_rows(group, begin, count, rows)
         origin = bounded(begin)
-        load_vectors(x, group.place_on_grid, origin)
-        load_vectors(v, group.v, origin)
+        load_vectors(places, group.place_on_grid, origin)
+        load_vectors(speeds, group.v, origin)
         if ti.static(group.total):
-            load_vectors(here, group.x, origin)
+            load_vectors(heres, group.x, origin)
         if count < LANES:
-            repeat_first(x, count)
-            repeat_first(v, count)
-            repeat_first(here, count)
+            repeat_first(places, count)
+            repeat_first(speeds, count)
+            repeat_first(heres, count)
         load_layers(behind, grid, group, begin, count)
-        more = ti.static(group.averaged or particles.touches or group.slips or group.pushed or keeps)
-        for lane in range(ti.static(LANES * more)):
+        for lane in range(ti.static(LANES * loaded)):
             # What reads more than arrays: lanes beyond the last particle repeat it.
             p = begin + ti.min(lane, count - 1)
-            if ti.static(group.averaged):
-                missing[lane] = missing_to_mean(grid, g, group, p)
-            if ti.static(keeps):
-                shares[lane] = group.kept[group.row_number(p)]
-            if ti.static(particles.touches):
-                push = particles.contact.push(group, p, grid.spacing, particles.run)
-                for c in ti.static(range(d)):
-                    touches[c, lane] = push[c]
-            if ti.static(group.slips):
-                friction = friction_of_walls(particles, group, p, kick, lane < count)
-                for c in ti.static(range(d)):
-                    frictions[c, lane] = friction[c]
-            if ti.static(group.pushed):
-                push, slope = group.force.acceleration(group, p, group.force.spreads)
-                for c in ti.static(range(d)):
-                    pushes[c, lane] = push[c]
-                    for a in ti.static(range(d)):
-                        pushes[d + c * d + a, lane] = slope[c, a]
+            share, lacking, push, slope, touch, friction = loads_on(particles, g, group, p, kick, lane < count)
+            shares[lane], missing[lane] = share, lacking
+            set_vector(pushes, 0, push, lane)
+            set_matrix(pushes, d, slope, lane)
+            set_vector(touches, 0, touch, lane)
+            set_vector(frictions, 0, friction, lane)
 
-        # The law, and what the nodes get; see `transfer.scatter`.
         for lane in range(LANES):
-            C = matrix_of(affine, d, lane)
-            place, own = vector_of(x, 0, d, lane), vector_of(v, 0, d, lane)
-            state = stored_of(group, deformation, lane)
-            seen, share = state, 1.0
-            if ti.static(group.averaged):
-                share = stretch_to(missing[lane], d)
-                seen = share * state
-            stress, _, state_after, inner_after = group.law.respond(
-                seen, vector_of(internal, 0, inners, lane), C, kick, constants_of(rows, lane)
-            )
+            place, v, C = vector_of(places, 0, d, lane), vector_of(speeds, 0, d, lane), matrix_of(affine, 0, d, lane)
+            here = place
+            if ti.static(group.total):
+                here = vector_of(heres, 0, d, lane)
+            state, inner = stored_of(group, deformation, lane), vector_of(internal, 0, inners, lane)
+            row, constants = vector_of(rows, 0, ti.static(group.table.n), lane), constants_of(rows, lane)
+            share, lacking = shares[lane], missing[lane]
+            push, slope = vector_of(pushes, 0, d, lane), matrix_of(pushes, d, d, lane)
+            touch, friction = vector_of(touches, 0, d, lane), vector_of(frictions, 0, d, lane)
+            (loads,) = ti.static((Loads(share, lacking, push, slope, touch, friction),))
+            (own,) = ti.static((Sender(place, here, v, C, state, inner, row, constants, loads),))
+            base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
+            middle, change, plastic, inner_after = hand_over(particles, group, own, distance, kick)
             ratios[lane] = volume_ratio(group, state)
             if ti.static(group.law.projects):
-                difference = state_after - seen
-                if ti.static(group.averaged):
-                    difference /= share
-                if ti.static(keeps_F):
-                    for i, j in ti.static(ti.ndrange(d, d)):
-                        deformation[i * d + j, lane] += difference[i, j]
-                else:
-                    deformation[0, lane] += difference
-                for i in ti.static(range(inners)):
-                    internal[i, lane] = inner_after[i]
-            if ti.static(group.pushed):
-                own += kick * vector_of(pushes, 0, d, lane)
-                for c, a in ti.static(ti.ndrange(d, d)):
-                    C[c, a] += kick * pushes[d + c * d + a, lane]
-            if ti.static(group.total):
-                row = vector_of(rows, 0, ti.static(group.table.n), lane)
-                if ti.static(particles.touches):
-                    own += kick * vector_of(touches, 0, d, lane)
-                if ti.static(group.slips):
-                    own += kick * vector_of(frictions, 0, d, lane)
-                at = vector_of(here, 0, d, lane)
-                own += kick * push_of_walls(particles, group, at, place, state, row, constants_of(rows, lane))
-                C = C @ state
-                stress = pulled_back(stress, state)
-            base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
+                set_deformation(group, deformation, deformation_of(group, deformation, lane) + plastic, lane)
+                set_vector(internal, 0, inner_after, lane)
             first_node[lane] = near.linear_index(base) + behind[lane]
             w = grid.scheme.spline.weights(distance)
             for k in ti.static(range(nodes)):
                 for a in ti.static(range(d)):
                     weights[k * d + a, lane] = w[k, a]
-            middle, slope = momentum(grid, distance, rows[MASS, lane], rows[VOLUME, lane], own, C, stress, kick)
-            if ti.static(keeps):
-                kept_C = matrix_of(affine, d, lane)
-                if ti.static(group.total):
-                    kept_C = kept_C @ state
-                add_kept(
-                    grid, distance, shares[lane] * rows[MASS, lane], vector_of(v, 0, d, lane), kept_C, middle, slope
-                )
             for c in ti.static(range(width)):
                 middles[lane, c] = middle[c]
                 for a in ti.static(range(d)):
-                    slopes[lane, a * width + c] = slope[a, c]
+                    changes[lane, a * width + c] = change[a, c]
 
         if ti.static(group.law.projects):
             store_projected(group, begin, count, deformation, internal, ratios)
@@ -182,8 +127,8 @@ def scatter_range(
             if ratios[lane] > SMALLEST_J:
                 w = weights_of(weights, nodes, d, lane)
                 middle = node_values_of(middles, 0, width, lane)
-                slope = node_rows_of(slopes, d, width, 0, width, lane)
-                add_linear(near.nodes, near, first_node[lane], w, middle, slope, False)
+                change = node_rows_of(changes, d, width, 0, width, lane)
+                add_linear(near.nodes, near, first_node[lane], w, middle, change, False)
             else:
                 ti.atomic_min(particles.lost[particles.first_lost + g], p)
             if ti.static(grid.keeps_filling):
@@ -246,18 +191,19 @@ def advance_range(
     width = ti.static(grid.width)
     nodes = ti.static(grid.scheme.spline.nodes)
     keeps_F = ti.static(group.law.deformation == "F")
-    x, distances, deformation = zero_lanes(d), zero_lanes(d), zero_lanes(ti.static(stored_entries(group)))
-    first_node, weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(nodes * d))
-    velocities = ti.Matrix.zero(float, LANES, width)
+    places, heres = zero_lanes(d), zero_lanes(ti.static(d if group.total else 1))
+    distances, remainders = zero_lanes(d), zero_lanes(d)
+    deformation, after = zero_lanes(ti.static(stored_entries(group))), zero_lanes(ti.static(stored_entries(group)))
+    first_node, behind = ti.Vector.zero(int, LANES), ti.Vector.zero(int, LANES)
+    weights = zero_lanes(ti.static(nodes * d))
+    velocities, moments = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
     # Of particles whose body keeps a share of its motion.
-    keeps, kept = ti.static((grid.scheme.keeps_before, grid.kept))
-    v, affine = zero_lanes(ti.static(d if keeps else 1)), zero_lanes(ti.static(d * d if keeps else 1))
-    shares, behind = ti.Vector.zero(float, LANES), ti.Vector.zero(int, LANES)
-    moments = ti.Matrix.zero(float, LANES, ti.static(d * width))
-    speeds, gradients, rates = zero_lanes(d), zero_lanes(ti.static(d * d)), ti.Vector.zero(float, LANES)
-    moved, beyond, after = zero_lanes(d), ti.Vector.zero(float, LANES), zero_lanes(ti.static(stored_entries(group)))
-    here = zero_lanes(ti.static(d if group.total else 1))
-    remainders, missing, growths = zero_lanes(d), zero_lanes(1), zero_lanes(1)
+    keeps = ti.static(grid.scheme.keeps_before)
+    kept = ti.static(grid.kept if keeps else 0)
+    own_speeds, own_affine = zero_lanes(ti.static(d if keeps else 1)), zero_lanes(ti.static(d * d if keeps else 1))
+    shares, missing = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES)
+    speeds, gradients, moved = zero_lanes(d), zero_lanes(ti.static(d * d)), zero_lanes(d)
+    beyond, rates, growths = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES), zero_lanes(1)
     rows = zero_lanes(ti.static(group.table.n if group.law.grows_by_constants else CONSTANTS + 1))
     sharpest = NOTHING
     if ti.static(group.law.grows_by_constants and not group.several):
@@ -266,27 +212,27 @@ def advance_range(
     while begin < last:
         count = ti.min(LANES, last - begin)
         origin = bounded(begin)
-        load_vectors(x, group.place_on_grid, origin)
+        load_vectors(places, group.place_on_grid, origin)
         if ti.static(group.total):
-            load_vectors(here, group.x, origin)
+            load_vectors(heres, group.x, origin)
         if ti.static(group.carries):
             for c in ti.static(range(d)):
                 load_entry(remainders, c, group.gradient, (c, d), origin)
         load_deformation(group, origin, deformation)
         if ti.static(keeps):
-            load_vectors(v, group.v, origin)
+            load_vectors(own_speeds, group.v, origin)
             for c, a in ti.static(ti.ndrange(d, d)):
-                load_entry(affine, c * d + a, group.gradient, (a, c), origin)
+                load_entry(own_affine, c * d + a, group.gradient, (a, c), origin)
         if ti.static(group.law.grows_by_constants and group.several):
             load_rows(group, begin, count, rows)
         if count < LANES:
-            repeat_first(x, count)
-            repeat_first(here, count)
+            repeat_first(places, count)
+            repeat_first(heres, count)
             repeat_first(deformation, count)
         load_layers(behind, grid, group, begin, count)
 
         for lane in range(LANES):
-            base, distance = grid.scheme.spline.stencil(vector_of(x, 0, d, lane), grid.inverse_spacing)
+            base, distance = grid.scheme.spline.stencil(vector_of(places, 0, d, lane), grid.inverse_spacing)
             first_node[lane] = near.linear_index(base) + behind[lane]
             w = grid.scheme.spline.weights(distance)
             for a in ti.static(range(d)):
@@ -296,7 +242,7 @@ def advance_range(
 
         for lane in range(count):
             if ti.static(group.evened):
-                missing[0, lane] = missing_growth(grid, g, group, begin + lane)
+                missing[lane] = missing_growth(grid, g, group, begin + lane)
             w = weights_of(weights, nodes, d, lane)
             velocity, moment = gather_linear(near.nodes, near, first_node[lane], w)
             for c in ti.static(range(width)):
@@ -307,53 +253,27 @@ def advance_range(
                 shares[lane] = group.kept[group.row_number(begin + lane)]
 
         for lane in range(LANES):
-            velocity = node_values_of(velocities, 0, d, lane)
-            moment = node_rows_of(moments, d, width, 0, d, lane)
-            distance = vector_of(distances, 0, d, lane)
-            C = centred(grid, distance, velocity, moment).transpose()
-            place = vector_of(x, 0, d, lane)
+            place, remainder = vector_of(places, 0, d, lane), vector_of(remainders, 0, d, lane)
             if ti.static(group.total):
-                place = vector_of(here, 0, d, lane)
-                grown = matrix_of(deformation, d, lane) + dt * C
-                for i, j in ti.static(ti.ndrange(d, d)):
-                    after[i * d + j, lane] = grown[i, j]
-                C = C @ (grown + ti.Matrix.identity(float, d)).inverse()
-            for c, a in ti.static(ti.ndrange(d, d)):
-                gradients[a * d + c, lane] = C[c, a]
-            for c in ti.static(range(d)):
-                speeds[c, lane] = velocity[c]
-            if ti.static(keeps):
-                before = node_values_of(velocities, kept, d, lane)
-                slope = node_rows_of(moments, d, width, kept, d, lane)
-                before_C = centred(grid, distance, before, slope).transpose()
-                own_C = matrix_of(affine, d, lane)
-                if ti.static(group.total):
-                    own_C = own_C @ stored_of(group, deformation, lane)
-                unseen, unseen_C = shares[lane] * (vector_of(v, 0, d, lane) - before), shares[lane] * (own_C - before_C)
-                turn = turned(grid, velocity - before - gravity_step, unseen, unseen_C, before_C, dt)
-                if ti.static(group.total):
-                    unseen_C = unseen_C @ (matrix_of(after, d, lane) + ti.Matrix.identity(float, d)).inverse()
-                for c in ti.static(range(d)):
-                    speeds[c, lane] += unseen[c]
-                    for a in ti.static(range(d)):
-                        gradients[a * d + c, lane] += unseen_C[c, a] + turn[c, a]
-            inside, left, outside = particles.moved(group, place, vector_of(remainders, 0, d, lane), velocity, dt)
-            for c in ti.static(range(d)):
-                moved[c, lane] = inside[c]
-                if ti.static(group.carries):
-                    remainders[c, lane] = left[c]
-            beyond[lane] = outside
-            rates[lane] = deformation_rate(group, C)
-            if ti.static(keeps_F and not group.total):
-                stored = matrix_of(deformation, d, lane)
-                if ti.static(group.evened):
-                    stored = even(stored, missing[0, lane])
-                    growths[0, lane] = log_volume(dt * C)
-                deformed = deformed_gradient(stored, C, dt)
-                for i, j in ti.static(ti.ndrange(d, d)):
-                    after[i * d + j, lane] = deformed[i, j]
-            if ti.static(not keeps_F):
-                after[0, lane] = group.law.grown(deformation[0, lane], volume_growth(C, dt), constants_of(rows, lane))
+                place = vector_of(heres, 0, d, lane)
+            v, C = vector_of(own_speeds, 0, d, lane), matrix_of(own_affine, 0, d, lane)
+            before, constants = deformation_of(group, deformation, lane), constants_of(rows, lane)
+            share, lacking, distance = shares[lane], missing[lane], vector_of(distances, 0, d, lane)
+            velocity, moment = node_values_of(velocities, 0, d, lane), node_rows_of(moments, d, width, 0, d, lane)
+            old_velocity = node_values_of(velocities, kept, d, lane)
+            old_moment = node_rows_of(moments, d, width, kept, d, lane)
+            (own,) = ti.static((Receiver(place, remainder, v, C, before, constants, share, lacking),))
+            (sums,) = ti.static((NodeSums(distance, velocity, moment, old_velocity, old_moment),))
+            v_after, C_after, inside, left, out, state, growth, rate = take_back(
+                particles, group, own, sums, dt, gravity_step
+            )
+            set_vector(speeds, 0, v_after, lane)
+            set_matrix(gradients, 0, C_after.transpose(), lane)
+            set_vector(moved, 0, inside, lane)
+            if ti.static(group.carries):
+                set_vector(remainders, 0, left, lane)
+            set_deformation(group, after, state, lane)
+            beyond[lane], growths[0, lane], rates[lane] = out, growth, rate
 
         # Written so that a NaN is not sound; then it stays, and no later step writes outside the grid.
         sound = count

@@ -119,20 +119,57 @@ def load_layers(behind: ti.template(), grid: ti.template(), group: ti.template()
 
 
 @ti.func
-def matrix_of(lanes: ti.template(), d: ti.template(), lane: int):
+def matrix_of(lanes: ti.template(), first: ti.template(), d: ti.template(), lane: int):
+    """Return a d x d matrix of a lane, of the rows from `first` on; zero where there are none."""
     result = ti.Matrix.zero(float, d, d)
-    for i, j in ti.static(ti.ndrange(d, d)):
-        result[i, j] = lanes[i * d + j, lane]
+    if ti.static(first + d * d <= lanes.n):
+        for i, j in ti.static(ti.ndrange(d, d)):
+            result[i, j] = lanes[first + i * d + j, lane]
     return result
 
 
 @ti.func
 def vector_of(lanes: ti.template(), first: ti.template(), size: ti.template(), lane: int):
-    """Return some entries of a lane, from row `first` on."""
+    """Return some entries of a lane, from row `first` on; zero where there are none."""
     result = ti.Vector.zero(float, size)
-    for i in ti.static(range(size)):
-        result[i] = lanes[first + i, lane]
+    if ti.static(first + size <= lanes.n):
+        for i in ti.static(range(size)):
+            result[i] = lanes[first + i, lane]
     return result
+
+
+@ti.func
+def set_vector(lanes: ti.template(), first: ti.template(), vector: ti.template(), lane: int):
+    """Set the rows of a lane from `first` on to a vector, if there are that many."""
+    if ti.static(first + vector.n <= lanes.n):
+        for i in ti.static(range(vector.n)):
+            lanes[first + i, lane] = vector[i]
+
+
+@ti.func
+def set_matrix(lanes: ti.template(), first: ti.template(), matrix: ti.template(), lane: int):
+    """Set the rows of a lane from `first` on to a matrix, row by row, if there are that many."""
+    if ti.static(first + matrix.n * matrix.m <= lanes.n):
+        for i, j in ti.static(ti.ndrange(matrix.n, matrix.m)):
+            lanes[first + i * matrix.m + j, lane] = matrix[i, j]
+
+
+@ti.func
+def set_deformation(group: ti.template(), lanes: ti.template(), deformation: ti.template(), lane: int):
+    """Set J - 1, or F - I, of a lane."""
+    if ti.static(group.law.deformation == "F"):
+        set_matrix(lanes, 0, deformation, lane)
+    else:
+        lanes[0, lane] = deformation
+
+
+@ti.func
+def deformation_of(group: ti.template(), deformation: ti.template(), lane: int):
+    """Return J - 1, or F - I as a d x d matrix, of a lane."""
+    if ti.static(group.law.deformation == "F"):
+        return matrix_of(deformation, 0, ti.static(group.dimension), lane)
+    else:
+        return deformation[0, lane]
 
 
 @ti.func
@@ -140,7 +177,7 @@ def stored_of(group: ti.template(), deformation: ti.template(), lane: int):
     """Return J, or F as a d x d matrix, of a lane."""
     if ti.static(group.law.deformation == "F"):
         d = ti.static(group.dimension)
-        return ti.Matrix.identity(float, d) + matrix_of(deformation, d, lane)
+        return ti.Matrix.identity(float, d) + matrix_of(deformation, 0, d, lane)
     else:
         return 1.0 + deformation[0, lane]
 

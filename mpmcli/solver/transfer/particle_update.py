@@ -1,7 +1,4 @@
-"""What a step does with one particle: P2G and G2P as a GPU takes them, and parts of both that the CPU takes, too.
-
-MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015), or AFLIP; see docs/theory.md, 2.
-"""
+"""P2G and G2P of one particle as a thread of a GPU does them, with atomics, and how particles move on any device."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -11,109 +8,13 @@ from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.grid import Grid, LinearNodes
 from mpmcli.solver.grid.period import opaque
 from mpmcli.solver.particles.arrays import MASS, VOLUME
-from mpmcli.solver.particles.state_bounds import deformation_rate, volume_growth, volume_ratio
+from mpmcli.solver.particles.state_bounds import deformation_rate, volume_ratio
 from mpmcli.solver.solids.contact import ParticleContact
-from mpmcli.solver.solids.reference_grid import friction_of_walls, pulled_back, push_of_walls
+from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, hand_over, loads_on, take_back
 from mpmcli.solver.transfer.splines import PAD
-from mpmcli.solver.transfer.stencils import add_linear, gather_linear
-from mpmcli.solver.transfer.volume_average import even, log_volume, missing_growth, missing_to_mean, stretch_to
+from mpmcli.solver.transfer.stencils import add_linear, columns, gather_linear
+from mpmcli.solver.transfer.volume_average import missing_growth
 from mpmcli.solver.transfer.volume_relaxation import relax_volume
-
-
-@ti.func
-def scatter(g: ti.template(), group: ti.template(), particles: ti.template(), p: int, kick: float):
-    """Add the mass and the momentum of particle p, stress included, to the nodes around it, with atomics.
-
-    A law with plastic flow projects the particle's state first; forces change v by kick a, and C by kick da/dx. Node i
-    receives w_i (m v + A (x_i - x_p)) with A = m C - dt V0 tau / D (Hu et al. 2018, eq. 18), and w_i m.
-    """
-    grid = particles.grid
-    row = group.row(p)
-    mass = row[MASS]
-    v, C = group.motion(p)
-    seen = group.stored(p)
-    share = 1.0
-    if ti.static(group.averaged):
-        share = stretch_to(missing_to_mean(grid, g, group, p), ti.static(group.dimension))
-        seen *= share
-    stress, _, deformation, inner = group.law.respond(seen, group.inner(p), C, kick, group.constants(p))
-    if ti.static(group.law.projects):
-        if ti.static(group.averaged):
-            group.store(p, group.stored(p) + (deformation - seen) / share, inner)
-        else:
-            group.store(p, deformation, inner)
-    if ti.static(group.pushed):
-        push, slope = group.force.acceleration(group, p, group.force.spreads)
-        v += kick * push
-        C += kick * slope
-    if ti.static(group.total):
-        F = group.stored(p)
-        if ti.static(group.slips):
-            v += kick * friction_of_walls(particles, group, p, kick, True)
-        v += kick * push_of_walls(particles, group, group.x[p], group.initial[p], F, row, group.constants(p))
-        # Entry by entry: Taichi loses matrices that are assigned as a whole here.
-        C_rest, P = C @ F, pulled_back(stress, F)
-        for i, j in ti.static(ti.ndrange(group.dimension, group.dimension)):
-            C[i, j] = C_rest[i, j]
-            stress[i, j] = P[i, j]
-    base, distance = grid.scheme.spline.stencil(group.on_grid(p), grid.inverse_spacing)
-    w = grid.scheme.spline.weights(distance)
-    middle, change = momentum(grid, distance, mass, row[VOLUME], v, C, stress, kick)
-    if ti.static(grid.scheme.keeps_before):
-        # Last, and with a copy: before it, Taichi 1.7.4 loses what a force with branches adds to v and C.
-        own_v, own_C = group.motion_on_grid(p)
-        add_kept(grid, distance, group.kept[group.row_number(p)] * mass, own_v, own_C, middle, change)
-    first = grid.linear_index(base)
-    if ti.static(grid.deterministic):
-        if not add_fixed(grid.fixed.nodes, grid, first, w, mass, middle, change):
-            grid.fixed.note(group.id[p])
-    else:
-        add_linear(grid.nodes, grid, first, w, middle, change, True)
-
-
-@ti.func
-def momentum(
-    grid: ti.template(),
-    distance: ti.template(),
-    mass: float,
-    volume: float,
-    v: ti.template(),
-    C: ti.template(),
-    stress: ti.template(),
-    kick: float,
-):
-    """Return the momentum and mass that the middle node of a stencil would take, and their change per cell and axis."""
-    d = ti.static(grid.dimension)
-    middle = ti.Vector.zero(float, grid.width)
-    change = ti.Matrix.zero(float, d, grid.width)
-    stress_scale = kick * volume * grid.gradient_scale
-    for c in ti.static(range(d)):
-        middle[c] = mass * v[c]
-        for a in ti.static(range(d)):
-            change[a, c] = (mass * grid.spacing) * C[c, a] - stress_scale * stress[c, a]
-            middle[c] -= change[a, c] * (distance[a] - 1.0)
-    middle[d] = mass
-    return middle, change
-
-
-@ti.func
-def add_kept(
-    grid: ti.template(),
-    distance: ti.template(),
-    mass: float,
-    v: ti.template(),
-    C: ti.template(),
-    middle: ti.template(),
-    change: ti.template(),
-):
-    """Set what a stencil takes of the share, of that mass, that a body keeps of its motion, see `momentum`."""
-    d, kept = ti.static((grid.dimension, grid.kept))
-    for c in ti.static(range(d)):
-        middle[kept + c] = mass * v[c]
-        for a in ti.static(range(d)):
-            change[a, kept + c] = (mass * grid.spacing) * C[c, a]
-            middle[kept + c] -= change[a, kept + c] * (distance[a] - 1.0)
-    middle[kept + d] = mass
 
 
 @ti.func
@@ -146,28 +47,6 @@ def add_fixed(
     if fits:
         add_linear(sums, grid, first, w, middle, change, True)
     return fits
-
-
-@ti.func
-def gather(x: ti.template(), grid: ti.template(), field: ti.template()):
-    """Return the velocity at a point and its gradient, sum w_i (x_i - x) v_i^T / D, of a field of the nodes.
-
-    Row a of the gradient is dv/dx_a. Of both, as wide as a node, the first d columns count.
-    """
-    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
-    w = grid.scheme.spline.weights(distance)
-    velocity, moment = gather_linear(field, grid, grid.linear_index(base), w)
-    return velocity, centred(grid, distance, velocity, moment)
-
-
-@ti.func
-def centred(grid: ti.template(), distance: ti.template(), velocity: ti.template(), moment: ti.template()):
-    """Return the gradient of the velocity at a point from sums over its stencil, see `gather` and `gather_linear`."""
-    gradient = moment
-    for a in ti.static(range(moment.n)):
-        for c in ti.static(range(moment.m)):
-            gradient[a, c] = (moment[a, c] - velocity[c] * (distance[a] - 1.0)) * grid.gradient_scale
-    return gradient
 
 
 NOT_LOST = 2**31 - 1
@@ -222,13 +101,30 @@ class ParticleUpdate:
     @ti.func
     def scatter(self, g: ti.template(), group: ti.template(), p: int, kick: float, relaxed: float):
         """Scatter one particle, with atomics; one that is crushed is lost: its stress would spread NaN."""
-        if volume_ratio(group, group.stored(p)) > SMALLEST_J:
-            scatter(g, group, self, p, kick)
+        state, row = group.stored(p), group.row(p)
+        if volume_ratio(group, state) > SMALLEST_J:
+            (grid,) = ti.static((self.grid,))
+            v, C = group.motion(p)
+            inner, constants = group.inner(p), group.constants(p)
+            place, here = group.on_grid(p), group.x[p]
+            share, missing, push, slope, touch, friction = loads_on(self, g, group, p, kick, True)
+            (loads,) = ti.static((Loads(share, missing, push, slope, touch, friction),))
+            (own,) = ti.static((Sender(place, here, v, C, state, inner, row, constants, loads),))
+            base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
+            middle, change, plastic, inner_after = hand_over(self, group, own, distance, kick)
+            if ti.static(group.law.projects):
+                group.change(p, plastic, inner_after)
+            w, first = grid.scheme.spline.weights(distance), grid.linear_index(base)
+            if ti.static(grid.deterministic):
+                if not add_fixed(grid.fixed.nodes, grid, first, w, row[MASS], middle, change):
+                    grid.fixed.note(group.id[p])
+            else:
+                add_linear(grid.nodes, grid, first, w, middle, change, True)
         else:
             self.lose(g, group, p)
         if ti.static(self.grid.keeps_filling):
             if relaxed > 0.0:
-                scatter_volume(group.x[p], group.row(p)[VOLUME], self.grid, True)
+                scatter_volume(group.x[p], row[VOLUME], self.grid, True)
 
     @ti.func
     def relax(self, group: ti.template(), p: int, relaxed: float):
@@ -242,77 +138,56 @@ class ParticleUpdate:
 
     @ti.func
     def advance(self, g: ti.template(), group: ti.template(), p: int, dt: float, gravity_step: ti.template()):
-        """Gather and move one particle; return its rate of deformation, 1/s (see `deformation_rate`).
-
-        x += dt v, and F <- (I + dt C) F or J *= det(I + dt C); on the grid of the state at rest F += dt dv/dX.
-        """
-        d = ti.static(self.dimension)
-
-        # Gather.
-        x = group.x[p]
-        v, gradient = gather(group.on_grid(p), self.grid, self.grid.nodes)
-        C = ti.Matrix.zero(float, d, d)
-        for c, a in ti.static(ti.ndrange(d, d)):
-            C[c, a] = gradient[a, c]
-        remainder = ti.Vector.zero(float, d)
+        """Gather and move one particle; return its rate of deformation, 1/s (see `deformation_rate`)."""
+        d, grid = ti.static((self.dimension, self.grid))
+        x, remainder, share, missing = group.x[p], ti.Vector.zero(float, d), 0.0, 0.0
+        v, C = group.motion(p)
         if ti.static(group.carries):
             for c in ti.static(range(d)):
                 remainder[c] = group.gradient[p][c, d]
-        inside, after, beyond = self.moved(group, x, remainder, v, dt)
-        own_v, own_C, turn = self.kept_motion(group, p, v, gradient, dt, gravity_step)
-
-        # Motion.
-        for c in ti.static(range(group.v.n)):
-            group.v[p][c] = v[c]
-            if ti.static(self.grid.scheme.keeps_before):
-                group.v[p][c] += own_v[c]
-        if ti.static(group.total):
-            for c, a in ti.static(ti.ndrange(d, d)):
-                group.displacement_gradient[p][c, a] += dt * C[c, a]
-            # Entry by entry: Taichi loses matrices that are assigned as a whole here.
-            in_space = C @ group.stored(p).inverse()
-            for c, a in ti.static(ti.ndrange(d, d)):
-                C[c, a] = in_space[c, a]
-                gradient[a, c] = in_space[c, a]
-        if ti.static(self.grid.scheme.keeps_before):
-            if ti.static(group.total):
-                own_C = own_C @ group.stored(p).inverse()
-            for c, a in ti.static(ti.ndrange(d, d)):
-                gradient[a, c] += own_C[c, a] + turn[c, a]
-        for a in ti.static(range(d)):
-            for c in ti.static(range(group.v.n)):
-                group.gradient[p][a, c] = gradient[a, c]
-            if ti.static(group.carries):
-                group.gradient[p][a, d] = after[a]
-
-        # Deformation. The rate here, where C is at hand, takes half the time that it would take at the end.
-        deforming = deformation_rate(group, C)
         if ti.static(group.evened):
-            missing = missing_growth(self.grid, g, group, p)
-            group.displacement_gradient[p] = even(group.displacement_gradient[p], missing)
-            group.growth[p] = log_volume(dt * C)
-        if ti.static(group.law.deformation == "F" and not group.total):
-            group.displacement_gradient[p] = deformed_gradient(group.displacement_gradient[p], C, dt)
-        if ti.static(group.law.deformation == "J"):
-            growth = volume_growth(C, dt)
-            if ti.static(group.law.grows_by_constants):
-                group.J_minus_1[p] = group.law.grown(group.J_minus_1[p], growth, group.constants(p))
-            else:
-                group.J_minus_1[p] = group.law.grown(group.J_minus_1[p], growth, ti.Vector.zero(float, 1))
+            missing = missing_growth(grid, g, group, p)
+        if ti.static(grid.scheme.keeps_before):
+            share = group.kept[group.row_number(p)]
+        deformation, constants = group.deformation(p), group.constants(p)
+        base, distance = grid.scheme.spline.stencil(group.on_grid(p), grid.inverse_spacing)
+        w = grid.scheme.spline.weights(distance)
+        all_sums, moments = gather_linear(grid.nodes, grid, grid.linear_index(base), w)
+        velocity, moment = columns(all_sums, moments, 0, d)
+        kept = ti.static(grid.kept if grid.scheme.keeps_before else 0)
+        old_velocity, old_moment = columns(all_sums, moments, kept, d)
+        (own,) = ti.static((Receiver(x, remainder, v, C, deformation, constants, share, missing),))
+        (sums,) = ti.static((NodeSums(distance, velocity, moment, old_velocity, old_moment),))
+        v_after, C_after, inside, left, beyond, after, growth, rate = take_back(
+            self, group, own, sums, dt, gravity_step
+        )
+        for c in ti.static(range(d)):
+            group.v[p][c] = v_after[c]
+            for a in ti.static(range(d)):
+                group.gradient[p][a, c] = C_after[c, a]
+            if ti.static(group.carries):
+                group.gradient[p][c, d] = left[c]
+        if ti.static(group.law.deformation == "F"):
+            for i, j in ti.static(ti.ndrange(d, d)):
+                group.displacement_gradient[p][i, j] = after[i, j]
+        else:
+            group.J_minus_1[p] = after
+        if ti.static(group.evened):
+            group.growth[p] = growth
 
-        # Position. Written so that a NaN is not sound; then it stays, and no later step writes outside the grid.
+        # Written so that a NaN is not sound; then it stays, and no later step writes outside the grid.
         sound = beyond <= 0.5 * self.grid.spacing
         if ti.static(self.watches_box and not group.total):
-            base, _ = self.grid.scheme.spline.stencil(inside, self.grid.inverse_spacing)
+            base_after, _ = self.grid.scheme.spline.stencil(inside, self.grid.inverse_spacing)
             for a in ti.static(range(d)):
                 low = self.grid.box[0, a]
                 reach = ti.static(self.grid.scheme.spline.nodes - 1)
-                sound = sound and base[a] >= low and base[a] + reach < low + self.grid.box[1, a]
+                sound = sound and base_after[a] >= low and base_after[a] + reach < low + self.grid.box[1, a]
         for c in ti.static(range(d)):
             group.x[p][c] = ti.select(sound, inside[c], x[c])
         if not sound:
             self.lose(g, group, p)
-        return deforming
+        return rate
 
     @ti.func
     def lose(self, g: ti.template(), group: ti.template(), p: int):
@@ -351,63 +226,3 @@ class ParticleUpdate:
                         # `opaque` is for numbers that are not negative.
                         after[c] = ti.select(inside[c] > 0.0, after[c], 0.0)
         return inside, after, beyond
-
-    @ti.func
-    def kept_motion(
-        self,
-        group: ti.template(),
-        p: int,
-        seen: ti.template(),
-        slope: ti.template(),
-        dt: float,
-        gravity_step: ti.template(),
-    ):
-        """Return what particle p keeps of its velocity and of its gradient on the grid, and what turns with it.
-
-        Args:
-            seen, slope: what the stencil of the particle holds, as `gather` returns it.
-        """
-        d, kept = ti.static((self.dimension, self.grid.kept))
-        velocity, gradient, turn = ti.Vector.zero(float, d), ti.Matrix.zero(float, d, d), ti.Matrix.zero(float, d, d)
-        if ti.static(self.grid.scheme.keeps_before):
-            share = group.kept[group.row_number(p)]
-            v, C = group.motion_on_grid(p)
-            gained, H = ti.Vector.zero(float, d), ti.Matrix.zero(float, d, d)
-            for c in ti.static(range(d)):
-                velocity[c] = share * (v[c] - seen[kept + c])
-                gained[c] = seen[c] - seen[kept + c] - gravity_step[c]
-                for a in ti.static(range(d)):
-                    H[c, a] = slope[a, kept + c]
-                    gradient[c, a] = share * (C[c, a] - H[c, a])
-            found = turned(self.grid, gained, velocity, gradient, H, dt)
-            for c, a in ti.static(ti.ndrange(d, d)):
-                turn[c, a] = found[c, a]
-        return velocity, gradient, turn
-
-
-@ti.func
-def turned(grid: ti.template(), gained: ti.template(), v: ti.template(), C: ti.template(), H: ti.template(), dt: float):
-    """Return what C takes so that a velocity v that a particle keeps, and C with it, turn no angular momentum.
-
-    It is dt (g v^T - v g^T) / (2 D) + dt (C H^T - H C^T) / 2: g is what the nodes gained since, but from
-    gravity, and H the gradient of the share that is kept, both without what was lost (docs/theory.md, 2.3).
-    """
-    d = ti.static(grid.dimension)
-    result, scale = ti.Matrix.zero(float, d, d), 0.5 * dt * grid.gradient_scale * grid.inverse_spacing
-    sheared = C @ H.transpose()
-    for c, a in ti.static(ti.ndrange(d, d)):
-        result[c, a] = scale * (gained[c] * v[a] - v[c] * gained[a]) + 0.5 * dt * (sheared[c, a] - sheared[a, c])
-    return result
-
-
-@ti.func
-def deformed_gradient(H: ti.template(), C: ti.template(), dt: float):
-    """Return F - I after a step from H = F - I before it, d rows: it grows by dt C + dt C H."""
-    new = H
-    for i in ti.static(range(H.n)):
-        for k in ti.static(range(H.n)):
-            rate = dt * C[i, k]
-            new[i, k] += rate
-            for j in ti.static(range(H.m)):
-                new[i, j] += rate * H[k, j]
-    return new

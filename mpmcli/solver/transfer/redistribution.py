@@ -280,7 +280,7 @@ def shift_lanes(at: ti.template(), first: int, last: int, time: float, back: ti.
                 for a in ti.static(range(d)):
                     ways[a, lane] = slope[a]
         for lane in range(LANES):
-            C, way = matrix_of(affine, d, lane), vector_of(ways, 0, d, lane)
+            C, way = matrix_of(affine, 0, d, lane), vector_of(ways, 0, d, lane)
             if ti.static(not back):
                 way = way_down(at, way, C, time)
             way = held_back(at, vector_of(x, 0, d, lane), way)

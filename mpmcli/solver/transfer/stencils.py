@@ -78,6 +78,17 @@ def row_of(matrix: ti.template(), row: ti.template(), width: ti.template()):
 
 
 @ti.func
+def columns(vector: ti.template(), matrix: ti.template(), first: ti.template(), count: ti.template()):
+    """Return `count` entries of a vector, and as many columns of a matrix, from `first` on."""
+    entries, part = ti.Vector.zero(float, count), ti.Matrix.zero(float, matrix.n, count)
+    for c in ti.static(range(count)):
+        entries[c] = vector[first + c]
+        for a in ti.static(range(matrix.n)):
+            part[a, c] = matrix[a, first + c]
+    return entries, part
+
+
+@ti.func
 def add_multiple(result: ti.template(), factor: ti.template(), vector: ti.template()):
     """Add -1, 0, 1 or 2 times a vector."""
     for c in ti.static(range(result.n)):

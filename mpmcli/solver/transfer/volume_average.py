@@ -81,7 +81,7 @@ def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), f
             # What lies beyond the last particle is no row of the table.
             volumes[lane] = group.row(begin + ti.min(lane, count - 1))[VOLUME]
         for lane in range(LANES):
-            logs[lane] = log_volume(matrix_of(deformation, d, lane))
+            logs[lane] = log_volume(matrix_of(deformation, 0, d, lane))
             cells[lane] = cell_of(grid, vector_of(x, 0, d, lane))
             if ti.static(group.layers > 1):
                 cells[lane] += group.layer_of(begin + ti.min(lane, count - 1)) * ti.static(grid.node_count)

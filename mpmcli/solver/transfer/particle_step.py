@@ -1,0 +1,295 @@
+"""The two halves of a step of one particle: what it hands to the nodes around it, and what it takes back from them.
+
+Both are functions of variables alone, so that the CPU's loops over lanes (`cpu_transfers`) and the GPU's threads
+(`particle_update`) compile the same ones. MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015), or AFLIP; see
+docs/theory.md, 2.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.particles.arrays import MASS, VOLUME
+from mpmcli.solver.particles.state_bounds import deformation_rate, volume_growth
+from mpmcli.solver.solids.reference_grid import friction_of_walls, pulled_back, push_of_walls
+from mpmcli.solver.transfer.volume_average import even, log_volume, missing_to_mean, stretch_to
+
+
+@dataclass(frozen=True)
+class Sender:
+    """A particle before P2G: variables of a kernel.
+
+    Attributes:
+        place: on the grid, m; here: in the domain, m, which differs only for a group that is `total`.
+        v, C: velocity and affine velocity; state: J or F; inner: internal variables.
+        row, constants: its row of the table of its group, and the constants of the law in it.
+        loads: what `loads_on` returned.
+    """
+
+    place: Any
+    here: Any
+    v: Any
+    C: Any
+    state: Any
+    inner: Any
+    row: Any
+    constants: Any
+    loads: "Loads"
+
+
+@dataclass(frozen=True)
+class Loads:
+    """What acts on a particle from outside: variables of a kernel, zero where the scene has none of it.
+
+    Attributes:
+        share: share of its motion that its body keeps; missing: ln J that it lacks of the mean of its cell.
+        push, slope: acceleration by forces, and its gradient; touch, friction: by other bodies, by rough walls; m/s^2.
+    """
+
+    share: Any
+    missing: Any
+    push: Any
+    slope: Any
+    touch: Any
+    friction: Any
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """A particle before G2P: variables of a kernel.
+
+    Attributes:
+        place: in the domain, m; remainder: what rounding took from it, m.
+        v, C: before the step, where its body keeps a share of its motion; deformation: J - 1 or F - I.
+        constants: of the law; share: of its motion that its body keeps.
+        missing: growth of ln J that it lacks of the mean of its cell.
+    """
+
+    place: Any
+    remainder: Any
+    v: Any
+    C: Any
+    deformation: Any
+    constants: Any
+    share: Any
+    missing: Any
+
+
+@dataclass(frozen=True)
+class NodeSums:
+    """What the stencil of a particle holds before G2P: variables of a kernel.
+
+    Attributes:
+        distance: of the particle from the first node, cells.
+        velocity, moment: sums of the velocity of nodes, see `gather_linear`.
+        old_velocity, old_moment: of the velocity that bodies keep, where they do.
+    """
+
+    distance: Any
+    velocity: Any
+    moment: Any
+    old_velocity: Any
+    old_moment: Any
+
+
+@ti.func
+def loads_on(particles: ti.template(), g: ti.template(), group: ti.template(), p: int, kick: float, counts: bool):
+    """Return the parts of `Loads` of particle p; `counts` is as of `friction_of_walls`."""
+    d = ti.static(group.dimension)
+    share, missing, slope = 0.0, 0.0, ti.Matrix.zero(float, d, d)
+    push, touch, friction = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
+    if ti.static(particles.grid.scheme.keeps_before):
+        share = group.kept[group.row_number(p)]
+    if ti.static(group.averaged):
+        missing = missing_to_mean(particles.grid, g, group, p)
+    if ti.static(group.pushed):
+        push, slope = group.force.acceleration(group, p, group.force.spreads)
+    if ti.static(particles.touches):
+        touch = particles.contact.push(group, p, particles.grid.spacing, particles.run)
+    if ti.static(group.slips):
+        friction = friction_of_walls(particles, group, p, kick, counts)
+    return share, missing, push, slope, touch, friction
+
+
+@ti.func
+def hand_over(particles: ti.template(), group: ti.template(), own: ti.template(), distance: ti.template(), kick: float):
+    """Return what a particle, a `Sender`, hands to its nodes, and the change of its state.
+
+    Node i receives w_i (m v + A (x_i - x_p)) with A = m C - dt V0 tau / D (Hu et al. 2018, eq. 18), and w_i m.
+
+    Args:
+        distance: from the first node of its stencil, cells.
+        kick: time over which stress and forces act, s.
+
+    Returns:
+        middle, change: momentum and mass at the middle node, and their change per cell and axis, see `momentum`.
+        plastic, inner: what a law that projects adds to J or F, and the internal variables after that.
+    """
+    grid, d = ti.static((particles.grid, group.dimension))
+    seen, stretch = own.state, 1.0
+    if ti.static(group.averaged):
+        stretch = stretch_to(own.loads.missing, d)
+        seen *= stretch
+    stress, _, plastic, inner = group.law.respond(seen, own.inner, own.C, kick, own.constants)
+    if ti.static(group.law.projects):
+        plastic -= seen
+        if ti.static(group.averaged):
+            plastic /= stretch
+    v, C = own.v, own.C
+    if ti.static(group.pushed):
+        v += kick * own.loads.push
+        C += kick * own.loads.slope
+    if ti.static(group.total):
+        if ti.static(particles.touches):
+            v += kick * own.loads.touch
+        if ti.static(group.slips):
+            v += kick * own.loads.friction
+        v += kick * push_of_walls(particles, group, own.here, own.place, own.state, own.row, own.constants)
+        # Entry by entry: Taichi loses matrices that are assigned as a whole here.
+        at_rest, nominal = C @ own.state, pulled_back(stress, own.state)
+        for i, j in ti.static(ti.ndrange(d, d)):
+            C[i, j] = at_rest[i, j]
+            stress[i, j] = nominal[i, j]
+    middle, change = momentum(grid, distance, own.row[MASS], own.row[VOLUME], v, C, stress, kick)
+    if ti.static(grid.scheme.keeps_before):
+        kept = own.C
+        if ti.static(group.total):
+            kept = own.C @ own.state
+        add_kept(grid, distance, own.loads.share * own.row[MASS], own.v, kept, middle, change)
+    return middle, change, plastic, inner
+
+
+@ti.func
+def take_back(
+    particles: ti.template(),
+    group: ti.template(),
+    own: ti.template(),
+    sums: ti.template(),
+    dt: float,
+    gravity_step: ti.template(),
+):
+    """Return a particle, a `Receiver`, after a step of dt with these `NodeSums`.
+
+    x += dt v, and F <- (I + dt C) F or J *= det(I + dt C); on the grid of the state at rest F += dt dv/dX.
+
+    Returns:
+        v, C: velocity and affine velocity.
+        place, remainder, beyond: see `ParticleUpdate.moved`.
+        deformation: J - 1 or F - I; growth: ln J that the step added, where the group is `evened`.
+        rate: of deformation, 1/s (see `deformation_rate`).
+    """
+    grid, d = ti.static((particles.grid, group.dimension))
+    C = centred(grid, sums.distance, sums.velocity, sums.moment).transpose()
+    after, growth, F = own.deformation, 0.0, ti.Matrix.identity(float, d)
+    if ti.static(group.total):
+        after += dt * C
+        F += after
+        C = C @ F.inverse()
+    v, affine = sums.velocity, C
+    if ti.static(grid.scheme.keeps_before):
+        C_before = centred(grid, sums.distance, sums.old_velocity, sums.old_moment).transpose()
+        own_C = own.C
+        if ti.static(group.total):
+            own_C = own.C @ (ti.Matrix.identity(float, d) + own.deformation)
+        unseen, unseen_C = own.share * (own.v - sums.old_velocity), own.share * (own_C - C_before)
+        turn = turned(grid, sums.velocity - sums.old_velocity - gravity_step, unseen, unseen_C, C_before, dt)
+        if ti.static(group.total):
+            unseen_C = unseen_C @ F.inverse()
+        v += unseen
+        affine += unseen_C + turn
+    place, remainder, beyond = particles.moved(group, own.place, own.remainder, sums.velocity, dt)
+    rate = deformation_rate(group, C)
+    if ti.static(group.law.deformation == "J"):
+        after = group.law.grown(own.deformation, volume_growth(C, dt), own.constants)
+    elif ti.static(not group.total):
+        if ti.static(group.evened):
+            after = even(own.deformation, own.missing)
+            growth = log_volume(dt * C)
+        after = deformed_gradient(after, C, dt)
+    return v, affine, place, remainder, beyond, after, growth, rate
+
+
+@ti.func
+def momentum(
+    grid: ti.template(),
+    distance: ti.template(),
+    mass: float,
+    volume: float,
+    v: ti.template(),
+    C: ti.template(),
+    stress: ti.template(),
+    kick: float,
+):
+    """Return the momentum and mass that the middle node of a stencil would take, and their change per cell and axis."""
+    d = ti.static(grid.dimension)
+    middle = ti.Vector.zero(float, grid.width)
+    change = ti.Matrix.zero(float, d, grid.width)
+    stress_scale = kick * volume * grid.gradient_scale
+    for c in ti.static(range(d)):
+        middle[c] = mass * v[c]
+        for a in ti.static(range(d)):
+            change[a, c] = (mass * grid.spacing) * C[c, a] - stress_scale * stress[c, a]
+            middle[c] -= change[a, c] * (distance[a] - 1.0)
+    middle[d] = mass
+    return middle, change
+
+
+@ti.func
+def add_kept(
+    grid: ti.template(),
+    distance: ti.template(),
+    mass: float,
+    v: ti.template(),
+    C: ti.template(),
+    middle: ti.template(),
+    change: ti.template(),
+):
+    """Set what a stencil takes of the share, of that mass, that a body keeps of its motion, see `momentum`."""
+    d, kept = ti.static((grid.dimension, grid.kept))
+    for c in ti.static(range(d)):
+        middle[kept + c] = mass * v[c]
+        for a in ti.static(range(d)):
+            change[a, kept + c] = (mass * grid.spacing) * C[c, a]
+            middle[kept + c] -= change[a, kept + c] * (distance[a] - 1.0)
+    middle[kept + d] = mass
+
+
+@ti.func
+def centred(grid: ti.template(), distance: ti.template(), velocity: ti.template(), moment: ti.template()):
+    """Return the gradient of the velocity at a point from sums over its stencil, see `gather_linear`.
+
+    It is sum w_i (x_i - x) v_i^T / D: row a is dv/dx_a.
+    """
+    gradient = moment
+    for a in ti.static(range(moment.n)):
+        for c in ti.static(range(moment.m)):
+            gradient[a, c] = (moment[a, c] - velocity[c] * (distance[a] - 1.0)) * grid.gradient_scale
+    return gradient
+
+
+@ti.func
+def turned(grid: ti.template(), gained: ti.template(), v: ti.template(), C: ti.template(), H: ti.template(), dt: float):
+    """Return what C takes so that a velocity v that a particle keeps, and C with it, turn no angular momentum.
+
+    It is dt (g v^T - v g^T) / (2 D) + dt (C H^T - H C^T) / 2: g is what the nodes gained since, but from
+    gravity, and H the gradient of the share that is kept, both without what was lost (docs/theory.md, 2.3).
+    """
+    d = ti.static(grid.dimension)
+    result, scale = ti.Matrix.zero(float, d, d), 0.5 * dt * grid.gradient_scale * grid.inverse_spacing
+    sheared = C @ H.transpose()
+    for c, a in ti.static(ti.ndrange(d, d)):
+        result[c, a] = scale * (gained[c] * v[a] - v[c] * gained[a]) + 0.5 * dt * (sheared[c, a] - sheared[a, c])
+    return result
+
+
+@ti.func
+def deformed_gradient(H: ti.template(), C: ti.template(), dt: float):
+    """Return F - I after a step from H = F - I before it, d rows: it grows by dt C + dt C H."""
+    new = H
+    for i in ti.static(range(H.n)):
+        for k in ti.static(range(H.n)):
+            rate = dt * C[i, k]
+            new[i, k] += rate
+            for j in ti.static(range(H.m)):
+                new[i, j] += rate * H[k, j]
+    return new
