@@ -208,3 +208,17 @@ def test_a_poisson_disk_sample_is_told_by_the_seed_and_the_body_alone():
     boxes = [{"shape": {"box": {"min": [x, 0], "max": [x + 1, 1]}}, "sampling": "poisson"} for x in (0, 2)]
     a, b = sample_bodies(scene_of(*boxes))
     assert a.position.shape != b.position.shape or not np.allclose(a.position + np.array([2, 0]), b.position)
+
+
+def test_bodies_of_mud_are_turned_and_relaxed_by_default() -> None:
+    """They flow far and are not shifted; what the scene says itself counts, and points are as they are."""
+    mud = {"material": {"law": "viscoplastic", "density": 1500.0, "yield_stress": 100.0, "consistency": 1.0}}
+
+    def sampled(**more: object) -> tuple[str, bool]:
+        (body,) = scene_of({"shape": BOX, **more}).bodies
+        return body.sampling, body.relaxed
+
+    assert sampled(**mud) == sampled(**mud, sampling="turned") == ("turned", True)
+    assert sampled(**mud, relaxed=False) == ("turned", False)
+    assert sampled(**mud, sampling="lattice") == sampled() == ("lattice", False)
+    assert sampled(sampling="turned") == ("turned", False)

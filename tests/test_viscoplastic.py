@@ -1,15 +1,18 @@
 """The viscoplastic fluid: rest below yield, Bingham and Herschel-Bulkley flow above, tearing, and hard states."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+from command import run_here
 from law_probe import LawProbe, Probes, rotations
 from law_tangent import largest_stiffness
 from pydantic import ValidationError
 
 from mpmcli.materials.law import StateBound
 from mpmcli.materials.viscoplastic import CRUSHED, TEAR_STRAIN, ViscoplasticParameters
+from mpmcli.output import open_result
 from mpmcli.scene.material import SceneBounds
 
 K, G, YIELD, CONSISTENCY = 1e6, 1e5, 100.0, 10.0
@@ -257,3 +260,34 @@ def test_parameters() -> None:
     for wrong in ({"consistency": 0.0}, {"yield_stress": -1.0}, {"flow_index": 0.05}, {"flow_index": 2.5}):
         with pytest.raises(ValidationError):
             parameters(**wrong)
+
+
+LUMP = """
+[domain]
+size = [0.5, 0.5, 0.2]
+spacing = 0.02
+gravity = [0.0, 0.0, -9.81]
+[time]
+end = 0.33
+frames = 1
+[[bodies]]
+name = "lump"
+material = "mud"
+shape = { ball = { center = [0.25, 0.25, 0.1], radius = 0.08 } }
+"""
+
+
+@pytest.mark.slow
+def test_mud_that_spreads_stays_whole(tmp_path: Path) -> None:
+    """A ball that flattens on a floor has no gap along its planes of symmetry; on a lattice it splits there."""
+    (tmp_path / "lump.toml").write_text(LUMP, encoding="utf-8")
+    gaps = {}
+    for sampling in ("turned", "lattice"):
+        out = tmp_path / sampling
+        asked = "--set", f"bodies.lump.sampling={sampling}", "--quiet"
+        assert run_here("simulate", tmp_path / "lump.toml", "-o", out, *asked).status == 0
+        place = open_result(out).frame(1).position[:, :2].astype(float) - 0.25
+        assert np.linalg.norm(place, axis=1).max() > 2 * 0.08
+        strips = [place[np.abs(place[:, 1 - a] - 0.1) < 0.02, a] for a in (0, 1)]
+        gaps[sampling] = max(np.diff(np.sort(strip[np.abs(strip) < 0.1])).max() for strip in strips)
+    assert gaps["turned"] < 0.02 < gaps["lattice"]

@@ -66,7 +66,7 @@ def _soft(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     if weight > SOFT * modulus:
         what = (
             f'Body "{body.name}" is so soft that its own weight, {number_text(weight)} Pa at its foot, is '
-            f"{weight / modulus:.2g} of its modulus of {number_text(modulus)} Pa: it collapses."
+            f"{number_text(weight / modulus)} times its modulus of {number_text(modulus)} Pa: it collapses."
         )
         lower = f"make the body lower than {body.height * SOFT * modulus / weight:.2g} m."
         fix = f"Raise the modulus above {number_text(weight / SOFT)} Pa, or {lower}"

@@ -318,7 +318,9 @@ class CrowdCheck(FrameCheck):
         if densest > CROWDED or empty > GAPS:
             what = f"In frame {frame.index} a cell of liquid or grains has {densest:.3g} times the particles meant"
             what += f", and {100 * empty:.2g} % of the cells inside have none: flow has piled particles up"
-            fix = 'Set solver.redistribute = "auto", or jitter the sampling.'
+            fix = 'Refine the domain, or set sampling = "turned".'
+            if not header.shifts:
+                fix = 'Set solver.redistribute = "auto".'
             self._findings.add("note", "crowd", frame.index, what, fix, value=densest)
 
     def _spray(self, frame: Frame) -> None:

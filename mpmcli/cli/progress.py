@@ -113,7 +113,7 @@ class SimulateProgress(ProgressBar):
         if summary.frames < 2 or done < 1:
             return  # the kernels compile in the first step, or a frame was left from before
         taken = summary.timings["solve_s"] + summary.timings["output_s"]
-        steps_left = (self._end - summary.time) / row.step_max
+        steps_left = max(self._end - summary.time, 0.0) / row.step_max
         left = taken / done * steps_left
         self.show(
             summary.frames,

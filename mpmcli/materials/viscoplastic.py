@@ -1,7 +1,7 @@
 """Viscoplastic fluid: elastic below its yield stress, viscous above; lava, mud, paste."""
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field
 
@@ -29,6 +29,8 @@ class ViscoplasticParameters(WeaklyCompressibleParameters):
     """Parameters of the Bingham and of the Herschel-Bulkley fluid."""
 
     law: Literal["viscoplastic"] = "viscoplastic"
+    usual_sampling: ClassVar[Literal["lattice", "turned"]] = "turned"
+
     yield_stress: Annotated[
         NotNegative, Knob("strength", 1.0, 1e5, "0 is thin slurry, 0.3 ketchup, 0.4 mud, 0.6 lava, 1 stiff clay")
     ] = Field(description="Shear stress below which the material does not flow, Pa; mud 10 to 1000.")

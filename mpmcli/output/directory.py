@@ -181,7 +181,9 @@ def close_abandoned(directory: Path, made: Sequence[Path], pid: int, signal: str
         elif ours:
             with suppress(OSError):
                 temporary_of(directory / PACKED).unlink(missing_ok=True)
-            message = f"the run was interrupted ({signal}) and ended by force; its frames were left unpacked"
+            message = (
+                f"the run was interrupted ({signal}) and ended by force; its frames are kept, and --resume goes on"
+            )
             failure = {"message": message, "signal": signal}
             closed = {**record, "status": "interrupted", "ended": time_now(), "failure": failure}
             write_text(directory / RECORD, json.dumps(closed, indent=2, ensure_ascii=False) + "\n")

@@ -130,6 +130,7 @@ class MaterialParameters(BaseModel):
         elastic: whether its stress is a function of F alone.
         hydrostatic: whether it is a fluid whose J follows from the pressure, by `volume_ratio_under`.
         solid: whether a body of it keeps its shape, so that it stays where it stands.
+        usual_sampling: of its bodies; "turned" where it flows far and its particles are not shifted.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
@@ -143,6 +144,7 @@ class MaterialParameters(BaseModel):
     elastic: ClassVar[bool] = False
     hydrostatic: ClassVar[bool] = False
     solid: ClassVar[bool] = False
+    usual_sampling: ClassVar[Literal["lattice", "turned"]] = "lattice"
 
     @classmethod
     def internal_in(cls, dimension: int) -> tuple[Internal, ...]:

@@ -225,6 +225,20 @@ class Time(Table):
     )
 
 
+def _usual_sampling(value: object, info: ValidationInfo) -> object:
+    return _usual(info) if value is None else value
+
+
+def _usually_relaxed(value: object, info: ValidationInfo) -> object:
+    return info.data.get("sampling") == _usual(info) != "lattice" if value is None else value
+
+
+def _usual(info: ValidationInfo) -> str:
+    """Return how the material of a body is sampled by default; points are as they are."""
+    material, shape = info.data.get("material"), info.data.get("shape")
+    return "lattice" if material is None or getattr(shape, "points", None) else material.usual_sampling
+
+
 def _not_for_points(relaxed: bool, info: ValidationInfo) -> bool:
     # An invalid shape has a message of its own, and is absent from the data.
     if relaxed and getattr(info.data.get("shape"), "points", None):
@@ -262,17 +276,20 @@ class Body(Table):
         description='"hydrostatic": a fluid starts with the J at which it carries its own weight, density g times '
         "the depth below the top of its bounding box. Default: none.",
     )
-    sampling: Literal["lattice", "turned", "jittered", "poisson"] = Field(
-        "lattice",
-        description="Particles on a lattice, on one turned such that no flow along the axes lines them up, one at "
+    sampling: Annotated[Literal["lattice", "turned", "jittered", "poisson"], BeforeValidator(_usual_sampling)] = Field(
+        None,
+        validate_default=True,
+        description="Particles on a lattice, on one rotated so that no flow along the axes lines them up, one at "
         "random in each cell of the lattice, or a Poisson-disk sample: as many at random, none closer than 0.82 (2D) "
-        "or 0.87 (3D) of its spacing to another.",
-    )
-    relaxed: Annotated[Flag, AfterValidator(_not_for_points)] = Field(
-        False,
+        'or 0.87 (3D) of its spacing to another. Default: "lattice"; "turned" for viscoplastic material.',
+    )  # type: ignore[assignment]
+    relaxed: Annotated[Flag, AfterValidator(_not_for_points), BeforeValidator(_usually_relaxed)] = Field(
+        None,
+        validate_default=True,
         description="Whether particles are moved a little, until each node of the grid whose spline the body fills, "
-        "with its images behind walls, has the volume and the centre of a full cell. Not for points.",
-    )
+        "with its images behind walls, has the volume and the centre of a full cell. Not for points. Default: false; "
+        "true for viscoplastic material on a turned lattice.",
+    )  # type: ignore[assignment]
     particles_per_cell: ParticlesPerCell = None  # type: ignore[assignment]
     seed: Integer = Field(0, ge=0, le=2**63 - 1, description="Seed of the random positions; unused by lattices.")
 

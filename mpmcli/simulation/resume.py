@@ -55,6 +55,8 @@ class Resumption:
     @property
     def note(self) -> str:
         """Where the run goes on, a sentence."""
+        if self.complete:
+            return f"resumed: all {self.frames} frames are there"
         point = self.checkpoint
         place = "the start" if point is None else f"step {point.step} at {point.time:.6g} s"
         return f"resumed: {counted(self.frames, 'frame')} kept, computed again from {place}"
