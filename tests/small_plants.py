@@ -33,7 +33,7 @@ def _of(file: str, *changes: tuple) -> tuple[SmallPlant, ...]:
 
 TRANSFERS = (
     *_of(
-        "solver/transfer/particle_update.py",
+        "solver/transfer/particle_step.py",
         ("stress_scale = kick * volume", "stress_scale = 1.05 * kick * volume", "bar_fixed_fixed"),
         ("(mass * grid.spacing) * C[c, a] - stress", "(0.95 * mass * grid.spacing) * C[c, a] - stress", "taylor_green"),
         ("(distance[a] - 1.0)) * grid", "(distance[a] - 1.0)) * 1.05 * grid", "bar_fixed_fixed"),
@@ -54,9 +54,12 @@ TRANSFERS = (
         ("value[a] / value[d] + pull[a]", "value[a] / value[d] + 1.05 * pull[a]", "take_off"),
     ),
     *_of(
-        "solver/transfer/particle_update.py",
+        "solver/transfer/particle_step.py",
         ("rate = dt * C[i, k]", "rate = 1.05 * dt * C[i, k]", "bar_fixed_fixed"),
         ("new[i, j] += rate * H[k, j]", "new[i, j] += 0.95 * rate * H[k, j]", "sand_blocks"),
+    ),
+    *_of(
+        "solver/transfer/particle_update.py",
         ("way = dt * v[c] + remainder[c]", "way = 1.05 * dt * v[c] + remainder[c]", "take_off"),
     ),
     *_of(
@@ -83,11 +86,11 @@ DRIVES = (
         ("result[a] = kick * self.values", "result[a] = 1.05 * kick * self.values", "column_static"),
     ),
     *_of(
-        "solver/transfer/cpu_transfers.py",
-        ("own += kick * vector_of(pushes", "own += 1.05 * kick * vector_of(pushes", "mms_1d"),
+        "solver/transfer/particle_step.py",
+        ("v += kick * own.loads.push", "v += 1.05 * kick * own.loads.push", "mms_1d"),
         (
-            "C[c, a] += kick *",
-            "C[c, a] += 0.95 * kick *",
+            "C += kick * own.loads.slope",
+            "C += 0.95 * kick * own.loads.slope",
             "sand_blocks",
             "inside a body the nodes have the slope from the velocities of its particles; this one acts at its surface",
         ),
