@@ -9,6 +9,7 @@ from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import damped_step, expected_steps, steps_at, wave_loss
 from mpmcli.check.geometry import spanned_axes, touched_walls
+from mpmcli.plain_text import number_text
 from mpmcli.scene.bounds import highest_speed
 from mpmcli.scene.schema import USUAL_FLIP, SolverSettings
 from mpmcli.scene.shapes import Ball, Box, Form, Points
@@ -179,8 +180,9 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     if not now >= NOTED_SHARE:
         return
     what = (
-        f'In its impact at {speed:.3g} m/s, {mach:.2g} of its wave speed, body "{body.name}", {length / h:.3g} cells '
-        f"long, loses about {_percent(now)} of the energy to the transfers, at steps of {courant * h / waves:.3g} s."
+        f'In its impact at {speed:.3g} m/s, {mach:.2g} times its wave speed, body "{body.name}", '
+        f"{length / h:.3g} cells long, loses about {_percent(now)} of the energy to the transfers, at steps of "
+        f"{courant * h / waves:.3g} s."
     )
     fix = _cure(facts, lost(scene.solver, h / 2), lost(_aflip(scene.solver), h))
     yield Finding("note", "impact-loss", what, fix, now, body.name)
@@ -256,8 +258,9 @@ def rounding_findings(facts: SceneFacts) -> Iterator[Finding]:
         noise = HALF_ULP * body.stiffness
         if typical > 0 and noise > STRESS_NOISE * typical:
             what = (
-                f'Body "{body.name}" is so stiff that rounding its strain in single precision makes {noise:.2g} Pa, '
-                f"{100 * noise / typical:.2g} % of the {typical:.2g} Pa of its {'weight' if weight > 0 else 'motion'}."
+                f'Body "{body.name}" is so stiff that rounding its strain in single precision makes '
+                f"{number_text(noise)} Pa, {_percent(noise / typical)} of the {number_text(typical)} Pa of its "
+                f"{'weight' if weight > 0 else 'motion'}."
             )
             fix = 'Set solver.precision = "f64", or take a softer material.'
             yield Finding("warning", "rounding-strains", what, fix, noise / typical, body.name)
