@@ -398,6 +398,9 @@ def test_a_rehearsal_tells_draws_disk_and_time(truth: Path, tmp_path: Path) -> N
     stored = sum(path.stat().st_size for path in (truth / "shards").iterdir())
     assert report["bytes"] == pytest.approx(stored, rel=0.3)
     assert report["seconds"] > 0 and not (tmp_path / "d").exists()
+    one = run_here("sweep", write_sweep(tmp_path), "--dry-run", "--count", 1, "-o", tmp_path / "d")
+    notes = [line for line in one.stdout.splitlines() if line.startswith("note: no trajectory is in the split")]
+    assert len(notes) == 2 and one.stdout.endswith("compilation apart\n")
 
 
 POINTS = BASE.replace(

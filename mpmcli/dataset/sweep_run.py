@@ -37,6 +37,8 @@ SAMPLE = 16
 HEADER_BYTES, FRAME_BYTES = 11_000, 200
 # Most trajectories of a task, and tasks per worker below which they become shorter.
 TASK, GPU_TASK, ROUNDS = 8, 128, 8
+# Trajectories after which every split has some, unless its fraction is smaller than that of one.
+SURE = 1000
 # Why a trajectory has failed that no worker survived.
 LOST = "every worker that computed it was killed, perhaps for want of memory."
 # Rows of the table of a rehearsal, and faults below it.
@@ -348,10 +350,11 @@ class Rehearsed:
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """Trajectories of a part, and the workers that share them."""
+    """Trajectories of a part, the workers that share them, and the splits that no trajectory of the sweep is in."""
 
     trajectories: tuple[Rehearsed, ...]
     workers: int
+    empty: tuple[str, ...] = ()
 
     @property
     def passes(self) -> bool:
@@ -390,8 +393,9 @@ class Rehearsal:
         if len(faults) > MOST_FAULTS:
             lines.append(f"error: {len(faults) - MOST_FAULTS} more cannot be computed; --json tells why")
         time_text = "" if self.seconds is None else f", about {duration_text(self.seconds)}"
-        total = counted(len(self.trajectories), "trajectory")
-        lines.append(f"{total}: {size_text(self.bytes)}{time_text} with {counted(self.workers, 'worker')}")
+        total, workers = counted(len(self.trajectories), "trajectory"), counted(self.workers, "worker")
+        lines += [f'note: no trajectory is in the split "{name}": raise count' for name in self.empty]
+        lines.append(f"{total}: {size_text(self.bytes)}{time_text} with {workers}, compilation apart")
         return "\n".join(lines)
 
 
@@ -416,7 +420,9 @@ def rehearse(sweep: Sweep, settings: SweepSettings, stop: Callable[[], bool] = l
         except InputError as error:
             fault = str(error)
         found.append(Rehearsed(number, sweep.split_of(number), values, *counts, fault))
-    return Rehearsal(tuple(found), settings.workers or available_cores())
+    used = {sweep.split_of(number) for number in range(min(sweep.count, SURE))}
+    empty = tuple(name for name, share in sweep.split if share > 0 and name not in used)
+    return Rehearsal(tuple(found), settings.workers or available_cores(), empty)
 
 
 def _short(value: Any) -> str:
