@@ -42,7 +42,12 @@ fragOutput0 = vec4(pow(max(color, vec3(0.0)), vec3(1.0 / 2.2)), 1.0);
 vec2 bend = -vec2(dot(n, cameraRight), dot(n, cameraUp)) * min(carriedLight.z, thickUnit) * BENT * pixelsToMetre;
 if (atWall) { bend = vec2(0.0); }
 vec2 place = clamp(here + bend / pictureSize, vec2(0.002), vec2(0.998));
-vec3 behind = pow(texture(behindTexture, place).rgb, vec3(2.2));
+vec4 seenBehind = texture(behindTexture, place);
+// What stands before the surface is not seen through it.
+if (seenBehind.a < (dot(cameraAt - worldPoint, toCamera) - nearAndFar.x) / (nearAndFar.y - nearAndFar.x) - 0.01) {
+    seenBehind = texture(behindTexture, here);
+}
+vec3 behind = pow(seenBehind.rgb, vec3(2.2));
 //// matte
 color = base * (lampColor * lamp * wrapped(dot(n, lampTo), 0.12) + sky * softLight(n)
         + 0.12 * max(dot(n, fillTo), 0.0) * sky);

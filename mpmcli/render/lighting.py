@@ -22,7 +22,7 @@ LIGHT, TINT, ROUGH, OUTWARDS = "lightMC", "tintMC", "roughMC", "outwardsMC"
 CARRIED = (LIGHT, TINT, ROUGH, OUTWARDS)
 # Handed from vertices to fragments, sampled at the centroid of the covered part of the pixel.
 VARYINGS = "centroid {0} vec4 carriedLight;\ncentroid {0} vec3 carriedTint, carriedRough, worldPoint, worldNormal;\n"
-BEHIND = "behindTexture"  # name of the picture behind clear things
+BEHIND = "behindTexture"  # name of the picture behind clear things, and its depth from 0, near, to 1, far, as alpha
 # How far what lies behind a clear finish is shifted, as a share of its thickness.
 BENT = {"translucent": "0.08", "water": "0.08", "syrup": "0.08"}
 
@@ -76,6 +76,7 @@ def fragment_code(
         "thickUnit": [0.3 * np.cbrt(np.prod(np.maximum(extent, 1e-12)))],
         "pictureSize": [finer * length for length in view.size],
         "pixelsToMetre": [finer * view.pixels_per_metre],
+        "nearAndFar": [view.near, view.far],
     }
     parts = shader_parts()
     declared = VARYINGS.format("in") + "".join(map(_constant, constants, constants.values())) + parts["room"]

@@ -69,11 +69,16 @@ class SurfaceRenderer:
             for actor in clear:
                 actor.SetVisibility(False)
             self.window.render()
-            _put(self.behind, self.window.pixels())
+            _put(self.behind, np.concatenate([self.window.pixels(), self._nearness()], axis=2))
             for actor in clear:
                 actor.SetVisibility(True)
         self.window.render()
         return self.window.picture()
+
+    def _nearness(self) -> np.ndarray:
+        """Return the depth of what is drawn, (h, w, 1) uint8 from 0, near, to 255, far and nothing."""
+        share = (self.window.depth() - self.view.near) / (self.view.far - self.view.near)
+        return (255 * np.clip(share, 0, 1)).astype(np.uint8)[..., None]
 
     def _posed(self, group: Group, frame: Frame, occlusion: Occlusion) -> Any:
         """Return the actor of a group, with the mesh of this frame."""
