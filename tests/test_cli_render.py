@@ -13,12 +13,15 @@ from command import run_here
 from drawn_results import JELLY, WATER, frame, header, lattice, write
 from PIL import Image
 
+from mpmcli.materials.registry import parameter_models
 from mpmcli.output import Result, open_result
 from mpmcli.output.segments import SEGMENTS
 from mpmcli.render.picture_file import settings_digest, write_picture
 from mpmcli.render.render_scene import APPEARANCES
 from mpmcli.render.request import Request, plan_render
+from mpmcli.render.scene_start import result_of_start
 from mpmcli.render.settings import THEMES
+from mpmcli.scene import load_scene
 
 pytestmark = pytest.mark.usefixtures("drawing")
 
@@ -130,6 +133,38 @@ def test_a_scene_is_drawn_as_it_starts(tmp_path: Path, monkeypatch: pytest.Monke
     assert place(arrow.max(), column)[1] == pytest.approx(0.3, abs=0.02)
     assert json.loads(run_here("render", "start.toml", "--json").stdout)["made"] == 0
     assert "--frame is for results" in refused("start.toml", "--frame", "first", "-o", "other.png")
+
+
+TURNING = """
+[domain]
+size = [1.0, 0.6, 0.5]
+spacing = 0.05
+[time]
+end = 0.1
+frames = 1
+[[bodies]]
+name = "drop"
+material = "water"
+shape = { box = { min = [0.8, 0.2, 0.2], max = [0.9, 0.3, 0.3] } }
+[[colliders]]
+name = "bar"
+shape = { box = { min = [0.3, 0.2, 0.1], max = [0.7, 0.3, 0.4] } }
+angular_velocity = 2.0
+axis = [0.0, 2.0, 0.0]
+"""
+
+
+def test_what_turns_has_an_arrow_at_its_rim(tmp_path: Path) -> None:
+    """The velocity of the rim is the spin times the arm; what is at rest has no arrow."""
+    scene = tmp_path / "turning.toml"
+    flat = TURNING.replace("axis = [0.0, 2.0, 0.0]", "")
+    for numbers in ("1.0, 0.6, 0.5", "0.8, 0.2, 0.2", "0.9, 0.3, 0.3", "0.3, 0.2, 0.1", "0.7, 0.3, 0.4"):
+        flat = flat.replace(numbers, numbers.rpartition(",")[0])
+    for text, rim in ((TURNING, ((0.7, 0.25, 0.25), (0.0, 0.0, -0.4))), (flat, ((0.7, 0.25), (0.0, 0.4)))):
+        scene.write_text(text, encoding="utf-8")
+        with result_of_start(load_scene(scene, laws=parameter_models()).scene) as (_, arrows):
+            ((place, velocity),) = arrows
+        assert place == pytest.approx(rim[0]) and velocity == pytest.approx(rim[1])
 
 
 def test_stdout_gets_the_paths_that_were_asked_for(run: Path, tmp_path: Path) -> None:

@@ -15,10 +15,12 @@ from mpmcli.output.result import Result, open_result
 from mpmcli.output.store import SegmentStore
 from mpmcli.render.settings import Arrow
 from mpmcli.scene import Scene, sample_bodies, scene_to_toml
+from mpmcli.scene.colliders import Collider, Plane
 from mpmcli.scene.expression import evaluate
 from mpmcli.scene.schema import Emitter
 from mpmcli.scene.sheets import sheets_of
 
+PARALLEL = 0.9  # cosine above which an axis is too near to that of a rotation to be an arm
 NOTHING_YET = dict.fromkeys(("kinetic", "elastic", "potential", "mass", "speed_max", "courant_max"), 0.0)
 
 
@@ -40,8 +42,7 @@ def result_of_start(scene: Scene) -> Iterator[tuple[Result, tuple[Arrow, ...]]]:
         there.append(np.arange(len(one.position)) < shown)
         arrows.append((one.position[:shown].mean(axis=0), velocity))
     for collider in scene.colliders:
-        rates = collider.velocity if collider.free else [evaluate(one, {"t": 0.0}) for one in collider.motion.rates]
-        arrows.append((collider.motion.pose(0.0)[0], np.array(rates[:d], np.float64)))
+        arrows += _motion_of(collider, d)
     frame = Frame(
         0,
         0.0,
@@ -66,3 +67,24 @@ def result_of_start(scene: Scene) -> Iterator[tuple[Result, tuple[Arrow, ...]]]:
         store.finish()
         moving = [(place, velocity) for place, velocity in arrows if velocity.any()]
         yield open_result(directory), tuple((tuple(x.tolist()), tuple(v.tolist())) for x, v in moving)
+
+
+def _motion_of(collider: Collider, d: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return places of a collider and their velocities at the start: its pivot, and its rim where it turns."""
+    pivot = collider.motion.pose(0.0)[0]
+    if collider.free:
+        velocity = np.array(collider.rates[:d])
+        spin = np.array([0.0, 0.0, collider.spin[0]] if d == 2 else collider.spin)
+    else:
+        rates = [evaluate(one, {"t": 0.0}) for one in collider.motion.rates]
+        velocity, spin = np.array(rates[:d], np.float64), np.array(collider.motion.axis) * rates[d]
+    arrows = [(pivot, velocity)]
+    if spin.any() and not isinstance(collider.form, Plane):
+        axis = spin / np.linalg.norm(spin)
+        along = next(a for a in np.eye(3) if abs(a @ axis) < PARALLEL)
+        across = np.cross(axis, np.cross(along, axis))
+        across /= np.linalg.norm(across)
+        half = 0.5 * float(np.ptp(collider.form.bounds(), axis=0) @ np.abs(across[:d]))
+        arm = half * across
+        arrows.append((pivot + arm[:d], velocity + np.cross(spin, arm)[:d]))
+    return arrows
