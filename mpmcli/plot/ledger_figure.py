@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LABEL_WIDTH = 22  # characters in a line of a label beside the axis of values
+LABEL_WIDTH = 24  # characters in a line of a label beside the axis of values
 MARKED = 8  # fewer points than this are marked, since a single one makes no line
 FEW_DECADES = 2.5  # fewer decades than this have numbers at 2 and 5 times their powers, too
 NAME_MAX = 16  # characters of a name in a legend
