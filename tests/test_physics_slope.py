@@ -30,11 +30,14 @@ def layer(
     walls: object = WALLS,
     friction: object = 0.0,
 ) -> Scene:
-    """Return a layer H deep and `length` H long, with a gap below its lower end, x down the slope."""
+    """Return a layer H deep and `length` H long, with a gap below its lower end, x down the slope.
+
+    Its particles are in rows, over which means are taken.
+    """
     return scene(
         [cells * (length + gap), cells + 4],
         H / cells,
-        [block(name, material, [0, 0], [length * H, H])],
+        [block(name, material, [0, 0], [length * H, H], sampling="lattice")],
         end,
         frames=frames,
         gravity=tilted(degrees),
