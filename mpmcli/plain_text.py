@@ -34,7 +34,7 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun[:-1]}ies" if noun.endswith("y") else f"{count} {noun}s"
 
 
-def number_text(value: float) -> str:
+def plain_number(value: float) -> str:
     """Write a number with three digits, without an exponent where that is legible, such as "3,920" or "0.0251"."""
     return f"{float(f'{value:.3g}'):,.10g}" if 1e-4 <= abs(value) < 1e7 else f"{value:.3g}"
 

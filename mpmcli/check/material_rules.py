@@ -8,7 +8,7 @@ import numpy as np
 from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.geometry import touched_walls
-from mpmcli.plain_text import number_text
+from mpmcli.plain_text import plain_number
 from mpmcli.scene.primitives import Box
 from mpmcli.scene.quantity import AXES
 
@@ -33,7 +33,8 @@ def material_findings(facts: SceneFacts) -> Iterator[Finding]:
         for rule in (_impact, _soft, _locking, _friction):
             yield from rule(facts, body)
     yield from _density(facts)
-    yield from _floor(facts)
+    yield from _slippery(facts)
+    yield from _unpressed(facts)
 
 
 def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
@@ -54,7 +55,7 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     stiffness = body.law.first_set(body.body.material, body.law.stiffness_parameters)
     name, value = stiffness or ("its stiffness", body.stiffness)
     needed = value * (ratio / FAST) ** 2
-    fix = f"Raise {name} from {number_text(value)} to {number_text(needed)} Pa or more, or slow the scene down."
+    fix = f"Raise {name} from {plain_number(value)} to {plain_number(needed)} Pa or more, or slow the scene down."
     yield Finding("warning", "impact-speed", what, fix, ratio, body.name)
 
 
@@ -65,11 +66,11 @@ def _soft(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     weight = body.body.material.density * facts.bounds.gravity * body.height
     if weight > SOFT * modulus:
         what = (
-            f'Body "{body.name}" is so soft that its own weight, {number_text(weight)} Pa at its foot, is '
-            f"{number_text(weight / modulus)} times its modulus of {number_text(modulus)} Pa: it collapses."
+            f'Body "{body.name}" is so soft that its own weight, {plain_number(weight)} Pa at its foot, is '
+            f"{plain_number(weight / modulus)} times its modulus of {plain_number(modulus)} Pa: it collapses."
         )
         lower = f"make the body lower than {body.height * SOFT * modulus / weight:.2g} m."
-        fix = f"Raise the modulus above {number_text(weight / SOFT)} Pa, or {lower}"
+        fix = f"Raise the modulus above {plain_number(weight / SOFT)} Pa, or {lower}"
         yield Finding("warning", "soft", what, fix, weight / modulus, body.name)
 
 
@@ -119,34 +120,43 @@ def _density(facts: SceneFacts) -> Iterator[Finding]:
         yield Finding("warning", "density-ratio", what, fix, ratio, light.name)
 
 
-def _floor(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield materials that slide on a floor without friction, and liquids that begin without the pressure of rest."""
-    scene = facts.scene
-    gravity = np.nan_to_num(scene.domain.gravity_at(0.0))
-    axis = int(np.abs(gravity).argmax())
-    side = int(gravity[axis] > 0)
-    face, word = f"{AXES[axis]}_{('min', 'max')[side]}", scene.domain.walls.faces(scene.dimension)[axis][side]
-    if not gravity.any() or word not in ("slip", "separate"):
+def _slippery(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield a material that slides on a floor without friction, which it would hold to."""
+    (axis, side), domain = _floor(facts), facts.scene.domain
+    if side is None or domain.walls.faces(facts.scene.dimension)[axis][side] not in ("slip", "separate"):
         return
     gripping = [body.name for body in facts.bodies if _grips(body)]
-    if gripping and scene.domain.frictions[axis][side] == 0:
+    if gripping and domain.frictions[axis][side] == 0:
+        face = f"{AXES[axis]}_{('min', 'max')[side]}"
         what = f'Body "{gripping[0]}" slides on the wall {face}, which has no friction.'
         fix = f'Set domain.walls = {{ {face} = "stick" }}, or domain.friction = {{ {face} = 0.5 }}, if it should not.'
         yield Finding("note", "slippery", what, fix, 0.0, gripping[0])
-    for body in facts.bodies:
+
+
+def _unpressed(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield pools at rest that begin without the pressure of rest."""
+    axis, side = _floor(facts)
+    for body in facts.bodies if side is not None else ():
         form, source = body.body.shape.form, body.body
         if body.law.deformation != "J" or source.initial_pressure or not isinstance(form, Box):
             continue
-        touched = touched_walls(scene, form)
+        touched = touched_walls(facts.scene, form)
         level = all(all(faces) for a, faces in enumerate(touched) if a != axis)
         if level and touched[axis][side] and source.deformation is None and not np.any(source.velocity):
-            pressure = source.material.density * float(np.abs(gravity[axis])) * body.height
+            pressure = source.material.density * facts.bounds.gravity * body.height
             what = (
                 f'Body "{body.name}" fills the domain from wall to wall and begins without pressure: it sinks and '
-                f"bounces for seconds, and its pressure varies by up to {number_text(pressure)} Pa."
+                f"bounces for seconds, and its pressure varies by up to {plain_number(pressure)} Pa."
             )
             fix = 'Set initial_pressure = "hydrostatic" to begin at rest.'
             yield Finding("note", "no-pressure", what, fix, pressure, body.name)
+
+
+def _floor(facts: SceneFacts) -> tuple[int, int | None]:
+    """Return the axis and the side, 0 or 1, of the wall that gravity points at; None for the side without gravity."""
+    gravity = np.nan_to_num(facts.scene.domain.gravity_at(0.0))
+    axis = int(np.abs(gravity).argmax())
+    return axis, int(gravity[axis] > 0) if gravity.any() else None
 
 
 def _grips(body: BodyFacts) -> bool:

@@ -6,6 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from mpmcli.check.finding import FrameFindings, Severity
+from mpmcli.check.material_rules import VISCOUS
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
@@ -32,8 +33,8 @@ NEIGHBOUR = 1.2
 FEW, MOST_CELLS = 4, 3e7
 # Particles in a cell over those meant, and share of empty cells inside, from which on it is said.
 CROWDED, GAPS = 3.0, 0.05
-# Mean J of a liquid of that viscosity, Pa s, or more from which on it is said.
-OPENED, VISCOUS = 1.2, 0.1
+# Mean J of a viscous liquid from which on it is said.
+OPENED = 1.2
 # Cells to each side of one that is inside, how full they are on average then, and the fewest that tell a share.
 WINDOW, INSIDE, ENOUGH = 2, 0.85, 64
 

@@ -9,7 +9,7 @@ from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import damped_step, expected_steps, steps_at, wave_loss
 from mpmcli.check.geometry import spanned_axes, touched_walls
-from mpmcli.plain_text import number_text
+from mpmcli.plain_text import plain_number
 from mpmcli.scene.bounds import highest_speed
 from mpmcli.scene.schema import USUAL_FLIP, SolverSettings
 from mpmcli.scene.shapes import Ball, Box, Form, Points
@@ -259,7 +259,7 @@ def rounding_findings(facts: SceneFacts) -> Iterator[Finding]:
         if typical > 0 and noise > STRESS_NOISE * typical:
             what = (
                 f'Body "{body.name}" is so stiff that rounding its strain in single precision makes '
-                f"{number_text(noise)} Pa, {_percent(noise / typical)} of the {number_text(typical)} Pa of its "
+                f"{plain_number(noise)} Pa, {_percent(noise / typical)} of the {plain_number(typical)} Pa of its "
                 f"{'weight' if weight > 0 else 'motion'}."
             )
             fix = 'Set solver.precision = "f64", or take a softer material.'
